@@ -203,6 +203,7 @@ class Simulation(WorldViews):
         """Go on from what `save` gave, in worlds of the same environment.
 
         Raises:
+            ConfigError: it is damaged, or one of other worlds; these are as they were.
             JournalError: the state is not one of the run whose journal this is.
             SumoError: SUMO moves vehicles there, and what it was told is not on record; see
                 `SumoTraffic.keep_logs`.
@@ -223,11 +224,24 @@ class Simulation(WorldViews):
         tick.peers.share_rows(tick.gate, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
+        self.check(saved)
         roots, episodes, *rest = saved
         ownership = self._saved_ownership(rest)
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
         self._tick.gate = snapshot.load(self._parts(), rest, ownership, home)
+
+    def check(self, saved: Sequence[NDArray[Any]]) -> None:
+        """See that worlds can go on from what `save` gave. Raises ConfigError: they cannot."""
+        if len(saved) < 2 or saved[0].shape != (2,) or saved[1].shape != self._episodes.shape:
+            raise ConfigError("the state is damaged: it says of no episode which one it is")
+        snapshot.form_of(self._parts()).check(saved[2:])
+
+    def check_share(self, share: Sequence[NDArray[Any]]) -> None:
+        """See that `join` can take what `share_of` gave. Raises ConfigError: it cannot."""
+        if [array.shape for array in share[:2]] != [(2,), (1,)]:
+            raise ConfigError("the state is damaged: it says of no episode which one it is")
+        snapshot.form_of(self._parts()).check_share(share[2:])
 
     def _saved_ownership(self, saved: Sequence[NDArray[Any]]) -> list[SavedOwnership] | None:
         """Who owns which vehicle in a saved state, if it is known and the zones are the same."""

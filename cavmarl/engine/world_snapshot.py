@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.engine.component import Attached
+from cavmarl.engine.state_check import StateForm
 from cavmarl.handoff.coordinator.coordinators import Coordination
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership, zone_table
 from cavmarl.handoff.division import Division
@@ -102,6 +103,19 @@ def load(
         ownership = ownership if goes_on else None
     parts.coordination.go_on(ownership)
     return gate
+
+
+def form_of(parts: Parts) -> StateForm:
+    """What a saved state of these worlds looks like."""
+    rerouting = [*_of_rerouting(parts)]
+    return StateForm(
+        parts.traffic.network.arrays,
+        parts.division,
+        parts.traffic,
+        parts.attached,
+        [*_fixed(parts)],
+        rerouting,
+    )
 
 
 def ownership_of(parts: Parts, saved: Sequence[Array]) -> list[SavedOwnership] | None:

@@ -22,6 +22,7 @@ from cavmarl.handoff.owner_changes import OwnerChanges
 from cavmarl.shards.executor import Executor
 from cavmarl.shards.kernels.group_phases import count_rows
 from cavmarl.shards.shard import Shard
+from cavmarl.shards.state_check import RowCheck
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, note_gathered, take_own
@@ -65,6 +66,7 @@ class Division:
         touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
         borders: Borders,  # when a vehicle is near one
         codec: TransferCodec,  # of vehicles' states
+        row_check: RowCheck,  # of rows that come from outside
         may_teleport: bool,  # whether vehicles may be put anywhere between two ticks
     ) -> None:
         self.zones: ZoneArrays = partition.arrays
@@ -72,6 +74,7 @@ class Division:
         self.may_teleport = may_teleport
         self.borders = borders
         self.codec = codec
+        self.row_check = row_check
         self.book = make_book(*shards[0].worlds.rows.shape)  # vehicles near a border
         self._shards = tuple(shards)
         self._zoned = zoned

@@ -240,13 +240,21 @@ class LocalWorlds:
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave; errors as of `Simulation.load`."""
-        self._steps[:], self._waiting[:] = saved[:2]
+        self.check(saved)
         self.simulation.load(saved[2:])
+        self._steps[:], self._waiting[:] = saved[:2]
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
         """The same where other processes hold zones; see `Simulation.load_own`."""
-        self._steps[:], self._waiting[:] = saved[:2]
+        self.check(saved)
         self.simulation.load_own(saved[2:], home)
+        self._steps[:], self._waiting[:] = saved[:2]
+
+    def check(self, saved: Sequence[NDArray[Any]]) -> None:
+        """See that worlds can go on from what `save` gave. Raises ConfigError: they cannot."""
+        if any(array.shape != self._steps.shape for array in saved[:2]):
+            raise ConfigError("the state is damaged: it is one of another number of worlds")
+        self.simulation.check(saved[2:])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """What a copy is made of: the worlds' parts, their state, and what is to be read of it.
@@ -319,12 +327,16 @@ class LocalWorlds:
         zones = self.world.partition.count
         like = self.share_of(0)
         shares = [from_bytes(one, [*like[:-zones], like[-1]]) for one in saved]
+        for share in shares:
+            if any(array.shape != (1,) for array in share[:2]):
+                raise ConfigError("the state is damaged: it is not one of one world")
+            self.simulation.check_share(share[2:])
         return self.join([[*share, *[share[-1][:0]] * (zones - 1)] for share in shares])
 
     def refusal(self, saved: Sequence[bytes]) -> str:
         """Why worlds cannot go on from these; empty: they can."""
         try:
-            self.read_worlds(saved)
+            self.check(self.read_worlds(saved))
         except ConfigError as error:
             return str(error)
         return ""

@@ -203,9 +203,8 @@ def test_frames_whose_head_is_not_guarded(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("mix", ["lose", "duplicate", "reorder"])
 def test_frames_that_are_not_counted(monkeypatch: pytest.MonkeyPatch, mix: str) -> None:
     """The campaign finds it: a frame is missing, comes twice or comes out of turn."""
-    monkeypatch.setattr(
-        "cavmarl.parallel.nodes.link.xxh3_64_intdigest",
-        lambda data, seed=0: xxh3_64_intdigest(data),
+    checksum = "cavmarl.parallel.nodes.link.xxh3_64_intdigest"
+    monkeypatch.setattr(checksum, lambda data, seed=0: xxh3_64_intdigest(data))
     )
     assert one_line(mix, seeds=8).wrong
 

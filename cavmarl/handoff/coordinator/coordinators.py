@@ -125,7 +125,11 @@ class Coordinators:
     def save(self, w: int) -> SavedOwnership:
         """What decides the next changes of owner in a world, but for its zones."""
         saved = self.coordinators[w].save()
-        return saved._replace(numbers=saved.numbers._replace(is_stirred=int(self._stirred[w])))
+        if not self._stirred[w]:
+            return saved
+        # Rows have moved since those near a border were noted, and are looked at again.
+        numbers = saved.numbers._replace(is_stirred=1, crossed=0)
+        return saved._replace(numbers=numbers, near=saved.near[:0])
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
         """Go on with worlds that have been loaded.

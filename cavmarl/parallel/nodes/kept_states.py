@@ -85,12 +85,12 @@ class KeptStates:
             _drop_later(states, state)
         like = self._worlds.save()
         own = self._own.get(state)
-        saved = None if own is None else from_bytes(own, like)
+        saved = None if own is None else self._read(own, like)
         for number in lost:
             found = self._others.get(number, {}).get(state)
             if saved is None or found is None:
                 raise WorkerError(f"what node {number} had is kept nowhere")
-            saved[self._first - 1] += self._join(saved, from_bytes(found, like), like)
+            saved[self._first - 1] += self._join(saved, self._read(found, like), like)
         if takers and saved is not None:
             data = to_bytes(saved)
             for taker in takers:
@@ -101,8 +101,12 @@ class KeptStates:
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
                 check()  # it may take what is awaited
+<<<<<<< HEAD
             self._links.wanted = ()
             given = from_bytes(self._given.pop(donor).data, like)
+=======
+            given = self._read(self._given.pop(donor).data, like)
+>>>>>>> w-state
             if saved is None:
                 saved = given
                 saved[self._first - 1][...] = 0  # contacts stay where they were counted
@@ -115,6 +119,12 @@ class KeptStates:
             if (n - self._first) % count not in zones:
                 saved[n] = saved[n][:0]
         self._worlds.load_own(saved, zones[0])
+
+    def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
+        """A state that is kept. Raises ConfigError: worlds cannot go on from it."""
+        saved = from_bytes(data, like)
+        self._worlds.check(saved)
+        return saved
 
     @property
     def _first(self) -> int:
