@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-<<<<<<< HEAD
+from collections.abc import Iterator, Sequence
+
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-=======
-from collections.abc import Iterator, Sequence
->>>>>>> w-state
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,13 +57,11 @@ class Messaging:
         """The inboxes, the counts, and what is in flight."""
         return self.bus.arrays()
 
-<<<<<<< HEAD
+    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
+        return self.bus.wrong(saved)
+
 
 def without_network(attached: Iterable[object]) -> AbstractContextManager[None]:
     """Return the time in which no network simulator is asked; see `Bus.unheard`."""
     buses = (part.bus for part in attached if isinstance(part, Messaging))
     return next((bus.unheard() for bus in buses), nullcontext())
-=======
-    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        return self.bus.wrong(saved)
->>>>>>> w-state

@@ -205,7 +205,6 @@ def test_frames_that_are_not_counted(monkeypatch: pytest.MonkeyPatch, mix: str) 
     """The campaign finds it: a frame is missing, comes twice or comes out of turn."""
     checksum = "cavmarl.parallel.nodes.link.xxh3_64_intdigest"
     monkeypatch.setattr(checksum, lambda data, seed=0: xxh3_64_intdigest(data))
-    )
     assert one_line(mix, seeds=8).wrong
 
 

@@ -101,12 +101,8 @@ class KeptStates:
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
                 check()  # it may take what is awaited
-<<<<<<< HEAD
             self._links.wanted = ()
-            given = from_bytes(self._given.pop(donor).data, like)
-=======
             given = self._read(self._given.pop(donor).data, like)
->>>>>>> w-state
             if saved is None:
                 saved = given
                 saved[self._first - 1][...] = 0  # contacts stay where they were counted
