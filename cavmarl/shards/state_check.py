@@ -38,7 +38,7 @@ class RowCheck:
     Args:
         roads: the network.
         traffic: types of vehicles and ways.
-        num_agents: of a world.
+        num_agents: that an episode of a world can have.
         num_zones: of a world.
     """
 
