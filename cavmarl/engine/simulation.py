@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import CapacityError, SumoError
+from cavmarl.core.errors import CapacityError, ConfigError, SumoError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.rng import world_key
 from cavmarl.core.memory import Zeros
