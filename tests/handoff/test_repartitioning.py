@@ -56,8 +56,8 @@ def test_who_enters_in_the_last_tick_before_the_cut_goes_to_its_new_zone() -> No
         pending = [coordinator.notes()[0] for coordinator in recut.coordinators]
         for w, births in enumerate(pending):
             for birth in births:
-                zone, row = recut._tick.division.changes.find(w, birth.vehicle)
-                place = recut._tick.division.owned(w, zone)[row]
+                zone, row = recut.division.changes.find(w, birth.vehicle)
+                place = recut.division.owned(w, zone)[row]
                 assert zone == birth.zone == recut.partition.zone_of(place["x"], place["y"])
                 entered += len(recut.zones.recuts) > 0
     assert entered > 0

@@ -57,5 +57,5 @@ def test_a_view_stays_what_it_was(divided: Simulation) -> None:
 
 def test_transfers_are_handed_through(divided: Simulation) -> None:
     one = TransferInFlight(vehicle=7, source=0, target=1, state="offered")
-    view = view_zones(divided._shards, divided.partition, HALO_M, transfers=[one])
+    view = view_zones(divided.shards, divided.partition, HALO_M, transfers=[one])
     assert view.transfers == (one,)

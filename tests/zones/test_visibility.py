@@ -61,8 +61,8 @@ def test_who_may_have_reached_a_line_is_nearer_than_half_a_body_and_what_is_kept
 ) -> None:
     simulation = driven(blocks).simulation
     kept_m = float(simulation.network.lanes["stop_back_m"].max())
-    half_m = 0.5 * float(simulation._tick.division.owned(0, 0)["length"].max())
-    assert half_m + kept_m < simulation._tick.division.halo.line_m < half_m + kept_m + 5.0
+    half_m = 0.5 * float(simulation.division.owned(0, 0)["length"].max())
+    assert half_m + kept_m < simulation.division.halo.line_m < half_m + kept_m + 5.0
 
 
 def test_the_monitor_asks_for_those_who_are_seen(blocks: Path) -> None:
