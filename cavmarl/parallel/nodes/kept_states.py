@@ -13,12 +13,14 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import WorkerError
+from cavmarl.core.errors import MessageError, WorkerError
 from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
+from cavmarl.parallel.nodes.peer_faults import FAULTS, reading
+from cavmarl.parallel.nodes.row_checks import RowChecks
 
 Array = NDArray[Any]
 KEPT = 2  # so many states: the newest may not have come everywhere
@@ -90,7 +92,11 @@ class KeptStates:
             found = self._others.get(number, {}).get(state)
             if saved is None or found is None:
                 raise WorkerError(f"what node {number} had is kept nowhere")
-            saved[self._first - 1] += self._join(saved, from_bytes(found, like), like)
+            try:
+                theirs = self._read(found, like)
+            except FAULTS as error:
+                raise WorkerError(f"what node {number} had cannot be read: {error}") from error
+            saved[self._first - 1] += self._join(saved, theirs, like)
         if takers and saved is not None:
             data = to_bytes(saved)
             for taker in takers:
@@ -100,7 +106,8 @@ class KeptStates:
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
                 check()  # it may take what is awaited
-            given = from_bytes(self._given.pop(donor).data, like)
+            with reading(donor):
+                given = self._read(self._given.pop(donor).data, like)
             if saved is None:
                 saved = given
                 saved[self._first - 1][...] = 0  # contacts stay where they were counted
@@ -113,6 +120,20 @@ class KeptStates:
             if (n - self._first) % count not in zones:
                 saved[n] = saved[n][:0]
         self._worlds.load_own(saved, zones[0])
+
+    def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
+        """What another node has saved, checked against what there is here.
+
+        Raises:
+            ConfigError, MessageError: it is of other worlds, or of vehicles that cannot be.
+        """
+        found, checks = from_bytes(data, like), RowChecks(self._worlds.simulation)
+        for array, own in zip(found[: self._first], like, strict=False):
+            if array.shape != own.shape and array.shape[:1] != own.shape[:1]:
+                raise MessageError(f"an array of {array.shape} in the place of {own.shape}")
+        for rows in found[self._first :]:
+            checks.check(rows)
+        return found
 
     @property
     def _first(self) -> int:
