@@ -187,6 +187,14 @@ class TransferCodec:
             )
         return header
 
+    def record(self, data: bytes, vehicle: int) -> bytes:
+        """The record of a vehicle's state, once that is seen to be whole and of this layout."""
+        header = self.header(data)
+        self._check_record(header, data)
+        if header.vehicle != vehicle:
+            raise MessageError(f"the state of vehicle {vehicle} is that of {header.vehicle}")
+        return data[_HEADER.size : _HEADER.size + self._size]
+
     def _check_record(self, header: TransferHeader, data: bytes) -> int:
         first = _HEADER.size
         (vehicle,) = _LONG.unpack_from(data, first + self._id_at)

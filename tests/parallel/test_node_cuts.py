@@ -145,7 +145,7 @@ def test_zones_are_told_to_the_last_bit(make: Make) -> None:
     vec = make("grid4x4", agents=1, background=0)
     partition = cut_map(vec.simulation.network, "bisection", 7)
     assert read_zones(told_zones(partition)).content_hash == partition.content_hash
-    assert read_neighbours([[[0, 1], [1]], True]).near == (frozenset({0, 1}), frozenset({1}))
+    assert read_neighbours([[[0, 1], [1]], True], 2).near == (frozenset({0, 1}), frozenset({1}))
 
 
 @pytest.mark.parametrize("mix", ["kill", "kill_in_recovery"])

@@ -18,10 +18,11 @@ from cavmarl.parallel.hosts.encryption import encrypted
 from cavmarl.parallel.network.tcp_transport import TcpConnection
 from cavmarl.parallel.network.transport import READS
 from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, said_by
-from cavmarl.parallel.nodes.links import LinkLostError, Links
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_system import MACHINE
+from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from cavmarl.parallel.nodes.zone_hosts import packed
 from tests.parallel.test_node_joining import WAIT_S
 
@@ -155,7 +156,7 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
 
 @pytest.mark.parametrize("said", [b"no JSON", b"{}", b"\xff"])
 def test_a_list_is_a_list(said: bytes) -> None:
-    with pytest.raises(MessageError, match="a frame of kind PONG says"):
+    with pytest.raises(MessageError, match="a frame of kind PONG: it"):
         said_by(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
 
 

@@ -18,9 +18,10 @@ from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.network.tcp_transport import TcpConnection, TcpListener
 from cavmarl.parallel.nodes import newcomers as newcomers_module
 from cavmarl.parallel.nodes.link import FrameKind
-from cavmarl.parallel.nodes.links import LinkLostError, Links
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomers
 from cavmarl.parallel.nodes.node_process import run_node
+from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from tests.parallel.test_node_joining import WAIT_S, elsewhere
 
 
@@ -29,7 +30,7 @@ class Door:
 
     def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
         self.listener = TcpListener(address, key)
-        self.newcomers = Newcomers(self.listener, {}, [], lambda: room)
+        self.newcomers = Newcomers(self.listener, {}, [], lambda: room, 1)
         self._is_open = True
         self._thread = threading.Thread(target=self._look)
         self._thread.start()

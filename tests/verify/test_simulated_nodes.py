@@ -17,11 +17,11 @@ from cavmarl.engine.world_setup import World, make_world
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.transport import Bytes
-from cavmarl.parallel.nodes import links as links_module
 from cavmarl.parallel.nodes.agent_stream import AgentStream
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_system import NodeSystem
+from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from cavmarl.parallel.nodes.row_stream import RowStream
 from cavmarl.verify.simulated_faults import (
     CALLER_DEATHS,
@@ -88,12 +88,12 @@ def test_bytes_that_change_on_the_way_are_noticed(world: World) -> None:
     def double(end: SimulatedSocket) -> None:
         end.due = lambda data: [data, data]
 
-    with pytest.raises(links_module.LinkLostError, match="not the next one"):
+    with pytest.raises(LinkLostError, match="not the next one"):
         exchange(world, 3, double)
 
 
 def test_a_connection_without_answers_ends(world: World) -> None:
-    with pytest.raises(links_module.LinkLostError):
+    with pytest.raises(LinkLostError):
         exchange(world, 3, SimulatedSocket.fall_silent)
 
 
@@ -194,10 +194,14 @@ def test_nodes_that_do_not_heed_an_order_to_go_back(monkeypatch: pytest.MonkeyPa
     assert one_line("partition", seeds=3).wrong
 
 
-def test_frames_whose_head_is_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The campaign finds it: a damaged frame is taken for another one."""
+@pytest.mark.slow
+def test_frames_that_are_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The campaign finds it: a frame that is damaged, or comes twice, is taken for another one.
+
+    What it says is checked, too, so that most of them are refused for that.
+    """
     monkeypatch.setattr("cavmarl.parallel.nodes.link.xxh3_64_intdigest", lambda data, seed=0: 0)
-    assert one_line("damage", seeds=12).wrong
+    assert one_line("damage", seeds=12).wrong or one_line("duplicate", seeds=40).wrong
 
 
 @pytest.mark.parametrize("mix", ["lose", "duplicate", "reorder"])

@@ -15,7 +15,6 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from enum import IntEnum
 from functools import cache
 from itertools import count
@@ -37,7 +36,7 @@ ABOUT = 0  # the tag of messages about connections
 LISTENER = 0  # the number by which a poll tells of the listener
 LOOKS = 500  # without a nap between them
 NAP_S = 50e-6
-END_S = 1.0  # for the last messages to go out
+END_S = 60.0  # for the others to end after the caller
 PRINTED_S = 0.3  # for what this process has printed to come through, before the run is ended
 HOW = f"mpirun -n 1 python PROGRAM : -n NODES cavmarl node --{MPI}"
 _ABOUT = struct.Struct("<IIII")
@@ -167,7 +166,7 @@ class MpiTransport:
         self._mpi, self._comm, self._status = mpi, mpi.COMM_WORLD, mpi.Status()
         self.rank, self.ranks = self._comm.Get_rank(), self._comm.Get_size()
         self.wait_s: float | None = None
-        self.is_broken = False
+        self.is_broken = self._has_left = False
         self._listener = MpiListener((MPI, self.rank))
         self._numbers = count(1)
         self._ends: dict[int, MpiConnection] = {}
@@ -212,14 +211,17 @@ class MpiTransport:
             self._say(end.rank, _About.CLOSE, 0, end.far)
 
     def _say(self, rank: int, what: _About, first: int, second: int) -> None:
-        self.send(rank, ABOUT, _ABOUT.pack(what, first, second, 0))
+        if not self._has_left:
+            self.send(rank, ABOUT, _ABOUT.pack(what, first, second, 0))
 
     def send(self, rank: int, tag: int, data: bytes) -> None:
         """Send a message.
 
         Raises:
-            OSError: MPI cannot.
+            OSError: MPI cannot, or this process ends.
         """
+        if self._has_left:
+            raise BrokenPipeError("this process ends")
         try:
             self._sent.append((self._comm.Isend([data, self._mpi.BYTE], rank, tag), data))
         except self._mpi.Exception as error:
@@ -232,6 +234,8 @@ class MpiTransport:
             WorkerError: MPI has lost a rank.
         """
         mpi, status = self._mpi, self._status
+        if mpi.Is_finalized():
+            return
         try:
             while (message := self._comm.Improbe(status=status)) is not None:
                 data = bytearray(status.Get_count(mpi.BYTE))
@@ -287,18 +291,34 @@ class MpiTransport:
             )
 
     def _end(self) -> None:
-        """Let the other ranks know that this process ends; end them, if one of them is lost."""
-        if self._mpi.Is_finalized():
+        """End with all other ranks; end them, if one of them is lost.
+
+        MPI ends well only when each message has been received, and a rank says nothing after GONE.
+        What Python destroys later, as environments that were not closed, finds MPI at its end.
+        """
+        mpi = self._mpi
+        if mpi.Is_finalized():
             return
+        others = set(range(self.ranks)) - {self.rank}
+        until_s = None
+        try:
+            for rank in others:
+                self._say(rank, _About.GONE, 0, 0)
+            self._has_left = True
+            for look in count():
+                self.take()
+                if self.is_broken or (others <= self._gone and not self._sent):
+                    break
+                if until_s is None and CALLER in (self.rank, *self._gone):
+                    until_s = time.monotonic() + END_S
+                self.is_broken = until_s is not None and time.monotonic() > until_s
+                _rest(look)
+        except (OSError, WorkerError):
+            self.is_broken = True
         if self.is_broken:
             time.sleep(PRINTED_S)
             self._comm.Abort(1)
-        until_s = time.monotonic() + END_S
-        with suppress(OSError, WorkerError):
-            for rank in range(self.ranks):
-                self._say(rank, _About.GONE, 0, 0)
-            while self._sent and time.monotonic() < until_s:
-                self.take()
+        mpi.Finalize()
 
 
 @cache

@@ -19,6 +19,7 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
+from cavmarl.parallel.nodes.peer_faults import FAULTS, reading
 
 Array = NDArray[Any]
 KEPT = 2  # so many states: the newest may not have come everywhere
@@ -90,7 +91,11 @@ class KeptStates:
             found = self._others.get(number, {}).get(state)
             if saved is None or found is None:
                 raise WorkerError(f"what node {number} had is kept nowhere")
-            saved[self._first - 1] += self._join(saved, self._read(found, like), like)
+            try:
+                theirs = self._read(found, like)
+            except FAULTS as error:
+                raise WorkerError(f"what node {number} had cannot be read: {error}") from error
+            saved[self._first - 1] += self._join(saved, theirs, like)
         if takers and saved is not None:
             data = to_bytes(saved)
             for taker in takers:
@@ -102,7 +107,8 @@ class KeptStates:
                 self._links.pump(None)
                 check()  # it may take what is awaited
             self._links.wanted = ()
-            given = self._read(self._given.pop(donor).data, like)
+            with reading(donor):
+                given = self._read(self._given.pop(donor).data, like)
             if saved is None:
                 saved = given
                 saved[self._first - 1][...] = 0  # contacts stay where they were counted

@@ -13,7 +13,6 @@ It is compared before anything else of the frame is awaited.
 
 from __future__ import annotations
 
-import json
 import struct
 from collections import deque
 from collections.abc import Sequence
@@ -26,6 +25,7 @@ from xxhash import xxh3_64_intdigest
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
 from cavmarl.parallel.network.transport import MOST_PIECES, Bytes, Connection
+from cavmarl.parallel.nodes.peer_faults import read_json
 
 MAGIC = b"cavN"
 VERSION = 7
@@ -244,12 +244,10 @@ def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError
 def said_by(frame: NodeFrame) -> list[Any]:
     """A list as JSON. Raises MessageError: it is none."""
     try:
-        said = json.loads(bytes(frame.data))
-    except ValueError as error:
-        raise MessageError(f"a frame of kind {frame.kind.name} says nothing: {error}") from error
-    if not isinstance(said, list):
-        raise MessageError(f"a frame of kind {frame.kind.name} says {said!r}")
-    return said
+        found: list[Any] = read_json(frame.data, list)
+    except MessageError as error:
+        raise MessageError(f"a frame of kind {frame.kind.name}: {error}") from error
+    return found
 
 
 def _text(frame: NodeFrame) -> str:

@@ -12,11 +12,14 @@ from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.transport import READS, READS_AND_WRITES, Bytes, Connection
 from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, reading
 
 LOST = (EOFError, OSError, MessageError)  # what ends a connection
 
-Urgent: TypeAlias = Callable[[int, NodeFrame], None]
-"""What is called with an urgent frame as soon as it has come, and the number of its sender."""
+Urgent: TypeAlias = Callable[[int, NodeFrame], Exception | None]
+"""What is called with an urgent frame as soon as it has come, and the number of its sender.
+
+What fails in it is the sender's fault; what it returns is not, and is raised."""
 
 
 class SilenceError(Exception):
@@ -29,15 +32,6 @@ class SilenceError(Exception):
     def __init__(self, text: str, awaited: Collection[int] = ()) -> None:
         super().__init__(text)
         self.awaited = awaited
-
-
-class LinkLostError(Exception):
-    """A connection has ended, or what came over it was no frame."""
-
-    def __init__(self, peer: int, cause: Exception | None = None) -> None:
-        why = f": {cause}" if isinstance(cause, MessageError) else ""
-        super().__init__(f"the connection to node {peer} has ended{why}")
-        self.peer = peer
 
 
 class RecoveryOrderedError(Exception):
@@ -214,9 +208,14 @@ class Links:
         while self._heard:
             number, frame = self._heard.popleft()
             try:
-                self.urgent(number, frame)
-            except LOST as error:
-                raise self._lost(number, error) from error
+                with reading(number):
+                    passed_on = self.urgent(number, frame)
+            except LinkLostError as lost:
+                if lost.peer == number:
+                    self.drop(number)
+                raise
+            if passed_on is not None:
+                raise passed_on
 
     def _lost(self, number: int, error: Exception) -> LinkLostError:
         self.drop(number)
@@ -255,5 +254,6 @@ class Links:
             self.drop(number)
 
 
-def _unheard(number: int, frame: NodeFrame) -> None:
+def _unheard(number: int, frame: NodeFrame) -> Exception | None:
     """What is of no use any more."""
+    return None

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable
 
 from cavmarl.core.errors import MessageError
 from cavmarl.parallel.network.transport import READS, Connection, Place, TransportListener
-from cavmarl.parallel.nodes.links import LinkLostError
 from cavmarl.parallel.nodes.node_system import NodeSystem
+from cavmarl.parallel.nodes.peer_faults import LinkLostError
 
 LOOK_MS = 50.0  # so often it is looked whether those that are awaited still live
 ANSWER_S = 5.0  # for a node to answer a call

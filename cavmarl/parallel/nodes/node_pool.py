@@ -6,15 +6,15 @@ import json
 import logging
 import math
 import os
-import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import MessageError, ProtocolError, WorkerError, WorkerFailureError
+from cavmarl.core.errors import MessageError, WorkerError, WorkerFailureError
 from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
@@ -28,7 +28,7 @@ from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
-from cavmarl.parallel.nodes.links import LinkLostError, Links
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_actions import NodeCommand, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
@@ -37,6 +37,7 @@ from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
 from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
 from cavmarl.parallel.nodes.zone_moves import ZoneMoves, living_of, moves_of, name_of, nodes_of
 from cavmarl.parallel.recipe import recipe_of
@@ -50,6 +51,11 @@ log = logging.getLogger("cavmarl.nodes")
 KEEP_S = 0.2  # so much of work may have to be done again
 END_S = 1.0  # for nodes to hear that they are needed no more
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
+
+Found = TypeVar("Found")
+
+Read: TypeAlias = Callable[[int, memoryview], Found]
+"""Reads what the node of a number has found."""
 
 
 class NodePool:
@@ -69,7 +75,6 @@ class NodePool:
     """
 
     _owner: NDArray[np.int32]  # (W · A,) the node that owns each agent, as far as is known
-    _tellers: Sequence[int] = ()  # the nodes of the last results
     _performed: NodeCommand | None = None  # what they do now
 
     def __init__(
@@ -131,7 +136,7 @@ class NodePool:
         }
         files = files_of(config, base_dir)
         self._starter, listener = start(hosts, nodes, config.workers, base_dir, route)
-        self._newcomers = Newcomers(listener, job, files, self._room, system)
+        self._newcomers = Newcomers(listener, job, files, self._room, count, system)
         try:
             self._begin(nodes)
         except BaseException:
@@ -205,8 +210,15 @@ class NodePool:
 
     # Commands, and what becomes of them when nodes are lost
 
-    def run(self, command: NodeCommand) -> list[memoryview]:
-        """Let all nodes do a command; what each has found, by rising numbers.
+    def run(self, command: NodeCommand, read: Read[Found]) -> list[Found]:
+        """Let all nodes do a command.
+
+        Args:
+            command: what they are to do.
+            read: reads what a node has found, of a number; what fails in it is that node's fault.
+
+        Returns:
+            what was read, first of all of the node that tells what all know alike.
 
         Raises:
             WorkerDeathError: no node has kept the zones of lost ones, or too many were lost.
@@ -218,7 +230,7 @@ class NodePool:
         if command.changes:
             self._log.append(command)
         try:
-            results = self._insist(command)
+            results = self._insist(command, read)
         except BaseException:  # it is as if the command had never been given
             self._is_torn, self._opened = True, None
             if command.changes:
@@ -230,7 +242,7 @@ class NodePool:
             self._keep_again_s = self._links.now_s() + KEEP_S
         return results
 
-    def _insist(self, command: NodeCommand | None) -> list[memoryview]:
+    def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
         """Do a command, or none, again and again, until no node is lost meanwhile."""
         while True:
             try:
@@ -239,9 +251,17 @@ class NodePool:
                     changes = command is not None and command.changes
                     for one in self._log[: -1 if changes else None]:
                         self._perform(one)
-                return [] if command is None else self._perform(command)
+                return [] if command is None else self._read(self._perform(command), read)
             except LinkLostError as lost:
                 self._lose(lost)
+
+    def _read(self, results: Mapping[int, memoryview], read: Read[Found]) -> list[Found]:
+        """Read what nodes have found. Raises LinkLostError: one has found what cannot be."""
+        found = []
+        for number, data in results.items():
+            with reading(number):
+                found.append(read(number, data))
+        return found
 
     def _replace_lost(self) -> bool:  # whether the worlds go back for that
         """Let nodes that have joined meanwhile host what lost ones had.
@@ -267,8 +287,8 @@ class NodePool:
         self._opened = PoolState(self._next_state, self.zones, switched, self._cut)
         self._next_state += 1
 
-    def _perform(self, command: NodeCommand) -> list[memoryview]:
-        """Do a command once. Raises LinkLostError: a node is lost."""
+    def _perform(self, command: NodeCommand) -> dict[int, memoryview]:
+        """Do a command once; what each node has found. Raises LinkLostError: one is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         self._performed = command
         leases = leases_of(command.ticks, self._lease_ticks)
@@ -277,14 +297,17 @@ class NodePool:
             pieces = command.of_node(number, self._owner, lease.get(number, b""))
             self._links.send(number, FrameKind.COMMAND, kept, pieces)
         if not command.changes:
-            return [frame.data for frame in self._take(FrameKind.RESULT).values()]
+            return {n: frame.data for n, frame in self._take(FrameKind.RESULT).items()}
         results = self._commit()
         for _ in range(1, leases):
             self._coordinator.lease(self._begin_lease(), self._ticks_per_step)
             results = self._commit()
         if command.cut is not None:
-            self._cut = ZoneCut(command.cut, read_neighbours(json.loads(bytes(results[0]))))
-            self._coordinator.know(self._cut.neighbours)
+            count = self.world.partition.count
+            with reading(self._teller):
+                near = read_neighbours(read_json(results[self._teller], list), count)
+            self._cut = ZoneCut(command.cut, near)
+            self._coordinator.know(near)
         return results
 
     def _begin_lease(self) -> dict[int, bytes]:
@@ -297,23 +320,35 @@ class NodePool:
             lease = decide()
         return lease
 
-    def _hear(self, number: int, frame: NodeFrame) -> None:
-        """Take an urgent frame; an error of a node is raised here."""
-        if frame.kind is FrameKind.MISSED:
-            peer = int.from_bytes(frame.data, "little")
-            if frame.number == self._generation and peer in self._nodes:
-                self._watch.hear_missed(number, peer)
-        elif frame.kind is FrameKind.FAILED:
-            name, text, trace = said_by(frame)
-            failure = WorkerFailureError(number, name_of(self._homes[number]), name, text, trace)
-            raise own_error(failure) from failure
-        elif frame.kind is FrameKind.PONG:
-            self._watch.hear_pong(number, frame)
-        elif frame.kind is FrameKind.NOT_MINE:
-            if frame.number == self._generation:
-                self._send_on(frame)
-        else:
-            self._coordinator.hear(number, frame)
+    def _hear(self, number: int, frame: NodeFrame) -> Exception | None:
+        """Take an urgent frame.
+
+        Returns:
+            an error of a node, for the caller.
+        """
+        is_present = frame.number == self._generation
+        match frame.kind:
+            case FrameKind.MISSED:
+                peer = int.from_bytes(frame.data, "little")
+                if is_present and peer in self._nodes:
+                    self._watch.hear_missed(number, peer)
+            case FrameKind.FAILED:
+                name, text, trace = map(str, said_by(frame))
+                part = name_of(self._homes[number])
+                failure = WorkerFailureError(number, part, name, text, trace)
+                found = own_error(failure)
+                found.__cause__ = None if found is failure else failure
+                return found
+            case FrameKind.PONG:
+                self._watch.hear_pong(number, frame)
+            case FrameKind.NOT_MINE:
+                if is_present:
+                    self._send_on(frame)
+            case FrameKind.MESSAGES:
+                self._coordinator.hear(number, frame)
+            case _:
+                raise MessageError(f"a node sends no frame of kind {frame.kind.name}")
+        return None
 
     def _send_on(self, frame: NodeFrame) -> None:
         """Send actions that a node refuses to the owners that it names.
@@ -410,7 +445,7 @@ class NodePool:
         self._teller = self._teller if self._teller in old else (old or self._living)[0]
         return self._teller
 
-    def _commit(self) -> list[memoryview]:
+    def _commit(self) -> dict[int, memoryview]:
         """Wait for the nodes to be through with a tick.
 
         Returns:
@@ -419,18 +454,15 @@ class NodePool:
         Raises:
             LinkLostError: one is lost, or has sent what cannot be.
         """
-        told, results = {}, []
+        told, results = {}, {}
         frames = self._take(FrameKind.REPORT)
         for number in sorted(frames, key=self._teller.__ne__):  # else by rising numbers
-            try:
+            with reading(number):
                 messages, said, more = read_report(frames[number].data, len(self._runs))
-                self._coordinator.check(number, messages)
-            except (ValueError, TypeError, struct.error, ProtocolError) as error:
-                raise LinkLostError(number, MessageError(f"no report: {error}")) from error
+                self._coordinator.check(number, messages, said)
             told[number] = messages, said
-            results.append(more)
+            results[number] = more
         self._coordinator.commit(told)
-        self._tellers = list(told)
         return results
 
     def close(self) -> None:
@@ -443,5 +475,6 @@ class NodePool:
         self._starter.close()
 
 
-def _nothing(number: int, frame: NodeFrame) -> None:
+def _nothing(number: int, frame: NodeFrame) -> Exception | None:
     """Before a tick there are no messages."""
+    return None

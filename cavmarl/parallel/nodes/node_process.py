@@ -23,7 +23,7 @@ from cavmarl.parallel.network.transport import Bytes, Place
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.kept_states import KeptStates
 from cavmarl.parallel.nodes.link import FrameKind, NeededNoMoreError, NodeFrame
-from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
+from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_actions import ActionsTaken, refusal
 from cavmarl.parallel.nodes.node_cuts import cut_worlds, proposal_of, read_zones, told_neighbours
@@ -39,8 +39,9 @@ from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_network import AskedNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of
-from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
+from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of, unpacked
+from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of, read_order
 from cavmarl.parallel.worlds_job import Task, commands_of
 
 MEASURED_TICKS = 10  # one of so many shows what zones cost
@@ -74,8 +75,9 @@ class NodeProgram:
         links = self._links
         told = {"code": code_stamp(), "machine": socket.gethostname(), "pid": os.getpid()}
         links.send(COORDINATOR, FrameKind.JOIN, 0, [json.dumps(told).encode()])
-        job = json.loads(bytes(self._take(FrameKind.JOB)))
-        files = [WorldFile(*told) for told in job["files"]]
+        with reading(COORDINATOR):
+            job = read_json(self._take(FrameKind.JOB), dict)
+            files = [WorldFile(*told) for told in job["files"]]
         self._fetch(files)
         recipe = recipe_with(job["recipe"], files)
         self._worlds = worlds = self._system.worlds_of(
@@ -98,11 +100,12 @@ class NodeProgram:
         if not wanted:
             return
         self._links.send(COORDINATOR, FrameKind.WANTED, 0, [json.dumps(wanted).encode()])
-        data = self._take(FrameKind.FILES)
-        at = 8 + int.from_bytes(data[:8], "little")
-        for n, size in zip(wanted, json.loads(bytes(data[8:at])), strict=True):
-            files[n].keep(bytes(data[at : at + size]))
-            at += size
+        with reading(COORDINATOR):
+            data = self._take(FrameKind.FILES)
+            at = 8 + int.from_bytes(data[:8], "little")
+            for n, size in zip(wanted, read_json(data[8:at], list), strict=True):
+                files[n].keep(bytes(data[at : at + size]))
+                at += size
 
     def _take(self, kind: FrameKind) -> memoryview:
         """What the caller sends next, while it may send this node away."""
@@ -128,7 +131,8 @@ class NodeProgram:
         settings, division = simulation.config.zones, simulation.division
         self._hosts = ZoneHosts(
             division, mine, nodes_of(zones), told, limits_of(settings, division.codec.schema),
-            self._links, carried, generation, settings.check_invariants, self._lease_ticks,
+            self._links, carried, self._peers.checks, generation, settings.check_invariants,
+            self._lease_ticks,
         )  # fmt: skip
         self._run_own()
 
@@ -145,21 +149,25 @@ class NodeProgram:
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
-        if frame.kind is FrameKind.KEEP:
-            self._kept.take(number, frame)
-        elif frame.kind is FrameKind.AGENT:
-            self._hosts.keep_agent(frame)
-        elif frame.kind is FrameKind.ACTIONS:
-            self._actions.append(frame)
-        elif frame.kind is FrameKind.RECEPTIONS and self._network is not None:
-            self._network.hear(frame)
-        elif frame.kind is FrameKind.GIVE:
-            self._kept.take_given(number, frame)
-        elif frame.kind is FrameKind.PING:
-            said = json.dumps(self._links.awaited).encode()
-            self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
-        else:
-            self._hosts.hear(number, frame)
+        is_caller = number == COORDINATOR
+        match frame.kind:
+            case FrameKind.MESSAGES:
+                self._hosts.hear(number, frame)
+            case FrameKind.KEEP if not is_caller:
+                self._kept.take(number, frame)
+            case FrameKind.AGENT if not is_caller:
+                self._hosts.keep_agent(frame)
+            case FrameKind.GIVE if not is_caller:
+                self._kept.take_given(number, frame)
+            case FrameKind.ACTIONS if is_caller:
+                self._actions.append(frame)
+            case FrameKind.RECEPTIONS if is_caller and self._network is not None:
+                self._network.hear(frame)
+            case FrameKind.PING if is_caller:
+                said = json.dumps(self._links.awaited).encode()
+                self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
+            case _:
+                raise MessageError(f"it sends no frame of kind {frame.kind.name}")
 
     def serve(self) -> NoReturn:
         """Do what the coordinator asks for.
@@ -174,7 +182,9 @@ class NodeProgram:
                 if frame.kind is FrameKind.RECOVER:
                     self._recover(frame)
                 elif frame.kind is FrameKind.LEASE:
-                    self._hosts.note(frame.data)
+                    with reading(COORDINATOR):
+                        leased = unpacked(frame.data)
+                    self._hosts.note(leased)
                 else:
                     self._perform(frame)
             except RecoveryOrderedError as ordered:
@@ -207,10 +217,13 @@ class NodeProgram:
 
     def _recover(self, frame: NodeFrame) -> None:
         """Begin, or go back to a state that was kept, with the zones that the coordinator names."""
-        links, told = self._links, json.loads(bytes(frame.data))
+        links, count = self._links, self._worlds.world.partition.count
+        with reading(COORDINATOR):
+            told = read_order(frame.data, count, self._worlds.simulation.num_worlds)
+            partition = read_zones(told["partition"])
         self._generation = frame.number
         if self._number < 0:
-            self._number = int(told["number"])
+            self._number = told["number"]
             self._taken = ActionsTaken(self._worlds.arrays, self._number)
             self._kept = KeptStates(self._worlds, links, self._number)
             links.urgent = self._hear
@@ -221,8 +234,8 @@ class NodeProgram:
             links.drop(number)
         zones = told["zones"]
         others = [node for node, some in enumerate(zones) if some and node != self._number]
-        self._meet({node: (host, port) for node, (host, port) in told["places"]}, others)
-        self._worlds.simulation.zones.set_zones(read_zones(told["partition"]))
+        self._meet(told["places"], others)
+        self._worlds.simulation.zones.set_zones(partition)
         self._share(zones, told["runs"], told["hostings"], frame.number)
         state, mine = int(told["state"]), zones[self._number]
         if told["begins"]:  # what is kept elsewhere has come when the SYNC after it comes
@@ -274,21 +287,28 @@ class NodeProgram:
 
     def _perform(self, frame: NodeFrame) -> None:
         worlds, peers = self._worlds, self._peers
-        task, payload, at = command_of(frame.data)
+        with reading(COORDINATOR):
+            if frame.kind is not FrameKind.COMMAND:
+                raise MessageError(f"it sends no frame of kind {frame.kind.name} here")
+            task, payload, at = command_of(frame.data)
         self._kept.settle()
         if frame.number:
             self._kept.keep(frame.number, self._living)
         match task:
             case Task.STEP:
                 at = self._await_actions(frame.data, at)
-                at = self._inputs.take(task, frame.data, at)
-                self._hosts.lease(frame.data[at:])
+                with reading(COORDINATOR):
+                    at = self._inputs.take(task, frame.data, at)
+                    leased = unpacked(frame.data[at:])
+                self._hosts.lease(leased)
                 peers.begin_step()
                 worlds.step(self._commands)
                 self._hosts.report([self._results_of(worlds.simulation.everywhere, of_step=True)])
             case Task.RESET:
-                self._inputs.take(task, frame.data, at)
-                worlds.reset(payload["seed"], payload["first_world"])
+                with reading(COORDINATOR):
+                    self._inputs.take(task, frame.data, at)
+                    seed, first_world = payload["seed"], payload["first_world"]
+                worlds.reset(seed, first_world)
                 self._hosts.report([self._results_of(worlds.arrays.chosen, of_step=False)])
             case Task.LOAD if not payload["only_reads"]:
                 worlds.load_worlds(saved_of(payload))
@@ -322,7 +342,8 @@ class NodeProgram:
         """
         taken, owner = self._taken, self._peers.owner
         taken.begin(owner)
-        wrong, end = taken.take(data, at, owner)
+        with reading(COORDINATOR):
+            wrong, end = taken.take(data, at, owner)
         if len(wrong):
             said = refusal(wrong, owner)
             self._links.send(COORDINATOR, FrameKind.NOT_MINE, self._generation, said)
@@ -330,7 +351,8 @@ class NodeProgram:
             while self._actions:
                 late = self._actions.popleft()
                 if late.number == self._generation:
-                    taken.take(late.data, 0, owner)
+                    with reading(COORDINATOR):
+                        taken.take(late.data, 0, owner)
             if taken.are_due:
                 self._links.heed()
                 self._links.pump(None)
@@ -384,8 +406,9 @@ class NodeProgram:
         return self._generation
 
 
-def _ignore(number: int, frame: NodeFrame) -> None:
+def _ignore(number: int, frame: NodeFrame) -> Exception | None:
     """Before a node has begun, it hears no messages of the protocol."""
+    return None
 
 
 def run_node(

@@ -7,13 +7,17 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from cavmarl.core.errors import MessageError, WorkerError
+from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
-from cavmarl.parallel.nodes.links import LinkLostError, Links, SilenceError
+from cavmarl.parallel.nodes.links import Links, SilenceError
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices
 
 LOOK_S = 0.5  # between looks; a process that is stopped at two of them is given up
 PONG_S = 1.0  # for a living node to answer
 MISSED_S = 0.1  # to hear which others miss a node
 VAIN = 5  # times that all nodes answer and yet nothing comes of a command
+
+MOST_NODES = 1 << 32
 
 Found = TypeVar("Found")
 
@@ -43,7 +47,9 @@ class NodeWatch:
 
     def hear_pong(self, number: int, frame: NodeFrame) -> None:
         if frame.number == self._pings:
-            self._answered[number] = list(said_by(frame))
+            awaited = said_by(frame)
+            check_indices("node", (peer for peer in awaited if peer != COORDINATOR), MOST_NODES)
+            self._answered[number] = awaited
 
     def wait(
         self,
@@ -108,6 +114,8 @@ class NodeWatch:
     def most_missed(self, lost: LinkLostError) -> LinkLostError:
         """The node that has ended, or else the one that cannot be reached by most others."""
         links = self._links
+        if not self._missed:  # what it sent cannot be
+            return lost
         until_s = links.now_s() + MISSED_S
         while lost.peer in links.numbers and (left_s := until_s - links.now_s()) > 0:
             try:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
-from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand
+from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand, ZoneRects
 from cavmarl.parallel.nodes.node_cuts import read_zones
 from cavmarl.parallel.nodes.node_frames import (
     pieces_of,
@@ -37,14 +38,16 @@ from cavmarl.parallel.nodes.node_frames import (
 from cavmarl.parallel.nodes.node_loads import (
     TO_BALANCE,
     TO_SHOW,
+    TOTALS,
     MachineAsked,
     NodeLoad,
     since,
 )
 from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_asked
-from cavmarl.parallel.nodes.node_pool import NodePool
+from cavmarl.parallel.nodes.node_pool import Found, NodePool, Read
 from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
+from cavmarl.parallel.nodes.peer_faults import check_indices, read_json
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
@@ -96,8 +99,8 @@ class NodeWorlds(NodePool):
 
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays = self.arrays
-        results = self.run(self._command(Task.RESET, {"seed": seed, "first_world": first_world}))
-        self._write(results, arrays.chosen, of_step=False)
+        command = self._command(Task.RESET, {"seed": seed, "first_world": first_world})
+        self.run(command, partial(self._write, arrays.chosen, False))
         if not arrays.chosen.all():
             arrays.observations[~arrays.mask] = 0.0
 
@@ -116,19 +119,26 @@ class NodeWorlds(NodePool):
         ):
             if array.size:
                 array[:] = told if told.size else 0
-        results = self.run(self._command(Task.STEP))
+        self.run(self._command(Task.STEP), partial(self._write, self._everywhere, True))
         self._ticks_done += self._ticks_per_step
-        self._write(results, self._everywhere, of_step=True)
 
     def _cut_anew(self) -> None:
         """Every so many steps cut the zones by their vehicles; see `zones.repartition_steps`."""
         self._steps += 1
         if not is_due(self._steps, self.world.config.zones.repartition_steps):
             return
-        if proposal := self._asked(Task.PROPOSE, None):
-            zones, *figures = proposal
-            self.run(self._command(Task.CUT, zones))
+        if proposal := self._asked(Task.PROPOSE, None, self._read_proposal):
+            zones, figures = proposal
+            self.run(self._command(Task.CUT, zones), _unread)
             self.recuts.append(Recut(self._steps - 1, *figures))
+
+    def _read_proposal(self, said: Any) -> tuple[ZoneRects, list[Any]] | None:
+        if said is None:
+            return None
+        zones, *figures = said
+        if read_zones(zones).count != self.world.partition.count or len(figures) != 4:
+            raise MessageError(f"it proposes {said!r}")
+        return zones, figures
 
     def connect_network(self, network: NetworkSimulator) -> None:
         """From now on let a network simulator of this process decide receptions.
@@ -139,21 +149,22 @@ class NodeWorlds(NodePool):
         check_external(self.world.config.v2x)
         self._network = network
 
-    def run(self, command: NodeCommand) -> list[memoryview]:
+    def run(self, command: NodeCommand, read: Read[Found]) -> list[Found]:
         try:
-            return super().run(command)
+            return super().run(command, read)
         except NetworkFailedError as failed:
             raise failed.error from None
 
-    def _perform(self, command: NodeCommand) -> list[memoryview]:
+    def _perform(self, command: NodeCommand) -> dict[int, memoryview]:
         self._exchanged = 0
         return super()._perform(command)
 
-    def _hear(self, number: int, frame: NodeFrame) -> None:
+    def _hear(self, number: int, frame: NodeFrame) -> Exception | None:
         if frame.kind is not FrameKind.EXCHANGE:
-            super()._hear(number, frame)
-        elif frame.number == self._generation:
+            return super()._hear(number, frame)
+        if frame.number == self._generation:
             self._exchange(frame)
+        return None
 
     def _exchange(self, frame: NodeFrame) -> None:
         """Tell all nodes what stations receive; of a step that is done again, what they did."""
@@ -174,8 +185,8 @@ class NodeWorlds(NodePool):
 
         Those that are not watched, or lost, are taken to be idle.
         """
-        for data in self.run(self._command(Task.HOST)):
-            for zone, spent_s in json.loads(bytes(data)):
+        for spent in self.run(self._command(Task.HOST), self._read_spent):
+            for zone, spent_s in spent:
                 self._spent_s[0, zone] += spent_s
         idle = idle_snapshot(len(self._homes))
         if not self.world.config.workers.monitor_cpu:
@@ -184,12 +195,17 @@ class NodeWorlds(NodePool):
         states = {one.worker: one for one in (*idle.workers, *seen.workers)}
         return replace(seen, workers=tuple(states[node] for node in sorted(states)))
 
+    def _read_spent(self, number: int, data: memoryview) -> list[tuple[int, float]]:
+        found = [(zone, float(spent_s)) for zone, spent_s in read_json(data, list)]
+        check_indices("zone", (zone for zone, _ in found), self._spent_s.shape[1])
+        return found
+
     def _move(self, task: Task, zones: list[Any], commits: bool) -> None:
         """Let zones have other homes from now on."""
         before, self._homes = self._homes, zones[0]
         self._is_torn, self._opened = True, None
         try:
-            self._insist(None)
+            self._insist(None, _unread)
         except BaseException:
             self._homes = before
             raise
@@ -204,20 +220,26 @@ class NodeWorlds(NodePool):
         return NodeCommand(pieces, changes, self._ticks_per_step, actions, receptions=[])
 
     def _write(
-        self, results: Sequence[memoryview], chosen: NDArray[np.bool_], of_step: bool
+        self, chosen: NDArray[np.bool_], of_step: bool, number: int, data: memoryview
     ) -> None:
-        for n, (number, data) in enumerate(zip(self._tellers, results, strict=True)):
-            self._results.take(data, chosen, of_step, n == 0, number, self._owner)
+        tells = number == self._teller
+        self._results.take(data, chosen, of_step, tells, number, self._owner)
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
         suggested = self.arrays.suggested
         suggested[...] = 0.0
-        for data in self.run(self._command(Task.SUGGEST)):
-            num = len(data) // (8 + suggested.itemsize * 2)
-            where = np.frombuffer(data, np.int64, num)
-            found = np.frombuffer(data, suggested.dtype, 2 * num, 8 * num)
-            suggested.reshape(-1, 2)[where] = found.reshape(-1, 2)
+        for where, found in self.run(self._command(Task.SUGGEST), self._read_suggested):
+            suggested.reshape(-1, 2)[where] = found
+
+    def _read_suggested(self, number: int, data: memoryview) -> tuple[NDArray[Any], NDArray[Any]]:
+        suggested = self.arrays.suggested
+        num, rest = divmod(len(data), 8 + suggested.itemsize * 2)
+        where = np.frombuffer(data, np.int64, num)
+        check_indices("agent", where, suggested.size // 2)
+        if rest:
+            raise MessageError(f"{len(data)} bytes tell of no suggestions")
+        return where, np.frombuffer(data, suggested.dtype, 2 * num, 8 * num).reshape(-1, 2)
 
     def node_loads(self) -> list[NodeLoad]:
         """What each node has done since this was asked last, by rising numbers.
@@ -226,8 +248,7 @@ class NodeWorlds(NodePool):
         """
         found = []
         ticks, self._ticks_told = self._ticks_done - self._ticks_told, self._ticks_done
-        for data in self.run(self._command(Task.LOADS)):
-            node, *now = json.loads(bytes(data))
+        for node, now in self.run(self._command(Task.LOADS), _read_totals):
             before = self._told.get(node)
             is_same = before is not None and before[0] <= now[0]
             found.append(since(node, ticks, now, before if is_same else None))
@@ -243,41 +264,50 @@ class NodeWorlds(NodePool):
         for node in self._nodes.values():
             here.setdefault(node.machine, []).append(node.pid)
         asked = self._command(Task.LOADS, MachineAsked(purpose, here))
-        found = [json.loads(bytes(data)) for data in self.run(asked)]
-        states = tuple(Candidate(node, Utilisation(*shares)) for node, shares, _ in found)
-        source = next((source for *_, source in found if source != NO_GPU), NO_GPU)
+        found = self.run(asked, _read_watched)
+        states = tuple(candidate for candidate, _ in found)
+        source = next((source for _, source in found if source != NO_GPU), NO_GPU)
         return LoadSnapshot(states, source, MEASURED)
 
-    def _asked(self, task: Task, payload: Any) -> Any:
-        return json.loads(bytes(self.run(self._command(task, payload))[0]))
+    def _asked(self, task: Task, payload: Any, read: Callable[[Any], Found]) -> Found:
+        """What the first node answers; the others have nothing to say."""
+        first = self._first_answer(lambda data: read(json.loads(bytes(data))))
+        found: Found = self.run(self._command(task, payload), first)[0]
+        return found
+
+    def _first_answer(self, read: Callable[[memoryview], Found]) -> Read[Any]:
+        return lambda number, data: read(data) if number == self._living[0] else None
 
     def write_states(self) -> None:
-        data = self.run(self._command(Task.WRITE_STATES))[0]
-        found = np.frombuffer(data, self.arrays.states.dtype)
-        self.arrays.states[...] = found.reshape(self.arrays.states.shape)
+        states = self.arrays.states
+
+        def read(data: memoryview) -> None:
+            states[...] = np.frombuffer(data, states.dtype).reshape(states.shape)
+
+        self.run(self._command(Task.WRITE_STATES), self._first_answer(read))
 
     def ticks(self) -> NDArray[np.int64]:
         return self.arrays.ticks.copy()
 
     def state_hash(self, world: int) -> str:
-        return str(self._asked(Task.STATE_HASH, self._number(world)))
+        return self._asked(Task.STATE_HASH, self._number(world), str)
 
     def traffic_stats(self, world: int) -> dict[str, float]:
-        found: dict[str, float] = self._asked(Task.TRAFFIC_STATS, self._number(world))
-        return found
+        return self._asked(Task.TRAFFIC_STATS, self._number(world), dict)
 
     def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        found = self._asked(Task.DRIVEN, [self._number(world), list(map(int, agents))])
-        return [Driven(*row) for row in found]
+        asked = [self._number(world), list(map(int, agents))]
+        return self._asked(Task.DRIVEN, asked, lambda said: [Driven(*row) for row in said])
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
-        return np.array(self._asked(Task.SIGNAL_PHASES, self._number(world)), dtype=np.int32)
+        asked = self._number(world)
+        return self._asked(Task.SIGNAL_PHASES, asked, lambda said: np.array(said, dtype=np.int32))
 
     def _number(self, world: int) -> int:
         return range(len(self.arrays.mask))[world]
 
     def save_worlds(self) -> list[bytes]:
-        return saved_of(self._asked(Task.SAVE, None))
+        return self._asked(Task.SAVE, None, saved_of)
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are.
@@ -285,9 +315,10 @@ class NodeWorlds(NodePool):
         Raises:
             ConfigError: it is of other worlds.
         """
-        if refusal := self._asked(Task.LOAD, worlds_payload(saved, only_reads=True)):
+        payload = worlds_payload(saved, only_reads=True)
+        if refusal := self._asked(Task.LOAD, payload, lambda said: said and str(said)):
             raise ConfigError(refusal)
-        self.run(self._command(Task.LOAD, worlds_payload(saved)))
+        self.run(self._command(Task.LOAD, worlds_payload(saved)), _unread)
 
     @property
     def partition(self) -> ZonePartition:
@@ -325,6 +356,24 @@ class NodeWorlds(NodePool):
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise uncopied()
+
+
+def _unread(number: int, data: memoryview) -> None:
+    """What a node has found is of no use."""
+
+
+def _read_totals(number: int, data: memoryview) -> tuple[int, list[Any]]:
+    """What a node has done; see `node_loads.totals`."""
+    said = read_json(data, list)
+    if len(said) != 1 + TOTALS or said[0] != number:
+        raise MessageError(f"it tells {said!r} of its load")
+    return number, list(map(float, said[1:5])) + list(map(int, said[5:]))
+
+
+def _read_watched(number: int, data: memoryview) -> tuple[Candidate, str]:
+    """How busy the machine of a node is, and the source of that."""
+    _, shares, source = read_json(data, list)
+    return Candidate(number, Utilisation(*shares)), str(source)
 
 
 def check_nodes(world: World, nodes: int) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
-from cavmarl.core.errors import MessageError, ProtocolError
+from cavmarl.core.errors import MessageError
 from cavmarl.core.records.arrays import Gate
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
@@ -33,6 +33,13 @@ from cavmarl.ownership.reactions import Advance, Hosting
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
+from cavmarl.parallel.nodes.peer_faults import (
+    LinkLostError,
+    check_indices,
+    read_json,
+    reading,
+)
+from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
@@ -70,6 +77,7 @@ class ZoneHosts:
         limits: Limits,
         links: Links,  # to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) of agents: what they do, what is kept of them
+        checks: RowChecks,  # of vehicles that are offered
         generation: int = 0,  # how often nodes have been lost
         is_checked: bool = False,  # whether the caller checks what zones own
         ticks: int = 1,  # of a lease
@@ -79,7 +87,7 @@ class ZoneHosts:
         self._owned_sum = specialized(owned_sum)
         self._carried = carried
         self._come: dict[tuple[int, int], memoryview] = {}  # world, vehicle → what is to be kept
-        self._division = division
+        self._division, self._checks = division, checks
         self._zones = frozenset(zones)
         self._node_of = node_of
         self._links = links
@@ -112,19 +120,23 @@ class ZoneHosts:
             if frame.kind is FrameKind.RECOVER:
                 raise RecoveryOrderedError(frame)
             if frame.kind is not FrameKind.LEASE:
-                raise ProtocolError(f"a frame of kind {frame.kind.name}, where a lease was due")
+                error = MessageError(f"a frame of kind {frame.kind.name}, where a lease was due")
+                raise LinkLostError(COORDINATOR, error)
+            with reading(COORDINATOR):
+                leased = unpacked(frame.data)
             if frame.number:
-                self.lease(frame.data)
+                self.lease(leased)
             else:
-                self.note(frame.data)
+                self.note(leased)
         self._enter_lease()
         self._left = self._ticks - 1
 
-    def lease(self, data: memoryview) -> None:
+    def lease(self, messages: Sequence[tuple[int, Message]]) -> None:
         """Take STEP messages; zones of worlds without any go on with what they own."""
-        told = set()
-        for w, message in unpacked(data):
-            told.add(w)
+        told = {w for w, _ in messages}
+        with reading(COORDINATOR):
+            check_indices("world", told, len(self._endpoints))
+        for w, message in messages:
             self._take(w, message)
         for w, endpoints in enumerate(self._endpoints):
             if not (w in told or self._leases[w] or self._is_quiet[w]):
@@ -138,9 +150,9 @@ class ZoneHosts:
     def _is_leased(self, w: int) -> bool:
         return self._is_quiet[w] or len(self._leases[w]) == len(self._zones)
 
-    def note(self, data: memoryview) -> None:
+    def note(self, messages: Sequence[tuple[int, Message]]) -> None:
         """Let a lease of no ticks begin and end: births come on record, and can be offered."""
-        self.lease(data)
+        self.lease(messages)
         self._enter_lease()
         self._stirred = [True] * len(self._stirred)
         self.report()
@@ -281,7 +293,12 @@ class ZoneHosts:
 
     def hear(self, number: int, frame: NodeFrame) -> None:
         """Take messages of other nodes as soon as they come."""
-        for w, message in unpacked(frame.data):
+        messages = unpacked(frame.data)
+        check_indices("world", (w for w, _ in messages), len(self._endpoints))
+        for w, message in messages:
+            for offer in message.entries if isinstance(message, Prepare) else ():
+                record = self._division.codec.record(offer.state, offer.vehicle)
+                self._checks.check_state(record)
             self._take(w, message)
 
     def _take(self, w: int, message: Message) -> None:
@@ -366,6 +383,10 @@ class ZoneHosts:
         if frame.number == self._generation:
             w, _ = _LENGTH.unpack_from(frame.data)
             vehicle = int(np.frombuffer(frame.data, np.int64, 1, _LENGTH.size)[0])
+            check_indices("world", [w], len(self._endpoints))
+            size = sum(array[0, 0].nbytes for array in self._carried)
+            if len(frame.data) != _LENGTH.size + 8 + size:
+                raise MessageError(f"{len(frame.data)} bytes are not what is kept of an agent")
             self._come[w, vehicle] = frame.data[_LENGTH.size + 8 :]
 
 
@@ -422,5 +443,11 @@ def read_report(
     messages = unpacked(data[at : at + size])
     end = at + size + length
     said = bytes(data[at + size : end]).rstrip()
-    reports = [Report(*report) for report in json.loads(said)] if said else [NOTHING] * num_worlds
+    reports = [NOTHING] * num_worlds
+    if said:
+        reports = [Report(*report) for report in read_json(said, list)]
+        if len(reports) != num_worlds:
+            raise MessageError(f"it tells of {len(reports)} worlds: there are {num_worlds}")
+    if len(data) < end:
+        raise MessageError(f"a report of {end} bytes has {len(data)}")
     return messages, reports, data[end:]
