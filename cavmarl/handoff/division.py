@@ -23,8 +23,8 @@ from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.shards.executor import Executor
 from cavmarl.shards.kernels.group_phases import count_rows
+from cavmarl.shards.row_check import RowCheck
 from cavmarl.shards.shard import Shard
-from cavmarl.shards.state_check import RowCheck
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.zones.kernels.borders import Borders, give_up, pass_on, take_over
 from cavmarl.zones.kernels.ghost_exchange import exchange, note_gathered, take_own
