@@ -244,7 +244,7 @@ class Simulation(WorldViews):
         snapshot.form_of(self._parts()).check_share(share[2:])
 
     def _saved_ownership(self, saved: Sequence[NDArray[Any]]) -> list[SavedOwnership] | None:
-        """Who owns which vehicle in a saved state, if it is known and the zones are the same."""
+        """The owners of vehicles in a saved state, if they are known and the zones are the same."""
         found = snapshot.ownership_of(self._parts(), saved)
         return found if found is not None and self.zones.take_saved(found[0]) else None
 

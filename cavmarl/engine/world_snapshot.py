@@ -119,7 +119,7 @@ def form_of(parts: Parts) -> StateForm:
 
 
 def ownership_of(parts: Parts, saved: Sequence[Array]) -> list[SavedOwnership] | None:
-    """Who owns which vehicle in a saved state; None: it is not known, or worlds had other zones.
+    """The owners of vehicles in a saved state; None: not known, or worlds had other zones.
 
     Raises:
         ConfigError: it says what cannot be.

@@ -21,8 +21,8 @@ from cavmarl.core.records.arrays import Worlds, Zoned
 from cavmarl.handoff.owner_changes import OwnerChanges
 from cavmarl.shards.executor import Executor
 from cavmarl.shards.kernels.group_phases import count_rows
+from cavmarl.shards.row_check import RowCheck
 from cavmarl.shards.shard import Shard
-from cavmarl.shards.state_check import RowCheck
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, note_gathered, take_own

@@ -20,8 +20,8 @@ from cavmarl.rewards.registered_terms import terms_reach_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.observed import carried_from, largest_radius_m, sensing_reach_m
 from cavmarl.sensors.registry import rig_reach_m
+from cavmarl.shards.row_check import RowCheck
 from cavmarl.shards.shard import Shard, make_zoned
-from cavmarl.shards.state_check import RowCheck
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.zones.kernels.borders import Borders

@@ -240,21 +240,24 @@ class LocalWorlds:
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave; errors as of `Simulation.load`."""
-        self.check(saved)
+        self._check_own(saved)
         self.simulation.load(saved[2:])
         self._steps[:], self._waiting[:] = saved[:2]
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
         """The same where other processes hold zones; see `Simulation.load_own`."""
-        self.check(saved)
+        self._check_own(saved)
         self.simulation.load_own(saved[2:], home)
         self._steps[:], self._waiting[:] = saved[:2]
 
     def check(self, saved: Sequence[NDArray[Any]]) -> None:
         """See that worlds can go on from what `save` gave. Raises ConfigError: they cannot."""
+        self._check_own(saved)
+        self.simulation.check(saved[2:])
+
+    def _check_own(self, saved: Sequence[NDArray[Any]]) -> None:
         if any(array.shape != self._steps.shape for array in saved[:2]):
             raise ConfigError("the state is damaged: it is one of another number of worlds")
-        self.simulation.check(saved[2:])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """What a copy is made of: the worlds' parts, their state, and what is to be read of it.

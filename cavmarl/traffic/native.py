@@ -395,7 +395,7 @@ class NativeTraffic:
         """How many departures the demand file orders in the episode of a key."""
         if self.schedule is None:
             return 0
-        return len(self.schedule.orders(key, self.horizon_s))
+        return self.schedule.count(key, self.horizon_s)
 
     def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
         """Fill the chosen worlds (W,) for a new episode."""

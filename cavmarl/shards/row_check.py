@@ -47,6 +47,8 @@ class RowCheck:
     ) -> None:
         self._roads = roads
         self._travel = travel = traffic.travel
+        none = np.zeros(0, dtype=np.int32)
+        self._step_lanes = none if traffic.schedule is None else traffic.schedule.step_lanes
         self._is_moved = traffic.sumo is not None
         num_lanes, num_links = len(roads.lanes), len(roads.links)
         self._num_lanes = num_lanes
@@ -144,7 +146,7 @@ class RowCheck:
         return _of(rows[np.argmax(wrong)], "order", "or id or tick, is none") if wrong.any() else ""
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
-        """Follow each way to its end, but for those whose every step is in the table of a goal."""
+        """See that a way begins at a step of its lane; follow it where lanes are not known."""
         lane, way = self._own_lanes(rows["lane"]), rows["way"]
         at = way + lane
         if wrong := self._wrong_places(rows, lane, way):
@@ -152,6 +154,10 @@ class RowCheck:
         travel, lanes = self._travel, self._num_lanes
         planned = (at < self._plan_steps) & (at % lanes == lane)
         if travel.first_detour:
+            of_routes = (at >= self._plan_steps) & (at < travel.first_detour)
+            planned[of_routes] = (
+                self._step_lanes[at[of_routes] - self._plan_steps] == lane[of_routes]
+            )
             behind = at - travel.first_detour
             planned |= (behind >= 0) & (at < travel.num_fixed) & (behind % lanes == lane)
         drives = (rows["driver"] == DRIVER_BACKGROUND) | (rows["driver"] == DRIVER_AGENT)
