@@ -9,11 +9,11 @@ import socket
 import subprocess
 import sys
 import time
-import zlib
 from statistics import median
 from typing import Annotated, Any
 
 import numpy as np
+from xxhash import xxh3_64_digest
 
 from benchmarks.program import run
 from cavmarl.bench.harness import BenchmarkReport, Say, check_positive, silent
@@ -34,6 +34,7 @@ REPLACED_S = 120.0  # for another node to have joined
 LOCAL = "127.0.0.1"
 FRAME = bytes(96)  # about as long as those of an empty tick
 PORT_BYTES = 4
+SUM_BYTES = 8  # of a checksum
 SERVES = "import sys; from benchmarks.node_latencies import serve; serve(*sys.argv[1:])"
 
 
@@ -201,12 +202,12 @@ def _prompt(connection: socket.socket) -> socket.socket:
 
 
 def _framed() -> bytes:
-    return FRAME + zlib.crc32(FRAME).to_bytes(4, "little")
+    return FRAME + xxh3_64_digest(FRAME)
 
 
 def _take(connection: socket.socket) -> None:
-    data = _read(connection, len(FRAME) + 4)
-    if zlib.crc32(data[:-4]).to_bytes(4, "little") != data[-4:]:
+    data = _read(connection, len(FRAME) + SUM_BYTES)
+    if xxh3_64_digest(data[:-SUM_BYTES]) != data[-SUM_BYTES:]:
         raise ConfigError("a frame is not what was sent")
 
 

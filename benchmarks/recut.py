@@ -95,12 +95,12 @@ def _run_beside(
             began = time.perf_counter()
             vec.step(actions)
             taken[step] = 1e3 * (time.perf_counter() - began)
-            uneven[step] = vec.simulation.zone_loads().imbalance()[0]
+            uneven[step] = vec.simulation.zones.loads().imbalance()[0]
     return found
 
 
 def _row(name: str, vec: CavVectorEnv, uneven: list[float], taken: list[float]) -> dict[str, Any]:
-    recuts = vec.simulation.recuts
+    recuts = vec.simulation.zones.recuts
     interval = mean_interval(np.array(uneven))
     return {
         "name": name,

@@ -196,7 +196,7 @@ def _row(own: TwinWorlds, turns: list[Pair], undivided: list[Pair]) -> dict[str,
     return {
         "zones": own.zones,
         "side_m": math.sqrt((max_x - min_x) * (max_y - min_y) / own.zones),
-        "halo_m": simulation.zone_loads().halo_m,
+        "halo_m": simulation.zones.loads().halo_m,
         "vehicles": loads["vehicles"] / steps,
         "ghosts": loads["ghosts"] / steps,
         "imbalance": loads["imbalance"] / steps,

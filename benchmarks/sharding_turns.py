@@ -147,7 +147,7 @@ def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
         began = time.process_time_ns()
         world.step(commands)
         ns += time.process_time_ns() - began
-        loads = simulation.zone_loads()
+        loads = simulation.zones.loads()
         owned = loads.owned[:, 0]
         vehicles += int(owned.sum())
         ghosts += int(loads.ghosts.sum())

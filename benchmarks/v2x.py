@@ -15,11 +15,13 @@ from typing import Annotated, Any
 from benchmarks.program import run
 from cavmarl.bench.harness import BenchmarkReport, Say, check_positive, one_core, silent
 from cavmarl.cli.output import OptionalEnvironment, Seed, about
+from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.driven_worlds import DrivenWorld
-from cavmarl.v2x.bus import V2xStatistics
+from cavmarl.shards.shard import common_of
+from cavmarl.v2x.bus import Bus, V2xStatistics
 
 # As exponent and spread that of Cheng et al. (JSAC 2007) in a suburb; the air as of IEEE 802.11p.
 CHANNELS: Mapping[str, Mapping[str, Any]] = {
@@ -68,7 +70,9 @@ def measure(
         buses = {}
         for name, channel in CHANNELS.items():
             with_messages = SHAPE | {"v2x.enabled": True} | dict(channel)
-            buses[name] = simulation.listen(load_world(env, **counts, overrides=with_messages)[0])
+            buses[name] = _bus_beside(
+                simulation, load_world(env, **counts, overrides=with_messages)[0]
+            )
         world = DrivenWorld(simulation)
         world_ms: list[float] = []
         bus_ms: dict[str, list[float]] = {name: [] for name in CHANNELS}
@@ -111,6 +115,13 @@ def _row(name: str, found: V2xStatistics, every_ms: list[float], warmup: int) ->
         "reception_ratio": found.reception_ratio,
         "busy_ratio": found.busy_mean,
     }
+
+
+def _bus_beside(simulation: Simulation, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
+    """Return a bus beside a world, which stations of the world do not hear, and its exchange."""
+    division, worlds = simulation.division, simulation.shards[0].worlds
+    bus = Bus(config, simulation.network, simulation.types, division.zoned, common_of(worlds))
+    return bus, lambda: bus.exchange(division.side)
 
 
 def _timed_ms(step: Callable[[], None]) -> float:

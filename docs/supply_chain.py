@@ -37,6 +37,7 @@ EXTRAS = (
     "train",
     "torchrl",
     "ray",
+    "mpi",
 )
 HEAD = """\
 # Every file that `pip install '.[{extras}]'` takes on 64-bit Linux with Python

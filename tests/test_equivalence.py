@@ -25,6 +25,7 @@ from tests.support.demand_worlds import make, tiny
 from tests.support.driving import drive, start
 from tests.support.netgenerate import netgenerate
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, write_demand
+from tests.support.world import traffic_of
 
 ZONES = (2, 3, 4, 9)
 # The built-in driver with a trembling hand: some collide, leave the road, and are followed.
@@ -240,7 +241,7 @@ def test_a_full_world_is_full_wherever_its_vehicles_are(tmp_path: Path) -> None:
 
     def build(zones: dict[str, Any]) -> Simulation:
         simulation = tiny("merge", tmp_path, overrides=FAST | zones)
-        vars(simulation._tick.traffic)["capacity"] = most
+        vars(traffic_of(simulation))["capacity"] = most
         return simulation
 
     whole = hashes_agree(build, 150, (2, 4))

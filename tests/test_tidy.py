@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.code_bounds import PackageCode, counted_parameters, has_untyped_arguments
 from tests.support.cpu_time import ARGUED_S, argued, costs_of_files, known_costs, rare_tests
 from tests.support.references import Package
 from tests.support.tiers import ALONE_FILES, is_needed
@@ -20,18 +21,55 @@ from tests.support.tiers import ALONE_FILES, is_needed
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("cavmarl", "tests", "train", "agents", "fuzz", "docs", "examples", "benchmarks")
 
+# Bounds of what makes code hard to follow. Each set of exceptions equals what is found.
+PUBLIC_METHODS = 25  # of a class with its bases, properties not counted
+WIDE_CLASSES: set[str] = set()
+
+ATTRIBUTES = 20  # that a class and its bases set
+LARGE_CLASSES = {
+    "cavmarl.ownership.trace_check.TraceChecker",
+    "cavmarl.parallel.nodes.node_peers.NodePeers",
+    "cavmarl.parallel.nodes.node_pool.NodePool",
+    "cavmarl.parallel.nodes.node_process.NodeProgram",
+    "cavmarl.parallel.nodes.node_worlds.NodeWorlds",
+    "cavmarl.parallel.nodes.zone_hosts.ZoneHosts",
+    "cavmarl.shards.shard.Shard",
+    "cavmarl.traffic.sumo.sumo_child.SumoSimulation",
+}
+
+PARAMETERS = 10  # keyword-only ones of public functions, and those of kernels, not counted
+WIDE_FUNCTIONS: set[str] = set()
+
+# Functions with untyped `*arguments`: they pass on the arguments of a kernel or of another library.
+PASSED_ON = {
+    "cavmarl.adapters.sb3_vec_env.CavSb3VecEnv.env_method",
+    "cavmarl.core.compiled.compiler.KernelCompiler.__init__",
+    "cavmarl.core.compiled.inlined_function.InlinedFunction.__call__",
+    "cavmarl.core.compiled.intrinsic.Intrinsic.__call__",
+    "cavmarl.core.compiled.kernel.Kernel.__call__",
+    "cavmarl.core.compiled.kernel._Specialized.__call__",
+    "cavmarl.core.compiled.kernel._Unchecked.__call__",
+    "cavmarl.core.math.elementary_arrays._mapped",
+    "cavmarl.core.records.record",
+    "cavmarl.cosim.followers.follower_connection._Patient.recv_into",
+    "cavmarl.cosim.followers.follower_connection._Patient.sendmsg",
+    "cavmarl.driving.kernels.models.registered_models._generate_call",
+    "cavmarl.evaluate.fresh._tell",
+    "cavmarl.evaluate.fresh.call_in_fresh_process",
+    "cavmarl.parallel.network.encryption.EncryptedSocket.sendmsg",
+    "cavmarl.policies.driver_network.LayerTable.add",
+    "cavmarl.render.topdown.TopDownRenderer.frame",
+}
+
+# A new capability raises these two by what it needs; the commit says why.
+PACKAGE_LINES = 109_000
+REACHABLE_LINES = 72_500  # from `make_vec` and `parallel_env`
+
 # Modules of one name, outside of cli/ and config/.
 SHARED_MODULE_NAMES: set[str] = set()
 
 # Public classes of one name in several modules.
-SHARED_CLASS_NAMES = set(
-    """
-    Answer Camera Change Clock Collector Control Difference Entry Follower Heard Host Image Job
-    Line Measured Moment Monitor Mount Move Outcome Parameters Placement Plan Pose Program Rates
-    Refusal Replica Room Row Run Samples Scene Schedule Seat Selection Sensor SensorJob Sight
-    Within Simulation Snapshot State Spread SumoConfig Tally Tick Turn Watch Window World
-    """.split()
-)
+SHARED_CLASS_NAMES = {"Job", "Parameters", "Spread", "Turn", "Within"}
 
 # Persons where the field says vehicle, zone, worker. These numbers may only fall.
 PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
@@ -43,6 +81,37 @@ def sources(*folders: str) -> Iterator[tuple[str, str]]:
     for folder in folders:
         for path in sorted((ROOT / folder).rglob("*.py")):
             yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def package() -> PackageCode:
+    return PackageCode()
+
+
+def test_classes_and_calls_are_narrow(package: PackageCode) -> None:
+    classes, functions = list(package.classes()), list(package.functions())
+    wide = {name for name, node in classes if len(package.public_methods(node)) > PUBLIC_METHODS}
+    large = {name for name, node in classes if len(package.attributes(node)) > ATTRIBUTES}
+    assert wide == WIDE_CLASSES, f"over {PUBLIC_METHODS} public methods, or not any more"
+    assert large == LARGE_CLASSES, f"over {ATTRIBUTES} attributes, or not any more"
+    long = {
+        name
+        for name, node, is_method in functions
+        if counted_parameters(node, is_method) > PARAMETERS
+    }
+    assert long == WIDE_FUNCTIONS, f"over {PARAMETERS} parameters, or not any more"
+    untyped = {name for name, node, _ in functions if has_untyped_arguments(node)}
+    assert untyped == PASSED_ON, "name the parameters, or pass a tuple"
+
+
+def test_the_package_does_not_grow_unnoticed(package: PackageCode) -> None:
+    reachable = package.reachable_lines(["cavmarl.env.vector", "cavmarl.env.parallel"])
+    everywhere = {
+        folder: sum(text.count("\n") for _, text in sources(folder)) for folder in FOLDERS
+    }
+    print(f"lines reachable from make_vec: {reachable}; of each folder: {everywhere}")
+    assert package.lines <= PACKAGE_LINES
+    assert reachable <= REACHABLE_LINES
 
 
 def test_no_two_modules_have_one_name() -> None:
@@ -65,12 +134,8 @@ def test_no_two_public_classes_have_one_name() -> None:
         for node in ast.parse(text).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places[node.name].append(path)
-    shared = {
-        name: paths
-        for name, paths in places.items()
-        if len(paths) > 1 and name not in SHARED_CLASS_NAMES
-    }
-    assert not shared, f"one of each wants a name of its own: {shared}"
+    shared = {name: paths for name, paths in places.items() if len(paths) > 1}
+    assert shared.keys() == SHARED_CLASS_NAMES, f"give each a name of its own: {shared}"
 
 
 @pytest.mark.parametrize("folder", PERSONS_AT_MOST)

@@ -36,7 +36,6 @@ from cavmarl.cli import (
     zoo,
 )
 from cavmarl.cli.output import about, print_error
-from cavmarl.cli.verify import determinism as verify_determinism
 from cavmarl.config.removed_keys import removed_option
 from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.core.tracebacks import print_traceback
@@ -44,8 +43,14 @@ from cavmarl.core.tracebacks import print_traceback
 __all__ = ["app", "main"]
 
 
+REMOVED = {"verify-determinism": "verify determinism"}  # command → what replaces it
+
+
 class _Group(TyperGroup):
-    """The commands. `map` is loaded when it is asked for: its imports take longer than the rest."""
+    """The commands; those that were removed are refused, with what replaces them.
+
+    `map` is loaded when it is asked for: its imports take longer than the rest.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; of an option that was removed, say what replaced it."""
@@ -60,6 +65,8 @@ class _Group(TyperGroup):
         return [*super().list_commands(ctx), "map"]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name in REMOVED:
+            raise ConfigError(f"{cmd_name} is no command: use cavmarl {REMOVED[cmd_name]}")
         if cmd_name != "map":
             return super().get_command(ctx, cmd_name)
         found = typer.main.get_group(import_module("cavmarl.cli.map").app)
@@ -78,13 +85,11 @@ app.command()(evaluate.evaluate)
 app.command()(evaluate.report)
 app.command()(suite.suite)
 app.command()(baseline.baseline)
-app.command()(verify.verify)
-app.command()(verify_determinism.verify_determinism)
 app.command()(journal.journal)
 app.command()(plan.plan)
 app.command()(lead.lead)
 app.command()(follow.follow)
-app.command()(node.node)
+app.command(context_settings={"allow_interspersed_args": False})(node.node)
 app.command()(view.view)
 app.command()(replay.replay)
 app.command()(demo.demo)
@@ -102,6 +107,7 @@ app.command("list")(listing.list_entries)
 app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
 app.add_typer(scenario.app, name="scenario")
+app.add_typer(verify.app, name="verify")
 app.add_typer(zoo.app, name="zoo")
 
 

@@ -68,3 +68,7 @@ class Attached(Protocol):
         no gaps between their fields: what stands there is not kept.
         """
         ...
+
+    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
+        """What is wrong with saved arrays of the shapes of `arrays`; empty: nothing."""
+        ...

@@ -91,7 +91,7 @@ class NoPeers:
         """All vehicles are of this process."""
 
     def take_up(self, gate: Gate, side: int) -> None:
-        """There is nobody to tell."""
+        """There is no other process to tell."""
 
     def everybody(self, gate: Gate, side: int) -> AbstractContextManager[None]:
         """Return at once: the rows of all zones are always here."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,10 @@ class MountedSensors:
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         return self.rig.arrays()
+
+    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
+        """Return nothing: no number of them is the place of something."""
+        return ""
 
     def scenes(self) -> list[SensedScene]:
         """What the agents of each zone can see now."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -15,33 +14,25 @@ from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.rng import world_key
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.codes import ACTION_IDLE
-from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import compiling_all, prepare_kernels
 from cavmarl.engine.compiled_step import CompiledStep, compiled_step
-from cavmarl.engine.peers import Peers
-from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import SharedOutputs
-from cavmarl.engine.sumo_phases import SumoPhases
+from cavmarl.engine.simulation_setup import add_coordinators, add_sumo, call_rare_kernels
 from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
+from cavmarl.engine.v2x_component import without_network
 from cavmarl.engine.world_views import WorldViews
-from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
-from cavmarl.handoff.coordinator.coordinators import Coordination, Coordinators
-from cavmarl.handoff.coordinator.handoff_log import HandoffLog
-from cavmarl.handoff.repartitioning import Recutter
-from cavmarl.ownership.messages import Switch
-from cavmarl.ownership.transfers import TransferLog
+from cavmarl.engine.zone_hosting import ZoneHosting
+from cavmarl.handoff.coordinator.coordinator_setup import OpenRun
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.observed import carried_from
-from cavmarl.shards.executor import Executor, TeamExecutor
-from cavmarl.shards.shard import Commands, Shard
-from cavmarl.shards.shard_group import ShardGroup
+from cavmarl.shards.executor import Executor
+from cavmarl.shards.shard import Commands
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.zones.partition.zone_partition import ZonePartition
-from cavmarl.zones.reach import longest_move_m
 
 
 class Simulation(WorldViews):
@@ -67,108 +58,45 @@ class Simulation(WorldViews):
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
         like: Simulation | None = None,  # of the same environment, whose tables are used
-        runs: Sequence[WorldRun] | None = None,  # what coordinators go by; None: `config.zones`
+        runs: Sequence[OpenRun] | None = None,  # what coordinators go by; None: `config.zones`
         late_ticks: int = 0,  # for so many more a vehicle that has crossed may stay with its zone
     ) -> None:
-        self.config = config
         self._carried_from = carried_from(config.sensors)
-        self.network = network
         self.demand = demand
-        self.num_worlds = num_worlds
-        self.partition = cut_zones(config, network) if partition is None else partition
         self._seed = 0
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
         self.everywhere = np.ones(num_worlds, dtype=np.bool_)  # (W,) all of the worlds
         self.frames: Frames = make_frames(config, num_worlds, zeros) if frames is None else frames
-        self.transfers: tuple[TransferLog, ...] = ()
-        self._recutter: Recutter | None = None
         self._compiled_step: CompiledStep | None = None
         prepare_kernels()
-        shared = SharedOutputs(config, network, num_worlds, observations, zeros)
-        self._tick = make_tick(
+        partition = cut_zones(config, network) if partition is None else partition
+        tick = make_tick(
             config,
             network,
-            self.partition,
-            self.demand,
-            shared,
+            partition,
+            demand,
+            SharedOutputs(config, network, num_worlds, observations, zeros),
             self.frames,
             zeros,
             None if like is None else like._tick.traffic.for_worlds(num_worlds),
             late_ticks,
         )
-        self._shards = self._tick.shards
+        super().__init__(config, network, tick, ZoneHosting(tick, partition))
         if warm:
-            with compiling_all(), self.unheard():
+            with compiling_all(), without_network(tick.attached):
                 self._call_every_kernel()
-        self._add_sumo()
-        self._add_coordinators(runs)
-
-    def _add_sumo(self) -> None:
-        if isinstance(self.demand, SumoDemand):
-            tick = self._tick
-            travel, zoned = tick.traffic.travel, tick.division.zoned
-            tick.sumo = SumoPhases(
-                SumoTraffic(
-                    self.demand, self.network, travel, travel.num_fixed, zoned, blank_vehicle()
-                )
-            )
-
-    def _add_coordinators(self, runs: Sequence[WorldRun] | None) -> None:
-        """Coordinators, and what makes other zones, where the settings ask for them."""
-        zones = self.config.zones
-        watched = zones.journal or zones.check_invariants
-        if self.partition.count > 1 or watched:
-            self._let_coordinate(runs)
-        coordination = self._tick.coordination
-        if (
-            zones.repartition_steps
-            and self.partition.count > 1
-            and isinstance(coordination, Coordinators)
-        ):
-            self._recutter = Recutter(
-                self.network,
-                self._tick.division,
-                coordination,
-                zones.repartition_steps,
-                zones.repartition_tolerance,
-            )
-
-    def _let_coordinate(self, runs: Sequence[WorldRun] | None) -> None:
-        """Let coordinators decide ownership; with one zone there are none."""
-        tick = self._tick
-        setup = make_coordinators(
-            self.config.zones,
-            tick.division,
-            longest_move_m(self.network, tick.traffic.travel, self.config.clock.sim_dt_s),
-            runs=runs,
-        )
-        tick.coordination = setup.coordination
-        self.transfers = setup.transfers
+        add_sumo(tick, demand, network)
+        self.transfers = add_coordinators(tick, config, network, runs)
+        self.zones.let_zones_change(network, config.zones)
 
     def _call_every_kernel(self) -> None:
-        tick = self._tick
         shape = self.outputs.present.shape
         controls = np.zeros((*shape, 2))
         self._populate(self.everywhere)
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
-        # Once more what is only called when vehicles leave or wait.
-        tick.let_in()
-        tick.traffic.accept(tick.gate, self._shard.worlds, tick.peers.running())
-        tick.admit()
-        tick.executor.leave(tick.gate)
-        tick.executor.retire(tick.gate)
-        tick.executor.forget(tick.gate)
-        tick.executor.gather(*tick.division.gathering)
-        tick.division.rehearse_gathering()
-        tick.traffic.settle(tick.gate, self._shard.worlds)
-        tick.division.near(0, everybody=True)
-        with suppress(ConfigError):
-            tick.division.hand_over(0, Switch(-1, 0, 0, 0, False))
-        book = HandoffLog(tick.division, 0)
-        book.release(book.hand_over(True, sum(tick.division.counts(0)), ()))
-        book.reset(0)
+        call_rare_kernels(self._tick)
         self._episodes[:] = 0
 
     def seed(self, seed: int, first_world: int = 0) -> None:
@@ -234,12 +162,8 @@ class Simulation(WorldViews):
         if self._compiled_step is not None:
             self._compiled_step.run(commands)
             return
+        self.zones.before_step()
         ticks = self.config.clock.ticks_per_step
-        if self._recutter is not None:
-            partition = self._recutter.before_step(self.partition)
-            if partition is not None:
-                self.partition = partition
-                self._tick.executor = ShardGroup(self._shards)
         for number in range(ticks):
             self.run_tick(commands, number == 0, number == ticks - 1)
 
@@ -249,7 +173,7 @@ class Simulation(WorldViews):
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
-        self._refuse_recutting("measuring the phases of a tick")
+        self.zones.refuse_changes("measuring the phases of a tick")
         self._tick.instrument(wrap)
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
@@ -258,58 +182,6 @@ class Simulation(WorldViews):
         A part that has phases of its own (another simulator's step, say) has a method `trace`.
         """
         self._tick.trace(wrap, note)
-
-    def host(
-        self,
-        # called with the shards, and with what the phase `gather` is called with
-        make: Callable[[Sequence[Shard], tuple[float, float]], TeamExecutor],
-    ) -> None:
-        """From now on let others run the phases of the shards, as `make` returns them.
-
-        Raises:
-            ConfigError: zones become others, and the caller would not be told.
-        """
-        self._refuse_recutting("the zones of one world over workers")
-        self._tick.host(make)
-
-    def share(self, peers: Peers, coordination: Coordination, executor: Executor) -> None:
-        """From now on host the zones that `executor` runs, and leave the others to `peers`."""
-        tick = self._tick
-        tick.peers, tick.coordination, tick.executor = peers, coordination, executor
-        self._recutter = None  # no process has the places of all vehicles
-
-    def divide(self, partition: ZonePartition) -> None:
-        """Say where zones are from now on, before zones have their vehicles; see `share`."""
-        if partition.content_hash != self.partition.content_hash:
-            self.partition = partition
-            self._tick.division.divide(partition)
-
-    def cut(
-        self,
-        partition: ZonePartition,
-        vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world, of all zones
-        contacts: NDArray[np.int64],  # (W,) that all zones have counted
-    ) -> None:
-        """Divide the plane otherwise, where others hold zones; then `share` has to follow."""
-        tick = self._tick
-        self.divide(partition)
-        tick.division.place(vehicles, contacts)
-        tick.peers.keep_own(self.everywhere)
-        tick.coordination.reset(self.everywhere)
-        tick.peers.take_up(tick.gate, tick.division.side)
-
-    def time_shards(self, every: int = 1) -> ShardClock:
-        """From now on run phases zone by zone, with a clock on each."""
-        self._refuse_recutting("measuring what each zone costs")
-        clock = ShardClock(self._shards, every)
-        self._tick.executor = clock
-        return clock
-
-    def _refuse_recutting(self, what: str) -> None:
-        if self._recutter is not None:
-            raise ConfigError(
-                f"zones.repartition_steps: {what} needs zones that stay; leave one out"
-            )
 
     def close(self) -> None:
         self._tick.sumo.close()
@@ -331,6 +203,8 @@ class Simulation(WorldViews):
         """Go on from what `save` gave, in worlds of the same environment.
 
         Raises:
+            ConfigError: it is damaged, or one of other worlds; these are as they were.
+            JournalError: the state is not one of the run whose journal this is.
             SumoError: SUMO moves vehicles there, and what it was told is not on record; see
                 `SumoTraffic.keep_logs`.
         """
@@ -350,10 +224,29 @@ class Simulation(WorldViews):
         tick.peers.share_rows(tick.gate, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
+        self.check(saved)
         roots, episodes, *rest = saved
+        ownership = self._saved_ownership(rest)
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
-        self._tick.gate = snapshot.load(self._parts(), rest, home)
+        self._tick.gate = snapshot.load(self._parts(), rest, ownership, home)
+
+    def check(self, saved: Sequence[NDArray[Any]]) -> None:
+        """See that worlds can go on from what `save` gave. Raises ConfigError: they cannot."""
+        if len(saved) < 2 or saved[0].shape != (2,) or saved[1].shape != self._episodes.shape:
+            raise ConfigError("the state is damaged: it says of no episode which one it is")
+        snapshot.form_of(self._parts()).check(saved[2:])
+
+    def check_share(self, share: Sequence[NDArray[Any]]) -> None:
+        """See that `join` can take what `share_of` gave. Raises ConfigError: it cannot."""
+        if [array.shape for array in share[:2]] != [(2,), (1,)]:
+            raise ConfigError("the state is damaged: it says of no episode which one it is")
+        snapshot.form_of(self._parts()).check_share(share[2:])
+
+    def _saved_ownership(self, saved: Sequence[NDArray[Any]]) -> list[SavedOwnership] | None:
+        """The owners of vehicles in a saved state, if they are known and the zones are the same."""
+        found = snapshot.ownership_of(self._parts(), saved)
+        return found if found is not None and self.zones.take_saved(found[0]) else None
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
         """What `save` would give if there were no world but one; views, to be copied."""
@@ -377,6 +270,8 @@ class Simulation(WorldViews):
             traffic=tick.traffic,
             outputs=self.outputs,
             coordination=tick.coordination,
+            partition=self.partition,
+            recut_steps=self.zones.recut_steps,
             has_past=self._carried_from < self.outputs.observations.shape[2],
             attached=tick.attached,
             sumo=tick.sumo.traffic,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,3 +54,12 @@ class Messaging:
     def arrays(self) -> Iterator[NDArray[Any]]:
         """The inboxes, the counts, and what is in flight."""
         return self.bus.arrays()
+
+    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
+        return self.bus.wrong(saved)
+
+
+def without_network(attached: Iterable[object]) -> AbstractContextManager[None]:
+    """Return the time in which no network simulator is asked; see `Bus.unheard`."""
+    buses = (part.bus for part in attached if isinstance(part, Messaging))
+    return next((bus.unheard() for bus in buses), nullcontext())

@@ -111,7 +111,7 @@ def frame_of(
     seen = np.empty(len(rows), dtype=SEEN) if room is None else room(len(rows))
     order = np.argsort(rows["id"], kind="stable")  # faster where many are sorted already
     write_seen(rows, order, simulation.types, seen)
-    view = simulation.zone_view(world) if simulation.partition.count > 1 else None
+    view = simulation.zones.view(world) if simulation.partition.count > 1 else None
     tick = int(simulation.ticks()[world])
     return WorldFrame(
         world,

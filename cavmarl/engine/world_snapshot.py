@@ -1,7 +1,8 @@
 """The state that the next tick of W worlds depends on: as arrays to go on from, and as a digest.
 
-Ownership is not part of it: that changes no result. A successor of a divided world gives
-each vehicle to the zone that it is in, as at a reset.
+Ownership is a part that changes no result. Worlds of the same zones go on with it, so that vehicles
+change their owner in the same ticks, and a journal goes on as if nothing had been loaded. Worlds of
+other zones leave it out, and give each vehicle to the zone that it is in, as at a reset.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ from numpy.typing import NDArray
 from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.engine.component import Attached
+from cavmarl.engine.state_check import StateForm
 from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership, zone_table
 from cavmarl.handoff.division import Division
 from cavmarl.shards.state import Use, arrays_of
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
+from cavmarl.zones.partition.zone_partition import ZonePartition
 
 Array = NDArray[Any]
 
@@ -34,6 +38,8 @@ class Parts(NamedTuple):
     traffic: NativeTraffic  # what comes
     outputs: Outputs  # what agents have got; the frames of the next observation, too
     coordination: Coordination  # decides ownership
+    partition: ZonePartition  # the zones
+    recut_steps: int  # that have been made, where zones are cut anew from time to time
     has_past: bool  # an observation takes something from the one before
     attached: tuple[Attached, ...]  # what acts in each tick beside the traffic
     sumo: SumoTraffic | None  # beside the worlds; None: there is none
@@ -47,6 +53,7 @@ def save(parts: Parts) -> list[Array]:
         *_fixed(parts),
         gate.queue[:, :waiting],
         *_of_rerouting(parts),
+        _stacked([_ownership(parts, w)[np.newaxis] for w in range(len(worlds.ticks))]),
         parts.division.contacts(),
         *(
             parts.division.owned(w, zone)
@@ -59,9 +66,14 @@ def save(parts: Parts) -> list[Array]:
 def load(
     parts: Parts,
     saved: Sequence[Array],
+    ownership: Sequence[SavedOwnership] | None,  # of each world, as `ownership_of` gives it
     home: int | None = None,  # the zone of this process, if others hold some; see `put_back`
 ) -> Gate:  # the gate, or a larger one
-    """Put everything in its place: vehicles in the zones that they are in, or that owned them."""
+    """Put everything in its place: vehicles in the zones that they are in, or that owned them.
+
+    Raises:
+        JournalError: a journal has never ended where it did then.
+    """
     everywhere = np.ones(len(parts.worlds.ticks), dtype=np.bool_)
     rest = iter(saved)
     parts.division.align()
@@ -74,14 +86,79 @@ def load(
     gate.num_passing[:] = 0
     for array in _of_rerouting(parts):
         _put(array, next(rest))
+    next(rest)  # the words of ownership
     contacts = next(rest)
     vehicles = [[next(rest) for _ in range(parts.division.count)] for _ in everywhere]
-    if home is None:
+    if home is not None:
+        parts.division.put_back(vehicles, contacts, home)
+    elif ownership is None:
         parts.division.place([np.concatenate(zones) for zones in vehicles], contacts)
     else:
-        parts.division.put_back(vehicles, contacts, home)
-    parts.coordination.reset(everywhere)
+        owned = [
+            np.split(np.concatenate(zones), np.cumsum(one.counts)[:-1])
+            for zones, one in zip(vehicles, ownership, strict=True)
+        ]
+        goes_on = _has_its_journals(parts, ownership)
+        parts.division.put_back(owned, contacts, 0, keeps_epochs=goes_on)
+        ownership = ownership if goes_on else None
+    parts.coordination.go_on(ownership)
     return gate
+
+
+def form_of(parts: Parts) -> StateForm:
+    """What a saved state of these worlds looks like."""
+    rerouting = [*_of_rerouting(parts)]
+    return StateForm(
+        parts.traffic.network.arrays,
+        parts.division,
+        parts.traffic,
+        parts.attached,
+        [*_fixed(parts)],
+        rerouting,
+    )
+
+
+def ownership_of(parts: Parts, saved: Sequence[Array]) -> list[SavedOwnership] | None:
+    """The owners of vehicles in a saved state; None: not known, or worlds had other zones.
+
+    Raises:
+        ConfigError: it says what cannot be.
+    """
+    division, num_worlds = parts.division, len(parts.worlds.ticks)
+    if not parts.coordination.coordinators:
+        return None
+    first = len(saved) - num_worlds * division.count
+    found: list[SavedOwnership] = []
+    for w, words in enumerate(saved[first - 2]):
+        one = SavedOwnership.unpack(words)
+        if one is None or len(one.zones) != 1 + division.count:
+            return None
+        if found and one.zones.tobytes() != found[0].zones.tobytes():
+            return None
+        rows = np.concatenate(saved[first + w * division.count : first + (w + 1) * division.count])
+        one.check(rows, division.count, parts.worlds.rows.shape[1])
+        found.append(one)
+    return found
+
+
+def _has_its_journals(parts: Parts, ownership: Sequence[SavedOwnership]) -> bool:
+    """Whether all journals go on where they ended in a saved state, if there are some.
+
+    Not where a state comes from a file: then a journal says that an episode begins.
+    """
+    pairs = zip(parts.coordination.coordinators, ownership, strict=True)
+    return all(
+        coordinator.journal is None or one.numbers.journal.lines >= 0 for coordinator, one in pairs
+    )
+
+
+def _ownership(parts: Parts, w: int) -> Array:
+    """(n,) words about the owners of vehicles of one world; none where they are not known here."""
+    saved = parts.coordination.save(w)
+    if saved is None:
+        return np.zeros(0, dtype=np.int64)
+    numbers = saved.numbers._replace(recut_steps=parts.recut_steps)
+    return saved._replace(zones=zone_table(parts.partition), numbers=numbers).pack()
 
 
 def share_of(parts: Parts, w: int) -> list[Array]:
@@ -101,6 +178,7 @@ def share_of(parts: Parts, w: int) -> list[Array]:
         *(array[w : w + 1] for array in _fixed(parts)),
         waiting,
         *(() if rerouting is None else rerouting.arrays_of(w)),
+        _ownership(parts, w)[np.newaxis],
         parts.division.contacts()[w : w + 1],
         *owned,
     ]

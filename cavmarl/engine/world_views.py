@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,12 +16,11 @@ from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.tick import Tick
 from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
 from cavmarl.engine.v2x_component import Messaging
+from cavmarl.engine.zone_hosting import ZoneHosting
 from cavmarl.handoff.coordinator.coordinator import Coordinator
-from cavmarl.handoff.division import Division, ZoneLoads
-from cavmarl.handoff.repartitioning import Recut, Recutter
-from cavmarl.handoff.zone_view import ZoneView, view_zones
+from cavmarl.handoff.division import Division
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.shards.shard import Shard, common_of
+from cavmarl.shards.shard import Shard
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.v2x.bus import Bus
@@ -30,15 +28,30 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class WorldViews:
-    """Read access to W worlds that run; `Simulation` makes and steps them."""
+    """Read access to W worlds that run; `Simulation` makes and steps them.
 
-    config: EnvConfig
-    network: RoadNetwork
-    num_worlds: int  # W
-    partition: ZonePartition  # the zones
-    _shards: Sequence[Shard]
-    _tick: Tick
-    _recutter: Recutter | None
+    Attributes:
+        zones: where the zones are, and which processes run them.
+    """
+
+    def __init__(
+        self, config: EnvConfig, network: RoadNetwork, tick: Tick, zones: ZoneHosting
+    ) -> None:
+        self.config = config
+        self.network = network
+        self.zones = zones
+        self._tick = tick
+        self._shards = tick.shards
+
+    @property
+    def num_worlds(self) -> int:
+        """W."""
+        return self._tick.division.num_worlds
+
+    @property
+    def partition(self) -> ZonePartition:
+        """Where the zones are now."""
+        return self.zones.partition
 
     @property
     def _shard(self) -> Shard:
@@ -67,26 +80,10 @@ class WorldViews:
                 return part.bus
         raise ConfigError("no messages are sent here: set v2x.enabled to true")
 
-    def unheard(self) -> AbstractContextManager[None]:
-        """The time in which no network simulator is asked; see `Bus.unheard`."""
-        buses = (part.bus for part in self._tick.attached if isinstance(part, Messaging))
-        return next((bus.unheard() for bus in buses), nullcontext())
-
     @property
     def gate(self) -> Gate:
         """Departures waiting in each world, and counts since its reset; resets may replace it."""
         return self._tick.gate
-
-    def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
-        """A bus beside the world, for tools that measure: stations in the world do not hear of it.
-
-        Returns:
-            the bus, and what lets it send and receive in the present tick.
-        """
-        worlds = self._shard.worlds
-        types, zoned = self._shard.travel.types, self._tick.division.zoned
-        bus = Bus(config, self.network, types, zoned, common_of(worlds))
-        return bus, lambda: bus.exchange(self._tick.division.side)
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
@@ -125,22 +122,8 @@ class WorldViews:
         """
         return self._tick.division.vehicles(world)
 
-    def zone_loads(self) -> ZoneLoads:
-        return self._tick.division.loads()
-
-    def zone_view(self, world: int = 0) -> ZoneView:
-        halo_m, transfers = self.zone_loads().halo_m, self._tick.coordination.in_flight(world)
-        return view_zones(self._shards, self.partition, halo_m, world, transfers)
-
     def running(self) -> NDArray[np.int64]:
         return self._tick.division.running()
-
-    def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
-        """What a zone sees of other zones' vehicles: VEHICLE (n,), a view that cannot be written.
-
-        It shows the present tick, until the next one.
-        """
-        return self._tick.division.ghosts(world, zone)
 
     @property
     def migrations(self) -> int:
@@ -183,11 +166,6 @@ class WorldViews:
 
     def ticks(self) -> NDArray[np.int64]:
         return self._shard.worlds.ticks
-
-    @property
-    def recuts(self) -> Sequence[Recut]:
-        """When other zones have been made while the worlds ran; see `zones.repartition_steps`."""
-        return () if self._recutter is None else self._recutter.recuts
 
     @property
     def sumo(self) -> SumoTraffic | None:

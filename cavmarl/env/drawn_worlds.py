@@ -79,7 +79,7 @@ class WorldCopy:
         simulation = self.standing(worlds)
         if self._copied is not None:
             if isinstance(worlds, NodeWorlds):
-                simulation.divide(worlds.partition)
+                simulation.zones.set_zones(worlds.partition)
             self._copied.load_worlds(worlds.save_worlds())
         return simulation
 

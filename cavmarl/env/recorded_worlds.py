@@ -87,7 +87,7 @@ class WorldRecorder:
             environment=f"{config.name}-v{config.version}",
             network=world.network,
             partition=world.partition,
-            halo_m=float(simulation.zone_loads().halo_m),
+            halo_m=float(simulation.zones.loads().halo_m),
             sim_dt_s=config.clock.sim_dt_s,
             step_s=config.clock.ctrl_dt_s,
             manifest={

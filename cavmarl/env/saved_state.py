@@ -21,12 +21,11 @@ def save_session(session: StepSession, mask: NDArray[np.bool_]) -> bytes:
 
     Raises:
         EpisodeError: before the first reset.
-        ConfigError: worlds have processes or files of their own: SUMO's, a journal's.
+        ConfigError: worlds have processes of their own: SUMO's.
     """
     if key := kept_elsewhere(session.config):
         raise ConfigError(
-            f"{key}: worlds with processes or files of their own cannot be saved; begin their "
-            "episodes anew"
+            f"{key}: worlds with processes of their own cannot be saved; begin their episodes anew"
         )
     session.refuse_unready("save_state()")
     saved = session.worlds.save_worlds()

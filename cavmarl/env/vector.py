@@ -356,7 +356,7 @@ class CavVectorEnv(WorldsEnvironment):
 
         Raises:
             EpisodeError: before the first reset.
-            ConfigError: worlds have processes or files of their own: SUMO's, a journal's.
+            ConfigError: worlds have processes of their own: SUMO's.
         """
         return save_session(self._session, self._mask)
 

@@ -262,7 +262,7 @@ class _Imbalance:
     def add(self, running: NDArray[np.bool_]) -> None:
         """Before a step of the worlds (W,) that are in their episode."""
         if self._is_divided:
-            self._sums[running] += self._simulation.zone_loads().imbalance()[running]
+            self._sums[running] += self._simulation.zones.loads().imbalance()[running]
             self._steps[running] += 1
 
     def means(self) -> NDArray[np.float64]:
@@ -274,7 +274,7 @@ def _zone_clock(vec: CavVectorEnv) -> ShardClock | None:
     """Times the zones of divided worlds; None of undivided ones."""
     if vec.simulation.partition.count == 1:
         return None
-    return vec.simulation.time_shards(TIMED_TICKS)
+    return vec.simulation.zones.measure_costs(TIMED_TICKS)
 
 
 def _speed(parts: list[_Part], worlds: int, clock: ShardClock | None) -> Speed:

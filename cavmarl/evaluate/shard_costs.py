@@ -54,7 +54,7 @@ def measure_rounds(
     for name, value in (("rounds", rounds), ("steps", steps), ("before", before)):
         if value < 1:
             raise ConfigError(f"{name} = {value}: must be at least 1")
-    clock = simulation.time_shards()
+    clock = simulation.zones.measure_costs()
     world = DrivenWorld(simulation)
     ticks = steps * simulation.config.clock.ticks_per_step
     for _ in range(before):

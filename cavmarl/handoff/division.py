@@ -16,19 +16,18 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
 from cavmarl.core.compiled.bound_call import bind
-from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.tallies import totals
 from cavmarl.core.records.arrays import Worlds, Zoned
-from cavmarl.handoff.coordinator.coordinator import Near
-from cavmarl.ownership.messages import Birth, Switch
+from cavmarl.handoff.owner_changes import OwnerChanges
 from cavmarl.shards.executor import Executor
 from cavmarl.shards.kernels.group_phases import count_rows
+from cavmarl.shards.row_check import RowCheck
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.vehicle_codec import TransferCodec
-from cavmarl.zones.kernels.borders import Borders, give_up, pass_on, take_over
+from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, note_gathered, take_own
-from cavmarl.zones.kernels.handoff import BorderRecords, hand_over, look, make_book, release
-from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays, zone_of
+from cavmarl.zones.kernels.handoff import BorderRecords, make_book
+from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.partition.zone_statistics import imbalance
 from cavmarl.zones.visibility import Visibility
@@ -54,7 +53,7 @@ class Division:
             a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
         neighbours: (k, k) between which zones vehicles change their owner.
         row_count: the call that notes that an undivided world has no ghosts.
-        call_hand_over: the kernel, with the types of all worlds' arrays found out once.
+        changes: vehicles near borders, and how they change their owner.
     """
 
     def __init__(
@@ -67,6 +66,7 @@ class Division:
         touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
         borders: Borders,  # when a vehicle is near one
         codec: TransferCodec,  # of vehicles' states
+        row_check: RowCheck,  # of rows that come from outside
         may_teleport: bool,  # whether vehicles may be put anywhere between two ticks
     ) -> None:
         self.zones: ZoneArrays = partition.arrays
@@ -74,6 +74,7 @@ class Division:
         self.may_teleport = may_teleport
         self.borders = borders
         self.codec = codec
+        self.row_check = row_check
         self.book = make_book(*shards[0].worlds.rows.shape)  # vehicles near a border
         self._shards = tuple(shards)
         self._zoned = zoned
@@ -83,19 +84,12 @@ class Division:
         self._touching_m = touching_m
         self.gathering = (touching_m, borders.max_speed_mps * borders.ahead_s)
         self._gatherers: Executor | None = None
-        self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
-        self._rects: list[list[float]] = self.zones.rects.tolist()
         self._call_exchange = specialized(exchange)
         self._note_gathered = specialized(note_gathered)
-        self._look = specialized(look)
-        self._pass_on = specialized(pass_on)
-        self._give_up = specialized(give_up)
-        self._take_over = specialized(take_over)
         self._running = np.zeros(self.num_worlds, dtype=np.int64)
         self._count_running = bind(totals, counts=zoned.num_owned, out=self._running)
         self.row_count = bind(count_rows, zoned=zoned)
-        self.call_hand_over = specialized(hand_over)
-        self.call_release = specialized(release)
+        self.changes = OwnerChanges(self, self._shards)
 
     @property
     def count(self) -> int:
@@ -139,22 +133,10 @@ class Division:
     def divide(self, partition: ZonePartition) -> None:
         """Say where zones are from now on; owners and ghosts are to be told anew."""
         zones, halo = partition.arrays, self._sight.halo(partition)
-        self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
+        self.zones, self._halo = zones, halo
         self.neighbours = partition.within(self._sight.outside_m)
         for shard in self._shards:
             shard.cut(zones, halo)
-
-    def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
-        """Give vehicles that are not on record yet to the zones that they are in now."""
-        settled = []
-        for vehicle, zone, state in births:
-            _, row = self.find(w, vehicle)
-            place = self.owned(w, zone)[row]
-            target = zone_of(self.zones, place["x"], place["y"])
-            if target != zone:
-                self.hand_over(w, Switch(vehicle, zone, target, 0, False), row)
-            settled.append(Birth(vehicle, target, state))
-        return settled
 
     def _forget_offers(self, w: int) -> None:
         """Vehicles near a border before are not to be counted again."""
@@ -228,6 +210,7 @@ class Division:
         vehicles: Sequence[Sequence[NDArray[np.void]]],  # VEHICLE (n,) of each world and zone
         contacts: NDArray[np.int64],  # (W,) as `contacts` counts them
         home: int,  # the zone whose contacts these are from now on
+        keeps_epochs: bool = False,  # vehicles have changed their owner as often as their rows say
     ) -> None:
         """Give every zone the vehicles that it owned; ghosts are to be renewed."""
         self._zoned.step_at[...] = 0
@@ -239,7 +222,9 @@ class Division:
             for shard, rows in zip(self._shards, zones, strict=True):
                 worlds = shard.worlds
                 worlds.rows[w, : len(rows)] = rows
-                worlds.rows["epoch"][w, : len(rows)] = 0
+                if not keeps_epochs:
+                    worlds.rows["epoch"][w, : len(rows)] = 0
+                worlds.rows["owner"][w, : len(rows)] = shard.zone
                 worlds.num_owned[w] = worlds.num_rows[w] = len(rows)
         self._exchange(self._first_side, 0, self.num_worlds)
 
@@ -251,69 +236,6 @@ class Division:
         """Let all shards keep their rows on the same side, whatever a tick has come to."""
         for shard in self._shards:
             shard.align()
-
-    def near(self, w: int, everybody: bool) -> list[Near]:
-        """Vehicles of a world near a border, by its committed rows."""
-        if everybody:
-            self._look(self.zones, self.borders, self._zoned, self.side, w, True, 0, self.book)
-        num = self.book.num_near.item(w)
-        if num == 0:
-            return []
-        return [Near(*entry) for entry in self.book.near[w, :num].tolist()]
-
-    def find(self, w: int, vehicle: int) -> tuple[int, int]:
-        """The zone that owns a vehicle, and its committed row there."""
-        for shard in self._shards:
-            worlds = shard.worlds
-            found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
-            if len(found):
-                return shard.zone, int(found[0])
-        raise ConfigError(f"vehicle {vehicle} is in no zone of world {w}")
-
-    def state(self, w: int, zone: int, row: int) -> bytes:
-        """The whole state of an owned vehicle of a zone, by its committed row."""
-        worlds = self._shards[zone].worlds
-        return self.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
-
-    def hand_over(
-        self,
-        w: int,
-        switch: Switch,  # the vehicle, its source and its target
-        hint: int = 0,  # the row where the old one probably keeps it
-    ) -> int:  # the row where the new one keeps it
-        """Let a vehicle change its owner, which goes on with the old one's committed row."""
-        place = self._pass_on(
-            switch.vehicle, switch.source, hint, switch.target, switch.epoch,
-            self._zoned, self._side(self._shards[0].worlds.rows), w,
-        )  # fmt: skip
-        if place == -1:
-            raise ConfigError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
-        if place == -2:
-            raise self.unseen(switch.vehicle, switch.target)
-        return place
-
-    def give_up(self, w: int, zone: int, vehicle: int) -> None:
-        """Let another process's zone have a vehicle of a zone of this one; it stays as a ghost."""
-        if not self._give_up(vehicle, zone, 0, self._zoned, self.side, w):
-            raise ConfigError(f"zone {zone} does not own vehicle {vehicle}")
-
-    def take_over(self, w: int, zone: int, vehicle: int, epoch: int, state: bytes) -> None:
-        """Go on with a vehicle of another zone, of which a zone of this process has a ghost."""
-        place = self._take_over(vehicle, zone, epoch, self._zoned, self.side, w)
-        if place < 0:
-            raise self.unseen(vehicle, zone)
-        worlds = self._shards[zone].worlds
-        self.codec.unpack(state, vehicle, int(worlds.ticks[w]), worlds.rows, w, place)
-        row = worlds.rows[w, place]
-        row["owner"], row["epoch"] = zone, epoch
-
-    @staticmethod
-    def unseen(vehicle: int, zone: int) -> ConfigError:
-        """What is wrong where a zone has no ghost of a vehicle that enters it."""
-        return ConfigError(
-            f"vehicle {vehicle} entered zone {zone}, which has not seen it come: the halo is too "
-            "narrow"
-        )
 
     def owned(self, w: int, zone: int) -> NDArray[np.void]:
         """VEHICLE (n,), the committed rows that a zone owns; a view."""

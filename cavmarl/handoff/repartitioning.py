@@ -60,12 +60,12 @@ class Recutter:
         tolerance: float,  # by which share of the mean the fullest zone has to become emptier
     ) -> None:
         self.recuts: list[Recut] = []  # what has been done
+        self.steps = 0  # that have begun
         self._network = network
         self._division = division
         self._coordination = coordination
         self._every = every
         self._tolerance = tolerance
-        self._steps = 0
 
     def before_step(self, partition: ZonePartition) -> ZonePartition | None:
         """Note that a step begins; its zones, if they are others than before.
@@ -73,8 +73,8 @@ class Recutter:
         Nothing may look at vehicles between the cut and the next tick, which hands them over: their
         owners may be far away from them.
         """
-        self._steps += 1
-        if not is_due(self._steps, self._every):
+        self.steps += 1
+        if not is_due(self.steps, self._every):
             return None
         began = time.perf_counter()
         proposal = propose_cut(self._network, self._division, partition, self._tolerance)
@@ -83,7 +83,7 @@ class Recutter:
         self.cut(proposal.partition)
         ms = 1e3 * (time.perf_counter() - began)
         self.recuts.append(
-            Recut(self._steps - 1, proposal.before, proposal.after, proposal.moved, ms)
+            Recut(self.steps - 1, proposal.before, proposal.after, proposal.moved, ms)
         )
         return proposal.partition
 

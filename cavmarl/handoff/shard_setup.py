@@ -20,6 +20,7 @@ from cavmarl.rewards.registered_terms import terms_reach_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.observed import carried_from, largest_radius_m, sensing_reach_m
 from cavmarl.sensors.registry import rig_reach_m
+from cavmarl.shards.row_check import RowCheck
 from cavmarl.shards.shard import Shard, make_zoned
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.traffic.native import NativeTraffic
@@ -87,6 +88,7 @@ def divide(
             zeros=zeros,
         )
         shards.append(shard)
+    row_check = RowCheck(shards[0].roads, traffic, outputs.present.shape[1], partition.count)
     division = Division(
         shards,
         zoned=zoned,
@@ -95,7 +97,10 @@ def divide(
         sight=sight,
         touching_m=touching_m,
         borders=Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
-        codec=TransferCodec.of(shards[0].worlds, outputs, carried_from(config.sensors)),
+        codec=TransferCodec.of(
+            shards[0].worlds, outputs, carried_from(config.sensors), row_check.wrong
+        ),
+        row_check=row_check,
         may_teleport=traffic.sumo is not None,
     )
     return shards, division

@@ -89,9 +89,9 @@ class SeenIds:
     All ids below `floor` have been seen, and those in `above`.
     """
 
-    def __init__(self) -> None:
-        self.floor = 0
-        self.above: set[int] = set()
+    def __init__(self, floor: int = 0, above: Iterable[int] = ()) -> None:
+        self.floor = floor
+        self.above = set(above)
 
     def __contains__(self, vehicle: int) -> bool:
         return vehicle < self.floor or vehicle in self.above

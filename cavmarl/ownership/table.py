@@ -126,6 +126,30 @@ class Table:
         del moves[len(owners) + 1 :]
         self.tick = tick
 
+    def go_on(
+        self,
+        run: bytes,
+        episode: int,  # -1: none has begun
+        tick: int,  # that was committed last
+        owners: dict[int, tuple[int, int]],  # as of that tick
+        seen: SeenIds,
+    ) -> None:
+        """Become the table of a coordinator whose zones all live in its own process.
+
+        Each of them has been hosted once, when the first episode began.
+        """
+        has_begun = episode >= 0
+        self.run, self.tick, self.episode = run, tick, episode
+        self.owners, self.seen = owners, seen
+        self.deferred, self.plan = {}, None
+        self.hosts = dict.fromkeys(self.hosts, (0, 1) if has_begun else (-1, 0))
+        self.states = dict.fromkeys(self.hosts, State.HOSTED if has_begun else State.UNHOSTED)
+        self.repeats.clear()
+        found = Counter(zone for zone, _ in owners.values())
+        self.counts = {zone: found[zone] for zone in self.hosts}
+        self._tallies = dict.fromkeys(self.hosts, OwnedTally())
+        self._moves = [(v, zone, epoch, True) for v, (zone, epoch) in owners.items()]
+
     def alive(self, zone: int, incarnation: int) -> bool:
         """Whether that process hosts the zone now."""
         return self.states[zone] is State.HOSTED and self.hosts[zone][1] == incarnation

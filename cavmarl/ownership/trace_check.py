@@ -33,6 +33,7 @@ from cavmarl.ownership.messages import (
     Reset,
     Step,
 )
+from cavmarl.ownership.table import Table
 from cavmarl.ownership.trace import TraceEntry, describe
 
 Holding = tuple[int, int, int, int, bytes]
@@ -131,6 +132,15 @@ class TraceChecker:
         self._fences, self._ready = {}, set()
         self._heard.clear()
         self._holdings.clear()
+
+    def go_on(self, table: Table) -> None:
+        """Know what a log says that led to a table, of a coordinator without messages."""
+        self._incarnations = {zone: number for zone, (_, number) in table.hosts.items() if number}
+        self._episode, self._tick = table.episode - 1, 0
+        self._reset(Reset(table.episode, table.tick, table.run))
+        self.owners = dict(table.owners)
+        self._born = SeenIds(table.seen.floor, table.seen.above)
+        self._tallies.update(table.tallies)
 
     def _host(self, record: Host) -> None:
         zone, before = record.zone, self._incarnations.get(record.zone, 0)

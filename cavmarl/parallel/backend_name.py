@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.parallel.network.mpi_transport import MPI
 
 LOCAL, PROCESSES, NODES, RAY = "local", "processes", "nodes", "ray"
 OWN = (LOCAL, PROCESSES, NODES, RAY)
-FORMS = "'local', 'processes:N', 'nodes:N', 'nodes:N@HOST:PORT', 'ray:N', 'ray'"
+FORMS = "'local', 'processes:N', 'nodes:N', 'nodes:N@HOST:PORT', 'nodes:N@mpi', 'ray:N', 'ray'"
 
 Address = tuple[str, int]
 
@@ -24,23 +26,30 @@ class BackendName:
     Attributes:
         kind: one of `OWN`, or the name of a registered backend.
         count: number of processes or nodes; None: none, or as many as are of use there.
-        address: host and port to listen on for nodes that are started by hand.
+        address: host and port to listen on for nodes that are started by hand; or MPI, whose other
+            ranks are the nodes.
     """
 
     kind: str = LOCAL
     count: int | None = None
-    address: Address | None = None
+    address: Address | Literal["mpi"] | None = None
 
     def __str__(self) -> str:
         count = "" if self.count is None else f":{self.count}"
-        return f"{self.kind}{count}" + (
-            "" if self.address is None else "@{}:{}".format(*self.address)
-        )
+        if self.address is None:
+            return f"{self.kind}{count}"
+        where = MPI if self.address == MPI else "{}:{}".format(*self.address)
+        return f"{self.kind}{count}@{where}"
 
     @property
     def is_local(self) -> bool:
         """Whether the worlds run in the caller's process."""
         return self.kind == LOCAL
+
+    @property
+    def is_mpi(self) -> bool:
+        """Whether the nodes are the other ranks of an MPI run."""
+        return self.address == MPI
 
     def is_split(self, num_worlds: int) -> bool:
         """Return whether there are more processes or nodes than worlds, which share out zones."""
@@ -105,7 +114,10 @@ def _read(backend: str, registered: Collection[str]) -> BackendName:
             f"backend = {backend!r}: only nodes are started by hand; use '{kind}:{count}', or "
             f"'{NODES}:{count}@{where}'"
         )
-    return BackendName(kind, int(count) if colon else None, read_address(where) if at else None)
+    number = int(count) if colon else None
+    if not at:
+        return BackendName(kind, number)
+    return BackendName(kind, number, MPI if where == MPI else read_address(where))
 
 
 def read_address(text: str) -> Address:

@@ -17,6 +17,7 @@ from cavmarl.parallel.backend_name import (
     read_backend,
 )
 from cavmarl.parallel.nodes.node_groups import NodeGroups
+from cavmarl.parallel.nodes.node_starters import system_of
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
@@ -81,7 +82,7 @@ def make_worlds(
 
     Raises:
         ConfigError: a setting that worlds of this backend cannot have.
-        MissingExtraError: a backend on Ray without Ray.
+        MissingExtraError: a backend on Ray without Ray, or on MPI without mpi4py.
         WorkerError: no process, no cluster, or no memory.
     """
     count = backend.count
@@ -90,7 +91,9 @@ def make_worlds(
     if backend.kind == PROCESSES:
         return PooledWorlds(world, base_dir, num_worlds, count or 1, in_next_step)
     if backend.kind in (NODES, RAY):
-        by_zones = count == 1 or backend.is_split(num_worlds)
+        # The pools of whole worlds have a thread each, and MPI is for one thread.
+        by_zones = count == 1 or backend.is_mpi or backend.is_split(num_worlds)
         make = NodeWorlds if by_zones else NodeGroups
-        return make(world, base_dir, num_worlds, backend, in_next_step)
+        system = system_of(backend)
+        return make(world, base_dir, num_worlds, backend, in_next_step, system=system)
     return _REGISTERED[backend.kind](world, base_dir, num_worlds, count, in_next_step)

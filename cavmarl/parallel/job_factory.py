@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
-from cavmarl.parallel.checkpoint.action_log import ActionLog, ActionLogJob
 from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.checkpoint.moving_job import MovingJob
 from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
-from cavmarl.parallel.journaled_worlds import runs_of, unwatched
+from cavmarl.parallel.journaled_worlds import open_runs, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.shared_huge_pages import huge_shared_zeros
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
@@ -23,7 +20,6 @@ from cavmarl.parallel.processes.worker_loop import Job, serve
 from cavmarl.parallel.recipe import CHANGED, world_of
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import sensor_workers_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
-from cavmarl.parallel.tasks import commands_of
 from cavmarl.parallel.team.team_job import LeaderJob
 from cavmarl.parallel.work_shares import Part
 
@@ -33,6 +29,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
 
     Raises:
         WorkerError: a file is not what it was.
+        JournalError: a journal cannot be opened.
     """
     world = world_of(recipe, CHANGED)
     config = world.config
@@ -41,13 +38,17 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     one = LocalWorlds(unwatched(world), 1, warm=True)
     parts = [Part(*given) for given in recipe["parts"]]
 
-    def make(first: int, last: int, runs: Sequence[WorldRun] | None = None) -> LocalWorlds:
-        part, in_next_step = arrays.part(first, last), recipe["in_next_step"]
-        count = last - first
-        return LocalWorlds(world, count, part, in_next_step=in_next_step, like=one, runs=runs)
+    runs = open_runs(recipe["runs"])  # which workers inherit
 
-    def make_watched(part: Part) -> LocalWorlds:
-        return with_sensors(make(part.first, part.last, runs_of(recipe["runs"], part)), part)
+    def make(first: int, last: int) -> LocalWorlds:
+        return LocalWorlds(
+            world,
+            last - first,
+            arrays.part(first, last),
+            in_next_step=recipe["in_next_step"],
+            like=one,
+            runs=runs[first:last] or None,
+        )
 
     def with_sensors(worlds: LocalWorlds, part: Part) -> LocalWorlds:
         if config.workers.sensors:
@@ -74,17 +75,16 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     job: CheckpointJob
     logs = recipe["checkpoint_logs"]
     for part, descriptors, fd in zip(parts, logs, recipe["saved_worlds"], strict=True):
-        if recipe["runs"]:
-            (actions,) = descriptors
-            commands = commands_of(arrays.part(part.first, part.last))
-            log = ActionLog(actions, commands)
-            jobs.append(ActionLogJob(partial(make_watched, part), part.first, log))
-            continue
         checkpoint_log = CheckpointLog(config, part.last - part.first, descriptors)
         if len(part.zones) > 1:
-            share, in_next_step = arrays.part(part.first, part.last), recipe["in_next_step"]
-            zeros = huge_shared_zeros
-            worlds = LocalWorlds(world, 1, share, in_next_step=in_next_step, zeros=zeros)
+            worlds = LocalWorlds(
+                world,
+                1,
+                arrays.part(part.first, part.last),
+                in_next_step=recipe["in_next_step"],
+                zeros=huge_shared_zeros,
+                runs=runs[part.first : part.last] or None,
+            )
             theirs = None if spent_s is None else spent_s[part.first]
             sensed = with_sensors(worlds, part)
             job = leader = LeaderJob(sensed, part.first, part.zones, checkpoint_log, theirs)

@@ -9,52 +9,25 @@ from pathlib import Path
 from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
-from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
-from cavmarl.parallel.work_shares import Part
+from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, WorldRun, prepare_runs
 
 RunText = tuple[str, str]  # the run in hex, and its journal; empty: it has none
 
 
-def is_watched(zones: ZonesConfig) -> bool:
-    """Whether what coordinators do is written down, beside the results."""
-    return bool(zones.journal)
-
-
 def unwatched(world: World) -> World:
-    """The same world without that, to make tables or load kernels with."""
+    """The same world without a journal, to make tables, copies or load kernels with."""
     zones = replace(world.config.zones, journal="")
     return world._replace(config=replace(world.config, zones=zones))
 
 
 def refuse_watched(zones: ZonesConfig, where: str, cure: str) -> None:
-    """Refuse what only the workers of whole worlds on this machine can have."""
-    if zones.journal:
-        raise ConfigError(f"zones.journal = {zones.journal!r} {where}: {cure}")
-
-
-def check_watched(world: World, parts: Sequence[Part], may_change: bool) -> None:
-    """See that worlds with a journal can be run by these workers.
+    """Refuse a journal where none can be written.
 
     Raises:
-        ConfigError: a world is divided among workers, or moves.
+        ConfigError: there is one.
     """
-    zones = world.config.zones
-    if not is_watched(zones):
-        return
-    num_worlds = parts[-1].last
-    if any(len(part.zones) > 1 for part in parts):
-        refuse_watched(
-            zones,
-            "of one world over several workers",
-            "its coordinator has to share a process with all zones; use at most "
-            f"workers={num_worlds}",
-        )
-    if may_change:
-        refuse_watched(
-            zones,
-            "of worlds that move from worker to worker",
-            "a journal stays in its process; leave workers.balance_steps 0",
-        )
+    if zones.journal:
+        raise ConfigError(f"zones.journal = {zones.journal!r} {where}: {cure}")
 
 
 def runs_as_text(zones: ZonesConfig, num_worlds: int) -> list[RunText]:
@@ -63,7 +36,7 @@ def runs_as_text(zones: ZonesConfig, num_worlds: int) -> list[RunText]:
     Raises:
         JournalError: one cannot be.
     """
-    if not is_watched(zones):
+    if not zones.journal:
         return []
     return [
         (run.hex(), "" if journal is None else str(journal))
@@ -71,9 +44,13 @@ def runs_as_text(zones: ZonesConfig, num_worlds: int) -> list[RunText]:
     ]
 
 
-def runs_of(texts: Sequence[RunText], part: Part) -> list[WorldRun]:
-    """The same of the worlds of one worker."""
+def open_runs(texts: Sequence[RunText]) -> list[OpenRun]:
+    """The same of all worlds, with the journals open for the workers that are forked.
+
+    Raises:
+        JournalError: one cannot be opened.
+    """
     return [
-        WorldRun(bytes.fromhex(run), Path(journal) if journal else None)
-        for run, journal in texts[part.first : part.last]
+        OpenRun.of(WorldRun(bytes.fromhex(run), Path(journal) if journal else None))
+        for run, journal in texts
     ]

@@ -20,10 +20,12 @@ from cavmarl.engine.kernels.step_results import Results, keep_last, report, repo
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import global_state, state_space, write_sensed
 from cavmarl.engine.world_setup import World
-from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
+from cavmarl.handoff.coordinator.coordinator_setup import OpenRun
+from cavmarl.handoff.coordinator.saved_ownership import without_journal
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
+from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
@@ -49,7 +51,7 @@ class LocalWorlds:
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
         # worlds of the same environment, whose tables are used; None: they are made
         like: LocalWorlds | None = None,
-        runs: Sequence[WorldRun] | None = None,  # see `Simulation`
+        runs: Sequence[OpenRun] | None = None,  # see `Simulation`
         late_ticks: int = 0,  # likewise
     ) -> None:
         self.world = world
@@ -99,7 +101,7 @@ class LocalWorlds:
 
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
         """Vehicles of one world whose next zone holds their state already."""
-        return self.simulation.zone_view(world).transfers
+        return self.simulation.zones.view(world).transfers
 
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays, chosen = self.arrays, self.arrays.chosen
@@ -239,31 +241,44 @@ class LocalWorlds:
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         """Go on from what `save` gave; errors as of `Simulation.load`."""
-        self._steps[:], self._waiting[:] = saved[:2]
+        self._check_own(saved)
         self.simulation.load(saved[2:])
+        self._steps[:], self._waiting[:] = saved[:2]
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
         """The same where other processes hold zones; see `Simulation.load_own`."""
-        self._steps[:], self._waiting[:] = saved[:2]
+        self._check_own(saved)
         self.simulation.load_own(saved[2:], home)
+        self._steps[:], self._waiting[:] = saved[:2]
+
+    def check(self, saved: Sequence[NDArray[Any]]) -> None:
+        """See that worlds can go on from what `save` gave. Raises ConfigError: they cannot."""
+        self._check_own(saved)
+        self.simulation.check(saved[2:])
+
+    def _check_own(self, saved: Sequence[NDArray[Any]]) -> None:
+        if any(array.shape != self._steps.shape for array in saved[:2]):
+            raise ConfigError("the state is damaged: it is one of another number of worlds")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """What a copy is made of: the worlds' parts, their state, and what is to be read of it.
 
+        A copy has no journal: the file is that of the worlds that are copied.
+
         Raises:
-            ConfigError: the worlds have processes or files of their own, or what is registered
-                could not be registered where a pickle is read.
+            ConfigError: the worlds have processes of their own, or what is registered could not be
+                registered where a pickle is read.
         """
         config = self.world.config
         if key := kept_elsewhere(config):
             raise ConfigError(
-                f"{key}: worlds with processes or files of their own cannot be copied; make "
+                f"{key}: worlds with processes of their own cannot be copied; make "
                 "the environment once more, with the same seed"
             )
         saved = [array.copy() for array in self.save()]
         shown = [array.copy() for array in every_array(self.arrays)]
         modules = extension_modules(config.registered)
-        return _made_again, (modules, self.world, self.in_next_step, saved, shown)
+        return _made_again, (modules, unwatched(self.world), self.in_next_step, saved, shown)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> LocalWorlds:
         """With the same map and settings, which never change."""
@@ -301,10 +316,17 @@ class LocalWorlds:
         return [*ended, *self.simulation.join([share[2:] for share in shares])]
 
     def save_worlds(self) -> list[bytes]:
-        """The state of each world, for `load_worlds` of any number of zones and workers."""
+        """The state of each world, for `load_worlds` of any number of zones and workers.
+
+        Owners are used by worlds of the same zones. A journal says that an episode begins.
+        """
         zones = self.world.partition.count
-        shares = (self.share_of(world) for world in range(len(self._steps)))
-        return [to_bytes([*share[:-zones], np.concatenate(share[-zones:])]) for share in shares]
+        saved = []
+        for world in range(len(self._steps)):
+            *common, words, contacts = (share := self.share_of(world))[:-zones]
+            filed = [*common, without_journal(words), contacts, np.concatenate(share[-zones:])]
+            saved.append(to_bytes(filed))
+        return saved
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are.
@@ -319,12 +341,16 @@ class LocalWorlds:
         zones = self.world.partition.count
         like = self.share_of(0)
         shares = [from_bytes(one, [*like[:-zones], like[-1]]) for one in saved]
+        for share in shares:
+            if any(array.shape != (1,) for array in share[:2]):
+                raise ConfigError("the state is damaged: it is not one of one world")
+            self.simulation.check_share(share[2:])
         return self.join([[*share, *[share[-1][:0]] * (zones - 1)] for share in shares])
 
     def refusal(self, saved: Sequence[bytes]) -> str:
         """Why worlds cannot go on from these; empty: they can."""
         try:
-            self.read_worlds(saved)
+            self.check(self.read_worlds(saved))
         except ConfigError as error:
             return str(error)
         return ""
@@ -374,11 +400,9 @@ def _made_again(
 
 def kept_elsewhere(config: EnvConfig) -> str:
     """The key by which worlds have state that is in none of their arrays; empty: none."""
-    zones = config.zones
     kept = {
         "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
         "workers.sensors": config.workers.sensors,
-        "zones.journal": zones.journal,
     }
     return next((key for key, is_so in kept.items() if is_so), "")
 

@@ -17,7 +17,7 @@ from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
 from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
 from cavmarl.parallel.commanded_worlds import CommandedWorlds
-from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
+from cavmarl.parallel.journaled_worlds import refuse_watched, runs_as_text, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.mover import Mover, MovingMemory
 from cavmarl.parallel.processes.process_barrier import usable_cores
@@ -59,7 +59,12 @@ class PooledWorlds(CommandedWorlds):
         self.placement = StepPlacement(world, num_worlds, workers)
         parts = parts_of(self.placement.plans, world.partition.count)
         may_change = bool(config.workers.balance_steps) and workers > 1 and self.placement.in_row
-        check_watched(world, parts, may_change)
+        if may_change and config.zones.repartition_steps:
+            refuse_watched(
+                config.zones,
+                "of worlds that move from worker to worker, each of which cuts its zones anew",
+                "leave workers.balance_steps or zones.repartition_steps 0",
+            )
         _warn_of_few_cores(workers)
         if not compiled_before():
             LocalWorlds(unwatched(world), 1, warm=True)
@@ -171,8 +176,6 @@ def _log_segments(config: EnvConfig, part: Part, may_change: bool) -> list[Segme
     """Memory for the checkpoints of a worker."""
     if may_change:
         return []
-    if is_watched(config.zones):
-        return [Segment.make(0)]
     return make_segments(config, part.last - part.first)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeGuard
 
 _PACKAGE = Path(__file__).parents[1]
 _DECORATORS = {"kernel", "inlined_kernel"}
@@ -56,13 +57,18 @@ def _functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
 def _defined(tree: ast.Module) -> Iterator[str]:
     yield from (function.name for function in _functions(tree) if _is_kernel(function))
     for statement in tree.body:
-        if (
-            isinstance(statement, ast.Assign)
-            and isinstance(statement.value, ast.Call)
-            and isinstance(statement.value.func, ast.Name)
-            and statement.value.func.id in _FACTORIES
-        ):
+        if _is_made(statement):
             yield from (name.id for name in statement.targets if isinstance(name, ast.Name))
+
+
+def _is_made(statement: ast.stmt) -> TypeGuard[ast.Assign]:
+    """Return whether a statement gives a name to a kernel that a factory makes."""
+    return (
+        isinstance(statement, ast.Assign)
+        and isinstance(statement.value, ast.Call)
+        and isinstance(statement.value.func, ast.Name)
+        and statement.value.func.id in _FACTORIES
+    )
 
 
 def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
@@ -73,9 +79,13 @@ def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
 
 
 def _called_by_plain(tree: ast.Module, kernels: set[str]) -> Iterator[str]:
-    """Yield kernels that the same file names outside of kernels."""
+    """Yield kernels that the same file names outside of kernels and of what makes kernels."""
     for statement in tree.body:
-        if not isinstance(statement, ast.FunctionDef) or not _is_kernel(statement):
+        is_of_kernels = _is_made(statement) or (
+            isinstance(statement, ast.FunctionDef)
+            and (_is_kernel(statement) or statement.name in _FACTORIES)
+        )
+        if not is_of_kernels:
             for node in ast.walk(statement):
                 if isinstance(node, ast.Name) and node.id in kernels:
                     yield node.id

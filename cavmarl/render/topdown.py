@@ -304,7 +304,7 @@ class WorldView:
             simulation.signal_phases(world),
             title=self._title,
             clock_s=float(simulation.ticks()[world]) * simulation.config.clock.sim_dt_s,
-            zones=simulation.zone_view(world) if count > 1 else None,
+            zones=simulation.zones.view(world) if count > 1 else None,
             ghosts_of=ghosts_of,
         )
         if self._mode == "rgb_array":

@@ -23,7 +23,7 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 PLAN = record(
     ("next", np.int32),  # LANE after this lane's end; -1: the goal's own lane, or no way
     ("link", np.int32),  # LINK that leads there; -1 inside junctions
-    ("shift", np.int32),  # what to add to a vehicle's way there, see `kernels.ways`
+    ("shift", np.int32),  # what to add to a vehicle's way there, see `lanes.route_following`
     ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0 this one is best
     ("changes", np.int16),  # lane changes to the best lane of this edge
     ("turnarounds", np.int16),  # U-turns on the way: where a road ends, plans turn round

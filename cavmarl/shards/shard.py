@@ -83,6 +83,7 @@ class Shard:
         self,
         config: EnvConfig,
         network: RoadNetwork,
+        *,
         plans: NDArray[np.void],  # PLAN (G, L), the ways of agents
         travel: Travel,
         zoned: Zoned,  # the rows of all zones

@@ -23,8 +23,8 @@ from cavmarl.shards.kernels.group_phases import (
     drive_on_each,
     fill_stacks_each,
     forget_each,
-    gather_each,
-    leave_each,
+    gather_ghosts_each,
+    leave_background_each,
     observe_messages_each,
     observe_optional_each,
     propose_each,
@@ -260,7 +260,9 @@ class GroupCalls:
         )
 
     def _bind_gather(self, touching_m: float, border_m: float) -> BoundCall[None]:
-        return bind(gather_each, members=self.members, touching_m=touching_m, border_m=border_m)
+        return bind(
+            gather_ghosts_each, members=self.members, touching_m=touching_m, border_m=border_m
+        )
 
     @cached_property
     def resolve(self) -> BoundCall[None]:
@@ -378,7 +380,7 @@ class GateCalls:
 
     @cached_property
     def leave(self) -> BoundCall[None]:
-        return bind(leave_each, members=self._members, gate=self.gate)
+        return bind(leave_background_each, members=self._members, gate=self.gate)
 
     @cached_property
     def dismiss(self) -> BoundCall[None]:

@@ -18,7 +18,7 @@ misses it does without. So every minor version reads every other.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
@@ -81,7 +81,11 @@ class TransferCodec:
         commands: NDArray[np.float64],
         # (W, A, F) float32, what the next observation of an agent takes from the last one
         frames: NDArray[np.float32],
+        # VEHICLE (1,) → what is wrong with it, empty: nothing; None: nothing ever is
+        check: Callable[[NDArray[np.void]], str] | None = None,
     ) -> None:
+        self._check = check
+        self._record = record
         text = layout_text(record)
         if sum(kind.itemsize for _, kind, _ in _fields(record)) != record.itemsize:
             raise MessageError(f"the record of a vehicle has padding: {text}")
@@ -101,9 +105,16 @@ class TransferCodec:
         self.schema = int.from_bytes(blake2b(same, digest_size=8).digest()) >> 1
 
     @classmethod
-    def of(cls, worlds: Worlds, outputs: Outputs, carried_from: int) -> TransferCodec:
+    def of(
+        cls,
+        worlds: Worlds,
+        outputs: Outputs,
+        carried_from: int,
+        check: Callable[[NDArray[np.void]], str] | None = None,
+    ) -> TransferCodec:
         """The codec of a shard's worlds; `carried_from` is that of `sensors.observed`."""
-        return cls(worlds.rows.dtype, worlds.pending, outputs.observations[:, :, carried_from:])
+        frames = outputs.observations[:, :, carried_from:]
+        return cls(worlds.rows.dtype, worlds.pending, frames, check)
 
     def pack(
         self,
@@ -138,6 +149,10 @@ class TransferCodec:
         first = _HEADER.size
         end = first + self._size
         agent = self._check_record(header, data)
+        if self._check is not None:
+            wrong = self._check(np.frombuffer(data, self._record, 1, first))
+            if wrong:
+                raise MessageError(f"the state of vehicle {vehicle} is of another world: {wrong}")
         rows.view(self._bytes)[world, i] = data[first:end]
         if agent < 0:
             return
@@ -171,6 +186,14 @@ class TransferCodec:
                 f"{self._size} and {self._layout.hex()}: run the same cavmarl everywhere"
             )
         return header
+
+    def record(self, data: bytes, vehicle: int) -> bytes:
+        """The record of a vehicle's state, once that is seen to be whole and of this layout."""
+        header = self.header(data)
+        self._check_record(header, data)
+        if header.vehicle != vehicle:
+            raise MessageError(f"the state of vehicle {vehicle} is that of {header.vehicle}")
+        return data[_HEADER.size : _HEADER.size + self._size]
 
     def _check_record(self, header: TransferHeader, data: bytes) -> int:
         first = _HEADER.size

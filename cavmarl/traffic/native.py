@@ -391,6 +391,12 @@ class NativeTraffic:
                 self.rerouting.begin(int(w), int(worlds.keys[w]), self.horizon_s)
         return gate
 
+    def num_orders(self, key: int) -> int:
+        """How many departures the demand file orders in the episode of a key."""
+        if self.schedule is None:
+            return 0
+        return self.schedule.count(key, self.horizon_s)
+
     def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
         """Fill the chosen worlds (W,) for a new episode."""
         populate(self.demand, self.network.arrays, self.travel, gate, worlds, chosen)

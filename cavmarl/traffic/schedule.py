@@ -21,6 +21,8 @@ MAX_STEPS = 50_000_000
 MAX_DETOUR_STEPS = 8_000_000
 DETOUR_CHANGE_WEIGHT = 100.0
 
+MAX_COUNTS = 4096  # episodes whose number of departures is known
+
 
 class Schedule:
     """The departures of a demand file as records, and the steps of their routes.
@@ -36,6 +38,8 @@ class Schedule:
 
     def __init__(self, demand: DemandFile, first_type: int, first_step: int) -> None:
         self.demand = demand
+        # what has been drawn last, by (key, seconds): a state that is loaded is checked before
+        self._counts: dict[tuple[int, float], int] = {}
         self._network: RoadNetwork = demand.network
         self._first_type = first_type
         ways = TripWays(self._network)
@@ -46,6 +50,7 @@ class Schedule:
         self.first_edge = np.zeros(len(demand.routes), dtype=np.int32)
         parts: list[NDArray[np.void]] = []
         begin = first_step
+        lanes = [np.zeros(0, dtype=np.int32)]
         self._longest = 0
         for route, mask_row in sorted(self._driven()):
             edges = self._edges(route, int(masks[mask_row]), ways)
@@ -53,6 +58,7 @@ class Schedule:
             first_lane = int(self._network.edges[edges[0]]["first_lane"])
             self._way[route, mask_row] = begin - first_lane
             parts.append(steps)
+            lanes.append(self._lanes(edges))
             self._longest = max(self._longest, len(steps))
             begin += len(steps)
             if begin > MAX_STEPS:
@@ -60,6 +66,7 @@ class Schedule:
                     f"the routes of the demand have over {MAX_STEPS} steps: fewer or shorter ones"
                 )
         self.first_detour = begin - first_step
+        self.step_lanes = np.concatenate(lanes)  # LANE row of each step before the first detour
         parts.append(self._detours(masks, ways))
         self.steps = np.concatenate(parts)
 
@@ -158,11 +165,23 @@ class Schedule:
         having = [c for c in choices if route in demand.route_choices.options(c)]
         return demand.place(int(np.isin(demand.elements["routes"], having).argmax()))
 
+    def _lanes(self, edges: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The LANE rows of the steps of a route."""
+        rows = self._network.edges[edges]
+        ends = np.cumsum(rows["num_lanes"])
+        firsts = np.repeat(rows["first_lane"] - (ends - rows["num_lanes"]), rows["num_lanes"])
+        return (firsts + np.arange(len(firsts))).astype(np.int32)
+
     def _steps(self, edges: NDArray[np.int32], mask: int) -> NDArray[np.void]:
         number = int(self._network.edges["num_lanes"][edges].sum())
         steps = np.zeros(number, dtype=PLAN)
         plan_route(self._network.arrays, edges, mask, 0, steps, np.zeros(number))
         return steps
+
+    def count(self, key: int, horizon_s: float) -> int:
+        """How many departures `draw` has of an episode."""
+        known = self._counts.get((key, horizon_s))
+        return len(self.orders(key, horizon_s)) if known is None else known
 
     def draw(self, key: int, horizon_s: float, dt: float) -> NDArray[np.void]:
         """The departures of one episode, DEPARTURE (n,) in order of `due`.
@@ -171,6 +190,9 @@ class Schedule:
         """
         demand = self.demand
         orders = self.orders(key, horizon_s)
+        self._counts[key, horizon_s] = len(orders)
+        while len(self._counts) > MAX_COUNTS:
+            del self._counts[next(iter(self._counts))]
         departures = np.zeros(len(orders), dtype=DEPARTURE)
         begin_s = demand.begin_ms / 1000.0
         departures["due"] = np.ceil((orders["depart"] - begin_s) / dt - 1e-6)

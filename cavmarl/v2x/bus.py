@@ -7,7 +7,7 @@ is divided.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -200,6 +200,26 @@ class Bus:
             yield from (mail.packets, mail.num_packets, mail.reports, mail.num_reports)
         if self._sending.cam_triggered:
             yield from (mail.last_cams, mail.num_last)
+
+    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
+        """What is wrong with saved arrays of the shapes of `arrays`; empty: nothing."""
+        found = {id(own): array for own, array in zip(self.arrays(), saved, strict=True)}
+        mail, packets = self.mail, found.get(id(self.mail.packets))
+        for numbers, most in (
+            (mail.num_packets, mail.packets.shape[2]),
+            (mail.num_reports, mail.reports.shape[2]),
+            (mail.num_last, mail.last_cams.shape[1]),
+        ):
+            counts = found.get(id(numbers))
+            if counts is not None and ((counts < 0) | (counts > most)).any():
+                return "there are more messages than there is room for"
+        if packets is None:
+            return ""
+        sent = np.arange(packets.shape[2]) < found[id(mail.num_packets)][:, :, np.newaxis]
+        first, count = packets["first"][sent], packets["count"][sent]
+        outside = (first < 0) | (count < 0) | (first + count > mail.reports.shape[2])
+        outside |= (packets["kind"][sent] < 0) | (packets["kind"][sent] >= NUM_KINDS)
+        return "a message has reports that are not there" if outside.any() else ""
 
     def declare(self, causes: NDArray[np.int32]) -> None:
         """Let agents tell of events in the next tick.

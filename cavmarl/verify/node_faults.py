@@ -1,11 +1,13 @@
-"""A campaign of faults between nodes: worlds go through all of them bit for bit."""
+"""A campaign of faults with real processes: nodes are killed, and their connections fail."""
 
 from __future__ import annotations
 
 import random
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
@@ -17,43 +19,78 @@ from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.faulty_network import FaultyNetwork, NetworkFault
 from cavmarl.verify.node_losses import FIRST_STEPS, ComparedWorlds
 
-KILL, STOP, ANY = "kill", "stop", "any of these"
+KILL, STOP, ANY = "kill", "stop", "any"
 SIGNALS = {KILL: signal.SIGKILL, STOP: signal.SIGSTOP}
 FAULTS = (*map(str, NetworkFault), KILL, STOP)
-HARMLESS = 10  # faults of a run that end no connection
-GRAVE = 2  # faults of a run that a node may be lost of; at most all nodes but one, or the only one
-APART = 8  # steps between two of those
+PER_RUN = {NetworkFault.DELAY: 10, KILL: 35, ANY: 5}  # faults of a run
+OTHERS = 2  # faults of a run, of all other kinds
+APART = 4  # steps between two faults that a node may be lost to, and after the last one
+WAIT_S = 0.05  # between two steps, while a lost node is replaced
+REPLACED_S = 60.0  # for a lost node to be replaced
 TIMEOUT_S = 1.0  # of silence, until a node is asked whether it lives
 
 
 @dataclass
 class FaultLine:
-    """Runs with one kind of fault."""
+    """The runs with one number of nodes and one kind of fault."""
 
-    nodes: int  # how many there were at the beginning
+    nodes: int  # number of nodes at the beginning
     fault: str  # the kind
-    runs: int = 0  # how many there were
-    done: int = 0  # faults in all of them
-    lost: int = 0  # nodes
-    ended: int = 0  # runs that ended with `WorkerDeathError`: what a node had was kept nowhere
-    different: list[int] = field(default_factory=list)  # seeds of runs in which anything differed
+    runs: int = 0  # number of runs
+    injected: Counter[str] = field(default_factory=Counter)  # faults that have happened, by kind
+    lost: int = 0  # nodes that were given up
+    recoveries: int = 0  # how often the worlds went back to a kept state
+    equal: int = 0  # runs that were equal to the undivided world to the end
+    ended: int = 0  # runs that ended with `WorkerDeathError`: a state was kept by no living node
+    wrong_seeds: list[int] = field(default_factory=list)  # of runs in which anything differed
+
+    @property
+    def deaths(self) -> int:
+        """How many processes got SIGKILL."""
+        return self.injected[KILL]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {**vars(self), "injected": dict(self.injected), "deaths": self.deaths}
 
 
 @dataclass(frozen=True)
 class NodeCampaign:
-    """What was found."""
+    """The result of a campaign with real processes."""
 
-    env: str  # of which environment
+    env: str  # name of the environment
     zones: int  # of each world
-    steps: int  # of each run
+    steps: int  # of each run, at least
     lines: tuple[FaultLine, ...]  # one for each number of nodes and kind of fault
 
     @property
     def holds(self) -> bool:
-        return not any(line.different for line in self.lines)
+        return not any(line.wrong_seeds for line in self.lines)
+
+    @property
+    def injected(self) -> dict[str, int]:
+        """Kind of fault → how many have happened in all runs."""
+        total: Counter[str] = Counter()
+        for line in self.lines:
+            total += line.injected
+        return {kind: total[kind] for kind in FAULTS if total[kind]}
+
+    def total(self, name: str) -> int:
+        """Return the sum of a number over all lines."""
+        return sum(getattr(line, name) for line in self.lines)
 
     def to_dict(self) -> dict[str, Any]:
-        return {**asdict(self), "holds": self.holds}
+        names = ("runs", "deaths", "lost", "recoveries", "equal", "ended")
+        return {
+            "env": self.env,
+            "zones": self.zones,
+            "steps": self.steps,
+            "faults": sum(self.injected.values()),
+            "injected": self.injected,
+            **{name: self.total(name) for name in names},
+            "wrong": sum(len(line.wrong_seeds) for line in self.lines),
+            "lines": [line.to_dict() for line in self.lines],
+            "holds": self.holds,
+        }
 
 
 def verify_node_faults(
@@ -62,8 +99,10 @@ def verify_node_faults(
     *,
     faults: Sequence[str] = (*FAULTS, ANY),
     seeds: int = 12,
+    first_seed: int = 0,
     zones: int | None = None,
     steps: int = 40,
+    per_run: int | None = None,
     policy: str | Path = "idm",
     progress: Callable[[int, int], None] | None = None,
     **keys: Unpack[WorldKeys],
@@ -75,11 +114,14 @@ def verify_node_faults(
 
     Args:
         env: as in `make_vec`, like the other keywords.
-        nodes: numbers of them.
-        faults: kinds of them; `ANY` draws among all.
+        nodes: numbers of nodes.
+        faults: kinds of faults; `ANY` draws among all.
         seeds: runs for each number of nodes and kind of fault.
+        first_seed: seed of the faults of the first of these runs; that of the next is one higher.
         zones: of each world; default: twice the most nodes.
-        steps: of each run.
+        steps: of each run, at least; a run goes on until all its faults have happened.
+        per_run: faults of a run; default: as `PER_RUN` says. A run with one node has one at most
+            that the node is lost to.
         policy: as in `load_policy`.
         progress: called with runs done and runs in all.
         keys: of the worlds.
@@ -93,50 +135,98 @@ def verify_node_faults(
         raise ConfigError(f"nodes = {list(nodes)}: name at least one number from 1 on")
     if unknown := [fault for fault in faults if fault not in (*FAULTS, ANY)]:
         raise ConfigError(f"faults = {unknown}: must be among {', '.join((*FAULTS, ANY))}")
-    if steps < FIRST_STEPS + APART * GRAVE:
-        raise ConfigError(f"steps = {steps}: a run needs {FIRST_STEPS + APART * GRAVE} or more")
+    if steps <= FIRST_STEPS:
+        raise ConfigError(f"steps = {steps}: a run needs {FIRST_STEPS + 1} or more")
     count = 2 * max(nodes) if zones is None else zones
+    spec = replace(given, overrides={"workers.timeout_s": TIMEOUT_S, **given.overrides})
     lines = [FaultLine(number, fault) for number in nodes for fault in faults]
     for n, line in enumerate(lines):
         for k in range(seeds):
-            overrides = {"workers.timeout_s": TIMEOUT_S, **given.overrides}
-            spec = replace(given, seed=given.seed + k, overrides=overrides)
-            _run(spec, line, count, steps, policy)
+            num = per_run or PER_RUN.get(line.fault, OTHERS)
+            _run(spec, line, first_seed + k, num, count, steps, policy)
             if progress is not None:
                 progress(n * seeds + k + 1, len(lines) * seeds)
     return NodeCampaign(given.env, count, steps, tuple(lines))
 
 
-def _run(spec: WorldSpec, line: FaultLine, zones: int, steps: int, policy: str | Path) -> None:
-    network, drawn = FaultyNetwork(spec.seed), random.Random(spec.seed)
+def _run(
+    spec: WorldSpec,
+    line: FaultLine,
+    seed: int,
+    num: int,  # faults
+    zones: int,
+    steps: int,
+    policy: str | Path,
+) -> None:
+    network = FaultyNetwork(seed)
     line.runs += 1
     try:
-        planned = list(_planned(line, steps, drawn))
         pair = ComparedWorlds(spec, line.nodes, zones, 1, policy, network.route)
-        strikes: dict[int, Callable[[], None]] = {}
-        for step, fault in planned:
-            line.done += 1
-            if fault in SIGNALS:
-                strikes[step] = partial(pair.strike, drawn, SIGNALS[fault])
-            else:
-                strikes[step] = partial(network.strike, NetworkFault(fault))
+        drawn = random.Random(f"{line.nodes} {line.fault} {seed}")
+        strikes = _Strikes(line, num, pair, network, drawn)
         try:
-            found = pair.compare(steps, strikes, lambda step: None)
-            if found.different is not None:
-                line.different.append(spec.seed)
+            found = pair.compare(steps, strikes.due, lambda step: None, strikes.are_left)
+            if found.different is None:
+                line.equal += 1
+            else:
+                line.wrong_seeds.append(seed)
         except WorkerDeathError:
             line.ended += 1
+        line.injected += strikes.signalled
+        line.injected += Counter({str(fault): num for fault, num in network.done.items()})
         line.lost += pair.worlds.pool.losses
+        line.recoveries += pair.worlds.pool.recoveries
     finally:
         network.close()
 
 
-def _planned(line: FaultLine, steps: int, drawn: random.Random) -> Iterator[tuple[int, str]]:
-    """The faults of a run, by the step in which each happens."""
-    fault = line.fault
-    if fault == NetworkFault.DELAY:
-        yield from ((step, fault) for step in drawn.sample(range(FIRST_STEPS, steps), HARMLESS))
-        return
-    first = drawn.randrange(FIRST_STEPS, steps - APART * (GRAVE - 1))
-    for n in range(min(GRAVE, max(1, line.nodes - 1))):
-        yield first + APART * n, drawn.choice(FAULTS) if fault == ANY else fault
+class _Strikes:
+    """The faults of a run: each happens when all nodes live, and some steps after the last one."""
+
+    def __init__(
+        self,
+        line: FaultLine,
+        num: int,  # faults
+        pair: ComparedWorlds,
+        network: FaultyNetwork,
+        drawn: random.Random,
+    ) -> None:
+        self._pair, self._network, self._drawn = pair, network, drawn
+        self._nodes = line.nodes
+        self._is_harmless = line.fault == NetworkFault.DELAY
+        num = 1 if line.nodes == 1 and not self._is_harmless else num
+        kinds = FAULTS if line.fault == ANY else (line.fault,)
+        self._kinds = drawn.choices(kinds, k=num)
+        self._next_step = FIRST_STEPS + drawn.randrange(APART)
+        self._waits_until_s = 0.0  # for a lost node to be replaced; 0: for none
+        self.signalled: Counter[str] = Counter()  # signals that were sent
+
+    def are_left(self, step: int) -> bool:
+        """Whether the run has to go on after so many steps."""
+        return bool(self._kinds) or step < self._next_step
+
+    def due(self, step: int) -> Callable[[], None] | None:
+        """Return what happens during a step."""
+        if not self._kinds or self._is_replaced_later(step) or step < self._next_step:
+            return None
+        kind = self._kinds.pop()
+        self._next_step = step + (1 if self._is_harmless else APART)
+        if kind in SIGNALS:
+            return partial(self._signal, kind)
+        return partial(self._network.strike, NetworkFault(kind))
+
+    def _is_replaced_later(self, step: int) -> bool:
+        """Wait a little for a lost node to be replaced; if none comes, go on in the end.
+
+        Some steps after that all states are kept by two nodes again.
+        """
+        if len(self._pair.worlds.pool.pids) >= self._nodes:
+            if self._waits_until_s:
+                self._waits_until_s, self._next_step = 0.0, step + APART
+            return False
+        self._waits_until_s = self._waits_until_s or time.monotonic() + REPLACED_S
+        time.sleep(WAIT_S)
+        return time.monotonic() < self._waits_until_s
+
+    def _signal(self, kind: str) -> None:
+        self.signalled[kind] += self._pair.strike(self._drawn, SIGNALS[kind])

@@ -109,8 +109,13 @@ def verify_nodes(
         drawn = random.Random(spec.seed)
         struck = drawn.sample(range(FIRST_STEPS, steps), min(kills, number - 1))
         kill = partial(pair.strike, drawn, signal.SIGKILL)
-        found.append(pair.compare(steps, dict.fromkeys(struck, kill), note))
+        due = partial(_due, dict[int, Callable[[], object]].fromkeys(struck, kill))
+        found.append(pair.compare(steps, due, note))
     return NodeReport(spec.env, count, worlds, steps, tuple(found))
+
+
+def _due(strikes: Mapping[int, Callable[[], object]], step: int) -> Callable[[], object] | None:
+    return strikes.get(step)
 
 
 class ComparedWorlds:
@@ -141,8 +146,9 @@ class ComparedWorlds:
     def compare(
         self,
         steps: int,
-        strikes: Mapping[int, Callable[[], None]],  # before which something is done in a step
+        due: Callable[[int], Callable[[], object] | None],  # step → what happens during it
         note: Callable[[int], None],
+        goes_on: Callable[[int], bool] = lambda step: False,  # after more steps than `steps`
     ) -> NodeRun:
         """Drive both, and close the nodes."""
         different: int | None = None
@@ -151,11 +157,12 @@ class ComparedWorlds:
         timers: list[Timer] = []
         drawn = random.Random(steps)
         try:
-            for step in range(steps):
+            step = -1
+            while (step := step + 1) < steps or goes_on(step):
                 first = self._runs[0].step()
-                if step in strikes:  # some time in the next step, or soon after it
+                if strike := due(step):  # some time in the next step, or soon after it
                     latest_s = 1e-3 * LATEST * statistics.median(calm_ms)
-                    timers.append(Timer(drawn.uniform(0.0, latest_s), strikes[step]))
+                    timers.append(Timer(drawn.uniform(0.0, latest_s), strike))
                     timers[-1].start()
                 before, began = self.worlds.pool.recoveries, time.perf_counter()
                 second = self._runs[1].step()
@@ -170,7 +177,7 @@ class ComparedWorlds:
             for timer in timers:
                 timer.join()
             one, other = self._hashes()  # a node that was killed last is missed now
-            different = steps if different is None and one != other else different
+            different = step if different is None and one != other else different
             migrations = self.worlds.migrations
         finally:
             self.worlds.close()
@@ -180,14 +187,16 @@ class ComparedWorlds:
             self._nodes, self.worlds.pool.losses, migrations, different, median_ms, above_ms
         )
 
-    def strike(self, drawn: random.Random, number: signal.Signals) -> None:
-        """Send a signal to a node that has got none yet."""
+    def strike(self, drawn: random.Random, number: signal.Signals) -> bool:
+        """Send a signal to a node that has got none yet; return whether there is one."""
         living = [pid for pid in self.worlds.pool.pids if pid not in self._struck]
         if living:
             pid = drawn.choice(living)
             self._struck.add(pid)
             with suppress(ProcessLookupError):
                 os.kill(pid, number)
+                return True
+        return False
 
     def _hashes(self) -> list[list[str]]:
         vecs = [run.vec for run in self._runs]

@@ -1,8 +1,9 @@
-"""`SimulatedMachine`: processes as threads of one, of which one runs at a time, and their network.
+"""`SimulatedMachine`: simulated processes and a simulated network in one real process.
 
-All that happens is a function of a seed: which process runs next, how late bytes come, and what a
-plan does to them. Time is a number that goes on when all processes wait. A process can be ended or
-stopped wherever it sends, waits or looks at its clock.
+Each simulated process is a thread; one thread runs at a time. A seed determines everything: which
+process runs next, how long bytes are on their way, and which faults happen to them. Time is a
+number that advances when all processes wait. A process can be ended or stopped at each place where
+it sends or waits.
 """
 
 from __future__ import annotations
@@ -10,19 +11,25 @@ from __future__ import annotations
 import heapq
 import random
 import select
-import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count
-from typing import Any, cast
+from typing import Any
 
 from cavmarl.core.errors import MessageError
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.network.transport import (
+    Bytes,
+    Connection,
+    Place,
+    TransportListener,
+    TransportPoll,
+)
 from cavmarl.parallel.nodes.leases import late_ticks
-from cavmarl.parallel.nodes.node_system import NodeListener, NodeSystem, Place, Poll
+from cavmarl.parallel.nodes.node_system import NodeSystem
 
 ADDRESS = "node"
 ALIVE_S = 25.0  # until a system ends a connection over which no answer comes
@@ -36,16 +43,19 @@ class ProcessEndedError(BaseException):
 
 
 class SimulatedProcess:
-    """One of them.
+    """A process of a simulated machine.
 
     Attributes:
-        slowness_s: what it takes longer at most each time that it waits.
-        clock: what its clock shows at the beginning, and how fast it goes.
+        slowness_s: by how much each turn of the process is longer, at most.
+        lag_s: by how much its next turn alone is longer.
+        clock: what its clock shows at time 0 of the machine, and the clock's rate.
+        on_send: called with each frame before it is sent; returns how many bytes still go out
+            before the process dies, or None: the process lives on.
     """
 
     def __init__(self, machine: SimulatedMachine, name: str) -> None:
         self.name = name
-        self.slowness_s = 0.0
+        self.slowness_s = self.lag_s = 0.0
         self.clock = (0.0, 1.0)
         self.is_ended = self.is_done = False
         self.stopped_until_s = 0.0
@@ -56,7 +66,16 @@ class SimulatedProcess:
         self.sockets: list[SimulatedSocket | SimulatedListener] = []
         self.on_send: Callable[[bytes], int | None] = lambda data: None
         self.failure: BaseException | None = None
+        self.newest_come = -1  # the number of the latest frame that has come, as sent
         self._machine = machine
+
+    def clock_s(self) -> float:
+        first_s, rate = self.clock
+        return first_s + rate * self._machine.now_s
+
+    def set_clock(self, jump_s: float, rate: float) -> None:
+        """Let the clock jump forward and then advance at another rate."""
+        self.clock = self.clock_s() + jump_s - rate * self._machine.now_s, rate
 
     def runs_at_s(self, now_s: float) -> float | None:
         """When it goes on; None: not by itself."""
@@ -72,6 +91,7 @@ class SimulatedMachine:
     Attributes:
         caller: the process of the thread that made this.
         now_s: the time.
+        before_send: called with a socket and a frame before the socket sends the frame.
         stuck: why the processes cannot go on; empty: they can.
     """
 
@@ -84,8 +104,11 @@ class SimulatedMachine:
         self.numbers = count(100)  # of sockets
         self.connections: list[tuple[SimulatedSocket, SimulatedSocket]] = []
         self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._moves = count()
+        self._moves = count()  # of processes, in all
+        self._event_numbers = count()  # of two events at the same time the first one comes first
         self._threads: list[threading.Thread] = []
+        self.frames = count()
+        self.before_send: Callable[[SimulatedSocket, bytes], None] = lambda end, data: None
         self.stuck = ""
         self.caller = self.running = self._new("caller")  # the thread that made this
 
@@ -129,7 +152,7 @@ class SimulatedMachine:
 
     def at(self, delay_s: float, act: Callable[[], None]) -> None:
         """Let something happen later."""
-        heapq.heappush(self._events, (self.now_s + delay_s, next(self._moves), act))
+        heapq.heappush(self._events, (self.now_s + delay_s, next(self._event_numbers), act))
 
     def end(self, process: SimulatedProcess) -> None:
         """As SIGKILL: it does nothing more, and its connections end."""
@@ -145,7 +168,8 @@ class SimulatedMachine:
         if process.is_ended:
             raise ProcessEndedError
         process.ready, process.until_s = ready, until_s
-        process.not_before_s = self.now_s + process.slowness_s * self.random.random()
+        longer_s, process.lag_s = process.lag_s, 0.0
+        process.not_before_s = self.now_s + longer_s + process.slowness_s * self.random.random()
         following = self._next()
         if following is not process:
             self.running = following
@@ -187,7 +211,7 @@ class SimulatedMachine:
 
     def close(self) -> None:
         """End all processes but the caller."""
-        self.stuck = ""
+        self.stuck, self._moves = "", count()
         for process in list(self.processes):
             if process is not self.caller:
                 self.end(process)
@@ -199,14 +223,19 @@ class SimulatedMachine:
 
 
 class SimulatedSocket:
-    """One end of a connection, with as much of `socket.socket` as `Link` needs.
+    """A `Connection` in memory.
+
+    `Link` sends a whole frame with each call of `sendmsg`.
 
     Attributes:
-        due: what is done to the next bytes that are sent; None: nothing.
-        is_mute: whether nothing that is sent comes, and the sender does not notice.
+        due: what the network does to the next frame; it returns the pieces that are delivered.
+        on_arrival: called when the next frame arrives, with whether the receiver has got a frame
+            before it that was sent later, over another connection.
+        held_until_s: before this time nothing of this direction arrives.
+        is_mute: whether nothing that is sent arrives, and the sender does not notice.
     """
 
-    family = socket.AF_UNIX  # it has none of TCP's options
+    address, keeps_bytes = ADDRESS, False
 
     def __init__(self, machine: SimulatedMachine, owner: SimulatedProcess) -> None:
         self._machine, self.owner = machine, owner
@@ -215,6 +244,7 @@ class SimulatedSocket:
         self.come: deque[bytes] = deque()
         self.has_ended = self.is_closed = self.is_mute = False
         self.due: Callable[[bytes], list[bytes]] | None = None
+        self.on_arrival: Callable[[bool], None] | None = None
         self.held_until_s = 0.0
         self._last_s = 0.0
         owner.sockets.append(self)
@@ -222,32 +252,35 @@ class SimulatedSocket:
     def fileno(self) -> int:
         return self._number
 
-    def getsockname(self) -> Place:
-        return ADDRESS, self._number
+    @property
+    def closed(self) -> bool:
+        return self.has_ended and not self.come
 
-    def setblocking(self, flag: bool) -> None:
-        """It never blocks."""
-
-    def sendmsg(self, pieces: list[memoryview]) -> int:
+    def send(self, pieces: Sequence[Bytes]) -> int:
         machine, data = self._machine, b"".join(map(bytes, pieces))
         if self.owner.is_ended:
             raise ProcessEndedError
-        sent = self.owner.on_send(data)
         if self.is_closed or self.has_ended:
             raise BrokenPipeError
+        machine.before_send(self, data)
+        sent = self.owner.on_send(data)
+        if self.is_closed or self.has_ended:  # a fault has ended it
+            raise BrokenPipeError
         change, self.due = self.due, None
+        arrived, self.on_arrival = self.on_arrival, None
+        number = next(machine.frames)
         chunks = [data if sent is None else data[:sent]]
         if change is not None:
             chunks = change(chunks[0])
         for chunk in [] if self.is_mute else chunks:
-            self._deliver(chunk)
+            self._deliver(chunk, number, arrived)
         if sent is not None:
             machine.end(self.owner)
             raise ProcessEndedError
         return len(data)
 
     def fall_silent(self) -> None:
-        """Nothing that is sent from here on comes; the system ends the connection for that."""
+        """Let nothing of this direction arrive; the system ends the connection after a while."""
         assert self.other is not None
         self.is_mute = True
         for end in (self, self.other):
@@ -256,8 +289,13 @@ class SimulatedSocket:
     def break_off(self) -> None:
         self.has_ended = True
 
-    def _deliver(self, chunk: bytes | None) -> None:
-        """Let bytes come later, after those before them; None: the end."""
+    def _deliver(
+        self,
+        chunk: bytes | None,  # None: the end of the connection
+        number: int = -1,  # of the frame
+        arrived: Callable[[bool], None] | None = None,  # see `on_arrival`
+    ) -> None:
+        """Let bytes arrive later, after those that were sent before them."""
         machine, other = self._machine, self.other
         assert other is not None
         at_s = max(machine.now_s, self.held_until_s) + machine.random.uniform(0.0, LATEST_S)
@@ -268,14 +306,16 @@ class SimulatedSocket:
                 other.has_ended = True
             elif chunk:
                 other.come.append(chunk)
+                receiver = other.owner
+                if arrived is not None:
+                    arrived(receiver.newest_come > number)
+                receiver.newest_come = max(receiver.newest_come, number)
 
         machine.at(self._last_s - machine.now_s, come)
 
-    def recv_into(self, room: memoryview) -> int:
+    def receive(self, room: memoryview) -> int:
         if not self.come:
-            if self.has_ended:
-                return 0
-            raise BlockingIOError
+            return 0
         chunk = self.come.popleft()
         size = min(len(room), len(chunk))
         room[:size] = chunk[:size]
@@ -310,9 +350,9 @@ class SimulatedListener:
     def is_readable(self) -> bool:
         return bool(self.callers)
 
-    def admit(self) -> list[tuple[int, socket.socket]]:
+    def admit(self) -> list[tuple[int, Connection]]:
         found, self.callers = self.callers, []
-        return [(number, cast("socket.socket", one)) for number, one in found]
+        return [*found]
 
     def close(self) -> None:
         self._machine.listeners.pop(self.place, None)
@@ -355,16 +395,15 @@ class _System:
         self._machine, self._process = machine, process
 
     def now_s(self) -> float:
-        first_s, rate = self._process.clock
-        return first_s + rate * self._machine.now_s
+        return self._process.clock_s()
 
-    def poll(self) -> Poll:
+    def poll(self) -> TransportPoll:
         return _Poll(self._machine, self._process)
 
-    def listen(self, address: str, secret: bytes) -> NodeListener:
+    def listen(self, address: str, secret: bytes) -> TransportListener:
         return SimulatedListener(self._machine, self._process)
 
-    def call(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Any:
+    def open(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Connection:
         machine = self._machine
         listener = machine.listeners.get((str(place[0]), int(place[1])))
         if listener is None or listener.owner.is_ended:

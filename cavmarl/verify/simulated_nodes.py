@@ -1,7 +1,7 @@
-"""Worlds over nodes in one process and in simulated time: thousands of runs, each of a seed.
+"""A campaign of faults on a simulated machine: thousands of runs, each reproduced from its seed.
 
-The code of the caller and of the nodes is the one that real processes run; only sockets, clocks and
-processes are those of `SimulatedMachine`. Clocks of all processes differ, and go differently fast.
+The caller and the nodes run the code that real processes run; only the sockets, the clocks and the
+processes are those of `SimulatedMachine`. The clocks of all processes differ in time and in rate.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import random
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
@@ -24,33 +24,59 @@ from cavmarl.core.errors import ConfigError, NodeRefusedError, WorkerDeathError
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.parallel.backend_name import NODES, BackendName
-from cavmarl.parallel.nodes.link import HEAD_BYTES, MAGIC, FrameKind
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import NodeStarter, Route
 from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import Arrays, DrivenRun, first_results, same_bytes, step_results
+from cavmarl.verify.simulated_faults import (
+    CALLER_DEATHS,
+    DEATHS,
+    FAULTS,
+    SEVERE_RATES,
+    TOLERATED,
+    TOLERATED_RATES,
+    Fault,
+    SimulatedFaults,
+    counts_by_name,
+    random_clock,
+)
 from cavmarl.verify.simulated_machine import (
     ProcessEndedError,
     SimulatedListener,
     SimulatedMachine,
     SimulatedProcess,
-    SimulatedSocket,
 )
 
 TIMEOUT_S = 1.0  # of silence, until a node is asked whether it lives
-STARTED_S = (0.05, 3.0)  # how long a new node takes
-WITHIN_S = 0.03  # of a step's beginning: when a fault happens
+STARTED = (-2.0, 0.5)  # decimal logarithm of the seconds that the start of a node takes
+THOUGHT_S = 0.15  # that the caller takes between two steps, at most
+WITHIN_S = 0.03  # after the beginning of a step: when a planned fault happens
+MAX_SEEDS = 1_000_000
 PATIENCE_S = 100.0  # for nodes to notice that the caller has ended
-FIRST_STEPS = 2
-HASHED = 4  # one of so many steps is compared as a whole
-SKEW_S = 1e6
-RATES = (0.8, 1.25)  # of clocks
+FIRST_STEPS = 2  # without planned faults
+HASHED = 4  # in one of so many steps the hash of the state is compared, too
 
-NODE_KINDS = (FrameKind.REPORT, FrameKind.MESSAGES, FrameKind.SHARE, FrameKind.KEEP)
-RECOVERY_KINDS = (FrameKind.SYNC, FrameKind.REPORT, FrameKind.GIVE, FrameKind.MISSED)
-CALLER_KINDS = (FrameKind.COMMAND, FrameKind.LEASE, FrameKind.RECOVER, FrameKind.PING)
+NONE, TWO, FOUR = "none", "two_at_once", "any_four"
+MANY_TOLERATED, MANY = "many_tolerated", "many"  # faults that are drawn for each frame
+MIXES = (NONE, *map(str, FAULTS), TWO, FOUR, MANY_TOLERATED, MANY, *map(str, CALLER_DEATHS))
+RATES = {MANY_TOLERATED: TOLERATED_RATES, MANY: {**TOLERATED_RATES, **SEVERE_RATES}}
+
+
+# A world in which many vehicles change their zone, for campaigns that name none.
+BUSY = WorldSpec(
+    env="grid4x4",
+    overrides={
+        "population.mode": "respawn",
+        "population.agents": 8,
+        "population.background": 120,
+        "clock.sim_dt_s": 0.1,
+        "clock.ctrl_dt_s": 0.4,
+        "clock.control_latency_ticks": 3,
+        "sensors.stack": 2,
+    },
+)
 
 
 class SimulatedNodes:
@@ -61,7 +87,7 @@ class SimulatedNodes:
     ) -> None:
         self.count = nodes
         self._machine, self._drawn = machine, drawn
-        self._ghosts = ghosts  # whether processes that are taken for lost may go on
+        self._ghosts = ghosts  # whether processes that are given up may go on
         self.listener = SimulatedListener(machine, machine.caller)
         self._processes = [self._start(number) for number in range(nodes)]
 
@@ -72,8 +98,8 @@ class SimulatedNodes:
                 run_node(place, secret, number, system=system)
 
         process = self._machine.start(f"node {number}", run)
-        process.clock = _clock(self._drawn)
-        process.not_before_s = self._machine.now_s + self._drawn.uniform(*STARTED_S)
+        process.clock = random_clock(self._drawn)
+        process.not_before_s = self._machine.now_s + 10.0 ** self._drawn.uniform(*STARTED)
         return process
 
     def trouble(self, begun: Collection[int]) -> str | None:
@@ -92,180 +118,85 @@ class SimulatedNodes:
         return set()  # a machine elsewhere does not tell
 
     def close(self) -> None:
-        """They end by themselves."""
-
-
-def _clock(drawn: random.Random) -> tuple[float, float]:
-    return drawn.uniform(-SKEW_S, SKEW_S), drawn.uniform(*RATES)
-
-
-class SimulatedFaults:
-    """What can happen to a machine; each method lets one thing happen.
-
-    Attributes:
-        done: how often each has happened.
-    """
-
-    def __init__(self, machine: SimulatedMachine, drawn: random.Random) -> None:
-        self._machine, self._drawn = machine, drawn
-        self.done: Counter[str] = Counter()
-
-    def happen(self, name: str) -> None:
-        self.done[name] += 1
-        getattr(self, name)()
-
-    def _node(self) -> SimulatedProcess | None:
-        machine = self._machine
-        living = [one for one in machine.processes if one is not machine.caller]
-        living = [one for one in living if not one.is_ended]
-        return self._drawn.choice(living) if living else None
-
-    def _end(self) -> SimulatedSocket | None:
-        """One end of a connection."""
-        open_ones = [pair for pair in self._machine.connections if not pair[0].is_closed]
-        return self._drawn.choice(self._drawn.choice(open_ones)) if open_ones else None
-
-    def kill(self) -> None:
-        if node := self._node():
-            self._machine.end(node)
-
-    def kill_at_point(self) -> None:
-        """A node dies as it sends a frame of some kind, of which a part may go out."""
-        if node := self._node():
-            node.on_send = _Trap(self._drawn, NODE_KINDS)
-
-    def kill_in_recovery(self) -> None:
-        """One dies, and another one as it takes part in the recovery from that."""
-        self.kill()
-        if node := self._node():
-            node.on_send = _Trap(self._drawn, RECOVERY_KINDS, first=1)
-
-    def stop(self) -> None:
-        """A node stops for a while; the rest of the world does not know."""
-        if node := self._node():
-            node.stopped_until_s = self._machine.now_s + self._drawn.choice((0.1, 1.5, 20.0, 60.0))
-
-    def stop_caller(self) -> None:
-        self._machine.caller.stopped_until_s = self._machine.now_s + self._drawn.choice((0.1, 30.0))
-
-    def slow(self) -> None:
-        if node := self._node():
-            node.slowness_s = self._drawn.choice((0.001, 0.02, 0.1))
-
-    def damage(self) -> None:
-        if end := self._end():
-            end.due = partial(_damaged, self._drawn)
-
-    def duplicate(self) -> None:
-        if end := self._end():
-            end.due = lambda data: [data, data]
-
-    def reorder(self) -> None:
-        """What is sent next comes after what is sent then."""
-        if end := self._end():
-            end.due = partial(_kept_back, end)
-
-    def delay(self) -> None:
-        if end := self._end():
-            end.held_until_s = self._machine.now_s + self._drawn.choice((0.01, 0.5, 3.0))
-
-    def lose(self) -> None:
-        """Nothing comes any more in one direction, and the sender does not notice."""
-        if end := self._end():
-            end.fall_silent()
-
-    def part(self) -> None:
-        """A node and the others do not hear each other any more."""
-        if node := self._node():
-            for pair in self._machine.connections:
-                if node in (pair[0].owner, pair[1].owner):
-                    for end in pair:
-                        end.fall_silent()
-
-    def cut(self) -> None:
-        if (end := self._end()) and end.other:
-            end.close()
-            end.other.close()
-
-
-FAULTS = (
-    "kill", "kill_at_point", "kill_in_recovery", "stop", "stop_caller", "slow", "damage",
-    "duplicate", "reorder", "delay", "lose", "part", "cut",
-)  # fmt: skip
-LOSES = {"stop_caller": 0, "kill_in_recovery": 2}  # nodes at most; of the others 1
-END_CALLER, END_CALLER_AT_POINT = "end_caller", "end_caller_at_point"
-MIXES = ("none", *FAULTS, "two at once", "any four", END_CALLER, END_CALLER_AT_POINT)
-
-
-class _Trap:
-    """Ends a process as it sends a frame of a kind that is drawn."""
-
-    def __init__(
-        self,
-        drawn: random.Random,
-        kinds: Sequence[FrameKind],
-        first: int = 6,  # the last of the first frames of the kind that it may be
-    ) -> None:
-        self._kind, self._left = drawn.choice(kinds), drawn.randrange(first)
-        self._part = drawn.choice((0.0, 0.5, 1.0))
-
-    def __call__(self, data: bytes) -> int | None:
-        if data[: len(MAGIC)] != MAGIC or int.from_bytes(data[6:8], "little") != self._kind:
-            return None
-        self._left -= 1
-        return None if self._left >= 0 else int(self._part * len(data))
-
-
-def _damaged(drawn: random.Random, data: bytes) -> list[bytes]:
-    changed = bytearray(data)
-    at = drawn.randrange(min(len(data), HEAD_BYTES) if drawn.random() < 0.5 else len(data))
-    changed[at] ^= 1 << drawn.randrange(8)
-    return [bytes(changed)]
-
-
-def _kept_back(end: SimulatedSocket, data: bytes) -> list[bytes]:
-    end.due = lambda more: [more, data]
-    return []
+        """Do nothing: simulated nodes end by themselves."""
 
 
 @dataclass
 class SimulatedLine:
-    """Runs with one kind of fault."""
+    """The runs with one number of nodes and one mix of faults."""
 
-    nodes: int  # how many there were at the beginning
-    faults: str  # which
-    runs: int = 0  # how many there were
-    lost: int = 0  # nodes
-    back: int = 0  # how often the worlds went back
-    ended: int = 0  # runs that ended with `WorkerDeathError`: what a node had was kept nowhere
-    wrong: list[str] = field(default_factory=list)  # what should not have been, by seeds
+    nodes: int  # number of nodes at the beginning
+    mix: str  # of MIXES
+    runs: int = 0  # number of runs
+    injected: Counter[Fault] = field(default_factory=Counter)  # faults that have happened
+    lost: int = 0  # nodes that were given up
+    recoveries: int = 0  # how often the worlds went back to a kept state
+    replacements: int = 0  # nodes that took the zones of lost ones over during a run
+    migrations: int = 0  # vehicles that changed their owner
+    equal: int = 0  # runs that were equal to the undivided world to the end
+    ended: int = 0  # runs that ended with `WorkerDeathError`: a state was kept by no living node
+    caller_ended: int = 0  # runs in which the caller died, and all nodes ended by themselves
+    wrong: list[str] = field(default_factory=list)  # of each other run: what happened
+    wrong_seeds: list[int] = field(default_factory=list)  # of the same runs
+
+    @property
+    def deaths(self) -> int:
+        """How many processes faults have ended."""
+        return sum(self.injected[fault] for fault in DEATHS)
+
+    def to_dict(self) -> dict[str, Any]:
+        injected = counts_by_name(self.injected.items())
+        return {**vars(self), "injected": injected, "deaths": self.deaths}
 
 
 @dataclass(frozen=True)
 class SimulatedCampaign:
-    """What was found."""
+    """The result of a campaign on a simulated machine."""
 
-    env: str  # of which environment
+    env: str  # name of the environment
     zones: int  # of each world
     steps: int  # of each run
-    lines: tuple[SimulatedLine, ...]  # one for each number of nodes and kind of fault
-    faults: dict[str, int]  # how often each happened
+    lines: tuple[SimulatedLine, ...]  # one for each number of nodes and mix of faults
 
     @property
     def holds(self) -> bool:
         return not any(line.wrong for line in self.lines)
 
+    @property
+    def injected(self) -> dict[str, int]:
+        """Kind of fault → how many have happened in all runs."""
+        total: Counter[Fault] = Counter()
+        for line in self.lines:
+            total += line.injected
+        return counts_by_name(total.items())
+
+    def total(self, name: str) -> int:
+        """Return the sum of a number over all lines."""
+        return sum(getattr(line, name) for line in self.lines)
+
     def to_dict(self) -> dict[str, Any]:
-        return {**asdict(self), "holds": self.holds}
+        names = (
+            "runs", "deaths", "lost", "recoveries", "replacements", "migrations", "equal", "ended",
+            "caller_ended",
+        )  # fmt: skip
+        return {
+            "env": self.env,
+            "zones": self.zones,
+            "steps": self.steps,
+            "faults": sum(self.injected.values()),
+            "injected": self.injected,
+            **{name: self.total(name) for name in names},
+            "wrong": sum(len(line.wrong) for line in self.lines),
+            "lines": [line.to_dict() for line in self.lines],
+            "holds": self.holds,
+        }
 
 
 class _Reference:
-    """What an undivided world gives, and what drives it."""
+    """What the undivided world gives, and the actions that drive it."""
 
     def __init__(self, spec: WorldSpec, steps: int, policy: str | Path) -> None:
-        told = {name: value for name, value in spec.overrides.items() if name != "zones.faults"}
-        keywords = {**spec.keywords, "overrides": told}
-        vec = make_vec(spec.env, num_envs=1, **keywords)
+        vec = make_vec(spec.env, num_envs=1, **spec.keywords)
         run = DrivenRun(vec, policy, spec.seed)
         self.seed, self.first = spec.seed, run.results
         self.results: list[Arrays] = []
@@ -283,19 +214,23 @@ def verify_simulated_nodes(
     *,
     mixes: Sequence[str] = MIXES,
     seeds: int = 100,
+    first_seed: int = 0,
     zones: int | None = None,
     steps: int = 16,
     policy: str | Path = "idm",
     progress: Callable[[int, int], None] | None = None,
     **keys: Unpack[WorldKeys],
 ) -> SimulatedCampaign:
-    """Drive worlds over simulated nodes, and compare them with an undivided one.
+    """Drive worlds over simulated nodes, and compare each run with an undivided world.
+
+    A run is a function of the world, the number of nodes, the mix and the seed of its faults.
 
     Args:
         env: as in `make_vec`, like the other keywords.
-        nodes: numbers of them.
+        nodes: numbers of nodes.
         mixes: which faults happen, of MIXES.
         seeds: runs for each number of nodes and mix.
+        first_seed: seed of the faults of the first of these runs; that of the next is one higher.
         zones: of each world; default: twice the most nodes.
         steps: of each run.
         policy: as in `load_policy`.
@@ -307,12 +242,15 @@ def verify_simulated_nodes(
     """
     given = WorldSpec.of(env, **keys)
     check_count("steps", steps, MAX_STEPS)
+    check_count("seeds", seeds, MAX_SEEDS)
+    if first_seed < 0:
+        raise ConfigError(f"first_seed = {first_seed}: must be a whole number from 0 on")
     if not nodes or min(nodes) < 1:
         raise ConfigError(f"nodes = {list(nodes)}: name at least one number from 1 on")
     if steps < 2 * FIRST_STEPS:
         raise ConfigError(f"steps = {steps}: a run needs {2 * FIRST_STEPS} or more")
     if unknown := [mix for mix in mixes if mix not in MIXES]:
-        raise ConfigError(f"faults = {unknown}: must be among {', '.join(MIXES)}")
+        raise ConfigError(f"mixes = {unknown}: must be among {', '.join(MIXES)}")
     count = 2 * max(nodes) if zones is None else zones
     overrides = {"workers.timeout_s": TIMEOUT_S, **given.overrides}
     keywords = {**given.keywords, "overrides": overrides}
@@ -320,72 +258,93 @@ def verify_simulated_nodes(
     world = make_world(config, base_dir)
     reference = _Reference(given, steps, policy)
     lines = [SimulatedLine(number, mix) for number in nodes for mix in mixes]
-    done: Counter[str] = Counter()
     with _quiet():
         for n, line in enumerate(lines):
             for k in range(seeds):
-                run = _Run(world, base_dir, reference, line, given.seed + k)
-                done += run.whole(steps)
+                _Run(world, base_dir, reference, line, first_seed + k).whole()
                 if progress is not None:
                     progress(n * seeds + k + 1, len(lines) * seeds)
-    return SimulatedCampaign(given.env, count, steps, tuple(lines), dict(done))
+    return SimulatedCampaign(given.env, count, steps, tuple(lines))
 
 
 class _Run:
-    """One of them."""
+    """One run: a world over simulated nodes, and the faults that a seed determines."""
 
     def __init__(
         self, world: World, base_dir: Path, reference: _Reference, line: SimulatedLine, seed: int
     ) -> None:
         self._world, self._base_dir = world, base_dir
         self._reference, self._line, self._seed = reference, line, seed
-        self._drawn = random.Random(f"{line.nodes} {line.faults} {seed}")
+        self._drawn = random.Random(f"{line.nodes} {line.mix} {seed}")
         self._machine = SimulatedMachine(self._drawn.randrange(1 << 32), world)
-        self._machine.caller.clock = _clock(self._drawn)
-        self._faults = SimulatedFaults(self._machine, self._drawn)
+        self._machine.caller.clock = random_clock(self._drawn)
+        self._faults = SimulatedFaults(self._machine, self._drawn, RATES.get(line.mix, {}))
+        self._losses = 0  # nodes that are lost
+        # nodes lost before, and living when, all nodes kept the state that they can go back to
+        self._losses_before, self._living = 0, line.nodes
 
-    def whole(self, steps: int) -> Counter[str]:
-        """Do it, and note in its line what came of it."""
+    def whole(self) -> None:
+        """Do the run, and note its result in its line."""
         line, machine = self._line, self._machine
         line.runs += 1
+        wrong = ""
         try:
-            try:
-                self._drive(steps, self._planned(steps))
-            except WorkerDeathError as error:
-                line.ended += 1
-                lost = sum(n * LOSES.get(name, 1) for name, n in self._faults.done.items())
-                if lost < min(2, line.nodes):
-                    self._note(f"one fault, and {error}")
-            except ProcessEndedError:
-                if not machine.caller.is_ended:
-                    raise
+            result = self._result()
             if left := machine.outlived(PATIENCE_S):
-                self._note(f"{', '.join(left)} did not end")
+                wrong = f"{', '.join(left)} did not end"
         except Exception as error:
-            self._note(f"{type(error).__name__}: {error}")
+            wrong = f"{type(error).__name__}: {error}"
         finally:
             machine.close()
-        return self._faults.done
+            line.injected += self._faults.injected
+        if not wrong and self._losses and self._bears_all:
+            wrong = f"{self._losses} nodes were lost to faults that have to be tolerated"
+        if wrong:
+            line.wrong.append(f"{counts_by_name(self._faults.injected.items())}: {wrong}")
+            line.wrong_seeds.append(self._seed)
+        else:
+            setattr(line, result, getattr(line, result) + 1)
 
-    def _note(self, text: str) -> None:
-        self._line.wrong.append(f"seed {self._seed}, {dict(self._faults.done)}: {text}")
+    def _result(self) -> str:
+        """Drive the worlds; return how the run came to its end.
 
-    def _planned(self, steps: int) -> dict[int, list[str]]:
-        """The faults by the steps in which they happen."""
-        drawn, mix = self._drawn, self._line.faults
-        if mix == "none":
+        Raises:
+            AssertionError: the worlds differ from the reference, or gave up too soon.
+        """
+        try:
+            self._drive()
+        except WorkerDeathError as error:
+            lost = self._losses - self._losses_before
+            if lost < min(2, self._living):  # the state of a lost node is kept by the next one
+                raise AssertionError(f"given up after {lost} losses in a row: {error}") from error
+            return "ended"
+        except ProcessEndedError:
+            if not self._machine.caller.is_ended:
+                raise
+            return "caller_ended"
+        return "equal"
+
+    @property
+    def _bears_all(self) -> bool:
+        """Whether no fault of this run may cost a node."""
+        return self._line.mix in (NONE, MANY_TOLERATED, *TOLERATED)
+
+    def _planned(self) -> dict[int, list[Fault]]:
+        """Return the planned faults by the steps in which they happen."""
+        drawn, mix, steps = self._drawn, self._line.mix, len(self._reference.results)
+        if mix == NONE or mix in RATES:
             return {}
-        if mix == "two at once":
+        if mix == TWO:
             return {drawn.randrange(FIRST_STEPS, steps): drawn.choices(FAULTS, k=2)}
-        names = drawn.choices(FAULTS, k=4) if mix == "any four" else [mix]
-        found: dict[int, list[str]] = {}
-        for name in names:
-            found.setdefault(drawn.randrange(FIRST_STEPS, steps), []).append(name)
+        faults = drawn.choices(FAULTS, k=4) if mix == FOUR else [Fault(mix)]
+        found: dict[int, list[Fault]] = {}
+        for fault in faults:
+            found.setdefault(drawn.randrange(FIRST_STEPS, steps), []).append(fault)
         return found
 
-    def _drive(self, steps: int, planned: dict[int, list[str]]) -> None:
+    def _drive(self) -> None:
         machine, line, reference = self._machine, self._line, self._reference
-        ghosts = self._drawn.random() < 0.5
+        planned, ghosts = self._planned(), self._drawn.random() < 0.5
 
         def start(
             backend: BackendName,
@@ -401,39 +360,42 @@ class _Run:
             self._world, self._base_dir, 1, BackendName(NODES, line.nodes),
             system=machine.system(machine.caller), start=start,
         )  # fmt: skip
+        self._faults.begin_severe()
         try:
             vec = CavVectorEnv(worlds)
             self._compare("reset", first_results(vec, reference.seed), reference.first)
             for step, wanted in enumerate(reference.results):
-                for name in planned.get(step, ()):
-                    machine.at(self._drawn.uniform(0.0, WITHIN_S), partial(self._strike, name))
+                for fault in planned.get(step, ()):
+                    delay_s = self._drawn.uniform(0.0, WITHIN_S)
+                    machine.at(delay_s, partial(self._faults.happen, fault))
+                before = worlds.pool.losses, worlds.pool.replacements
+                living = len(worlds.pool.pids)
+                until_s = machine.now_s + self._drawn.uniform(0.0, THOUGHT_S)
+                machine.wait(machine.caller, lambda: False, until_s)
                 found = step_results(vec.step(wanted["actions"]), wanted["actions"])
+                if before == (worlds.pool.losses, worlds.pool.replacements):
+                    self._losses_before, self._living = worlds.pool.losses, living
                 self._compare(f"step {step}", found, wanted)
-                if step % HASHED == 0 or step == steps - 1:
+                if step % HASHED == 0 or step == len(reference.results) - 1:
                     if worlds.state_hash(0) != reference.hashes[step]:
-                        raise AssertionError(f"another state after step {step}")
+                        raise AssertionError(f"the state after step {step} is different")
         finally:
-            line.lost += worlds.pool.losses
-            line.back += worlds.pool.recoveries
+            pool = worlds.pool
+            self._losses = pool.losses
+            line.lost += pool.losses
+            line.recoveries += pool.recoveries
+            line.replacements += pool.replacements
+            line.migrations += worlds.migrations
             worlds.close()
-
-    def _strike(self, name: str) -> None:
-        caller = self._machine.caller
-        if name == END_CALLER:
-            self._machine.end(caller)
-        elif name == END_CALLER_AT_POINT:
-            caller.on_send = _Trap(self._drawn, CALLER_KINDS)
-        else:
-            self._faults.happen(name)
 
     def _compare(self, when: str, found: Arrays, wanted: Arrays) -> None:
         if not same_bytes(found, wanted):
-            raise AssertionError(f"something else came out of {when}")
+            raise AssertionError(f"the results of {when} are different")
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Nodes are lost on purpose: nothing is logged of it."""
+    """Log nothing of nodes, which are lost on purpose."""
     log = logging.getLogger("cavmarl.nodes")
     before, log.disabled = log.disabled, True
     try:

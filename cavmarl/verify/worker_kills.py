@@ -107,7 +107,7 @@ def verify_kills(
     if where.kind != PROCESSES or where.count is None:
         raise ConfigError(
             f"backend = '{where}': workers are killed of 'processes:N'; nodes by "
-            "verify --nodes N --kill K"
+            "cavmarl verify nodes --nodes N --kill K"
         )
     if kills < 1:
         raise ConfigError(f"{kills} kills: must be at least 1")

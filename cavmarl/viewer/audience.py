@@ -12,12 +12,15 @@ import json
 import queue
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, ParamSpec
 
 from cavmarl.viewer.frame_messages import Publication
 from cavmarl.viewer.page_requests import PageRequest
+
+P = ParamSpec("P")
 
 MAX_TEXTS = 256  # that wait for one watcher
 MAX_REQUESTS = 1000  # that wait for the world
@@ -175,12 +178,12 @@ class Audience:
         zones = {one.ghosts_of for one in watchers if one.ghosts_of is not None}
         self.wishes = Wishes(len(self._watchers), vehicles, sensed, tuple(sorted(zones)))
 
-    def _call(self, function: Any, *arguments: Any) -> None:
+    def _call(self, function: Callable[P, None], *given: P.args, **named: P.kwargs) -> None:
         loop = self._loop
         if loop is None or loop.is_closed():
             return
         try:
-            loop.call_soon_threadsafe(function, *arguments)
+            loop.call_soon_threadsafe(partial(function, *given, **named))
         except RuntimeError:  # closed since
             return
 

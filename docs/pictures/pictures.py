@@ -101,7 +101,7 @@ def draw_picture(picture: Picture) -> Surface:
         simulation.signal_phases(),
         title=config.name,
         clock_s=float(simulation.ticks()[0]) * config.clock.sim_dt_s,
-        zones=simulation.zone_view() if simulation.partition.count > 1 else None,
+        zones=simulation.zones.view() if simulation.partition.count > 1 else None,
         ghosts_of=picture.ghosts_of,
     )
 

@@ -22,7 +22,6 @@ COMMANDS = (
     "report",
     "suite",
     "verify",
-    "verify-determinism",
     "journal",
     "plan",
     "lead",
@@ -141,7 +140,7 @@ def test_verify_says_for_each_number_of_zones_that_it_is_equal(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "found.json"
-    words = ("verify", "merge", "--zones", "1,4", "--steps", "5", "--worlds", "2", *QUICK)
+    words = ("verify", "zones", "merge", "--zones", "1,4", "--steps", "5", "--worlds", "2", *QUICK)
     assert run(*words, "--layout", "strips", "--json", str(path)) == 0
     found = json.loads(path.read_text())
     assert found["holds"]
@@ -157,7 +156,7 @@ def test_verify_takes_the_zones_of_a_file(
     monkeypatch.chdir(tmp_path)
     network = load_network(find_map("merge"))
     write_zones(tmp_path / "mine.json", cut_map(network, "strips", 3))
-    words = ("verify", "merge", "--steps", "2", "--layout", "mine.json", *QUICK)
+    words = ("verify", "zones", "merge", "--steps", "2", "--layout", "mine.json", *QUICK)
     assert run(*words, "--json", "found.json") == 0
     (row,) = json.loads((tmp_path / "found.json").read_text())["results"]
     assert row["zones"] == 3
@@ -169,7 +168,7 @@ def test_verify_fails_and_names_the_first_difference_of_each(
 ) -> None:
     monkeypatch.setattr(dividing, "halo_m", lambda *_: 1.0)
     path = tmp_path / "found.json"
-    words = ("verify", "grid4x4", "--zones", "1,4", "--steps", "40", "--json", str(path))
+    words = ("verify", "zones", "grid4x4", "--zones", "1,4", "--steps", "40", "--json", str(path))
     assert run(*words) == 1
     whole, divided = json.loads(path.read_text())["results"]
     assert whole["difference"] is None
@@ -183,7 +182,7 @@ def test_verify_determinism_says_equal_and_gives_the_hash(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "found.json"
-    words = ("verify-determinism", "merge", "--steps", "3", *QUICK)
+    words = ("verify", "determinism", "merge", "--steps", "3", *QUICK)
     assert run(*words, "--json", str(path)) == 0
     found = json.loads(path.read_text())
     assert found["difference"] is None
@@ -204,7 +203,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         "def make_policy(env):\n"
         "    return Hashing(env)\n"
     )
-    words = ("verify-determinism", "merge", "--policy", str(script), "--steps", "3", *QUICK)
+    words = ("verify", "determinism", "merge", "--policy", str(script), "--steps", "3", *QUICK)
     assert run(*words) == 1
     assert "different: step 1 (tick 2), vehicle 0, s: " in capsys.readouterr().out
 
@@ -226,15 +225,15 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("suite", "nothing"), "no suite or file 'nothing'"),
         (("suite", "--maps", "no-folder"), "is no environment and no file in no-folder"),
         (("report", "no-folder"), "no-folder: no manifest.json"),
-        (("verify-determinism", "merge", "--steps", "0"), "steps = 0: must be"),
-        (("verify-determinism", "merg"), "did you mean merge"),
-        (("verify", "merge", "--steps", "0"), "steps = 0: must be"),
-        (("verify", "merge", "--zones", "1,x"), "--zones 1,x: must be numbers"),
-        (("verify", "merge", "--zones", "0"), "zones = 0: must be whole numbers from 1"),
-        (("verify", "merge", "--layout", "hexagons"), "zones.layout"),
-        (("verify", "merge", "--layout", "none.json"), "none.json"),
+        (("verify", "determinism", "merge", "--steps", "0"), "steps = 0: must be"),
+        (("verify", "determinism", "merg"), "did you mean merge"),
+        (("verify", "zones", "merge", "--steps", "0"), "steps = 0: must be"),
+        (("verify", "zones", "merge", "--zones", "1,x"), "--zones 1,x: must be numbers"),
+        (("verify", "zones", "merge", "--zones", "0"), "zones = 0: must be whole numbers from 1"),
+        (("verify", "zones", "merge", "--layout", "hexagons"), "zones.layout"),
+        (("verify", "zones", "merge", "--layout", "none.json"), "none.json"),
         (
-            ("verify", "merge", "--layout", "grid", "--set", "zones.layout=strips"),
+            ("verify", "zones", "merge", "--layout", "grid", "--set", "zones.layout=strips"),
             "zones.layout stands in overrides and is given as layout",
         ),
         (("evaluate", "merge", "--agents", "-1"), "population.agents = -1"),
@@ -295,8 +294,7 @@ def test_a_json_path_is_tried_before_any_work(
         "evaluate": ("evaluate", "nowhere"),
         "report": ("report", "nowhere"),
         "suite": ("suite", "nowhere"),
-        "verify": ("verify", "nowhere"),
-        "verify-determinism": ("verify-determinism", "nowhere"),
+        "verify": ("verify", "zones", "nowhere"),
         "view": ("view", "nowhere"),
         "map": ("map", "check", str(network)),
         "bench": ("bench", "step", "--agents", "0"),

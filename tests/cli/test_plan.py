@@ -81,7 +81,9 @@ def test_zones_can_be_cut_by_what_was_measured(
     said = capsys.readouterr().out.splitlines()[-1]
     assert f"of 50 vehicles are in other zones: {path}" in said
     assert run(*rush, *short, "--layout", str(path)) == 0
-    assert run("verify", "rush", "--zones", "4", "--layout", str(path), "--steps", "5") == 0
+    assert (
+        run("verify", "zones", "rush", "--zones", "4", "--layout", str(path), "--steps", "5") == 0
+    )
     path.unlink()
     assert run(*rush, *short, "--tolerance", "4", "--cut-anew", str(path)) == 0
     assert "is not written" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""`cavmarl verify --kill`: what it prints, writes and refuses."""
+"""`cavmarl verify workers`: what it prints, writes and refuses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_workers_are_killed_and_nobody_can_tell(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "kills.json"
-    assert run("verify", *SMALL, "--kill", "4", "--zones", "2", "--json", str(path)) == 0
+    assert run("verify", "workers", *SMALL, "--kill", "4", "--zones", "2", "--json", str(path)) == 0
     assert "equal in all 22 steps" in capsys.readouterr().out
     found = json.loads(path.read_text())
     assert found["holds"]
@@ -41,7 +41,7 @@ def test_a_successor_that_forgets_is_found_out(
 
     monkeypatch.setattr(WorkerProcesses, "replace", without_memory)
     monkeypatch.setattr(worker_kills, "same_bytes", lambda *_: True)  # states tell it alone
-    assert run("verify", *SMALL, "--kill", "5") == 1
+    assert run("verify", "workers", *SMALL, "--kill", "5") == 1
     assert "different after step" in capsys.readouterr().out
 
 
@@ -50,29 +50,45 @@ def test_results_that_differ_are_found_out_where_states_do_not(
 ) -> None:
     answers = iter([True, True, False])
     monkeypatch.setattr(worker_kills, "same_bytes", lambda *_: next(answers))
-    assert run("verify", *SMALL, "--kill", "1") == 1
+    assert run("verify", "workers", *SMALL, "--kill", "1") == 1
     assert "different after step 2" in capsys.readouterr().out
 
 
 def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str]) -> None:
     town = ("town", "--agents", "4", "--background", "30", "--worlds", "1", "--zones", "4")
-    assert run("verify", *town, "--kill", "12", "--workers", "2") == 0
+    assert run("verify", "workers", *town, "--kill", "12", "--workers", "2") == 0
     assert "equal in all 46 steps" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("verify", "--kill", "3"), ("--kill", "name an environment")),
-        (("verify", "ring", "--backend", "ray:2"), ("--backend ray:2", "--kill")),
-        (("verify", "ring", "--kill", "1", "--backend", "slurm"), ("backend = 'slurm'", "'ray'")),
-        (("verify", "ring", "--kill", "1", "--backend", "nodes:2"), ("'nodes:2'", "--nodes N")),
-        (("verify", "ring", "--kill", "1", "--hosts", "ray"), ("--hosts was removed", "--backend")),
-        (("verify", "ring", "--kill", "0"), ("0 kills", "at least 1")),
-        (("verify", "ring", "--kill", "5", "--steps", "7"), ("7 steps", "at least 15")),
-        (("verify", "ring", "--kill", "1", "--zones", "1,2"), ("--zones 1,2", "one number")),
-        (("verify", "ring", "--kill", "1", "--layout", "grid"), ("--layout", "--set")),
-        (("verify", "ring", "--kill", "1", "--workers", "3", "--worlds", "2"), ("workers = 3",)),
+        (
+            ("verify", "workers", "ring", "--kill", "1", "--backend", "slurm"),
+            ("backend = 'slurm'", "'ray'"),
+        ),
+        (
+            ("verify", "workers", "ring", "--kill", "1", "--backend", "nodes:2"),
+            ("'nodes:2'", "verify nodes"),
+        ),
+        (
+            ("verify", "workers", "ring", "--kill", "1", "--hosts", "ray"),
+            ("--hosts was removed", "--backend"),
+        ),
+        (("verify", "workers", "ring", "--kill", "0"), ("0 kills", "at least 1")),
+        (("verify", "workers", "ring", "--kill", "5", "--steps", "7"), ("7 steps", "at least 15")),
+        (
+            ("verify", "workers", "ring", "--kill", "1", "--zones", "1,2"),
+            ("--zones", "valid integer"),
+        ),
+        (
+            ("verify", "workers", "ring", "--kill", "1", "--layout", "grid"),
+            ("No such option", "--layout"),
+        ),
+        (
+            ("verify", "workers", "ring", "--kill", "1", "--workers", "3", "--worlds", "2"),
+            ("workers = 3",),
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(

@@ -37,7 +37,7 @@ def world(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 def listed(simulation: Simulation, rows: NDArray[np.void]) -> Scratch:
     room = scratch(simulation.network, len(rows))
-    travel = simulation._tick.traffic.travel
+    travel = simulation.travel
     step, step_at = np.zeros(len(rows), PLAN), np.zeros(len(rows), np.int64)
     register_links(simulation.network.arrays, travel, rows, len(rows), step, step_at, room)
     return room
@@ -53,7 +53,7 @@ def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
 @pytest.mark.parametrize("stand", [False, True])
 def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation, stand: bool) -> None:
     """Of vehicles that are kept where they are, too."""
-    travel, roads = world._tick.traffic.travel, world.network
+    travel, roads = world.travel, world.network
     for step in range(0, 12, 2):
         for _ in range(step):
             drive(world)

@@ -162,7 +162,7 @@ def test_at_red_one_stops_before_the_line_and_goes_at_green(scene: Make) -> None
     for arm, goal in (("W", "E_out"), ("S", "N_out")):
         here.put(arm, f"{arm}_in_0", 60.0, goal, speed=13.0)
     links = {
-        arm: int(here.simulation._tick.traffic.plans[here[arm]["goal"], here[arm]["lane"]]["link"])
+        arm: int(here.simulation.plans[here[arm]["goal"], here[arm]["lane"]]["link"])
         for arm in ("W", "S")
     }
     stood = set()
@@ -189,9 +189,7 @@ def test_at_yellow_one_goes_on_only_if_stopping_would_be_hard(
     here = scene("traffic_light")
     network = here.simulation.network
     here.put("probe", "W_in_0", 140.0, "E_out")
-    link = int(
-        here.simulation._tick.traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]["link"]
-    )
+    link = int(here.simulation.plans[here["probe"]["goal"], here["probe"]["lane"]]["link"])
     # On to the first tick of yellow, then put the car where it is to decide.
     here.clear()
     for _ in here.run(200.0):
@@ -234,7 +232,7 @@ def test_a_left_turn_waits_inside_for_who_comes_and_goes_when_they_are_through(s
     here = scene("traffic_light")
     network = here.simulation.network
     here.put("probe", "W_in_0", 140.0, "N_out")
-    step = here.simulation._tick.traffic.plans[here["probe"]["goal"], here["probe"]["lane"]]
+    step = here.simulation.plans[here["probe"]["goal"], here["probe"]["lane"]]
     link = int(step["link"])
     wait_m = float(network.links[link]["wait_m"])
     assert np.isfinite(wait_m), "this turn has a waiting position"

@@ -35,7 +35,7 @@ def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_t
     tmp_path: Path,
 ) -> None:
     world, right, left, goal = before_dead_end(tmp_path, length_m=200.0)
-    roads, plans, tables = world.network, world.plans, world._tick.traffic.travel
+    roads, plans, tables = world.network, world.plans, world.travel
     way = goal * len(roads.lanes)
     assert plans["change"][goal, right] == 1
     assert plans["link"][goal, right] >= 0, "its lane goes on, too"

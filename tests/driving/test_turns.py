@@ -20,6 +20,7 @@ from tests.support.dead_ends import before_dead_end, put
 from tests.support.driving import drive, make_simulation, start, suggested
 from tests.support.netgenerate import netconvert, netgenerate
 from tests.support.traffic import network
+from tests.support.world import traffic_of
 
 STEERING_RAD = math.pi / 4.0
 # A road that bends by 100° to the right, its first lane within 3 m.
@@ -60,7 +61,7 @@ def test_turns_that_are_too_tight_are_sharp_ones_and_no_trip_has_one(tmp_path: P
     tight = np.flatnonzero(links["direction"] != roads.links["direction"])
     assert 0 < tight.size < 0.15 * len(links)
     assert min(_turn_rad(roads, roads.links[link]) for link in tight) > 1.2
-    traffic = world._tick.traffic
+    traffic = traffic_of(world)
     for origin, goal in traffic.demand.agent_trips.pairs.tolist():
         plan, lane = traffic.plans[goal], origin
         while plan[lane]["next"] >= 0:
@@ -130,7 +131,7 @@ def test_alone_on_two_lanes_an_agent_stays_on_its_own(tmp_path: Path) -> None:
         drive(world)
         row = world.vehicles(0)[0]
         lane = int(row["lane"])
-        planned = world._tick.traffic.plans[row["goal"], before]["change"] if before >= 0 else 0
+        planned = world.plans[row["goal"], before]["change"] if before >= 0 else 0
         if before >= 0 and roads.lanes["edge"][lane] == roads.lanes["edge"][before] != lane:
             changes += lane != before and planned == 0
         before = lane

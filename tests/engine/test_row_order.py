@@ -13,7 +13,7 @@ STEPS = 150
 
 def shuffle_rows(simulation: Simulation, rng: np.random.Generator) -> int:
     """Put the committed rows of each world in another order; how many of them changed places."""
-    worlds = simulation._shard.worlds
+    worlds = simulation.shards[0].worlds
     moved = 0
     for w, num in enumerate(worlds.num_owned):
         order = rng.permutation(num)

@@ -110,7 +110,7 @@ def test_speed_limits_hold_for_every_driver_in_his_own_measure(env: str) -> None
 def test_nobody_drives_through_red(env: str) -> None:
     simulation = make_traffic(env, background=60, num_worlds=2, overrides=PER_TICK)
     start(simulation, seed=2)
-    roads, steps = simulation.network.arrays, simulation._tick.traffic.travel.steps
+    roads, steps = simulation.network.arrays, simulation.travel.steps
     crossed = 0
     before: list[dict[int, tuple[int, float]]] = [{}, {}]
     for _ in minutes(simulation, 2.0):

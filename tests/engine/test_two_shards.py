@@ -19,6 +19,7 @@ from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_layouts import cut_map
 from tests.support.actuated import actuated_grid
 from tests.support.driving import idle, make_simulation, make_traffic, start, suggested
+from tests.support.world import traffic_of
 
 STEPS = 120
 TICKS = 1000
@@ -46,7 +47,7 @@ class Halves:
 
     def __init__(self, whole: Simulation) -> None:
         self.shared = SharedOutputs(whole.config, whole.network, whole.num_worlds)
-        traffic = whole._tick.traffic
+        traffic = traffic_of(whole)
         shards = []
         partition = cut_map(whole.network, "strips", 2)
         halo = zone_halo(partition, EVERYWHERE_M)
@@ -55,14 +56,14 @@ class Halves:
             shard = Shard(
                 whole.config,
                 whole.network,
-                traffic.plans,
-                traffic.travel,
-                zoned,
-                self.shared.outputs,
-                zone,
-                partition.arrays,
-                halo,
-                shards[0] if shards else None,
+                plans=traffic.plans,
+                travel=traffic.travel,
+                zoned=zoned,
+                outputs=self.shared.outputs,
+                zone=zone,
+                zones=partition.arrays,
+                halo=halo,
+                first=shards[0] if shards else None,
             )
             shards.append(shard)
         self.shards = shards

@@ -148,15 +148,24 @@ def test_a_world_that_is_sent_to_another_process() -> None:
 
 
 @pytest.mark.parametrize("how", COPIES)
-def test_worlds_with_processes_or_files_are_refused(how: str, tmp_path: Any) -> None:
+def test_worlds_with_processes_are_refused(how: str) -> None:
     env = cavmarl.parallel_env("grid4x4", agents=2, zones=2, workers=2)
     with pytest.raises(cavmarl.ConfigError, match="backend='local'"):
         COPIES[how](env)
     env.close()
-    journal = {"zones.journal": str(tmp_path / "journal")}
+
+
+def test_a_copy_goes_on_without_the_journal(tmp_path: Any) -> None:
+    path = tmp_path / "journal"
+    journal = {"zones.journal": str(path), "zones.check_invariants": True}
     env = cavmarl.parallel_env("grid4x4", agents=2, zones=2, overrides=journal)
-    with pytest.raises(cavmarl.ConfigError, match=r"zones\.journal"):
-        COPIES[how](env)
+    drive(env, 0, 5)
+    written = path.read_bytes()
+    other = copy.deepcopy(env)
+    found = drive(other, 5, 5)
+    assert path.read_bytes() == written
+    assert drive(env, 5, 5) == found
+    assert len(path.read_bytes()) > len(written)
 
 
 class Named(cavmarl.CavEnv):

@@ -47,7 +47,7 @@ def test_every_zone_takes_some_time(simulation: Simulation) -> None:
 
 
 def test_what_drivers_would_do_is_no_cost(simulation: Simulation) -> None:
-    clock = simulation.time_shards()
+    clock = simulation.zones.measure_costs()
     simulation.suggest(np.zeros((*simulation.outputs.present.shape, 2)))
     assert not clock.take_s().any()
 

@@ -84,7 +84,7 @@ def test_a_hundred_cross_a_border_in_the_same_tick(platoon: Build, tmp_path: Pat
         crossed.append(sum(zone != before.get(car, zone) for car, zone in now.items()))
         before = now
     assert max(crossed) == sum(crossed) == MANY
-    assert divided.zone_loads().owned[:, 0].tolist() == [0, MANY]
+    assert divided.zones.loads().owned[:, 0].tolist() == [0, MANY]
 
 
 def test_a_hundred_cross_in_both_directions_in_the_same_tick(tmp_path: Path) -> None:

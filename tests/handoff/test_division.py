@@ -36,13 +36,13 @@ def divided(zones: int = 4, **overrides: Any) -> Simulation:
 
 def owned(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
     """Of each shard."""
-    parts = [shard.worlds for shard in simulation._shards]
+    parts = [shard.worlds for shard in simulation.shards]
     return [worlds.rows[world, : worlds.num_owned[world]] for worlds in parts]
 
 
 def ghosts(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
     """Of each shard."""
-    parts = [shard.worlds for shard in simulation._shards]
+    parts = [shard.worlds for shard in simulation.shards]
     return [
         worlds.rows[world, worlds.num_owned[world] : worlds.num_rows[world]] for worlds in parts
     ]
@@ -84,13 +84,13 @@ def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
     simulation = divided()
     drive(simulation)
     here, there = (int(owned(simulation, 0)[zone]["id"][0]) for zone in (0, 3))
-    for shard in simulation._shards:
+    for shard in simulation.shards:
         shard.worlds.num_rows[:] = shard.worlds.num_owned
-    division = simulation._tick.division
+    division = simulation.division
     with pytest.raises(ConfigError, match=f"vehicle {here} entered zone 3, which has not seen"):
-        division.hand_over(0, Switch(here, 0, 3, 1, False))
+        division.changes.hand_over(0, Switch(here, 0, 3, 1, False))
     with pytest.raises(ConfigError, match=f"zone 0 does not own vehicle {there}"):
-        division.hand_over(0, Switch(there, 0, 3, 1, False))
+        division.changes.hand_over(0, Switch(there, 0, 3, 1, False))
 
 
 def test_a_collision_over_a_border_is_found_once_and_of_both() -> None:
@@ -138,24 +138,24 @@ def test_all_shards_together_are_the_world() -> None:
         rows = [w.rows[world, : w.num_owned[world]] for w in (first, second)]
         one, other = (part[np.argsort(part["id"])] for part in rows)
         assert (one[list(STATE_FIELDS)] == other[list(STATE_FIELDS)]).all()
-        assert len(one) == parts._tick.division.running()[world]
+        assert len(one) == parts.division.running()[world]
     assert set(PLACEMENT_FIELDS).isdisjoint(STATE_FIELDS)
 
 
 def test_what_is_changed_in_all_next_rows_goes_back_to_their_shards() -> None:
     simulation = divided()
     drive(simulation)
-    for shard in simulation._shards:
+    for shard in simulation.shards:
         np.copyto(shard.worlds.next_rows, shard.worlds.rows)
     before = [[part.copy() for part in owned(simulation, world)] for world in range(2)]
-    with simulation._tick.division.everybody_next() as everybody:
+    with simulation.division.everybody_next() as everybody:
         for world in range(2):
             num = everybody.num_owned[world]
             assert num == len(simulation.vehicles(world))
             rows = everybody.next_rows[world, :num]
             rows["leg"] += rows["id"] % 3
     for world in range(2):
-        for shard, part in zip(simulation._shards, before[world], strict=True):
+        for shard, part in zip(simulation.shards, before[world], strict=True):
             after = shard.worlds.next_rows[world, : len(part)]
             part["leg"] += part["id"] % 3
             assert (after == part).all()

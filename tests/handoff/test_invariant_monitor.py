@@ -14,6 +14,7 @@ from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import Birth
 from cavmarl.zones.kernels.zone_lookup import is_inside, squared_distance
 from tests.support.driving import drive, make_simulation, start
+from tests.support.world import coordination_of
 
 STEPS = 8
 LOSSES = {"drop": 0.2, "duplicate": 0.2, "delay": 0.2, "reorder": 0.3}
@@ -75,15 +76,15 @@ class Meddling:
 
     def __init__(self, simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
         self.simulation, self._patch = simulation, monkeypatch
-        self.division: Division = simulation._tick.division
+        self.division: Division = simulation.division
 
     def zone(self, zone: int) -> tuple[Any, int, int]:
         """Rows, owned ones and all of a zone."""
-        worlds = self.simulation._shards[zone].worlds
+        worlds = self.simulation.shards[zone].worlds
         return worlds.rows[0], int(worlds.num_owned[0]), int(worlds.num_rows[0])
 
     def caught(self, meddle: Any, words: str) -> None:
-        coordination: Any = self.simulation._tick.coordination
+        coordination: Any = coordination_of(self.simulation)
         monitor = coordination._monitor
         look = monitor.end
 
@@ -104,9 +105,9 @@ def meddling(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Meddlin
 def test_a_vehicle_that_two_zones_own(meddling: Meddling) -> None:
     def meddle() -> None:
         rows, owned, _ = meddling.zone(1)
-        others = meddling.simulation._shards[2].worlds
+        others = meddling.simulation.shards[2].worlds
         rows[owned] = others.rows[0, 0]
-        meddling.simulation._shards[1].worlds.num_owned[0] += 1
+        meddling.simulation.shards[1].worlds.num_owned[0] += 1
 
     meddling.caught(meddle, r"tick \d+ of world 0: one owner: vehicle \d+ is owned by zones \[1, 2")
 
@@ -135,7 +136,7 @@ def test_a_vehicle_without_a_place(meddling: Meddling) -> None:
 def test_a_vehicle_that_is_lost(meddling: Meddling) -> None:
     def meddle() -> None:
         rows, owned, num = meddling.zone(2)
-        worlds = meddling.simulation._shards[2].worlds
+        worlds = meddling.simulation.shards[2].worlds
         rows[owned - 1 : num - 1] = rows[owned:num].copy()
         worlds.num_owned[0] -= 1
         worlds.num_rows[0] -= 1
@@ -148,7 +149,7 @@ def test_a_vehicle_that_has_never_entered(meddling: Meddling) -> None:
         rows, owned, _ = meddling.zone(2)
         rows[owned] = rows[0]
         rows[owned]["id"], rows[owned]["tick"] = 9_999, meddling.simulation.ticks()[0] - 1
-        meddling.simulation._shards[2].worlds.num_owned[0] += 1
+        meddling.simulation.shards[2].worlds.num_owned[0] += 1
 
     meddling.caught(meddle, r"population: vehicle 9999 of zone 2 has never entered: \d+ vehicles")
 
@@ -164,7 +165,7 @@ def test_a_row_whose_epoch_is_not_that_on_record(meddling: Meddling) -> None:
 
 def test_a_row_that_is_with_another_zone_than_on_record(meddling: Meddling) -> None:
     def meddle() -> None:
-        source, target = (meddling.simulation._shards[zone].worlds for zone in (0, 1))
+        source, target = (meddling.simulation.shards[zone].worlds for zone in (0, 1))
         own, other = source.rows[0, 0].copy(), target.rows[0, 0].copy()
         source.rows[0, 0], target.rows[0, 0] = other, own
 
@@ -173,7 +174,7 @@ def test_a_row_that_is_with_another_zone_than_on_record(meddling: Meddling) -> N
 
 def test_a_clock_that_is_late(meddling: Meddling) -> None:
     def meddle() -> None:
-        shard = meddling.simulation._shards[2]
+        shard = meddling.simulation.shards[2]
         shard.worlds = shard.worlds._replace(ticks=shard.worlds.ticks - 1)
 
     meddling.caught(meddle, r"one clock: zone 2 is at tick \d+, not at \d+")
@@ -198,7 +199,7 @@ def test_a_ghost_that_somebody_has_written(meddling: Meddling) -> None:
 
 def test_a_ghost_that_is_not_there(meddling: Meddling) -> None:
     def meddle() -> None:
-        meddling.simulation._shards[1].worlds.num_rows[0] -= 1
+        meddling.simulation.shards[1].worlds.num_rows[0] -= 1
 
     meddling.caught(meddle, r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: zone \d owns")
 
@@ -216,7 +217,7 @@ def test_a_ghost_that_is_there_twice(narrow: Meddling) -> None:
     def meddle() -> None:
         rows, owned, num = narrow.zone(1)
         rows[num] = rows[owned]
-        narrow.simulation._shards[1].worlds.num_rows[0] += 1
+        narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
     narrow.caught(meddle, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: zone \d owns it")
 
@@ -228,7 +229,7 @@ def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
         rects = narrow.division.zones.rects
         away = [squared_distance(rects, 1, row["x"], row["y"]) for row in others[:owned]]
         rows[num] = others[int(np.argmax(away))]
-        narrow.simulation._shards[1].worlds.num_rows[0] += 1
+        narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
     narrow.caught(meddle, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: zone 2 owns it")
 
@@ -237,7 +238,7 @@ def test_a_ghost_of_nobody(narrow: Meddling) -> None:
     def meddle() -> None:
         rows, _, num = narrow.zone(1)
         rows[num]["id"] = 7_777
-        narrow.simulation._shards[1].worlds.num_rows[0] += 1
+        narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
     narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which is not there")
 
@@ -246,7 +247,7 @@ def test_an_arrival_of_somebody_who_is_there(
     narrow: Meddling, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All sums hold: it is said to arrive, deep in a zone where nobody else sees it."""
-    coordination: Any = narrow.simulation._tick.coordination
+    coordination: Any = coordination_of(narrow.simulation)
     coordinator = coordination.coordinators[0]
 
     def meddle() -> None:
@@ -257,7 +258,7 @@ def test_an_arrival_of_somebody_who_is_there(
         rows[owned] = rows[inside.index(True)]
         rows[owned]["id"] = vehicle = narrow.zone(2)[0][0]["id"]
         rows[owned]["epoch"], rows[owned]["tick"] = 0, narrow.simulation.ticks()[0] - 1
-        worlds = narrow.simulation._shards[1].worlds
+        worlds = narrow.simulation.shards[1].worlds
         worlds.num_owned[0] += 1
         worlds.num_rows[0] += 1
         monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(int(vehicle), 1, b""),), ()))
@@ -267,7 +268,7 @@ def test_an_arrival_of_somebody_who_is_there(
 
 def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = watched()
-    coordination: Any = simulation._tick.coordination
+    coordination: Any = coordination_of(simulation)
     coordinator = coordination.coordinators[0]
     monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(8_888, 0, b""),), ()))
     with pytest.raises(ProtocolError, match="vehicle 8888 of zone 0, epoch 0, is lost"):
@@ -276,7 +277,7 @@ def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_monitor_takes_as_much_memory_as_it_began_with() -> None:
     simulation = watched()
-    coordination: Any = simulation._tick.coordination
+    coordination: Any = coordination_of(simulation)
     monitor = coordination._monitor
     kept = {id(part.rows) for part in monitor._kept[0]}
     for _ in range(100):
@@ -291,7 +292,7 @@ def test_the_monitor_takes_as_much_memory_as_it_began_with() -> None:
 
 
 def test_ghosts_that_are_handed_out_cannot_be_written(simulation: Simulation) -> None:
-    ghosts = simulation.ghosts(1)
+    ghosts = simulation.zones.ghosts(1)
     assert len(ghosts)
     with pytest.raises(ValueError, match="read-only"):
         ghosts["x"][0] = 0.0

@@ -40,7 +40,7 @@ def test_the_journal_of_a_run_names_the_owners(busy: Recorded, tmp_path: Path) -
     assert told.owners == table.owners
     assert told.hosts == table.hosts
     assert told.tick == table.tick == 2 * STEPS
-    rows = dict(vec.simulation._tick.division.owners(0))
+    rows = dict(vec.simulation.division.owners(0))
     gone = {entry.vehicle for entry in vec.simulation.coordinators[0].notes()[1]}
     owners = {v: zone for v, (zone, _) in table.owners.items() if v not in gone}
     assert owners.items() <= rows.items()
@@ -107,7 +107,7 @@ def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
     whole, divided = (
         make_vec("ring", zones=zones, agents=2, background=3, max_cycles=1000) for zones in (1, 4)
     )
-    book, most = divided.simulation._tick.division.book, 0
+    book, most = divided.simulation.division.book, 0
     for vec in (whole, divided):
         vec.reset(seed=1)
     for _ in range(500):
@@ -140,7 +140,7 @@ def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late(
     born = dict(entry[:2] for entry in coordinator.notes()[0])
     gone = {entry.vehicle for entry in coordinator.notes()[1]}
     on_record = {v: zone for v, zone in (owners | born).items() if v not in gone}
-    assert on_record == dict(simulation._tick.division.owners(0))
+    assert on_record == dict(simulation.division.owners(0))
 
 
 def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> None:
@@ -161,7 +161,7 @@ def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> N
 def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
     vec = make_vec("grid4x4", zones=4, overrides=BUSY)
     vec.reset(seed=1)
-    lost = vec.simulation._shards[1].worlds.num_owned
+    lost = vec.simulation.shards[1].worlds.num_owned
     with pytest.raises(ProtocolError, match=r"zones own \[.*\] vehicles, not \["):  # noqa: PT012
         for step in range(STEPS):
             lost[0] -= step == 0

@@ -97,7 +97,7 @@ def test_who_went_astray_bars_no_lane_and_nobody_can_tell(
     assert row["events"] & EVENT_WRONG_WAY
     assert abs(row["d"]) > LOST_M
     away_m = -row["y"]
-    assert away_m > divided.zone_loads().halo_m
+    assert away_m > divided.zones.loads().halo_m
     street = whole.vehicles(0)
     passed = (street["driver"] != DRIVER_AGENT) & (street["s"] > row["s"])
     assert passed.sum() >= 3, "where the agent's lane still is, others drive on"

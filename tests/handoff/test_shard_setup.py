@@ -37,4 +37,4 @@ def test_a_world_is_not_made_that_could_not_be_exact() -> None:
     with pytest.raises(ConfigError, match="an overlap of 50 m is too narrow"):
         make_simulation("grid4x4", **settings)
     settings["overrides"] = SETTINGS | {"zones.halo_m": 5000.0}
-    assert make_simulation("grid4x4", **settings).zone_loads().halo_m == 5000.0
+    assert make_simulation("grid4x4", **settings).zones.loads().halo_m == 5000.0

@@ -14,6 +14,7 @@ from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.shards.shard_group import ShardGroup
 from tests.support.driving import drive, make_simulation, start
+from tests.support.world import use_executor
 
 STEPS = 40
 AGENTS = 12
@@ -39,7 +40,7 @@ class Strict(PhaseExecutor):
     def __init__(self, simulation: Simulation, strangers: float) -> None:
         self.controlled = 0
         self.sensed: list[set[int]] = []
-        self._hosts = [(shard, ShardGroup([shard])) for shard in simulation._shards]
+        self._hosts = [(shard, ShardGroup([shard])) for shard in simulation.shards]
         self._strangers = strangers
 
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
@@ -82,7 +83,7 @@ def test_a_control_counts_where_the_vehicle_is_owned_and_nowhere_else(
 ) -> None:
     plain, watched = divided(kind), divided(kind)
     strict = Strict(watched, strangers)
-    watched._tick.executor = strict
+    use_executor(watched, strict)
     for _ in range(STEPS):
         for simulation in (plain, watched):
             drive(simulation)
@@ -96,8 +97,8 @@ def test_a_control_counts_where_the_vehicle_is_owned_and_nowhere_else(
 
 def test_a_control_that_its_owner_does_not_get_is_missed() -> None:
     plain, watched = divided("continuous"), divided("continuous")
-    watched._tick.executor = Strict(watched, 0.0)
-    shard = watched._shards[0]
+    use_executor(watched, Strict(watched, 0.0))
+    shard = watched.shards[0]
     agent = int(agents_of(shard)[0])
     for simulation in (plain, watched):
         shape = simulation.outputs.present.shape

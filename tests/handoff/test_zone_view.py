@@ -33,7 +33,7 @@ def test_owners_stand_beside_the_vehicles_and_ghosts_are_those_near(divided: Sim
     for _ in range(10):
         drive(divided)
         for world in range(2):
-            view, rows = divided.zone_view(world), divided.vehicles(world)
+            view, rows = divided.zones.view(world), divided.vehicles(world)
             for row, owner in zip(rows, view.owners.tolist(), strict=True):
                 away = [squared_distance(rects, k, row["x"], row["y"]) for k in range(len(rects))]
                 # Who has crossed in this tick is handed over when the next one begins.
@@ -47,7 +47,7 @@ def test_owners_stand_beside_the_vehicles_and_ghosts_are_those_near(divided: Sim
 
 
 def test_a_view_stays_what_it_was(divided: Simulation) -> None:
-    view = divided.zone_view()
+    view = divided.zones.view()
     before = [ghosts.copy() for ghosts in view.ghosts]
     for _ in range(20):
         drive(divided)
@@ -57,5 +57,5 @@ def test_a_view_stays_what_it_was(divided: Simulation) -> None:
 
 def test_transfers_are_handed_through(divided: Simulation) -> None:
     one = TransferInFlight(vehicle=7, source=0, target=1, state="offered")
-    view = view_zones(divided._shards, divided.partition, HALO_M, transfers=[one])
+    view = view_zones(divided.shards, divided.partition, HALO_M, transfers=[one])
     assert view.transfers == (one,)

@@ -12,7 +12,6 @@ import pytest
 
 from cavmarl.engine.world_setup import load_world
 from cavmarl.parallel.checkpoint.checkpoint_log import STEPS, CheckpointLog, make_segments
-from cavmarl.parallel.processes.state_image import load_kernels
 from cavmarl.shards.shard import Commands
 from tests.support.vec_runs import Make, drive, pool_of, same
 
@@ -62,7 +61,6 @@ def test_worlds_that_are_reset_when_the_diary_is_full(make: Make, kind: dict[str
 
 @pytest.fixture
 def checkpoint_log() -> Iterator[CheckpointLog]:
-    load_kernels()
     config = load_world("merge").config
     segments = make_segments(config, 1)
     yield CheckpointLog(config, 1, [segment.fd for segment in segments])

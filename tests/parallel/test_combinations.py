@@ -97,14 +97,12 @@ ONLY_DIVIDED = (
     "zones.journal", "zones.check_invariants", "zones.repartition_steps",
     "workers.balance_steps", "workers.monitor_cpu",
 )  # fmt: skip
-OF_ONE_WORLD = "of one world over"
 OF_THE_CALLER = "a network simulator is in the caller's process"
 BY_COSTS = "whole worlds on nodes are balanced by what they cost"
 NOT_OVER_NODES = "worlds over nodes do not have it"
 REFUSED = {
     ("a network simulator", "workers"): OF_THE_CALLER,
     ("a network simulator", "zones over workers"): OF_THE_CALLER,
-    ("a journal", "zones over workers"): OF_ONE_WORLD,
     ("repartitions", "zones over workers"): "needs zones that stay",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
     ("sensor workers", "worlds over nodes"): NOT_OVER_NODES,

@@ -13,12 +13,13 @@ import pytest
 
 from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError, JournalError
-from cavmarl.handoff.coordinator.journal import Journal
+from cavmarl.handoff.coordinator.journal import Journal, JournalReader
+from cavmarl.ownership.log_records import replay
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from tests.support.replayed import BUSY
 from tests.support.vec_runs import Make
 
-STEPS = 12
+STEPS = 40  # two images of the checkpoint log, and more
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +33,7 @@ def _drive(vec: CavVectorEnv, kills: bool = False) -> list[Any]:
     found: list[Any] = [vec.reset(seed=3)[0].tobytes()]
     struck = itertools.count(1)
     for step in range(STEPS):
-        if kills and step % 4 in (1, 2):
+        if kills and step % 5 in (1, 2):
             assert isinstance(vec.worlds, PooledWorlds)
             pids = vec.worlds.pool.pids
             os.kill(pids[next(struck) % len(pids)], signal.SIGKILL)
@@ -49,12 +50,15 @@ def _journals(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-@pytest.mark.parametrize(("worlds", "workers"), [(1, 1), (2, 2), (2, 1)])
-def test_nobody_can_tell(make: Make, tmp_path: Path, worlds: int, workers: int) -> None:
+@pytest.mark.parametrize(("worlds", "workers"), [(1, 1), (2, 2), (2, 1), (1, 2)])
+@pytest.mark.parametrize("more", [{}, {"zones.check_invariants": True}])
+def test_journals_are_those_of_an_undisturbed_run(
+    make: Make, tmp_path: Path, worlds: int, workers: int, more: dict[str, Any]
+) -> None:
     def run(name: str, number: int, kills: bool = False) -> tuple[list[Any], dict[str, bytes]]:
         folder = tmp_path / name
         folder.mkdir()
-        settings = {**BUSY, "zones.journal": str(folder / "run.jsonl")}
+        settings = {**BUSY, **more, "zones.journal": str(folder / "run.jsonl")}
         vec = make("grid4x4", num_envs=worlds, zones=2, workers=number, overrides=settings)
         found = _drive(vec, kills)
         vec.close()
@@ -88,19 +92,48 @@ def test_a_journal_is_locked_until_its_world_is_closed(
     Journal(path, resume=True).close()
 
 
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        ({"workers": 2, "zones.journal": "x.jsonl"}, r"zones\.journal.*at most workers=1"),
-        (
-            {"num_envs": 3, "workers": 2, "zones.journal": "x.jsonl", "workers.balance_steps": 5},
-            r"leave workers\.balance_steps 0",
-        ),
-    ],
-)
-def test_what_cannot_be_is_refused(make: Make, more: dict[str, Any], words: str) -> None:
-    keywords = {name: more[name] for name in ("num_envs", "workers") if name in more}
-    overrides = {name: value for name, value in more.items() if "." in name}
-    with pytest.raises(ConfigError, match=words):
-        make("grid4x4", zones=2, overrides=overrides, **keywords)
+def test_zones_that_are_cut_anew_are_gone_on_with(make: Make, tmp_path: Path) -> None:
+    def run(name: str, workers: int, kills: bool = False) -> tuple[list[Any], dict[str, bytes]]:
+        folder = tmp_path / name
+        folder.mkdir()
+        recuts = {"zones.repartition_steps": 4, "zones.repartition_tolerance": 0.0}
+        settings = {**BUSY, **recuts, "zones.journal": str(folder / "run.jsonl")}
+        vec = make("grid4x4", zones=3, workers=workers, overrides=settings)
+        found = _drive(vec, kills)
+        vec.close()
+        return found, _journals(folder)
+
+    alone = run("alone", 0)
+    assert run("killed", 1, kills=True) == alone
+
+
+def test_worlds_that_move_and_are_cut_anew_are_refused(make: Make) -> None:
+    overrides = {
+        "zones.journal": "x.jsonl",
+        "workers.balance_steps": 5,
+        "zones.repartition_steps": 4,
+    }
+    with pytest.raises(ConfigError, match=r"leave workers\.balance_steps or zones\.repart"):
+        make("grid4x4", num_envs=3, zones=2, workers=2, overrides=overrides)
     assert not Path("x.jsonl").exists()
+
+
+@pytest.mark.parametrize("zones", [2, 3])
+def test_a_journal_says_that_a_loaded_state_begins_an_episode(
+    make: Make, tmp_path: Path, zones: int
+) -> None:
+    first = make("grid4x4", zones=2, overrides=dict(BUSY))
+    _drive(first)
+    path = tmp_path / "run.jsonl"
+    settings = {**BUSY, "zones.journal": str(path), "zones.check_invariants": True}
+    other = make("grid4x4", zones=zones, overrides=settings)
+    other.reset(seed=0)
+    other.load_state(first.save_state())
+    for _ in range(10):
+        actions = first.suggest_actions()
+        assert (other.step(actions)[0] == first.step(actions)[0]).all()
+        assert other.state_hash() == first.state_hash()
+    other.close()
+    table = replay(JournalReader(path))
+    assert table.episode == 1
+    assert len(table.owners) > 50

@@ -28,7 +28,7 @@ class Wires:
 
 def test_older_states_go_when_the_newest_has_come_everywhere() -> None:
     worlds, wires = Worlds(), Wires()
-    kept = KeptStates(worlds, wires, 1)  # type: ignore[arg-type]
+    kept = KeptStates(worlds, (), wires, 1)  # type: ignore[arg-type]
     for state in (1, 2, 3):
         kept.take(0, NodeFrame(FrameKind.KEEP, state, memoryview(b"theirs")))
         kept.keep(state, [0, 1, 4])

@@ -16,9 +16,11 @@ from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Offer, Prepare
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.leases import MOST, late_ticks, lease_ticks, leases_of
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.parallel.nodes.zone_hosts import Report, ZoneHosts, packed, read_report, unpacked
 
 WAIT_S = 0.1
@@ -88,7 +90,8 @@ def begun() -> tuple[ZoneHosts, NodeCoordinator, Division, Any]:
     coordinator = NodeCoordinator([bytes(16)], [0, 0], limits, wires, [None])
     wires.coordinator = coordinator
     hostings = coordinator.host(neighbours_of(division))
-    hosts = ZoneHosts(division, (0, 1), (0, 0), hostings, limits, wires, [], ticks=2)
+    checks = RowChecks(worlds.simulation)
+    hosts = ZoneHosts(division, (0, 1), (0, 0), hostings, limits, wires, [], checks, ticks=2)
     hosts.reset(np.ones(1, dtype=np.bool_))
     return hosts, coordinator, division, wires
 
@@ -102,7 +105,7 @@ def test_a_vehicle_that_crosses_before_it_is_on_record_is_offered_without_a_tick
     hosts.report()
     ((report,),) = wires.reports
     assert (report.movers, report.is_late, coordinator.is_late) == ([], True, True)
-    hosts.note(memoryview(coordinator.begin(WAIT_S)[0]))
+    hosts.note(unpacked(memoryview(coordinator.begin(WAIT_S)[0])))
     (report,) = wires.reports[1]
     assert [mover[:2] for mover in report.movers] == [[int(row["id"]), 1]]
     assert (report.is_late, coordinator.is_late, coordinator.switched) == (False, False, 0)
@@ -113,14 +116,17 @@ def test_a_vehicle_that_crosses_before_it_is_on_record_is_offered_without_a_tick
 def test_an_offer_that_comes_before_the_lease_of_its_episode_is_answered_after_it() -> None:
     hosts, coordinator, division, wires = begun()
     hosts.report()
-    table, state = coordinator._worlds[0].directory.table, b"state"
+    table, row = coordinator._worlds[0].directory.table, division.owned(0, 0)[0]
+    before, row["id"] = int(row["id"]), 10**6
+    state = division.state(0, 0, 0)
+    row["id"] = before
     offer = Offer(10**6, 0, state_digest(state), state)
     prepare = Prepare(
         bytes(16), table.episode, table.tick + 1, 0, 1, 1, division.codec.schema, (offer,)
     )
     hosts.hear(1, NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
     assert wires.answers == []
-    hosts.note(memoryview(coordinator.begin(WAIT_S)[0]))
+    hosts.note(unpacked(memoryview(coordinator.begin(WAIT_S)[0])))
     (ack,) = wires.answers
     assert isinstance(ack, Ack)
     assert (ack.zone, ack.entries[0].vehicle) == (1, 10**6)

@@ -24,6 +24,7 @@ from cavmarl.parallel.processes.worker_pool import Pool
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.tasks import Task
 from tests.support.pools import strike_soon
+from tests.support.replayed import BUSY
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.sumo_worlds import write_stops
 from tests.support.vec_runs import Make, drive, pool_of, same
@@ -61,6 +62,33 @@ def test_worlds_that_move_are_the_same(
     whole = drive(make(env, **wanted))
     vec = make(env, workers=(2, 2, 3, 3)[number % 4], overrides=RESTLESS, **wanted)
     assert same(drive(vec), whole)
+    assert sum(uneven) > 0
+
+
+def test_worlds_take_their_journals_along(
+    make: Make, uneven: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("secrets.token_bytes", lambda size: bytes(range(size)))
+
+    def run(name: str, workers: int, kills: bool = False) -> tuple[Any, list[bytes]]:
+        folder = tmp_path / name
+        folder.mkdir()
+        overrides = {**BUSY, "zones.journal": str(folder / "run.jsonl")}
+        if workers:
+            overrides |= RESTLESS
+        vec = make("grid4x4", num_envs=3, zones=2, workers=workers, overrides=overrides)
+        vec.reset(seed=3)
+        found = []
+        for step in range(24):
+            if kills and step % 3:
+                os.kill(pool_of(vec).pids[step % workers], signal.SIGKILL)
+            found.append(vec.step(vec.suggest_actions())[0].tobytes())
+        vec.close()
+        return found, [path.read_bytes() for path in sorted(folder.iterdir())]
+
+    whole = run("alone", 0)
+    assert run("moving", 2) == whole
+    assert run("killed", 2, kills=True) == whole
     assert sum(uneven) > 0
 
 

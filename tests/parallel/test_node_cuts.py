@@ -145,7 +145,7 @@ def test_zones_are_told_to_the_last_bit(make: Make) -> None:
     vec = make("grid4x4", agents=1, background=0)
     partition = cut_map(vec.simulation.network, "bisection", 7)
     assert read_zones(told_zones(partition)).content_hash == partition.content_hash
-    assert read_neighbours([[[0, 1], [1]], True]).near == (frozenset({0, 1}), frozenset({1}))
+    assert read_neighbours([[[0, 1], [1]], True], 2).near == (frozenset({0, 1}), frozenset({1}))
 
 
 @pytest.mark.parametrize("mix", ["kill", "kill_in_recovery"])
@@ -160,7 +160,7 @@ def test_simulated_nodes_fail_while_zones_are_cut_anew(
 
     monkeypatch.setattr(node_process, "cut_worlds", counted)
     found = verify_simulated_nodes(
-        "merge", [3], mixes=[mix], seeds=2, agents=3, background=20, zones=3, steps=10,
+        "merge", [3], mixes=[mix], seeds=6, agents=3, background=20, zones=3, steps=10,
         overrides={"zones.repartition_steps": 2, "zones.repartition_tolerance": 0.0},
     )  # fmt: skip
     (line,) = found.lines

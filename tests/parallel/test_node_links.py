@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import socket
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import numpy as np
 import pytest
+from xxhash import xxh3_64_intdigest
 
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Done
 from cavmarl.parallel.network.encryption import encrypted
+from cavmarl.parallel.network.tcp_transport import TcpConnection
+from cavmarl.parallel.network.transport import READS
 from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, said_by
-from cavmarl.parallel.nodes.links import LinkLostError, Links
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_system import MACHINE
+from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from cavmarl.parallel.nodes.zone_hosts import packed
 from tests.parallel.test_node_joining import WAIT_S
 
@@ -27,7 +30,7 @@ from tests.parallel.test_node_joining import WAIT_S
 def pair() -> tuple[Links, socket.socket]:
     near, far = socket.socketpair()
     links = Links(lambda number, frame: None)
-    links.add(0, near)
+    links.add(0, TcpConnection(near))
     return links, far
 
 
@@ -42,14 +45,15 @@ def frame(kind: FrameKind, data: bytes | memoryview) -> bytes:
 
 def head(kind: int, size: int) -> bytes:
     """The head of a first frame."""
-    found = b"cavN\x06\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
-    found += bytes(4)
-    return found + zlib.crc32(found, 1).to_bytes(4, "little")
+    found = b"cavN\x07\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
+    found += bytes(8)
+    return found + xxh3_64_intdigest(found, 1).to_bytes(8, "little")
 
 
 def test_the_bytes_of_a_frame() -> None:
     assert frame(FrameKind.PING, b"abc").hex() == (
-        "6361764e06000d0007000000000000000300000000000000c2412435" + "72a90954" + b"abc".hex()
+        "6361764e07000d000700000000000000" + "0300000000000000" + "50392f89945faf78"
+        "30bc61f204c45035" + b"abc".hex()
     )
 
 
@@ -58,7 +62,7 @@ def test_the_bytes_of_a_frame() -> None:
     [
         (b"GET / HTTP/1.1\r\n" * 9, "begins no frame"),
         (head(FrameKind.PING, MAX_FRAME + 1), "is none"),
-        (b"cavN\x09\x00" + bytes(26), "version 9"),
+        (b"cavN\x09\x00" + bytes(34), "version 9"),
         (head(255, 0), "kind 255"),
         (frame(FrameKind.PING, b"abc")[:-1] + b"d", "not what was sent"),
         (2 * frame(FrameKind.SYNC, b"abc"), "not the next one"),
@@ -130,8 +134,8 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
             there.do_handshake()
             ends = called.result(), there
     near, far = (Links(lambda number, frame: None) for _ in ends)
-    near.add(0, ends[0])
-    far.add(0, ends[1])
+    near.add(0, TcpConnection(ends[0]))
+    far.add(0, TcpConnection(ends[1]))
     parts = np.random.default_rng(0).integers(256, size=(3, 3 << 20), dtype=np.uint8)
     for part in parts:
         near.send(0, FrameKind.SHARE, 1, [part[:7].data, part[7:].data])
@@ -152,7 +156,7 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
 
 @pytest.mark.parametrize("said", [b"no JSON", b"{}", b"\xff"])
 def test_a_list_is_a_list(said: bytes) -> None:
-    with pytest.raises(MessageError, match="a frame of kind PONG says"):
+    with pytest.raises(MessageError, match="a frame of kind PONG: it"):
         said_by(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
 
 
@@ -160,7 +164,7 @@ def test_machines_that_vanish_are_missed() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         connection = socket.create_connection(server.getsockname())
     links = Links(lambda number, frame: None)
-    links.add(0, connection)
+    links.add(0, TcpConnection(connection))
     asked_s = sum(
         connection.getsockopt(socket.IPPROTO_TCP, option) * times
         for option, times in ((socket.TCP_KEEPIDLE, 1), (socket.TCP_KEEPINTVL, 3))
@@ -173,15 +177,21 @@ def test_machines_that_vanish_are_missed() -> None:
 def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
     listener = MACHINE.listen("127.0.0.1", b"secret")
 
-    def call(generation: int) -> bytes:
-        with call_node(MACHINE, listener.place, b"secret", 2, generation, of=1) as connection:
-            return connection.recv(1)
+    def call(generation: int) -> int:
+        """How many bytes come until the connection ends, at most 1."""
+        room = memoryview(bytearray(1))
+        with closing(call_node(MACHINE, listener.place, b"secret", 2, generation, of=1)) as found:
+            poll = MACHINE.poll()
+            poll.register(found, READS)
+            while not (got := found.receive(room)) and not found.closed:
+                poll.poll(None)
+        return got
 
     with closing(listener), ThreadPoolExecutor() as callers:
         earlier = callers.submit(call, 6)
         (found,) = calls_of(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
         found.close()  # the attempt has come to nothing
-        assert earlier.result() == b""
+        assert earlier.result() == 0
         earlier = callers.submit(call, 6)
         present: list[object] = []
 
@@ -190,7 +200,7 @@ def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
                 present.append(callers.submit(call, 7))
 
         found_now = calls_of(MACHINE, listener, [2], 7, WAIT_S, check)
-        assert earlier.result() == b""
+        assert earlier.result() == 0
         assert list(found_now) == [2]
         found_now[2].close()
         with pytest.raises(LinkLostError, match="node 3"):

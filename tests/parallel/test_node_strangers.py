@@ -15,11 +15,13 @@ from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.code_stamp import code_stamp
 from cavmarl.parallel.network.framed_socket import VERSION
 from cavmarl.parallel.network.listener import Listener, call
+from cavmarl.parallel.network.tcp_transport import TcpConnection, TcpListener
 from cavmarl.parallel.nodes import newcomers as newcomers_module
 from cavmarl.parallel.nodes.link import FrameKind
-from cavmarl.parallel.nodes.links import LinkLostError, Links
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomers
 from cavmarl.parallel.nodes.node_process import run_node
+from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from tests.parallel.test_node_joining import WAIT_S, elsewhere
 
 
@@ -27,8 +29,8 @@ class Door:
     """A caller's end, in a thread."""
 
     def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
-        self.listener = Listener(address, key)
-        self.newcomers = Newcomers(self.listener, {}, [], lambda: room)
+        self.listener = TcpListener(address, key)
+        self.newcomers = Newcomers(self.listener, {}, [], lambda: room, 1)
         self._is_open = True
         self._thread = threading.Thread(target=self._look)
         self._thread.start()
@@ -120,7 +122,7 @@ def test_who_has_come_in_and_talks_nonsense_is_sent_away() -> None:
     with closing(Door(b"a" * 32)) as door:
         for said in (b"no JSON", b"[]", b"{}"):
             links = Links(lambda number, frame: None)
-            links.add(COORDINATOR, call(door.listener.place, b"a" * 32, ANYONE))
+            links.add(COORDINATOR, TcpConnection(call(door.listener.place, b"a" * 32, ANYONE)))
             links.send(COORDINATOR, FrameKind.JOIN, 0, [said])
             with pytest.raises(LinkLostError):
                 links.take([COORDINATOR], WAIT_S)

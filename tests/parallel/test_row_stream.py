@@ -37,7 +37,7 @@ class Node:
         self.gate = make_gate(WORLDS, ROOM, ROADS.arrays, VEHICLE)
         self.running = np.zeros(WORLDS, dtype=np.int64)
         self.rerouted = np.zeros(WORLDS, dtype=np.int64)
-        law = forecast_of(ROADS.arrays, 0.05, 1)
+        law = forecast_of(ROADS.arrays, 0.05, 1, *2 * [np.empty((0, 4), dtype=np.int64)])
         self._frames = RowStream(self.zoned, zones, others, self.running, self.rerouted, law)
 
     def packed(self) -> bytearray:

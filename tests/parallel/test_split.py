@@ -206,12 +206,6 @@ def test_more_workers_than_zones() -> None:
         make_vec("grid4x4", num_envs=2, zones=4, workers=9)
 
 
-@pytest.mark.parametrize("name", ["journal", "faults"])
-def test_what_only_one_process_can(name: str) -> None:
-    with pytest.raises(ConfigError, match=f"zones.{name}.*at most workers=1"):
-        make_vec("grid4x4", zones=4, workers=2, overrides={f"zones.{name}": "{}"})
-
-
 @pytest.mark.parametrize(("worlds", "workers"), [(1, 2), (2, 3), (3, 7), (4, 2), (5, 5), (1, 9)])
 def test_everything_has_one_worker(worlds: int, workers: int) -> None:
     world = load_world("town", zones=9)

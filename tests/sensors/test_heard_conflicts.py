@@ -119,7 +119,7 @@ def test_what_a_hidden_vehicle_does_changes_nothing_until_it_says_so() -> None:
         pass
     shard = vec.worlds.simulation.shards[0]
     rows = vec.worlds.simulation.vehicles(0).copy()
-    walls = shard._optional.conflicts.walls
+    walls = shard.optional.conflicts.walls
     sensor = conflicts_sensor.settings(
         vec.config.sensors, 0, walls, vec.config.v2x.inbox.objects, 64
     )

@@ -18,6 +18,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.sensors.observed import SENSORS, largest_radius_m, layout, sensing_reach_m
 from tests.support.driving import drive, make_simulation, start
+from tests.support.world import tick_of
 
 TERMS_ALONE = "none but ego"
 MOST = 30  # vehicles of a crowd
@@ -117,7 +118,7 @@ def sensed(simulation: Simulation, rows: NDArray[np.void]) -> tuple[bytes, bytes
     worlds = simulation.worlds
     worlds.rows[0, : rows.size] = rows
     worlds.num_owned[0] = worlds.num_rows[0] = rows.size
-    simulation._tick.sense(EVERYWHERE)
+    tick_of(simulation).sense(EVERYWHERE)
     outputs = simulation.outputs
     assert outputs.acted[0, 0]
     return outputs.observations[0, 0].tobytes(), outputs.terms[0, 0].tobytes()

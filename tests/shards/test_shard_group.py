@@ -14,6 +14,7 @@ from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import TICKS_IN_ORDER, Shard
 from cavmarl.shards.shard_group import ShardGroup
 from tests.support.driving import drive, idle, make_simulation, start
+from tests.support.world import executor_of, use_executor
 
 STEPS = 2 * TICKS_IN_ORDER
 ZONES = 4
@@ -43,11 +44,11 @@ def divided(**overrides: Any) -> Simulation:
 
 def all_rows(simulation: Simulation) -> bytes:
     """Every row of every zone as it lies, and the counts."""
-    zoned = simulation._tick.division.zoned
+    zoned = simulation.division.zoned
     numbers = (zoned.num_owned, zoned.num_rows, zoned.num_near, zoned.num_contacts)
     rows = [
         shard.worlds.rows[w, :num].tobytes()
-        for shard in simulation._shards
+        for shard in simulation.shards
         for w, num in enumerate(shard.worlds.num_rows)
     ]
     return b"".join([*(array.tobytes() for array in numbers), *rows])
@@ -63,7 +64,7 @@ def all_rows(simulation: Simulation) -> bytes:
 )
 def test_all_together_do_what_parts_of_them_do(part: Parting) -> None:
     together, apart = divided(), divided()
-    apart._tick.executor = Groups(part(apart._shards))
+    use_executor(apart, Groups(part(apart.shards)))
     for step in range(STEPS):
         drive(together)
         drive(apart)
@@ -75,8 +76,8 @@ def test_all_together_do_what_parts_of_them_do(part: Parting) -> None:
 
 def test_a_shard_is_stepped_alone() -> None:
     simulation = divided()
-    shard = simulation._shards[2]
-    others = [other for other in simulation._shards if other is not shard]
+    shard = simulation.shards[2]
+    others = [other for other in simulation.shards if other is not shard]
     before = [other.sides[0].tobytes() + other.sides[1].tobytes() for other in others]
     own = shard.worlds.rows[0, : shard.worlds.num_owned[0]].copy()
     alone = ShardGroup([shard])
@@ -92,10 +93,10 @@ def test_a_shard_is_stepped_alone() -> None:
 
 def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
     simulation = divided()
-    division = simulation._tick.division
+    division = simulation.division
     for _ in range(STEPS):
-        simulation._tick.executor.advance(idle(simulation))
-        for shard in simulation._shards:
+        executor_of(simulation).advance(idle(simulation))
+        for shard in simulation.shards:
             left, low, right, high = division.halo.inner[shard.zone]
             worlds = shard.worlds
             for w in range(2):
@@ -106,7 +107,7 @@ def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
                 np.testing.assert_array_equal(noted["row"], np.flatnonzero(~inside))
                 for name in ("x", "y", "s", "speed", "lane"):
                     np.testing.assert_array_equal(noted[name], rows[name][noted["row"]])
-        simulation._tick.division.exchange()
+        simulation.division.exchange()
         assert (division.zoned.num_outer == -1).all()
-        simulation._tick.executor.commit()
-        simulation._shard.worlds.ticks[:] += 1
+        executor_of(simulation).commit()
+        simulation.shards[0].worlds.ticks[:] += 1

@@ -37,7 +37,7 @@ SCRIBBLE = 0xAB
 
 def codec_of(simulation: Simulation) -> TransferCodec:
     carried = carried_from(simulation.config.sensors)
-    return TransferCodec.of(simulation._shard.worlds, simulation.outputs, carried)
+    return TransferCodec.of(simulation.shards[0].worlds, simulation.outputs, carried)
 
 
 # Whole worlds
@@ -91,7 +91,7 @@ def rough_world(files: tuple[Path, Path], **overrides: Any) -> Simulation:
 
 def carry_everybody(simulation: Simulation) -> None:
     """Pack every vehicle, spoil all that was packed, and unpack them in another order."""
-    worlds, codec = simulation._shard.worlds, codec_of(simulation)
+    worlds, codec = simulation.shards[0].worlds, codec_of(simulation)
     packed = []
     for w, num in enumerate(worlds.num_owned.tolist()):
         tick, rows = int(worlds.ticks[w]), worlds.rows

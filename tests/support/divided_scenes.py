@@ -75,8 +75,8 @@ class DividedScene:
 
     def put(self, name: str, way: str, front_m: float, kind: str = "car", **fields: Any) -> None:
         """A vehicle on a way such as "W_in_0 N_out_0", its front `front_m` beyond its line."""
-        network, plans = self.whole.network, self.whole._tick.traffic.plans
-        travel = self.whole._tick.traffic.travel
+        network, plans = self.whole.network, self.whole.plans
+        travel = self.whole.travel
         before, after = (network.lane_ids.index(lane) for lane in way.split())
         links = network.links
         (link,) = np.flatnonzero((links["from_lane"] == before) & (links["to_lane"] == after))
@@ -103,7 +103,7 @@ class DividedScene:
         for simulation in (self.whole, self.divided):
             simulation.gate.next_id[0] = len(rows)
             saved = [array.copy() for array in simulation.save()]
-            zones = simulation._tick.division.count
+            zones = simulation.division.count
             saved[-zones:] = [rows, *(rows[:0] for _ in range(1, zones))]
             simulation.load(saved)
 
@@ -119,7 +119,7 @@ class DividedScene:
 
     def ghosts(self, name: str) -> set[str]:
         """The names of the vehicles that the zone of one sees of others."""
-        division, own = self.divided._tick.division, self.names.index(name)
+        division, own = self.divided.division, self.names.index(name)
         for zone in range(division.count):
             worlds = division._shards[zone].worlds
             owned, rows = int(worlds.num_owned[0]), worlds.rows[0, : worlds.num_rows[0]]

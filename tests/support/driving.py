@@ -13,6 +13,7 @@ from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
 from cavmarl.shards.shard import Commands
+from tests.support.world import traffic_of
 
 
 def make_simulation(
@@ -46,7 +47,7 @@ def make_traffic(
     simulation = make_simulation(
         env, mode="respawn", background=background, num_worlds=num_worlds, overrides=overrides
     )
-    traffic = simulation._tick.traffic
+    traffic = traffic_of(simulation)
     vars(traffic)["demand"] = traffic.demand._replace(num_agents=0, reenter=renewed)
     return simulation
 

@@ -14,6 +14,7 @@ import pytest
 from cavmarl.engine.simulation import Simulation
 from tests.support.driving import drive, make_traffic, start
 from tests.support.traffic import on_lane
+from tests.support.world import traffic_of
 
 sumo = pytest.importorskip("sumo", reason="crossings are made by netconvert of the extra 'sumo'")
 
@@ -84,20 +85,20 @@ class Scene:
         self.simulation: Simulation = make_traffic(
             path, background=12, renewed=False, overrides={"clock.ctrl_dt_s": 0.05}
         )
-        traffic = self.simulation._tick.traffic
+        traffic = traffic_of(self.simulation)
         vars(traffic)["demand"] = traffic.demand._replace(num_background=0)
         start(self.simulation, seed=0)
         self.names: list[str] = []
 
     def put(self, name: str, lane: str, to_line_m: float, goal: str, **fields: Any) -> None:
         """A car whose front is `to_line_m` before a lane's end and that drives to edge `goal`."""
-        network, worlds = self.simulation.network, self.simulation._shard.worlds
+        network, worlds = self.simulation.network, self.simulation.shards[0].worlds
         row = network.lane_ids.index(lane)
         s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
         goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges[0]]
-        travel = self.simulation._tick.traffic.travel
+        travel = self.simulation.travel
         car = on_lane(network, row, s, travel, goal=goals.index(goal), **fields)
-        plan = self.simulation._tick.traffic.plans[car[0]["goal"], row]
+        plan = self.simulation.plans[car[0]["goal"], row]
         car["to_go"] = plan["to_go"] - s
         car["id"] = self.simulation.gate.next_id[0]
         self.simulation.gate.next_id[0] += 1
@@ -108,7 +109,7 @@ class Scene:
 
     def clear(self) -> None:
         """Take all cars out."""
-        worlds = self.simulation._shard.worlds
+        worlds = self.simulation.shards[0].worlds
         worlds.num_owned[0] = worlds.num_rows[0] = self.simulation.gate.next_id[0] = 0
         self.names.clear()
 

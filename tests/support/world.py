@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.tick import Tick
 from cavmarl.shards.executor import Executor, PhaseExecutor
 from cavmarl.shards.phases import Phase
+from cavmarl.traffic.native import NativeTraffic
 
 
 class PhaseLog(PhaseExecutor):
@@ -19,6 +21,21 @@ class PhaseLog(PhaseExecutor):
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
         self.phases.append(phase)
         phase.run(self._executor, arguments)
+
+
+def tick_of(simulation: Simulation) -> Tick:
+    """Return the phases of a tick, to run some of them alone."""
+    return simulation._tick
+
+
+def traffic_of(simulation: Simulation) -> NativeTraffic:
+    """Return the generator of departures and the demand."""
+    return simulation._tick.traffic
+
+
+def coordination_of(simulation: Simulation) -> Any:
+    """Return what decides ownership."""
+    return simulation._tick.coordination
 
 
 def executor_of(simulation: Simulation) -> Executor:

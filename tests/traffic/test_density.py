@@ -78,14 +78,14 @@ def test_the_first_vehicles_are_the_same_in_all_densities(seed: int) -> None:
 @pytest.mark.parametrize("vehicles", DENSITIES)
 def test_who_starts_in_one_zone_shows_as_imbalance(vehicles: int, seed: int) -> None:
     simulation = world(vehicles, seed)
-    owned = simulation.zone_loads().owned[:, 0].tolist()
+    owned = simulation.zones.loads().owned[:, 0].tolist()
     assert sum(owned) == vehicles
     assert max(owned) >= SHARE * vehicles
     assert imbalance(owned) >= SHARE * ZONES
     found = zone_statistics(simulation.partition, simulation.network, positions=places(simulation))
     assert found.vehicles == tuple(owned)
     assert found.vehicle_imbalance == imbalance(owned)
-    anywhere = world(vehicles, seed, env="town").zone_loads().owned[:, 0].tolist()
+    anywhere = world(vehicles, seed, env="town").zones.loads().owned[:, 0].tolist()
     assert imbalance(anywhere) < SHARE * ZONES
 
 
@@ -93,8 +93,8 @@ def test_low_density_crosses_now_and_then() -> None:
     simulation = world(LOW)
     at_once: Counter[tuple[int, int]] = Counter()
     for _ in first_minute(simulation):
-        assert simulation.zone_loads().owned.sum() == len(simulation.vehicles())
-        in_flight = simulation.zone_view().transfers
+        assert simulation.zones.loads().owned.sum() == len(simulation.vehicles())
+        in_flight = simulation.zones.view().transfers
         at_once |= Counter((transfer.source, transfer.target) for transfer in in_flight)
     assert simulation.migrations >= 1
     assert min(at_once.values()) == 1, "at some border there are never two at a time"
@@ -113,7 +113,7 @@ def test_high_density_has_many_at_borders_at_once() -> None:
     simulation = world(HIGH, zones=9, approach_ticks=APPROACH_TICKS)
     in_flight = []
     for _ in first_minute(simulation):
-        in_flight.append(len({transfer.vehicle for transfer in simulation.zone_view().transfers}))
+        in_flight.append(len({transfer.vehicle for transfer in simulation.zones.view().transfers}))
         ids = simulation.vehicles()["id"]
         assert len(set(ids.tolist())) == len(ids), "nobody twice"
         stats = simulation.traffic_stats()

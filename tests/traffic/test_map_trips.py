@@ -7,10 +7,11 @@ import pytest
 
 from cavmarl.core.errors import ConfigError
 from tests.support.driving import make_traffic
+from tests.support.world import traffic_of
 
 
 def test_where_no_way_in_can_be_followed_vehicles_enter_anywhere() -> None:
-    traffic = make_traffic("grid4x4", background=4, overrides={"traffic.origins": []})._tick.traffic
+    traffic = traffic_of(make_traffic("grid4x4", background=4, overrides={"traffic.origins": []}))
     trips, num_goals = traffic._trips_of(0), traffic.goal_edges.shape[1]
     ways_in = np.flatnonzero(
         ~traffic.network.lanes["internal"] & (traffic.network.lanes["num_into"] == 0)

@@ -23,6 +23,7 @@ from tests.support.rerouting import (
     two_ways,
     write_demand,
 )
+from tests.support.world import traffic_of
 
 SECONDS = 1200
 ONCE = '<param key="has.rerouting.device" value="true"/>'
@@ -66,7 +67,7 @@ def test_vehicles_with_a_device_share_out_as_in_sumo(
 
 def test_vehicles_without_a_device_stand_in_the_jam(net: Path, tmp_path: Path) -> None:
     simulation = two_ways(net, tmp_path, cars() + FLOW)
-    assert simulation._tick.traffic.rerouting is None
+    assert traffic_of(simulation).rerouting is None
     assert passed(simulation, SECONDS)["long1"] == 0
     assert simulation.traffic_stats().rerouted == 0
     assert simulation.traffic_stats().mean_delay_s > 45.0
@@ -187,7 +188,7 @@ def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: 
     while simulation.traffic_stats().rerouted < 3:
         drive(simulation)
     before = simulation.state_hash()
-    rerouting = simulation._tick.traffic.rerouting
+    rerouting = traffic_of(simulation).rerouting
     assert rerouting is not None
     slots = rerouting._slots
     for array in (
@@ -195,7 +196,7 @@ def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: 
         rerouting._speed_sums,
         rerouting._looks["next"],
         rerouting._looks["goal"],
-        simulation._tick.traffic.travel.steps["to_go"][slots.first :],  # somebody drives there
+        simulation.travel.steps["to_go"][slots.first :],  # somebody drives there
     ):
         value = array.reshape(-1)[:1].copy()
         array[(0,) * array.ndim] -= 1
@@ -206,7 +207,7 @@ def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: 
 
 def test_room_does_not_grow_and_slots_serve_many(net: Path, tmp_path: Path) -> None:
     simulation = two_ways(net, tmp_path, cars(DEVICE) + FLOW)
-    traffic = simulation._tick.traffic
+    traffic = traffic_of(simulation)
     assert traffic._slots is not None
     size, looks = traffic.travel.steps.size, traffic.rerouting._looks.size
     while simulation.traffic_stats().rerouted < 90:

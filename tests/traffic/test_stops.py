@@ -10,6 +10,7 @@ import pytest
 from cavmarl.engine.simulation import Simulation
 from tests.support.demand_worlds import make
 from tests.support.driving import drive, start
+from tests.support.world import tick_of
 
 DT = 0.1
 World = Callable[..., Simulation]
@@ -128,7 +129,7 @@ def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> N
         '<trip id="v" type="c" depart="0" from="A1B1" to="D3right3"/>',
         "grid4x4",
     )
-    network, travel = simulation.network, simulation._tick.traffic.travel
+    network, travel = simulation.network, simulation.travel
     # Drivers ask themselves once a second.
     while not len(simulation.vehicles()) or simulation.ticks()[0] % round(1.0 / DT):
         drive(simulation)
@@ -141,9 +142,9 @@ def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> N
         row["lane"] = row["target_lane"] = wrong
         row["s"], row["speed"] = network.lanes[wrong]["length_m"] - 4.0, 0.0
         row["wait_s"] = waited
-        worlds = simulation._shard.worlds
+        worlds = simulation.shards[0].worlds
         worlds.next_rows[0, 0] = row
-        simulation._tick.leave()
+        tick_of(simulation).leave()
         assert simulation.traffic_stats().rerouted == times
         worlds.rows[0, 0] = worlds.next_rows[0, 0]
     row = simulation.vehicles()[0]

@@ -50,7 +50,7 @@ def test_the_table_is_what_the_reader_of_demand_finds(tmp_path: Path) -> None:
     """SUMO tells of lanes, places and times as our own reader does, also of a bus stop."""
     paths = write_stops(tmp_path)
     with coupled("merge", paths, "sumo-demand") as simulation:
-        network, travel = simulation.network, simulation._tick.traffic.travel
+        network, travel = simulation.network, simulation.travel
         own = read_demand(paths, network).stops
         assert simulation.sumo is not None
         found = {}
@@ -120,7 +120,7 @@ def test_zones_and_workers_change_nothing(tmp_path: Path) -> None:
 
 def test_more_stops_than_there_is_room_for_are_refused(tmp_path: Path) -> None:
     with coupled("merge", write_stops(tmp_path), "sumo-demand", seed=None) as simulation:
-        table = np.zeros(5, dtype=simulation._tick.traffic.travel.stops.dtype)
+        table = np.zeros(5, dtype=simulation.travel.stops.dtype)
         book = StopBook(simulation.network, table, 2)
         stop = (0, 1.0, 2.0, 3.0, -1.0, False)
         assert book.enter(0, []) == (-1, -1)

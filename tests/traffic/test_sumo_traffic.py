@@ -158,7 +158,7 @@ def test_a_vehicle_has_the_route_that_sumo_gave_it(tmp_path: Path) -> None:
 
 def edges_ahead(simulation: Simulation, row: np.void) -> list[str]:
     """Edges from a vehicle to the end of its way, wherever it has to change lanes."""
-    network, travel = simulation.network, simulation._shard.travel
+    network, travel = simulation.network, simulation.shards[0].travel
     lane, way, found = int(row["lane"]), int(row["way"]), []
     for _ in range(1000):
         here = network.lanes[lane]
@@ -191,13 +191,13 @@ def test_clocks_are_equal(tmp_path: Path) -> None:
         assert simulation.sumo.worlds.at(0).tick == simulation.ticks()[0]
         # A flow that has begun 100 s earlier: SUMO has begun at its 100th second, too.
         assert demand_begin(simulation) == 100.0
-        simulation._shard.worlds.ticks[0] += 1
+        simulation.shards[0].worlds.ticks[0] += 1
         with pytest.raises(Exception, match="its SUMO at"):
             drive(simulation)
 
 
 def demand_begin(simulation: Simulation) -> float:
-    return simulation._shard.travel.begin_s
+    return simulation.shards[0].travel.begin_s
 
 
 def test_sumos_cars_brake_for_an_agent_that_stands(tmp_path: Path) -> None:

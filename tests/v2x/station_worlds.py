@@ -42,7 +42,7 @@ class Standing:
         self.simulation = Simulation(config, network, 1, demand, partition)
         self.simulation.seed(3)
         self.simulation.reset()
-        self.worlds = self.simulation._shard.worlds
+        self.worlds = self.simulation.shards[0].worlds
         self.bus: Bus = self.simulation.messages
         self.bus.reset(np.ones(1, dtype=np.bool_))
 
@@ -67,7 +67,7 @@ class Standing:
     def tick(self) -> int:
         """Send and receive; which tick it was."""
         self.worlds.ticks[0] += 1
-        self.bus.exchange(self.simulation._shard.side)
+        self.bus.exchange(self.simulation.shards[0].side)
         return int(self.worlds.ticks[0])
 
     def key(self) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from cavmarl.core.math.walls import make_walls
 from cavmarl.sensors.observed import layout
 from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, KIND_CAM, KIND_CPM
+from tests.support.world import tick_of
 from tests.v2x.station_worlds import Standing
 
 # The agent, a truck before it, a car hidden behind the truck, and a car beside that sees both.
@@ -65,7 +66,7 @@ def test_lidar_does_not_meet_it_while_messages_tell_of_it() -> None:
 
     def lidar(vehicles: Any) -> Any:
         world.write(vehicles)
-        simulation._tick.sense(simulation.everywhere)
+        tick_of(simulation).sense(simulation.everywhere)
         place = layout(simulation.config.sensors)["lidar"]
         return simulation.outputs.observations[0, 0, place].copy()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 import time
@@ -15,8 +16,7 @@ from typer.testing import CliRunner
 from cavmarl.cli import app
 from cavmarl.core.errors import ConfigError
 from cavmarl.verify.faulty_network import FaultyNetwork, NetworkFault
-from cavmarl.verify.node_faults import STOP, verify_node_faults
-from cavmarl.verify.simulated_nodes import MIXES
+from cavmarl.verify.node_faults import FAULTS, KILL, STOP, verify_node_faults
 
 SMALL: dict[str, Any] = {"agents": 4, "background": 20}
 
@@ -135,16 +135,33 @@ def test_worlds_go_through_it(fault: str) -> None:
     found = verify_node_faults("merge", [3], faults=[fault], seeds=1, zones=3, steps=25, **SMALL)
     (line,) = found.lines
     assert found.holds
-    assert (line.fault, line.runs, line.done, line.ended) == (fault, 1, 2, 0)
+    assert (line.fault, line.runs, line.equal, line.ended) == (fault, 1, 1, 0)
+    assert line.injected == {fault: 2}
     assert 1 <= line.lost <= 2
+
+
+def test_processes_are_killed_one_after_the_other() -> None:
+    """Each is replaced before the next one is killed, so the run goes on."""
+    found = verify_node_faults("merge", [2], faults=[KILL], seeds=1, per_run=3, zones=2, **SMALL)
+    assert found.holds
+    told = found.to_dict()
+    assert (told["deaths"], told["lost"], told["recoveries"]) == (3, 3, 3)
+    assert told["injected"] == {"kill": 3}
+    assert (told["runs"], told["equal"], told["ended"]) == (1, 1, 0)
 
 
 @pytest.mark.slow
 def test_the_command(tmp_path: Path) -> None:
-    words = ("verify", "merge", "--nodes", "2,3", "--faults", "campaign", "--seeds", "2")
-    result = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "found.json")])
+    words = ("verify", "nodes", "merge", "--nodes", "2", "--faults", "campaign")
+    amount = ("--mix", "kill,damage", "--seeds", "2", "--process-runs", "1")
+    path = tmp_path / "found.json"
+    result = CliRunner().invoke(app, [*words, *amount, "--json", str(path)])
     assert result.exit_code == 0, result.output
-    assert result.output.count("equal") == 2 * len(MIXES) + 14, "simulated, and real"
+    found = json.loads(path.read_text())
+    assert found["holds"]
+    assert found["simulated"]["injected"] == {"damage": 2, "kill": 2}
+    assert found["processes"]["runs"] == len(FAULTS) + 1
+    assert found["processes"]["deaths"] >= 35
 
 
 @pytest.mark.parametrize(
@@ -152,7 +169,7 @@ def test_the_command(tmp_path: Path) -> None:
     [
         ([0], {}, "name at least one number from 1 on"),
         ([], {}, "name at least one number from 1 on"),
-        ([2], {"steps": 10}, "steps = 10"),
+        ([2], {"steps": 5}, "steps = 5"),
         ([2], {"faults": ["flood"]}, "must be among delay"),
     ],
 )

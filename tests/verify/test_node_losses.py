@@ -1,4 +1,4 @@
-"""`cavmarl verify --nodes`: nodes beside the undivided worlds."""
+"""`cavmarl verify nodes`: nodes beside the undivided worlds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from cavmarl import ConfigError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.verify.node_losses import verify_nodes
-from tests.cli.test_main import refusal, run
+from tests.cli.test_main import run
 
 
 def test_nodes_change_nothing_while_some_are_killed() -> None:
@@ -47,10 +47,5 @@ def test_bad_input(arguments: dict[str, object], words: str) -> None:
 
 def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     words = ("--nodes", "2", "--steps", "5", "--zones", "2")  # none of them is for kills
-    assert run("verify", "grid4x4", *words) == 0
+    assert run("verify", "nodes", "grid4x4", *words) == 0
     assert "equal" in capsys.readouterr().out
-
-
-def test_the_command_refuses_layouts(capsys: pytest.CaptureFixture[str]) -> None:
-    said = refusal(capsys, "verify", "grid4x4", "--nodes", "2", "--layout", "strips")
-    assert "does not go with --nodes; use --set zones.layout" in said

@@ -45,13 +45,13 @@ def driven(path: Path, **overrides: object) -> DrivenWorld:
 
 
 def ghosts(world: DrivenWorld) -> int:
-    return int(world.simulation.zone_loads().ghosts.sum())
+    return int(world.simulation.zones.loads().ghosts.sum())
 
 
 def test_a_named_halo_is_seen_whole_and_nobody_can_tell(blocks: Path) -> None:
     """More ghosts, the same world."""
     narrow = driven(blocks)
-    whole = driven(blocks, **{"zones.halo_m": narrow.simulation.zone_loads().halo_m})
+    whole = driven(blocks, **{"zones.halo_m": narrow.simulation.zones.loads().halo_m})
     assert ghosts(narrow) < 0.9 * ghosts(whole)
     assert narrow.simulation.state_hash() == whole.simulation.state_hash()
 
@@ -61,8 +61,8 @@ def test_who_may_have_reached_a_line_is_nearer_than_half_a_body_and_what_is_kept
 ) -> None:
     simulation = driven(blocks).simulation
     kept_m = float(simulation.network.lanes["stop_back_m"].max())
-    half_m = 0.5 * float(simulation._tick.division.owned(0, 0)["length"].max())
-    assert half_m + kept_m < simulation._tick.division.halo.line_m < half_m + kept_m + 5.0
+    half_m = 0.5 * float(simulation.division.owned(0, 0)["length"].max())
+    assert half_m + kept_m < simulation.division.halo.line_m < half_m + kept_m + 5.0
 
 
 def test_the_monitor_asks_for_those_who_are_seen(blocks: Path) -> None:

@@ -1,4 +1,4 @@
-"""`cavmarl verify-determinism`: checks that the same scenario gives the same bits."""
+"""`cavmarl verify determinism`: checks that the same scenario gives the same bits."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ from cavmarl.core.progress import counting
 def verify_determinism(
     world: WorldSpec,
     policy: PolicyName = "idm",
-    steps: Annotated[int, about("Compared steps.")] = 600,
+    steps: Annotated[int, about("Number of steps to compare.")] = 600,
     json_path: JsonPath = None,
 ) -> None:
-    """Drive one world in three fresh processes; exit code 1 and where they first differ."""
+    """Compare three fresh processes that run the same world.
+
+    On the first difference, print it and exit with 1.
+    """
     from cavmarl.verify.determinism import verify_determinism as verify
 
     console = Console()

@@ -65,7 +65,7 @@ class Travel(NamedTuple):
     """What vehicles are and which ways there are; the same for all worlds of an environment."""
 
     types: NDArray[np.void]  # VTYPE (num_types,), by VEHICLE["vtype"]
-    steps: NDArray[np.void]  # PLAN (num_steps,), see `kernels.ways`
+    steps: NDArray[np.void]  # PLAN (num_steps,), see `lanes.route_following`
     stops: NDArray[np.void]  # STOP (num_stops,), by VEHICLE["stop"]
     first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
     begin_s: float  # the clock of the demand at tick 0
@@ -112,7 +112,9 @@ class Worlds(NamedTuple):
     num_near: NDArray[np.int64]  # (W,) the first ghosts, up to here, can touch owned vehicles
     num_touching: NDArray[np.int64]  # (W,) owned vehicles that touched another before this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
-    step: NDArray[np.void]  # PLAN (W, C) of each row the step of its lane, see `ways.own_step`
+    step: NDArray[
+        np.void
+    ]  # PLAN (W, C) of each row the step of its lane, see `route_following.own_step`
     step_at: NDArray[np.int64]  # (W, C) 1 + which of `Travel.steps` that is, 0: none yet
     outer: NDArray[np.void]  # OUTER (W, C) owned next rows that other zones may see, rising
     num_outer: NDArray[np.int64]  # (W,) -1: not noted since rows changed

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,9 @@ from cavmarl.cosim.stack.stack_types import (
     Trajectory,
 )
 from cavmarl.sensors.mounted.geodesy import Geodesy, geodesy_of
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class Gains(NamedTuple):
@@ -273,9 +276,9 @@ class Stack:
         driven: Control2D = self._timed("control", self._control.control, pose, trajectory, mission)
         return driven
 
-    def _timed(self, stage: str, run: Callable[..., Any], *arguments: Any) -> Any:
+    def _timed(self, stage: str, run: Callable[P, R], *given: P.args, **named: P.kwargs) -> R:
         began = time.perf_counter()
-        found = run(*arguments)
+        found = run(*given, **named)
         self.times.add(stage, time.perf_counter() - began)
         return found
 

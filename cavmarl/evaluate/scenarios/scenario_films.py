@@ -76,7 +76,7 @@ class ScenarioCamera:
             simulation.signal_phases(),
             title=f"{config.scenario.name} on {config.name}",
             clock_s=float(simulation.ticks()[0]) * config.clock.sim_dt_s,
-            zones=simulation.zone_view() if simulation.partition.count > 1 else None,
+            zones=simulation.zones.view() if simulation.partition.count > 1 else None,
         )
         if is_closest:
             self._closest_m, self._best = float(apart_m), surface

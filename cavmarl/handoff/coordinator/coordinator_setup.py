@@ -38,6 +38,19 @@ class WorldRun(NamedTuple):
     journal: Path | None  # its file, which is there and is begun anew; None: it has none
 
 
+class OpenRun(NamedTuple):
+    """One world's, with its journal open; a fork of this process may write it."""
+
+    run: bytes
+    journal: Journal | None
+
+    @classmethod
+    def of(cls, run: WorldRun) -> OpenRun:
+        """Open the journal of a run. Raises JournalError: it cannot be opened."""
+        journal = None if run.journal is None else Journal(run.journal, anew=True)
+        return cls(run.run, journal)
+
+
 def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
     """What `make_coordinators` chooses for each world, for processes that may do it repeatedly.
 
@@ -59,7 +72,7 @@ def make_coordinators(
     division: Division,  # of the shards, one a zone
     longest_move_m: float,  # of a vehicle in a tick
     # one a world; None: they are chosen, and their journals must not be there
-    runs: Sequence[WorldRun] | None = None,
+    runs: Sequence[OpenRun] | None = None,
 ) -> CoordinatorSetup:
     """The coordinators of a divided world.
 
@@ -97,18 +110,17 @@ def _coordinator(
     division: Division,
     limits: Limits,
     transfers: TransferLog,
-    given: WorldRun | None,
+    given: OpenRun | None,
 ) -> LocalCoordinator:
     """The coordinator of one world."""
-    run = secrets.token_bytes(RUN_BYTES) if given is None else given.run
-    journal: Journal | None = None
-    if given is not None and given.journal is not None:
-        journal = Journal(given.journal, anew=True)
-    elif settings.journal:
-        journal = Journal(journal_path(settings.journal, w, division.num_worlds))
-    directory = Directory(run, range(division.count), _OwnersRows(), limits)
+    if given is None:
+        journal = None
+        if settings.journal:
+            journal = Journal(journal_path(settings.journal, w, division.num_worlds))
+        given = OpenRun(secrets.token_bytes(RUN_BYTES), journal)
+    directory = Directory(given.run, range(division.count), _OwnersRows(), limits)
     counts = partial(division.counts, w)
-    return LocalCoordinator(directory, journal, HandoffLog(division, w), counts, transfers)
+    return LocalCoordinator(directory, given.journal, HandoffLog(division, w), counts, transfers)
 
 
 def _monitor(

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Gate
-from cavmarl.handoff.coordinator.coordinator import Coordinator
-from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor
+from cavmarl.handoff.coordinator.invariant_monitor import Departed, InvariantMonitor
+from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.handoff.coordinator.row_digests import RowDigests
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.shards.shard import Commands
@@ -27,10 +28,18 @@ class Coordination(Protocol):
         needs_ghosts: whether ghosts and vehicles near borders are looked for in each tick.
     """
 
-    coordinators: tuple[Coordinator, ...]
+    coordinators: tuple[LocalCoordinator, ...]
     needs_ghosts: bool
 
     def reset(self, chosen: NDArray[np.bool_]) -> None: ...
+
+    def save(self, w: int) -> SavedOwnership | None:
+        """What decides the next changes of owner in a world; None: it is not known here."""
+        ...
+
+    def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
+        """Worlds have been loaded; None: ownership begins anew."""
+        ...
 
     def begin(self, commands: Commands) -> None:
         """The rows are those of a committed tick; vehicles change their owner now."""
@@ -54,10 +63,16 @@ class Coordination(Protocol):
 class NoCoordination:
     """One zone owns all vehicles, so nothing has to be decided."""
 
-    coordinators: tuple[Coordinator, ...] = ()
+    coordinators: tuple[LocalCoordinator, ...] = ()
     needs_ghosts = False
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
+        """All vehicles are of the one zone."""
+
+    def save(self, w: int) -> None:
+        """There is nothing to know of owners."""
+
+    def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
         """All vehicles are of the one zone."""
 
     def begin(self, commands: Commands) -> None:
@@ -85,7 +100,7 @@ class Coordinators:
     def __init__(
         self,
         division: Division,  # whose rows change hands
-        coordinators: Sequence[Coordinator],  # one a world
+        coordinators: Sequence[LocalCoordinator],  # one a world
         digests: RowDigests | None = None,  # of zones' rows; None: not needed
         monitor: InvariantMonitor | None = None,  # checks every tick that is committed; None: none
     ) -> None:
@@ -107,11 +122,53 @@ class Coordinators:
                 if self._monitor is not None:
                     self._monitor.begin(w, coordinator.notes()[0])
 
+    def save(self, w: int) -> SavedOwnership:
+        """What decides the next changes of owner in a world, but for its zones."""
+        saved = self.coordinators[w].save()
+        if not self._stirred[w]:
+            return saved
+        # Rows have moved since those near a border were noted, and are looked at again.
+        numbers = saved.numbers._replace(is_stirred=1, crossed=0)
+        return saved._replace(numbers=numbers, near=saved.near[:0])
+
+    def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
+        """Go on with worlds that have been loaded.
+
+        Args:
+            saved: of each world, what was known of owners; None: ownership begins anew, with the
+                vehicles where they are.
+
+        Raises:
+            JournalError: a journal has never ended where it did then.
+            ProtocolError: an invariant does not hold.
+        """
+        for w, coordinator in enumerate(self.coordinators):
+            gone: Sequence[Departed] = ()
+            if saved is None:
+                coordinator.reset()
+                coordinator.entered(self._division.owners(w))
+                self._stirred[w] = True
+            else:
+                gone = coordinator.go_on(saved[w], self._rows_of(w))
+                self._stirred[w] = bool(saved[w].numbers.is_stirred)
+            if self._monitor is not None:
+                table = coordinator.directory.table
+                self._monitor.go_on(w, table, coordinator.notes()[0], gone)
+
+    def _rows_of(self, w: int) -> dict[int, tuple[int, int]]:
+        """Vehicle → (zone, epoch) of all vehicles of a world."""
+        found: dict[int, tuple[int, int]] = {}
+        for zone in range(self._division.count):
+            rows = self._division.owned(w, zone)
+            pairs = zip(rows["id"].tolist(), rows["epoch"].tolist(), strict=True)
+            found.update((vehicle, (zone, epoch)) for vehicle, epoch in pairs)
+        return found
+
     def cut(self) -> None:
         """Zones are others, between two ticks: at the next one all vehicles are checked."""
         for w, coordinator in enumerate(self.coordinators):
             births, gone = coordinator.notes()
-            coordinator.resume(self._division.settle_newborn(w, births), gone)
+            coordinator.resume(self._division.changes.settle_newborn(w, births), gone)
             self._stirred[w] = True
 
     def begin(self, commands: Commands) -> None:

@@ -32,6 +32,20 @@ class OwnerChange(NamedTuple):
     ms: float
 
 
+class SavedBorders(NamedTuple):
+    """What is known of the borders of one world; see `BorderRecords`."""
+
+    tick: int
+    acknowledged: int
+    aborted: int
+    crossed: int
+    owned: int
+    known: int
+    near: NDArray[np.void]  # NEAR (n,)
+    coming: NDArray[np.void]  # COMING (n,)
+    before: NDArray[np.void]  # COMING (n,) of the tick before
+
+
 class HandoffLog:
     """Gives vehicles to the zones that they are in, and keeps what came of it until it is read."""
 
@@ -39,8 +53,8 @@ class HandoffLog:
         self._division = division
         self._world = world
         self._book = division.book
-        self._hand_over = division.call_hand_over
-        self._release = division.call_release
+        self._hand_over = division.changes.hand_over_all
+        self._release = division.changes.release_all
         self._neighbours = division.neighbours
         self._teleports: set[tuple[int, int]] = set()  # tick and vehicle, of changes not taken yet
 
@@ -108,7 +122,7 @@ class HandoffLog:
             raise ConfigError(f"zone {change.source} does not own vehicle {change.vehicle}")
         if not self._division.neighbours[change.source, change.target]:
             raise self._no_neighbour(change)
-        raise self._division.unseen(change.vehicle, change.target)
+        raise self._division.changes.unseen(change.vehicle, change.target)
 
     def _no_neighbour(self, change: OwnerChange) -> ProtocolError:
         zones = np.flatnonzero(self._division.neighbours[change.source]).tolist()
@@ -152,6 +166,39 @@ class HandoffLog:
         turn = 1 - book.turn.item(w)
         entries = book.coming[w, turn, : book.num_coming[w, turn]]
         return list(zip(entries["vehicle"].tolist(), entries["target"].tolist(), strict=True))
+
+    def save(self) -> SavedBorders:
+        """What the next tick has to know of vehicles near borders."""
+        book, w = self._book, self._world
+        now = book.turn.item(w)
+        num_now, num_before = book.num_coming[w, now], book.num_coming[w, 1 - now]
+        return SavedBorders(
+            book.tick.item(w),
+            book.acknowledged.item(w),
+            book.aborted.item(w),
+            book.num_crossed.item(w),
+            book.owned.item(w),
+            book.known.item(w),
+            book.near[w, : book.num_near[w]],
+            book.coming[w, now, :num_now],
+            book.coming[w, 1 - now, :num_before],
+        )
+
+    def go_on(self, saved: SavedBorders) -> None:
+        """Go on from what `save` returned; clocks begin now."""
+        book, w = self._book, self._world
+        now = book.turn.item(w)
+        self.reset(saved.tick)
+        self._neighbours = self._division.neighbours
+        book.acknowledged[w], book.aborted[w] = saved.acknowledged, saved.aborted
+        book.num_crossed[w], book.owned[w], book.known[w] = saved.crossed, saved.owned, saved.known
+        book.num_near[w] = len(saved.near)
+        book.near[w, : len(saved.near)] = saved.near
+        book.ms[w] = 1e3 * perf_counter()
+        for turn, coming in ((now, saved.coming), (1 - now, saved.before)):
+            book.num_coming[w, turn] = len(coming)
+            book.coming[w, turn, : len(coming)] = coming
+            book.coming["ms"][w, turn, : len(coming)] = book.ms[w]
 
     def reset(self, tick: int) -> None:
         self._book.num_changes[self._world] = 0

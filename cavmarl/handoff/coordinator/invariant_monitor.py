@@ -9,6 +9,7 @@ found when there is one (`coordinator.violations`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from cavmarl.handoff.coordinator.row_digests import digest_tables
 from cavmarl.handoff.coordinator.violations import Violations
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.kernels.invariant_checks import (
+    ANY_LATE,
     FINDING,
     KIND_NONE,
     TALLY,
@@ -32,10 +34,19 @@ from cavmarl.handoff.kernels.invariant_checks import (
 )
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Birth, Commit, Record, Reset
+from cavmarl.ownership.table import Table
 from cavmarl.ownership.trace import LOG, TraceEntry, describe
 from cavmarl.ownership.trace_check import Owner, TraceChecker
 
 WORD = 1 << 64
+
+
+class Departed(NamedTuple):
+    """A vehicle that has left the world since the last tick."""
+
+    vehicle: int
+    zone: int  # that owned it
+    epoch: int
 
 
 def _add(sums: NDArray[np.uint64], zone: int, term: int) -> None:
@@ -91,13 +102,23 @@ class OwnersOnRecord:
             _add(sums, change.source, -int(owner_hash(change.vehicle, change.epoch - 1)))
             _add(sums, change.target, int(owner_hash(change.vehicle, change.epoch)))
 
-    def sums(self, births: Sequence[Birth]) -> NDArray[np.uint64]:
-        """(k,) by zone the sum of `owner_hash` of its vehicles, with those not on record yet."""
-        if not births:
+    def go_on(self, table: Table) -> None:
+        """Know what a coordinator knows that goes on from a saved state."""
+        self._checker.go_on(table)
+        self.entered, self.left = len(table.owners), 0
+        sums = self._current = self._sums = np.zeros_like(self._sums)
+        for vehicle, (zone, epoch) in table.owners.items():
+            _add(sums, zone, int(owner_hash(vehicle, epoch)))
+
+    def sums(self, births: Sequence[Birth], gone: Sequence[Departed] = ()) -> NDArray[np.uint64]:
+        """(k,) by zone the sum of `owner_hash` of its vehicles, with what is not on record yet."""
+        if not (births or gone):
             return self._current
         sums = self._current.copy()
         for vehicle, zone, _ in births:
             _add(sums, zone, int(owner_hash(vehicle, 0)))
+        for vehicle, zone, epoch in gone:
+            _add(sums, zone, -int(owner_hash(vehicle, epoch)))
         return sums
 
     def _take(self, record: Record) -> None:
@@ -151,29 +172,42 @@ class InvariantMonitor:
         self._watch = specialized(watch)
 
     def begin(self, w: int, births: Sequence[Birth]) -> None:
-        """Look at a world that has been reset, or goes on from a state that was saved.
+        """Look at a world that has been reset. Raises ProtocolError: an invariant does not hold."""
+        self._begin(w)
+        self._look(w, births, new_late=0)
+
+    def go_on(
+        self, w: int, table: Table, births: Sequence[Birth], gone: Sequence[Departed] = ()
+    ) -> None:
+        """Look at a world that goes on from a saved state.
 
         Raises:
             ProtocolError: an invariant does not hold.
         """
+        self._records[w].go_on(table)
+        self._begin(w)
+        self._look(w, births, new_late=ANY_LATE, gone=gone)
+
+    def _begin(self, w: int) -> None:
         self._ticks[w] = self._division.ticks(w)[0]
         self._kept[w][0].num[:] = 0
         self._vehicles[w].clear()
-        self._look(w, births, new_late=0)
 
     def end(self, w: int, births: Sequence[Birth]) -> None:
         """Look at a world after a tick. Raises ProtocolError: an invariant does not hold."""
         self._ticks[w] += 1
         self._look(w, births, new_late=1)
 
-    def _look(self, w: int, births: Sequence[Birth], new_late: int) -> None:
+    def _look(
+        self, w: int, births: Sequence[Birth], new_late: int, gone: Sequence[Departed] = ()
+    ) -> None:
         division, record = self._division, self._records[w]
         clock = CheckTime(self._ticks[w], new_late, self._limit_m)
         before, now = self._kept[w]
         kind = self._watch(
             division.zones, division.halo, division.zoned, self._words, division.side, w, clock,
             self._masks, self._factors, before, now, self._strays,
-            record.entered + len(births) - record.left, record.sums(births),
+            record.entered + len(births) - record.left - len(gone), record.sums(births, gone),
             self._tallies, self._found,
         )  # fmt: skip
         self._kept[w] = now, before

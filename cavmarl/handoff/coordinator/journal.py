@@ -10,9 +10,10 @@ import os
 import sys
 import weakref
 from collections.abc import Iterable, Iterator
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self, TypeAlias, get_args
+from typing import Literal, NamedTuple, Self, TypeAlias, get_args
 
 from cavmarl.core.errors import ConfigError, JournalError
 from cavmarl.core.processes import refuse_fork
@@ -23,6 +24,28 @@ if sys.platform != "win32":
     import fcntl
 
 Sync: TypeAlias = Literal["flush", "fsync"]
+
+_TAIL = '"checksum":"{}"}}\n'
+
+
+class JournalPlace(NamedTuple):
+    """The end of a line of a journal."""
+
+    lines: int  # up to there
+    checksum: int  # of the last of them, a signed word; 0 before the first
+    size: int  # of these lines in bytes
+
+    @classmethod
+    def nowhere(cls) -> JournalPlace:
+        """Of what has no journal."""
+        return cls(-1, 0, 0)
+
+    def chain(self) -> LogChain:
+        """What writes the next line."""
+        chain = LogChain()
+        if self.lines:
+            chain.sequence, chain.last = self.lines, f"{self.checksum & ((1 << 64) - 1):016x}"
+        return chain
 
 
 class JournalReader:
@@ -78,6 +101,11 @@ class JournalReader:
             raise JournalError(f"{self.path}: {self.torn}; it was never acted upon")
 
 
+def _open_to_append(path: str, flags: int) -> int:
+    """Open a file whose writes go to its end, also where it is cut off meanwhile."""
+    return os.open(path, flags | os.O_APPEND, 0o666)
+
+
 class Journal:
     """A file that records are appended to, by one run at a time.
 
@@ -92,7 +120,8 @@ class Journal:
         # go on behind what is there. All of it is read, and a last line that is cut short is
         # dropped
         resume: bool = False,
-        # the file may exist, and is begun anew: by a run that does again what is in it
+        # the file may exist, and the first line or `go_to` cuts off what is in it: that is done by
+        # the process that writes here, which may be a fork of this one
         anew: bool = False,
         # when an append returns, its lines have been given to the operating system ("flush"), so
         # that they outlive the process, or have been written out ("fsync"), so that they outlive
@@ -104,11 +133,12 @@ class Journal:
         self.path = path
         self.dropped = ""
         self._chain = LogChain()
+        self._size = 0  # of the lines
         self._fsync = sync == "fsync"
         if resume and not path.is_file():
             raise JournalError(f"{path}: is no file to go on with; begin one without resume")
         try:
-            self._file = path.open("ab" if resume or anew else "xb", buffering=0)
+            self._file = FileIO(path, "ab" if resume or anew else "xb", opener=_open_to_append)
         except FileExistsError as error:
             raise JournalError(
                 f"{path}: exists; go on with it (resume), or choose another path"
@@ -118,12 +148,11 @@ class Journal:
         # Worlds are not closed: their journal is, when it is not referenced any more.
         weakref.finalize(self, self._file.close)
         self._pid = os.getpid()
+        self._is_taken = not anew  # by the process that writes
         try:
             self._lock()
             if resume:
                 self._read()
-            elif anew:
-                self._file.truncate(0)
         except JournalError:
             self._file.close()
             raise
@@ -133,8 +162,45 @@ class Journal:
         """The number of the next line."""
         return self._chain.sequence
 
+    @property
+    def place(self) -> JournalPlace:
+        """Where it ends."""
+        word = int(self._chain.last or "0", 16)
+        return JournalPlace(self.sequence, word - ((word >> 63) << 64), self._size)
+
+    def go_to(self, place: JournalPlace) -> None:
+        """Cut off what follows a place where it has ended before; this process goes on from there.
+
+        For a process that has taken over the file of another one, which writes no more.
+
+        Raises:
+            JournalError: it has never ended there.
+        """
+        chain = place.chain()
+        try:
+            if not self._has_ended(place, chain.last):
+                raise JournalError(
+                    f"{self.path}: has no line {place.lines} that ends at byte {place.size}; it is "
+                    "the journal of another run, or has been changed"
+                )
+            os.truncate(self.path, place.size)
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self._chain, self._size = chain, place.size
+        self._pid, self._is_taken = os.getpid(), True
+
+    def _has_ended(self, place: JournalPlace, checksum: str) -> bool:
+        if place.lines <= 0:
+            return place == JournalPlace(0, 0, 0)
+        tail = _TAIL.format(checksum).encode()
+        with self.path.open("rb") as file:
+            file.seek(max(place.size - len(tail), 0))
+            return file.read(len(tail)) == tail
+
     def append(self, records: Iterable[Record]) -> None:
         """Write records down; when it returns, messages may be sent."""
+        if not self._is_taken:
+            self.go_to(self.place)
         refuse_fork(self._pid, f"the lines of {self.path}")
         lines = [self._chain.write(record) for record in records]
         if not lines:
@@ -144,7 +210,8 @@ class Journal:
         left = memoryview("".join(lines).encode())
         try:
             while left:
-                left = left[self._file.write(left) :]
+                written = self._file.write(left)
+                left, self._size = left[written:], self._size + written
             if self._fsync:
                 os.fsync(self._file.fileno())
         except OSError as error:
@@ -189,7 +256,7 @@ class Journal:
         reader = JournalReader(self.path, drop_torn=True)
         for _ in reader:
             pass
-        self._chain, self.dropped = reader.chain, reader.torn
+        self._chain, self.dropped, self._size = reader.chain, reader.torn, reader.size
         if self.dropped:
             try:
                 os.truncate(self.path, reader.size)

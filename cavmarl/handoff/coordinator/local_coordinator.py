@@ -24,11 +24,13 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.coordinator import Coordinator
-from cavmarl.handoff.coordinator.handoff_log import HandoffLog, OwnerChange
-from cavmarl.handoff.coordinator.journal import Journal
+from cavmarl.handoff.coordinator.handoff_log import HandoffLog, OwnerChange, SavedBorders
+from cavmarl.handoff.coordinator.invariant_monitor import Departed
+from cavmarl.handoff.coordinator.journal import Journal, JournalPlace
+from cavmarl.handoff.coordinator.saved_ownership import OwnershipNumbers, SavedOwnership
 from cavmarl.ownership.directory import Directory
-from cavmarl.ownership.ledger import world_digest
-from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, ZoneLedger
+from cavmarl.ownership.ledger import SeenIds, world_digest
+from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Reset, Switch, ZoneLedger
 from cavmarl.ownership.transfers import Transfer, TransferLog
 from cavmarl.zones.kernels.handoff import LATE
 
@@ -106,6 +108,87 @@ class LocalCoordinator(Coordinator):
         for zone, (_, incarnation) in directory.table.hosts.items():
             if incarnation == 0:
                 self._record(*directory.host(zone, worker=0).records)
+
+    def save(self) -> SavedOwnership:
+        """What it knows between two ticks, beside zones and their rows."""
+        table, borders = self.directory.table, self._book.save()
+        born = {birth.vehicle: (birth.zone, 0) for birth in self._births}
+        births = [(birth.vehicle, birth.zone) for birth in self._births]
+        gone = [
+            (vehicle, reason, *(born.get(vehicle) or table.owners[vehicle]))
+            for vehicle, reason in self._gone
+        ]
+        journal = JournalPlace.nowhere() if self.journal is None else self.journal.place
+        numbers = OwnershipNumbers(
+            episode=table.episode,
+            tick=self._tick,
+            switched=self.switched,
+            seen_below=table.seen.floor,
+            is_stirred=0,
+            recut_steps=0,
+            near_tick=borders.tick,
+            acknowledged=borders.acknowledged,
+            aborted=borders.aborted,
+            crossed=borders.crossed,
+            owned=borders.owned,
+            known=borders.known,
+            journal=journal,
+        )
+        return SavedOwnership(
+            zones=np.zeros((0, 4)),
+            counts=np.array(self._counts(), dtype=np.int64),
+            numbers=numbers,
+            seen=np.array(sorted(table.seen.above), dtype=np.int64),
+            births=np.array(births, dtype=np.int64).reshape(-1, 2),
+            gone=np.array(gone, dtype=np.int64).reshape(-1, 4),
+            near=borders.near,
+            coming=borders.coming,
+            before=borders.before,
+        )
+
+    def go_on(self, saved: SavedOwnership, rows: Mapping[int, tuple[int, int]]) -> list[Departed]:
+        """Go on from what `save` returned.
+
+        Args:
+            saved: what was saved.
+            rows: vehicle → (zone, epoch) of all rows that zones own.
+
+        Returns:
+            the vehicles that have left since the tick that is on record.
+
+        Raises:
+            JournalError: the journal has never ended where it did then.
+        """
+        numbers = saved.numbers
+        if self.journal is not None:
+            self.journal.go_to(numbers.journal)
+        births = [Birth(vehicle, zone, b"") for vehicle, zone in saved.births.tolist()]
+        gone = saved.gone.tolist()
+        self.resume(births, (Removed(vehicle, reason) for vehicle, reason, _, _ in gone))
+        owners = {**rows, **{vehicle: (zone, epoch) for vehicle, _, zone, epoch in gone}}
+        for birth in births:
+            del owners[birth.vehicle]
+        table = self._directory.table
+        run, seen = self._directory.run, SeenIds(numbers.seen_below, saved.seen.tolist())
+        table.go_on(run, numbers.episode, numbers.tick, owners, seen)
+        self._book.go_on(
+            SavedBorders(
+                tick=numbers.near_tick,
+                acknowledged=numbers.acknowledged,
+                aborted=numbers.aborted,
+                crossed=numbers.crossed,
+                owned=numbers.owned,
+                known=numbers.known,
+                near=saved.near,
+                coming=saved.coming,
+                before=saved.before,
+            )
+        )
+        self._transfers.logged((Reset(numbers.episode, numbers.tick, run),))
+        self.switched, self._tick, self._vehicles = numbers.switched, numbers.tick, len(rows)
+        self._is_open, self._changed, self._late = False, 0, 0
+        self._new, self._news = (), {}
+        return [Departed(vehicle, zone, epoch) for vehicle, _, zone, epoch in gone]
 
     def begin(self, everybody: bool, inputs: bytes = b"") -> None:
         """Hand over vehicles outside their owner's zone, as `Coordinator.begin` says."""

@@ -69,11 +69,15 @@ FINDING = np.dtype(
 )
 
 
+ANY_LATE = -1
+
+
 class CheckTime(NamedTuple):
     """When a check is made."""
 
     tick: int
-    new_late: int  # by how much the tick of a vehicle lags that was not there before
+    # by how much the tick of a vehicle lags that was not there before; ANY_LATE: it is not known
+    new_late: int
     limit_m: float  # no vehicle moves further from one check to the next
 
 
@@ -269,7 +273,7 @@ def _match(
         else:
             strays.entered[entered] = entry["id"]
             entered += 1
-            if entry["late"] != clock.new_late:
+            if clock.new_late != ANY_LATE and entry["late"] != clock.new_late:
                 _note(finding, KIND_TICK, entry["id"])
     left = 0
     for n in range(missing):

@@ -1,1 +1,1 @@
-"""Connections with processes that share nothing, and the Ray cluster that may start them."""
+"""Connections between processes over TCP or MPI, and the Ray cluster that may start them."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError
-from cavmarl.parallel.nodes.link import Bytes
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import (
     Outcome,

@@ -17,8 +17,10 @@ from cavmarl.core.errors import WorkerError
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
+from cavmarl.parallel.nodes.peer_faults import FAULTS, reading
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
 Array = NDArray[Any]
@@ -39,6 +41,12 @@ class KeptStates:
         self._others: dict[int, dict[int, Bytes]] = {}  # node → the same
         self._given: dict[int, NodeFrame] = {}  # by nodes that have given zones away
         self._is_settled = True  # nothing has been kept since `settle`
+
+    def begin_anew(self, worlds: LocalWorlds, logs: Sequence[ToldLog]) -> None:
+        """Keep states of other worlds; what other nodes have sent already may be of these."""
+        self._worlds, self._logs = worlds, logs
+        self._own.clear()
+        self._given.clear()
 
     def settle(self) -> None:
         """What was kept here last has come everywhere: what is older is of no use any more."""
@@ -71,9 +79,11 @@ class KeptStates:
         _drop_later(self._own, -1)
         like = [*(log.words for log in self._logs), *self._worlds.save()]
         found = from_bytes(data, like)
+        saved = found[len(self._logs) :]
+        self._worlds.check(saved)
         for log, words in zip(self._logs, found, strict=False):
             log.take_up(words)
-        self._own[state] = to_bytes(found[len(self._logs) :])
+        self._own[state] = to_bytes(saved)
 
     def take(self, number: int, frame: NodeFrame) -> None:
         """What another node wants to have kept here."""
@@ -105,22 +115,29 @@ class KeptStates:
             _drop_later(states, state)
         like = self._worlds.save()
         own = self._own.get(state)
-        saved = None if own is None else from_bytes(own, like)
+        saved = None if own is None else self._read(own, like)
         for number in lost:
             found = self._others.get(number, {}).get(state)
             if saved is None or found is None:
                 raise WorkerError(f"what node {number} had is kept nowhere")
-            saved[self._first - 1] += self._join(saved, from_bytes(found, like), like)
+            try:
+                theirs = self._read(found, like)
+            except FAULTS as error:
+                raise WorkerError(f"what node {number} had cannot be read: {error}") from error
+            saved[self._first - 1] += self._join(saved, theirs, like)
         if takers and saved is not None:
             data = to_bytes(saved)
             for taker in takers:
                 self._links.send(taker, FrameKind.GIVE, generation, [data])
         for donor in donors:
             check()
+            self._links.wanted = (donor,)
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
                 check()  # it may take what is awaited
-            given = from_bytes(self._given.pop(donor).data, like)
+            self._links.wanted = ()
+            with reading(donor):
+                given = self._read(self._given.pop(donor).data, like)
             if saved is None:
                 saved = given
                 saved[self._first - 1][...] = 0  # contacts stay where they were counted
@@ -133,6 +150,12 @@ class KeptStates:
             if (n - self._first) % count not in zones:
                 saved[n] = saved[n][:0]
         self._worlds.load_own(saved, zones[0])
+
+    def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
+        """A state that is kept. Raises ConfigError: worlds cannot go on from it."""
+        saved = from_bytes(data, like)
+        self._worlds.check(saved)
+        return saved
 
     @property
     def _first(self) -> int:

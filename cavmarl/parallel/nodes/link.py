@@ -6,49 +6,38 @@ connection has ended. Nothing in a frame is ever run.
     head    magic, version, kind, number, bytes of what follows, checksum of what follows,
             checksum of the head
 
-The head's checksum begins with how many frames went before on that connection, so that one that
-comes twice or out of turn is no frame. It is compared before anything else of the frame is awaited.
+Checksums are XXH3 of 64 bits; they guard against accidents alone. The seed of the head's is how
+many frames went before on that connection, so that one that comes twice or out of turn is no frame.
+It is compared before anything else of the frame is awaited.
 """
 
 from __future__ import annotations
 
-import json
-import socket
 import struct
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
 from enum import IntEnum
 from itertools import islice
-from typing import Any, NamedTuple, TypeAlias
-from zlib import crc32
+from typing import Any, NamedTuple
 
 import numpy as np
+from xxhash import xxh3_64_intdigest
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
-from cavmarl.core.math.checksums import checksum
+from cavmarl.parallel.network.transport import MOST_PIECES, Bytes, Connection
+from cavmarl.parallel.nodes.peer_faults import read_json
 
 MAGIC = b"cavN"
-VERSION = 6
+VERSION = 7
 MAX_FRAME = 1 << 32
-_ALL = (1 << 32) - 1
+_ALL = (1 << 64) - 1
 BEGIN = MAGIC + VERSION.to_bytes(2, "little")
-_HEAD = struct.Struct("<6sHQQI")
+_HEAD = struct.Struct("<6sHQQQ")
 SUMMED = _HEAD.size  # bytes of a head that its checksum is of
-_SUM = struct.Struct("<I")
-_WHOLE_HEAD = struct.Struct("<6sHQQII")
+_SUM = struct.Struct("<Q")
+_WHOLE_HEAD = struct.Struct("<6sHQQQQ")
 HEAD_BYTES = _WHOLE_HEAD.size
-MOST = 512  # frames that the system is given at once
 ROOM = 1 << 14  # bytes that are read at once where it is not known what comes
-
-# A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
-_ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
-    (socket.IPPROTO_TCP, getattr(socket, name), value)
-    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
-    if hasattr(socket, name)
-]
-
-Bytes: TypeAlias = bytes | bytearray | memoryview
 
 
 class FrameKind(IntEnum):
@@ -117,13 +106,8 @@ class NeededNoMoreError(Exception):
 class Link:
     """One connection: what is to be sent, and what has come of the next frame."""
 
-    def __init__(self, connection: socket.socket) -> None:
-        if connection.family != socket.AF_UNIX:
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            for level, option, value in _ALIVE:
-                connection.setsockopt(level, option, value)
-        connection.setblocking(False)
-        self.socket = connection
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
         self.waiting: deque[memoryview] = deque()
         self.frames: deque[NodeFrame] = deque()
         self._room = memoryview(bytearray(ROOM))  # what has come, until it is known what it is
@@ -131,25 +115,19 @@ class Link:
         self._into = self._room  # where the next bytes go: there, or into a frame that has begun
         self._opened: tuple[NodeFrame, int] | None = None  # that frame, and its checksum
         self._num_sent = self._num_heard = 0  # frames
-        # of what has been decrypted and not read yet a poll tells nothing
-        self._has_more = hasattr(connection, "pending")
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> int:
-        """Send what the system takes at once; the rest is kept, as a copy.
+        """Send what the connection takes at once; the rest is kept, as a copy.
 
         Returns:
             bytes of the frame.
         """
         data = _joined(pieces)
         self._num_sent = num_sent = self._num_sent + 1 & _ALL
-        head = _HEAD.pack(BEGIN, kind, number, len(data), checksum(data))
-        head += _SUM.pack(crc32(head, num_sent))
-        size, sent = HEAD_BYTES + len(data), 0
-        if not self.waiting:
-            try:
-                sent = self.socket.sendmsg((head, data))
-            except BlockingIOError:
-                pass
+        head = _HEAD.pack(BEGIN, kind, number, len(data), xxh3_64_intdigest(data))
+        head += _SUM.pack(xxh3_64_intdigest(head, num_sent))
+        size = HEAD_BYTES + len(data)
+        sent = 0 if self.waiting else self.connection.send((head, data))
         if sent < size:
             self.waiting.append(memoryview(head)[sent:])
             self.waiting.append(memoryview(bytes(data))[max(sent - HEAD_BYTES, 0) :])
@@ -157,13 +135,14 @@ class Link:
 
     def go_on_sending(self) -> None:
         waiting = self.waiting
-        with suppress(BlockingIOError):
-            while waiting:
-                sent = self.socket.sendmsg(list(islice(waiting, MOST)))
-                while waiting and sent >= len(waiting[0]):
-                    sent -= len(waiting.popleft())
-                if sent:
-                    waiting[0] = waiting[0][sent:]
+        while waiting:
+            sent = self.connection.send(list(islice(waiting, MOST_PIECES)))
+            if not sent:
+                return
+            while waiting and sent >= len(waiting[0]):
+                sent -= len(waiting.popleft())
+            if sent:
+                waiting[0] = waiting[0][sent:]
 
     def receive(self, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
         """Take what has come; urgent frames are added to those of others, with a number each.
@@ -175,12 +154,11 @@ class Link:
         """
         while True:
             into = self._into
-            try:
-                got = self.socket.recv_into(into)
-            except BlockingIOError:
-                return
+            got = self.connection.receive(into)
             if not got:
-                raise EOFError
+                if self.connection.closed:
+                    raise EOFError
+                return
             if self._opened is None:
                 self._split(self._filled + got, urgent, number)
             elif got < len(into):
@@ -188,7 +166,7 @@ class Link:
             else:
                 opened, self._opened, self._into = self._opened, None, self._room
                 self._close(*opened, urgent, number)
-            if got < len(into) and not self._has_more:
+            if got < len(into) and not self.connection.keeps_bytes:
                 return
 
     def _split(self, filled: int, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
@@ -197,7 +175,7 @@ class Link:
         while filled - at >= HEAD_BYTES:
             begin, code, which, size, summed, own = _WHOLE_HEAD.unpack_from(room, at)
             self._num_heard = heard = self._num_heard + 1 & _ALL
-            is_next = crc32(room[at : at + SUMMED], heard) == own
+            is_next = xxh3_64_intdigest(room[at : at + SUMMED], heard) == own
             if begin != BEGIN or not is_next or code not in _KINDS or size > MAX_FRAME:
                 raise _stranger(begin, is_next, code, size)
             at += HEAD_BYTES
@@ -226,7 +204,7 @@ class Link:
         number: int,
     ) -> None:
         """Take a frame that has come whole."""
-        if checksum(frame.data) != summed:
+        if xxh3_64_intdigest(frame.data) != summed:
             raise MessageError("a frame is not what was sent")
         kind = frame.kind
         if kind not in _AT_ONCE:
@@ -266,12 +244,10 @@ def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError
 def said_by(frame: NodeFrame) -> list[Any]:
     """A list as JSON. Raises MessageError: it is none."""
     try:
-        said = json.loads(bytes(frame.data))
-    except ValueError as error:
-        raise MessageError(f"a frame of kind {frame.kind.name} says nothing: {error}") from error
-    if not isinstance(said, list):
-        raise MessageError(f"a frame of kind {frame.kind.name} says {said!r}")
-    return said
+        found: list[Any] = read_json(frame.data, list)
+    except MessageError as error:
+        raise MessageError(f"a frame of kind {frame.kind.name}: {error}") from error
+    return found
 
 
 def _text(frame: NodeFrame) -> str:

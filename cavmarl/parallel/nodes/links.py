@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import select
-import socket
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
@@ -11,26 +9,29 @@ from typing import TypeAlias
 
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, Link, NodeFrame
+from cavmarl.parallel.network.transport import READS, READS_AND_WRITES, Bytes, Connection
+from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, reading
 
 LOST = (EOFError, OSError, MessageError)  # what ends a connection
 
-Urgent: TypeAlias = Callable[[int, NodeFrame], None]
-"""What is called with an urgent frame as soon as it has come, and the number of its sender."""
+Urgent: TypeAlias = Callable[[int, NodeFrame], Exception | None]
+"""What is called with an urgent frame as soon as it has come, and the number of its sender.
+
+What fails in it is the sender's fault; what it returns is not, and is raised."""
 
 
 class SilenceError(Exception):
-    """Nothing has come for long."""
+    """Nothing has come for long.
 
+    Attributes:
+        awaited: nodes of which an answer to another node is awaited.
+    """
 
-class LinkLostError(Exception):
-    """A connection has ended, or what came over it was no frame."""
-
-    def __init__(self, peer: int, cause: Exception | None = None) -> None:
-        why = f": {cause}" if isinstance(cause, MessageError) else ""
-        super().__init__(f"the connection to node {peer} has ended{why}")
-        self.peer = peer
+    def __init__(self, text: str, awaited: Collection[int] = ()) -> None:
+        super().__init__(text)
+        self.awaited = awaited
 
 
 class RecoveryOrderedError(Exception):
@@ -50,18 +51,18 @@ class Links:
         self._looks = system.looks
         self._links: dict[int, Link] = {}
         self._poll = system.poll()
-        self._by_socket: dict[int, tuple[int, Link]] = {}
+        self._by_place: dict[int, tuple[int, Link]] = {}  # as the poll tells of them
         self._heard: deque[tuple[int, NodeFrame]] = deque()  # urgent frames, and their senders
-        self.wanted: Collection[int] = ()  # whose frames `take` waits for
+        self.wanted: Collection[int] = ()  # whose frames this process waits for
         self.waited_s = 0.0
         self.sent_bytes = 0
         self.sent_frames = 0
 
-    def add(self, number: int, connection: socket.socket | Link) -> None:
+    def add(self, number: int, connection: Connection | Link) -> None:
         link = connection if isinstance(connection, Link) else Link(connection)
         self._links[number] = link
-        self._by_socket[link.socket.fileno()] = number, link
-        self._poll.register(link.socket, select.POLLIN)
+        self._by_place[link.connection.fileno()] = number, link
+        self._poll.register(link.connection, READS)
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -69,7 +70,7 @@ class Links:
 
     @property
     def awaited(self) -> list[int]:
-        """Whose frames `take` waits for."""
+        """Nodes whose frames this process waits for."""
         links = self._links
         return sorted(n for n in self.wanted if n not in links or not links[n].frames)
 
@@ -88,7 +89,7 @@ class Links:
             raise self._lost(to, error) from error
         self.sent_frames += 1
         if link.waiting:
-            self._poll.modify(link.socket, select.POLLIN | select.POLLOUT)
+            self._poll.modify(link.connection, READS_AND_WRITES)
 
     def take(
         self,
@@ -188,13 +189,13 @@ class Links:
         else:
             ready = poll(timeout_ms)
         self.waited_s += self.now_s() - began_s
-        for socket_number, _ in ready:
-            number, link = self._by_socket[socket_number]
+        for place, _ in ready:
+            number, link = self._by_place[place]
             try:
                 if link.waiting:
                     link.go_on_sending()
                     if not link.waiting:
-                        self._poll.modify(link.socket, select.POLLIN)
+                        self._poll.modify(link.connection, READS)
                 link.receive(self._heard, number)
             except LOST as error:
                 self._tell()
@@ -207,9 +208,14 @@ class Links:
         while self._heard:
             number, frame = self._heard.popleft()
             try:
-                self.urgent(number, frame)
-            except LOST as error:
-                raise self._lost(number, error) from error
+                with reading(number):
+                    passed_on = self.urgent(number, frame)
+            except LinkLostError as lost:
+                if lost.peer == number:
+                    self.drop(number)
+                raise
+            if passed_on is not None:
+                raise passed_on
 
     def _lost(self, number: int, error: Exception) -> LinkLostError:
         self.drop(number)
@@ -223,12 +229,12 @@ class Links:
     def drop(self, number: int) -> None:
         """End a connection, if there is one."""
         if number in self._links:
-            self._forget(number).socket.close()
+            self._forget(number).connection.close()
 
     def _forget(self, number: int) -> Link:
         link = self._links.pop(number)
-        self._poll.unregister(link.socket)
-        del self._by_socket[link.socket.fileno()]
+        self._poll.unregister(link.connection)
+        del self._by_place[link.connection.fileno()]
         return link
 
     def end(self, timeout_s: float) -> None:
@@ -248,5 +254,6 @@ class Links:
             self.drop(number)
 
 
-def _unheard(number: int, frame: NodeFrame) -> None:
+def _unheard(number: int, frame: NodeFrame) -> Exception | None:
     """What is of no use any more."""
+    return None

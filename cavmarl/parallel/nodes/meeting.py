@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import select
-import socket
 from collections.abc import Callable, Iterable
 
 from cavmarl.core.errors import MessageError
-from cavmarl.parallel.nodes.links import LinkLostError
-from cavmarl.parallel.nodes.node_system import NodeListener, NodeSystem, Place
+from cavmarl.parallel.network.transport import READS, Connection, Place, TransportListener
+from cavmarl.parallel.nodes.node_system import NodeSystem
+from cavmarl.parallel.nodes.peer_faults import LinkLostError
 
 LOOK_MS = 50.0  # so often it is looked whether those that are awaited still live
 ANSWER_S = 5.0  # for a node to answer a call
@@ -22,22 +21,22 @@ def call_number(number: int, generation: int) -> int:
 
 def calls_of(
     system: NodeSystem,
-    listener: NodeListener,
+    listener: TransportListener,
     wanted: Iterable[int],  # numbers of those that are to call
     generation: int,  # how often nodes have come and gone; calls of other times count no more
     timeout_s: float,
     check: Callable[[], None],  # raises if one will never call
-) -> dict[int, socket.socket]:
+) -> dict[int, Connection]:
     """The connections of all that are awaited; other callers are turned away.
 
     Raises:
         LinkLostError: one has not called in time.
     """
     missing = {call_number(number, generation): number for number in wanted}
-    found: dict[int, socket.socket] = {}
+    found: dict[int, Connection] = {}
     until_s = system.now_s() + timeout_s
     poll = system.poll()
-    poll.register(listener, select.POLLIN)
+    poll.register(listener, READS)
     try:
         while missing:
             check()
@@ -58,13 +57,13 @@ def calls_of(
 
 def call_node(
     system: NodeSystem, place: Place, secret: bytes, number: int, generation: int, of: int
-) -> socket.socket:
+) -> Connection:
     """A connection to node `of` of node `number`.
 
     Raises:
         LinkLostError: it cannot be reached.
     """
     try:
-        return system.call(place, secret, call_number(number, generation), ANSWER_S)
+        return system.open(place, secret, call_number(number, generation), ANSWER_S)
     except (OSError, EOFError, MessageError) as error:
         raise LinkLostError(of) from error

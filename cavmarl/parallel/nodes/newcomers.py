@@ -9,14 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cavmarl.core.errors import WorkerError, WorkerFailureError
+from cavmarl.core.errors import MessageError, WorkerError, WorkerFailureError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.parallel.network.code_stamp import code_stamp
-from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
-from cavmarl.parallel.nodes.links import LinkLostError, Links
+from cavmarl.parallel.network.transport import Place, TransportListener
+from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame, said_by
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_cuts import read_neighbours
 from cavmarl.parallel.nodes.node_files import WorldFile
-from cavmarl.parallel.nodes.node_system import MACHINE, NodeListener, NodeSystem
+from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, read_json, reading
 from cavmarl.parallel.world_errors import own_error
 
 log = logging.getLogger("cavmarl.nodes")
@@ -34,7 +36,7 @@ class Newcomer:
     machine: str = "a machine"
     pid: int = 0  # of its process, there
     is_let_in: bool = False  # it runs what the caller runs
-    place: tuple[str, int] | None = None  # where other nodes can call, once it has loaded the world
+    place: Place | None = None  # where other nodes can call, once it has loaded the world
     neighbours: Neighbours | None = None  # between which zones vehicles change, by that world
 
 
@@ -50,16 +52,17 @@ class Newcomers:
 
     def __init__(
         self,
-        listener: NodeListener,
+        listener: TransportListener,
         job: Any,  # what they are told, as JSON knows it
         files: Sequence[WorldFile],  # that the world is made of
         room: Callable[[], int],  # how many more would be of use
+        zones: int,  # of each world
         system: NodeSystem = MACHINE,
     ) -> None:
         self._listener = listener
         self._job = json.dumps({**job, "files": files}).encode()
         self._files = files
-        self._room = room
+        self._room, self._zones = room, zones
         self._links = Links(self._hear, system)
         self.place = "{}:{}".format(*listener.place)
         self._all: dict[int, Newcomer] = {}
@@ -123,29 +126,36 @@ class Newcomers:
         return self._all.pop(number), self._links.release(number)
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
-        newcomer = self._all[number]
+        newcomer = self._all.get(number)
+        if newcomer is None:  # it has been sent away
+            return
         try:
-            match frame.kind:
-                case FrameKind.JOIN:
-                    self._examine(number, newcomer, json.loads(bytes(frame.data)))
-                case FrameKind.WANTED if newcomer.is_let_in:
-                    self._send_files(number, json.loads(bytes(frame.data)))
-                case FrameKind.READY if newcomer.is_let_in:
-                    host, port, near, may_teleport = json.loads(bytes(frame.data))
-                    newcomer.place = str(host), int(port)
-                    newcomer.neighbours = read_neighbours([near, may_teleport])
-                    self.ready.append(number)
-                case FrameKind.FAILED:
-                    name, text, trace = json.loads(bytes(frame.data))
-                    where = f"node on {newcomer.machine}"
-                    failure = WorkerFailureError(newcomer.asked, where, name, text, trace)
-                    self.failures.append(failure)
-                    log.warning("%s", failure)
-                    self._forget(number)
-                case _:
-                    self._forget(number)
-        except (LinkLostError, ValueError, KeyError, TypeError, IndexError):  # it is no node
+            with reading(number):
+                self._take(number, newcomer, frame)
+        except LinkLostError as lost:  # it is no node
+            log.warning("a caller is sent away: %s", lost)
             self._forget(number)
+
+    def _take(self, number: int, newcomer: Newcomer, frame: NodeFrame) -> None:
+        match frame.kind:
+            case FrameKind.JOIN if not newcomer.is_let_in:
+                self._examine(number, newcomer, read_json(frame.data, dict))
+            case FrameKind.WANTED if newcomer.is_let_in:
+                self._send_files(number, said_by(frame))
+            case FrameKind.READY if newcomer.is_let_in and newcomer.place is None:
+                host, port, near, may_teleport = said_by(frame)
+                newcomer.neighbours = read_neighbours([near, may_teleport], self._zones)
+                newcomer.place = str(host), int(port)
+                self.ready.append(number)
+            case FrameKind.FAILED:
+                name, text, trace = map(str, said_by(frame))
+                where = f"node on {newcomer.machine}"
+                failure = WorkerFailureError(newcomer.asked, where, name, text, trace)
+                self.failures.append(failure)
+                log.warning("%s", failure)
+                self._forget(number)
+            case _:
+                raise MessageError(f"a frame of kind {frame.kind.name} is not its turn")
 
     def _examine(self, number: int, newcomer: Newcomer, told: dict[str, Any]) -> None:
         newcomer.machine, newcomer.pid = str(told["machine"]), int(told["pid"])
@@ -166,6 +176,7 @@ class Newcomers:
         self._forget(number)
 
     def _send_files(self, number: int, wanted: Sequence[int]) -> None:
+        check_indices("file", wanted, len(self._files))
         contents = [Path(self._files[n].path).read_bytes() for n in wanted]
         head = json.dumps([len(content) for content in contents]).encode()
         size = len(head).to_bytes(8, "little")

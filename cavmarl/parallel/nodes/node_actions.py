@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized, unchecked
 from cavmarl.core.errors import MessageError
-from cavmarl.parallel.nodes.link import Bytes
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import UNOWNED, pack_actions, take_actions
 

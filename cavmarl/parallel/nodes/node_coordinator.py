@@ -11,13 +11,17 @@ from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.ledger import DIGEST_BYTES
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Begin, Birth, Message, Nack, Output
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, SilenceError
-from cavmarl.parallel.nodes.zone_hosts import Report, packed, unpacked
+from cavmarl.parallel.nodes.peer_faults import check_indices, reading
+from cavmarl.parallel.nodes.zone_hosts import NOTHING, Report, packed, unpacked
+
+MOST_IDS = 1 << 62  # of vehicles in a run
 
 
 class CrossingDigests:
@@ -170,14 +174,43 @@ class NodeCoordinator:
         for w, message in messages:
             self._take(w, message)
 
-    def check(self, number: int, messages: Sequence[tuple[int, Message]]) -> None:
-        """Raises MessageError: node `number` speaks for a zone that it does not host."""
+    def check(
+        self,
+        number: int,  # of a node
+        messages: Sequence[tuple[int, Message]],
+        reports: Sequence[Report] = (),  # of all worlds, or none
+    ) -> None:
+        """Refuse what a node cannot say.
+
+        Raises:
+            MessageError: it speaks for a zone that it does not host, or of what there is not.
+        """
+        check_indices("world", (w for w, _ in messages), len(self._worlds))
+        for report in reports:
+            self._check_report(number, report)
         for w, message in messages:
             zone, table = getattr(message, "zone", None), self._worlds[w].directory.table
             if zone is None or message.episode != table.episode or message.tick < table.tick:
                 continue
             if not 0 <= zone < len(self._node_of) or self._node_of[zone] != number:
                 raise MessageError(f"node {number} speaks for zone {zone}, which it does not host")
+
+    def _check_report(self, number: int, report: Report) -> None:
+        zones = [zone for _, zone in report.births] + [zone for zone, *_ in report.owned]
+        check_indices("zone", zones, len(self._node_of))
+        check_indices("zone", (zone for _, zone, _ in report.movers), len(self._node_of))
+        if any(self._node_of[zone] != number for zone in zones):
+            raise MessageError(f"node {number} tells of vehicles of a zone that it does not host")
+        check_indices("vehicle", (vehicle for vehicle, _ in report.births), MOST_IDS)
+        for vehicle, _, digest in report.movers:
+            if len(bytes.fromhex(digest)) != DIGEST_BYTES:
+                raise MessageError(f"{digest!r} is no digest of vehicle {vehicle}")
+
+    def _check_movers(self, number: int, w: int, report: Report) -> None:
+        owners = self._worlds[w].directory.table.owners
+        for vehicle, *_ in report.movers:
+            if vehicle not in owners or self._node_of[owners[vehicle][0]] != number:
+                raise MessageError(f"node {number} offers vehicle {vehicle}, which it does not own")
 
     def _take(self, w: int, message: Message) -> None:
         world = self._worlds[w]
@@ -192,8 +225,8 @@ class NodeCoordinator:
 
     def commit(self, reports: Mapping[int, tuple[list[tuple[int, Message]], list[Report]]]) -> None:
         """All nodes are through with the tick, as they report."""
-        if told := [message for messages, _ in reports.values() for message in messages]:
-            self._take_all(told)
+        if any(messages for messages, _ in reports.values()):
+            self._take_all({number: messages for number, (messages, _) in reports.items()})
         every = [report for _, report in reports.values() if report]
         self.is_late = any(one.is_late for report in every for one in report)
         for w, world in enumerate(self._worlds):
@@ -207,19 +240,25 @@ class NodeCoordinator:
             if any(report.began for report in said):
                 world.write(world.directory.reset())
                 world.births, world.has_told = [], False
+            for number, (_, report) in reports.items():
+                with reading(number):
+                    self._check_movers(number, w, report[w] if report else NOTHING)
             movers = [mover for report in said for mover in report.movers]
             world.movers = [(vehicle, target) for vehicle, target, _ in movers]
             world.states.told = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
             world.check_owned(w, said)
 
-    def _take_all(self, told: Sequence[tuple[int, Message]]) -> None:
+    def _take_all(self, told: Mapping[int, Sequence[tuple[int, Message]]]) -> None:
         """Take what nodes say of a tick; those of which nothing is said have changed nothing."""
-        disturbed = [w for w in {w for w, _ in told} if self._worlds[w].directory.is_quiet]
+        worlds = {w for messages in told.values() for w, _ in messages}
+        disturbed = [w for w in worlds if self._worlds[w].directory.is_quiet]
         for w in disturbed:
             self._worlds[w].write(self._worlds[w].directory.break_quiet())
-        for w, message in told:
-            self._take(w, message)
+        for number, messages in told.items():
+            with reading(number):
+                for w, message in messages:
+                    self._take(w, message)
         for w in disturbed:
             self._worlds[w].directory.answer_for_silent()
 
@@ -235,9 +274,10 @@ class NodeCoordinator:
         """
         until_s = self._links.now_s() + timeout_s
         for world in self._worlds:
-            while world.movers and not world.answered.issuperset(world.movers):
+            while missing := set(world.movers) - world.answered:
                 if self._links.now_s() > until_s:
-                    raise SilenceError(f"offers are not answered within {timeout_s:g} s")
+                    targets = {self._node_of[zone] for _, zone in missing}
+                    raise SilenceError(f"offers are not answered within {timeout_s:g} s", targets)
                 self._links.pump(1e3 * timeout_s)
         lease, messages = dict.fromkeys(self._node_of, b""), self._decide()
         return lease | self._by_node(messages) if messages else lease

@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cavmarl.core.errors import MessageError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff.repartitioning import propose_cut
 from cavmarl.handoff.shard_setup import neighbours_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.parallel.nodes.node_actions import ZoneRects
 from cavmarl.parallel.nodes.node_peers import NodePeers
+from cavmarl.parallel.nodes.peer_faults import check_indices
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
@@ -56,8 +58,13 @@ def told_neighbours(simulation: Simulation) -> list[Any]:
     return [list(map(sorted, near)), may_teleport]
 
 
-def read_neighbours(told: Sequence[Any]) -> Neighbours:
+def read_neighbours(told: Sequence[Any], zones: int) -> Neighbours:
+    """The same, read. Raises MessageError: it tells of other zones than there are."""
     near, may_teleport = told
+    if len(near) != zones:
+        raise MessageError(f"it tells of {len(near)} zones: there are {zones}")
+    for some in near:
+        check_indices("zone", some, zones)
     return Neighbours(tuple(map(frozenset, near)), bool(may_teleport))
 
 
@@ -78,4 +85,4 @@ def cut_worlds(simulation: Simulation, peers: NodePeers, told: Sequence[Sequence
     with peers.whole(simulation):
         vehicles = [division.vehicles(w).copy() for w in range(division.num_worlds)]
         contacts = division.contacts()
-    simulation.cut(read_zones(told), vehicles, contacts)
+    simulation.zones.repartition(read_zones(told), vehicles, contacts)

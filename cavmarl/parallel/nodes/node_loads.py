@@ -16,6 +16,7 @@ from cavmarl.balance.probe import Watch
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.nodes.links import Links
 
+TOTALS = 7  # numbers that a node says of itself
 TO_SHOW, TO_BALANCE = "to show", "to balance"  # for what nodes are asked about their machines
 
 

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
+from cavmarl.parallel.nodes.peer_faults import reading
 from cavmarl.v2x.bus import Bus
 from cavmarl.v2x.kernels.v2x_records import PACKET, RECEIVER
 from cavmarl.v2x.v2x_messages import RECEPTION, Exchange, NetworkSimulator, check_receptions
@@ -68,7 +70,12 @@ class AskedNetwork:
             while self._heard:
                 frame = self._heard.popleft()
                 if frame.number == self._generation:
-                    return np.frombuffer(frame.data, RECEPTION)
+                    with reading(COORDINATOR):
+                        found = np.frombuffer(frame.data, RECEPTION)
+                        latency = len(self._bus.mail.num_packets[sent.world]) - 1
+                        return check_receptions(
+                            found, sent, latency, self._bus.mail.num_packets[sent.world]
+                        )
             links.heed()
             links.pump(None)
 

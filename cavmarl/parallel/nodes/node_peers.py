@@ -21,9 +21,12 @@ from cavmarl.core.records.codes import (
     POS_LAST,
 )
 from cavmarl.engine.simulation import Simulation
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.agent_stream import AgentStream
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
-from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
+from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, reading
+from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.parallel.nodes.row_stream import RowStream, forecast_of, passing_of
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 from cavmarl.zones.kernels.row_frames import Passing, count_own
@@ -39,6 +42,7 @@ class NodePeers:
     Attributes:
         own: (W, A) agents that this node has sensed for last.
         stepped: the same at the end of the last step, before worlds began anew.
+        checks: what rows of other nodes have to be like.
         owner: (W · A,) the node that has sensed for each agent last; `UNOWNED`: none.
     """
 
@@ -71,7 +75,9 @@ class NodePeers:
         self._rerouted = np.zeros(self._num_worlds, dtype=np.int64)
         mine = (self._zoned, self._mine)
         clock = simulation.config.clock
-        law = forecast_of(shard.roads, clock.sim_dt_s, clock.ticks_per_step)
+        self.checks = checks = RowChecks(simulation)
+        bounds = checks.of_rows, checks.of_ghosts
+        law = forecast_of(shard.roads, clock.sim_dt_s, clock.ticks_per_step, *bounds)
         self._rows = {
             n: RowStream(*mine, self._zones[n], self._running, self._rerouted, law)
             for n in self._others
@@ -116,7 +122,10 @@ class NodePeers:
         self.owner[:] = UNOWNED
         self.owner[mine] = self._number
         for number, data in self._swap([mine.data]):
-            self.owner[np.frombuffer(data, np.int64)] = number
+            with reading(number):
+                agents = np.frombuffer(data, np.int64)
+                check_indices("agent", agents, self.owner.size)
+            self.owner[agents] = number
 
     def share_rows(self, gate: Gate, side: int) -> None:
         if gate is not self._gate:
@@ -127,10 +136,8 @@ class NodePeers:
             send(to, _SHARE, due, (rows.packed(side, passing),))
         for number, rows in self._rows.items():
             data = self._share_of(number)
-            try:
+            with reading(number):
                 rows.take(data, side, passing)
-            except MessageError as error:
-                raise LinkLostError(number, error) from error
 
     def running(self) -> NDArray[np.int64]:
         if not self._others:
@@ -151,9 +158,10 @@ class NodePeers:
         if not asks.any():
             return
         ranks, last_s = gate.ranks[:, :longest][asks], gate.last_s[:, :longest][asks]
-        for _, data in self._swap([ranks.data, last_s.data]):
-            theirs, at = _read(data, 0, ranks.dtype, ranks.size)
-            theirs_s, _ = _read(data, at, last_s.dtype, last_s.size)
+        for number, data in self._swap([ranks.data, last_s.data]):
+            with reading(number):
+                theirs, at = _read(data, 0, ranks.dtype, ranks.size)
+                theirs_s, _ = _read(data, at, last_s.dtype, last_s.size)
             np.maximum(ranks, theirs.reshape(ranks.shape), out=ranks)
             np.maximum(last_s, theirs_s.reshape(last_s.shape), out=last_s)
         gate.ranks[:, :longest][asks] = ranks
@@ -162,16 +170,20 @@ class NodePeers:
     def share_proposals(self, gate: Gate) -> None:
         places = [gate.places[w, :num] for w, num in enumerate(gate.num_passing.tolist())]
         pieces = [*self._passing(gate), np.concatenate(places).data]
-        for _, data in self._swap(pieces):
+        for number, data in self._swap(pieces):
             before = gate.num_passing.copy()
-            at = self._add_passing(gate, data, 0)
-            for w in range(self._num_worlds):
-                first, last = int(before[w]), int(gate.num_passing[w])
-                gate.places[w, first:last], at = _read(data, at, np.int64, last - first)
+            with reading(number):
+                at = self._add_passing(gate, data, 0)
+                for w in range(self._num_worlds):
+                    first, last = int(before[w]), int(gate.num_passing[w])
+                    found, at = _read(data, at, np.int64, last - first)
+                    check_indices("place in the queue", found, int(gate.num_queue[w]))
+                    gate.places[w, first:last] = found
 
     def share_leavers(self, gate: Gate) -> None:
-        for _, data in self._swap(self._passing(gate)):
-            self._add_passing(gate, data, 0)
+        for number, data in self._swap(self._passing(gate)):
+            with reading(number):
+                self._add_passing(gate, data, 0)
 
     def _passing(self, gate: Gate) -> list[Bytes]:
         """How many vehicles pass the gate of each world, and their rows."""
@@ -182,9 +194,11 @@ class NodePeers:
     def _add_passing(self, gate: Gate, data: memoryview, at: int) -> int:
         counts, at = _read(data, at, np.int64, self._num_worlds)
         for w, num in enumerate(counts.tolist()):
+            first = gate.num_passing.item(w)
+            check_indices("row of the gate", [num], 1 + gate.passing.shape[1] - first)
             if num:
-                first = gate.num_passing.item(w)
                 rows, at = _read(data, at, gate.passing.dtype, num)
+                self.checks.check(rows)
                 gate.passing[w, first : first + num] = rows
                 gate.num_passing[w] = first + num
         return at
@@ -195,10 +209,14 @@ class NodePeers:
         seen = worlds.detected_s
         changed = np.flatnonzero(seen.reshape(-1) != self._seen_s.reshape(-1))
         times = seen.reshape(-1)[changed]
-        for _, data in self._swap([np.int64(changed.size).tobytes(), changed.data, times.data]):
-            (num,), at = _read(data, 0, np.int64, 1)
-            where, at = _read(data, at, np.int64, int(num))
-            seen.reshape(-1)[where], _ = _read(data, at, np.float64, int(num))
+        told: list[Bytes] = [np.int64(changed.size).tobytes(), changed.data, times.data]
+        for number, data in self._swap(told):
+            with reading(number):
+                (num,), at = _read(data, 0, np.int64, 1)
+                where, at = _read(data, at, np.int64, int(num))
+                check_indices("detector", where, seen.size)
+                found, _ = _read(data, at, np.float64, int(num))
+            seen.reshape(-1)[where] = found
         self._seen_s[...] = seen
 
     def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
@@ -207,10 +225,8 @@ class NodePeers:
             self._is_stepping = False
             self.stepped[...] = self.own
         for number, data in self._swap([told]):
-            try:
+            with reading(number):
                 self._agents.take(data, number, self.owner)
-            except MessageError as error:
-                raise LinkLostError(number, error) from error
 
     @contextmanager
     def everybody(self, gate: Gate, side: int) -> Iterator[None]:
@@ -228,12 +244,14 @@ class NodePeers:
         with self._rows_of_all(simulation.division.side):
             pieces: list[Bytes] = [np.int64(len(mine)).tobytes(), mine.data]
             pieces += [_bytes(_by_agent(array)[mine]) for array in arrays]
-            for _, data in self._swap(pieces):
-                (num,), at = _read(data, 0, np.int64, 1)
-                agents, at = _read(data, at, np.int64, int(num))
-                for array in map(_by_agent, arrays):
-                    found, at = _read(data, at, array.dtype, int(num) * array[0].size)
-                    array[agents] = found.reshape(int(num), *array.shape[1:])
+            for number, data in self._swap(pieces):
+                with reading(number):
+                    (num,), at = _read(data, 0, np.int64, 1)
+                    agents, at = _read(data, at, np.int64, int(num))
+                    check_indices("agent", agents, self.own.size)
+                    for array in map(_by_agent, arrays):
+                        found, at = _read(data, at, array.dtype, int(num) * array[0].size)
+                        array[agents] = found.reshape(int(num), *array.shape[1:])
             yield
 
     def _agents_of(self, side: int) -> Array:
@@ -259,10 +277,15 @@ class NodePeers:
         pieces = [*map(_bytes, numbers), *map(_bytes, filter(len, owned))]
         for number, data in self._swap(pieces):
             zone = self._zones[number][0]
-            zoned.num_owned[zone], at = _read(data, 0, np.int64, self._num_worlds)
-            zoned.num_contacts[zone], at = _read(data, at, np.int64, self._num_worlds)
-            for w, num in enumerate(zoned.num_owned[zone].tolist()):
-                zoned.rows[side, zone, w, :num], at = _read(data, at, zoned.rows.dtype, num)
+            with reading(number):
+                owned_there, at = _read(data, 0, np.int64, self._num_worlds)
+                contacts, at = _read(data, at, np.int64, self._num_worlds)
+                check_indices("row", owned_there, 1 + zoned.rows.shape[3])
+                for w, num in enumerate(owned_there.tolist()):
+                    rows, at = _read(data, at, zoned.rows.dtype, num)
+                    self.checks.check(rows)
+                    zoned.rows[side, zone, w, :num] = rows
+            zoned.num_owned[zone], zoned.num_contacts[zone] = owned_there, contacts
         try:
             yield
         finally:
@@ -289,7 +312,8 @@ class NodePeers:
         if kind is FrameKind.SYNC:
             self._links.put_back(number, NodeFrame(kind, which, data))
             raise RecoveryOrderedError(None)
-        raise AssertionError(f"node {number} is at {kind, which}, not at share {self._sent}")
+        error = MessageError(f"it is at {kind.name} {which}, not at share {self._sent}")
+        raise LinkLostError(number, error)
 
 
 def _by_agent(array: Array) -> Array:
@@ -303,8 +327,14 @@ def _bytes(array: Array) -> Bytes:
 
 
 def _read(data: memoryview, at: int, kind: DTypeLike, num: int) -> tuple[Array, int]:
-    """An array (num,) of a frame, as a view, and where it ends."""
+    """An array (num,) of a frame, as a view, and where it ends.
+
+    Raises:
+        MessageError: the frame ends before that.
+    """
     dtype = np.dtype(kind)
+    if not 0 <= num <= (len(data) - at) // dtype.itemsize:
+        raise MessageError(f"{len(data)} bytes do not have {num} more of {dtype.itemsize}")
     return np.frombuffer(data, dtype, num, at) if num else np.zeros(0, dtype), at + (
         num * dtype.itemsize
     )

@@ -6,20 +6,14 @@ import json
 import logging
 import math
 import os
-import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import (
-    MessageError,
-    ProtocolError,
-    WorkerDeathError,
-    WorkerError,
-    WorkerFailureError,
-)
+from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError, WorkerFailureError
 from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
@@ -27,10 +21,11 @@ from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.kept_states import KEPT
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame, said_by
-from cavmarl.parallel.nodes.links import LinkLostError, Links
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.newcomers import Newcomer
 from cavmarl.parallel.nodes.node_actions import NodeCommand, ZoneRects, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
@@ -39,6 +34,7 @@ from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
 from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
 from cavmarl.parallel.nodes.zone_moves import (
     ZoneMoves,
@@ -56,6 +52,11 @@ log = logging.getLogger("cavmarl.nodes")
 KEEP_S = 0.2  # so much of work may have to be done again
 END_S = 1.0  # for nodes to hear that they are needed no more
 
+Found = TypeVar("Found")
+
+Read: TypeAlias = Callable[[int, memoryview], Found]
+"""Reads what the node of a number has found."""
+
 
 class NodePool:
     """The nodes of W worlds, the same zones of each at each node, and what they are to do.
@@ -63,7 +64,7 @@ class NodePool:
     Attributes:
         zones: that each node hosts.
         pids: of the nodes' processes, each on its machine.
-        tellers: numbers of the nodes of the last results.
+        teller: number of the node that tells what all know alike.
         owner: (W · A,) the node that owns each agent, as far as is known.
         partition: the zones' rectangles, as `node_cuts.told_zones` gives them.
         coordinator: of the ownership of vehicles.
@@ -80,7 +81,6 @@ class NodePool:
     """
 
     owner: NDArray[np.int32]
-    tellers: Sequence[int] = ()
     _performed: NodeCommand | None = None  # what they do now
     _exchanged = 0  # answers of a network simulator that nodes have got in the present command
 
@@ -108,7 +108,7 @@ class NodePool:
         self._max_retries = config.workers.max_retries
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
-        self._num_ids = config.population.num_ids
+        self._num_ids, self._num_zones = config.population.num_ids, world.partition.count
         self._partition = told_zones(world.partition)
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
@@ -128,7 +128,7 @@ class NodePool:
         """Have worlds that have not begun."""
         self.zones = self._homes
         self._living = living_of(self.zones)
-        self._teller = 0
+        self.teller = 0
         self._cut = ZoneCut(self._partition, Neighbours(()))
         # What all nodes can go back to, and what they keep before the next command.
         self._state = PoolState(self._next_state, self.zones, 0, self._cut)
@@ -194,6 +194,11 @@ class NodePool:
         return [self._nodes[number].pid for number in sorted(self._nodes)]
 
     @property
+    def first(self) -> int:
+        """The number of the node that answers what only one of them has to."""
+        return self._living[0]
+
+    @property
     def num_nodes(self) -> int:
         """How many nodes host zones if none is lost."""
         return len(self._homes)
@@ -238,8 +243,15 @@ class NodePool:
 
     # Commands, and what becomes of them when nodes are lost
 
-    def run(self, command: NodeCommand) -> list[memoryview]:
-        """Let all nodes do a command; what each has found, by rising numbers.
+    def run(self, command: NodeCommand, read: Read[Found]) -> list[Found]:
+        """Let all nodes do a command.
+
+        Args:
+            command: what they are to do.
+            read: reads what a node has found, of a number; what fails in it is that node's fault.
+
+        Returns:
+            what was read, first of all of the node that tells what all know alike.
 
         Raises:
             WorkerDeathError: no node has kept the zones of lost ones, or too many were lost.
@@ -252,7 +264,7 @@ class NodePool:
         if command.changes:
             self._log.append(command)
         try:
-            results = self._insist(command)
+            results = self._insist(command, read)
         except BaseException:  # it is as if the command had never been given
             self._is_torn, self._opened = True, None
             if command.changes:
@@ -274,12 +286,12 @@ class NodePool:
         before, self._homes = self._homes, zones
         self._is_torn, self._opened = True, None
         try:
-            self._insist(None)
+            self._insist(None, unread)
         except BaseException:
             self._homes = before
             raise
 
-    def _insist(self, command: NodeCommand | None) -> list[memoryview]:
+    def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
         """Do a command, or none, again and again, until no node is lost meanwhile."""
         while True:
             try:
@@ -288,9 +300,17 @@ class NodePool:
                     changes = command is not None and command.changes
                     for one in self._log[: -1 if changes else None]:
                         self._perform(one)
-                return [] if command is None else self._perform(command)
+                return [] if command is None else self._read(self._perform(command), read)
             except LinkLostError as lost:
                 self._lose(lost)
+
+    def _read(self, results: Mapping[int, memoryview], read: Read[Found]) -> list[Found]:
+        """Read what nodes have found. Raises LinkLostError: one has found what cannot be."""
+        found = []
+        for number, data in results.items():
+            with reading(number):
+                found.append(read(number, data))
+        return found
 
     def _replace_lost(self) -> bool:  # whether the worlds go back for that
         """Let nodes that have joined meanwhile host what lost ones had.
@@ -316,8 +336,8 @@ class NodePool:
         self._opened = PoolState(self._next_state, self.zones, switched, self._cut)
         self._next_state += 1
 
-    def _perform(self, command: NodeCommand) -> list[memoryview]:
-        """Do a command once. Raises LinkLostError: a node is lost."""
+    def _perform(self, command: NodeCommand) -> dict[int, memoryview]:
+        """Do a command once; what each node has found. Raises LinkLostError: one is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         self._performed, self._exchanged = command, 0
         leases = leases_of(command.ticks, self._lease_ticks)
@@ -326,14 +346,16 @@ class NodePool:
             pieces = command.of_node(number, self.owner, lease.get(number, b""))
             self._links.send(number, FrameKind.COMMAND, kept, pieces)
         if not command.changes:
-            return [frame.data for frame in self._take(FrameKind.RESULT).values()]
+            return {n: frame.data for n, frame in self._take(FrameKind.RESULT).items()}
         results = self._commit()
         for _ in range(1, leases):
             self.coordinator.lease(self._begin_lease(), self._ticks_per_step)
             results = self._commit()
         if command.cut is not None:
-            self._cut = ZoneCut(command.cut, read_neighbours(json.loads(bytes(results[0]))))
-            self.coordinator.know(self._cut.neighbours)
+            with reading(self.teller):
+                near = read_neighbours(read_json(results[self.teller], list), self._num_zones)
+            self._cut = ZoneCut(command.cut, near)
+            self.coordinator.know(near)
         return results
 
     def _begin_lease(self) -> dict[int, bytes]:
@@ -346,30 +368,42 @@ class NodePool:
             lease = decide()
         return lease
 
-    def _hear(self, number: int, frame: NodeFrame) -> None:
-        """Take an urgent frame; an error of a node is raised here."""
-        if frame.kind is FrameKind.MISSED:
-            peer = int.from_bytes(frame.data, "little")
-            if frame.number == self.generation and peer in self._nodes:
-                self._watch.hear_missed(number, peer)
-        elif frame.kind is FrameKind.FAILED:
-            name, text, trace = said_by(frame)
-            failure = WorkerFailureError(number, name_of(self._homes[number]), name, text, trace)
-            raise own_error(failure) from failure
-        elif frame.kind is FrameKind.PONG:
-            self._watch.hear_pong(number, frame)
-        elif frame.kind is FrameKind.KEEP:
-            self._kept[frame.number] = frame.data
-            for old in sorted(self._kept)[:-KEPT]:
-                del self._kept[old]
-        elif frame.kind is FrameKind.EXCHANGE:
-            if frame.number == self.generation:
-                self._exchange(frame)
-        elif frame.kind is FrameKind.NOT_MINE:
-            if frame.number == self.generation:
-                self._send_on(frame)
-        else:
-            self.coordinator.hear(number, frame)
+    def _hear(self, number: int, frame: NodeFrame) -> Exception | None:
+        """Take an urgent frame.
+
+        Returns:
+            an error of a node, for the caller.
+        """
+        is_present = frame.number == self.generation
+        match frame.kind:
+            case FrameKind.MISSED:
+                peer = int.from_bytes(frame.data, "little")
+                if is_present and peer in self._nodes:
+                    self._watch.hear_missed(number, peer)
+            case FrameKind.FAILED:
+                name, text, trace = map(str, said_by(frame))
+                part = name_of(self._homes[number])
+                failure = WorkerFailureError(number, part, name, text, trace)
+                found = own_error(failure)
+                found.__cause__ = None if found is failure else failure
+                return found
+            case FrameKind.PONG:
+                self._watch.hear_pong(number, frame)
+            case FrameKind.KEEP:
+                self._kept[frame.number] = frame.data
+                for old in sorted(self._kept)[:-KEPT]:
+                    del self._kept[old]
+            case FrameKind.EXCHANGE:
+                if is_present:
+                    self._exchange(frame)
+            case FrameKind.NOT_MINE:
+                if is_present:
+                    self._send_on(frame)
+            case FrameKind.MESSAGES:
+                self.coordinator.hear(number, frame)
+            case _:
+                raise MessageError(f"a node sends no frame of kind {frame.kind.name}")
+        return None
 
     def _exchange(self, frame: NodeFrame) -> None:
         """Tell all nodes what stations receive; of a step that is done again, what they did.
@@ -507,10 +541,10 @@ class NodePool:
     def _first_teller(self) -> int:
         """The node that tells what all know alike: one that has been there in the last step."""
         old = [number for number in self._living if number not in self._new]
-        self._teller = self._teller if self._teller in old else (old or self._living)[0]
-        return self._teller
+        self.teller = self.teller if self.teller in old else (old or self._living)[0]
+        return self.teller
 
-    def _commit(self) -> list[memoryview]:
+    def _commit(self) -> dict[int, memoryview]:
         """Wait for the nodes to be through with a tick.
 
         Returns:
@@ -519,18 +553,15 @@ class NodePool:
         Raises:
             LinkLostError: one is lost, or has sent what cannot be.
         """
-        told, results = {}, []
+        told, results = {}, {}
         frames = self._take(FrameKind.REPORT)
-        for number in sorted(frames, key=self._teller.__ne__):  # else by rising numbers
-            try:
+        for number in sorted(frames, key=self.teller.__ne__):  # else by rising numbers
+            with reading(number):
                 messages, said, more = read_report(frames[number].data, len(self._runs))
-                self.coordinator.check(number, messages)
-            except (ValueError, TypeError, struct.error, ProtocolError) as error:
-                raise LinkLostError(number, MessageError(f"no report: {error}")) from error
+                self.coordinator.check(number, messages, said)
             told[number] = messages, said
-            results.append(more)
+            results[number] = more
         self.coordinator.commit(told)
-        self.tellers = list(told)
         return results
 
     def close(self) -> None:
@@ -541,5 +572,10 @@ class NodePool:
         self.coordinator.close()
 
 
-def _nothing(number: int, frame: NodeFrame) -> None:
+def unread(number: int, data: memoryview) -> None:
+    """What a node has found is of no use."""
+
+
+def _nothing(number: int, frame: NodeFrame) -> Exception | None:
     """Before a tick there are no messages."""
+    return None

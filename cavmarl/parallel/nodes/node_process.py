@@ -20,10 +20,11 @@ from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.code_stamp import code_stamp
+from cavmarl.parallel.network.transport import Bytes, Place
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.kept_states import KeptStates
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NeededNoMoreError, NodeFrame
-from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
+from cavmarl.parallel.nodes.link import FrameKind, NeededNoMoreError, NodeFrame
+from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_actions import ActionsTaken, refusal
 from cavmarl.parallel.nodes.node_cuts import cut_worlds, proposal_of, read_zones, told_neighbours
@@ -39,8 +40,9 @@ from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_network import AskedNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of
-from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
+from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of, unpacked
+from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of, read_order
 from cavmarl.parallel.tasks import WORLD_TASKS, Task, WorldTask, commands_of
 
 MEASURED_TICKS = 10  # one of so many shows what zones cost
@@ -82,6 +84,8 @@ class NodeProgram:
         zones: that it hosts.
     """
 
+    _kept: KeptStates  # once it has begun
+
     def __init__(self, system: NodeSystem, links: Links, address: str, secret: bytes) -> None:
         self.zones: tuple[int, ...] = ()
         self._system, self._links = system, links
@@ -111,8 +115,9 @@ class NodeProgram:
         links = self._links
         told = {"code": code_stamp(), "machine": socket.gethostname(), "pid": os.getpid()}
         links.send(COORDINATOR, FrameKind.JOIN, 0, [json.dumps(told).encode()])
-        job = json.loads(bytes(self._take(FrameKind.JOB)))
-        files = [WorldFile(*told) for told in job["files"]]
+        with reading(COORDINATOR):
+            job = read_json(self._take(FrameKind.JOB), dict)
+            files = [WorldFile(*told) for told in job["files"]]
         self._fetch(files)
         recipe = recipe_with(job["recipe"], files)
         worlds = self._system.worlds_of(recipe, DIFFERENT, job["num_worlds"], job["in_next_step"])
@@ -138,11 +143,12 @@ class NodeProgram:
         if not wanted:
             return
         self._links.send(COORDINATOR, FrameKind.WANTED, 0, [json.dumps(wanted).encode()])
-        data = self._take(FrameKind.FILES)
-        at = 8 + int.from_bytes(data[:8], "little")
-        for n, size in zip(wanted, json.loads(bytes(data[8:at])), strict=True):
-            files[n].keep(bytes(data[at : at + size]))
-            at += size
+        with reading(COORDINATOR):
+            data = self._take(FrameKind.FILES)
+            at = 8 + int.from_bytes(data[:8], "little")
+            for n, size in zip(wanted, read_json(data[8:at], list), strict=True):
+                files[n].keep(bytes(data[at : at + size]))
+                at += size
 
     def _take(self, kind: FrameKind) -> memoryview:
         """What the caller sends next, while it may send this node away."""
@@ -168,7 +174,8 @@ class NodeProgram:
         settings, division = simulation.config.zones, simulation.division
         self._hosts = ZoneHosts(
             division, mine, nodes_of(zones), told, limits_of(settings, division.codec.schema),
-            self._links, carried, generation, settings.check_invariants, self._lease_ticks,
+            self._links, carried, self._peers.checks, generation, settings.check_invariants,
+            self._lease_ticks,
         )  # fmt: skip
         self._run_own()
 
@@ -181,25 +188,29 @@ class NodeProgram:
         self._clock = ShardClock(own, MEASURED_TICKS) if every else None
         plain = NodeExecutor(own, foreign)
         executor = plain if self._clock is None else TimedNodeExecutor(plain, self._clock)
-        simulation.share(self._peers, self._hosts, executor)
+        simulation.zones.host_zones(self._peers, self._hosts, executor)
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
-        if frame.kind is FrameKind.KEEP:
-            self._kept.take(number, frame)
-        elif frame.kind is FrameKind.AGENT:
-            self._hosts.keep_agent(frame)
-        elif frame.kind is FrameKind.ACTIONS:
-            self._actions.append(frame)
-        elif frame.kind is FrameKind.RECEPTIONS and self._network is not None:
-            self._network.hear(frame)
-        elif frame.kind is FrameKind.GIVE:
-            self._kept.take_given(number, frame)
-        elif frame.kind is FrameKind.PING:
-            said = json.dumps(self._links.awaited).encode()
-            self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
-        else:
-            self._hosts.hear(number, frame)
+        is_caller = number == COORDINATOR
+        match frame.kind:
+            case FrameKind.MESSAGES:
+                self._hosts.hear(number, frame)
+            case FrameKind.KEEP if not is_caller:
+                self._kept.take(number, frame)
+            case FrameKind.AGENT if not is_caller:
+                self._hosts.keep_agent(frame)
+            case FrameKind.GIVE if not is_caller:
+                self._kept.take_given(number, frame)
+            case FrameKind.ACTIONS if is_caller:
+                self._actions.append(frame)
+            case FrameKind.RECEPTIONS if is_caller and self._network is not None:
+                self._network.hear(frame)
+            case FrameKind.PING if is_caller:
+                said = json.dumps(self._links.awaited).encode()
+                self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
+            case _:
+                raise MessageError(f"it sends no frame of kind {frame.kind.name}")
 
     def serve(self) -> NoReturn:
         """Do what the coordinator asks for.
@@ -214,7 +225,9 @@ class NodeProgram:
                 if frame.kind is FrameKind.RECOVER:
                     self._recover(frame)
                 elif frame.kind is FrameKind.LEASE:
-                    self._hosts.note(frame.data)
+                    with reading(COORDINATOR):
+                        leased = unpacked(frame.data)
+                    self._hosts.note(leased)
                 else:
                     self._perform(frame)
             except RecoveryOrderedError as ordered:
@@ -247,17 +260,22 @@ class NodeProgram:
 
     def _recover(self, frame: NodeFrame) -> None:
         """Begin, or go back to a state that was kept, with the zones that the coordinator names."""
-        links, data = self._links, frame.data
-        at = 8 + int.from_bytes(data[:8], "little")
-        told = json.loads(bytes(data[8:at]))
+        links, data, before = self._links, frame.data, self._worlds
+        with reading(COORDINATOR):
+            at = 8 + int.from_bytes(data[:8], "little")
+            told = read_order(data[8:at], before.world.partition.count)
+            partition = read_zones(told["partition"])
         self._generation = frame.number
-        before = self._worlds
-        if told["num_worlds"] != len(before.arrays.mask) or (told["begins"] and self._number >= 0):
-            self._run_worlds(before.of_number(told["num_worlds"]))
+        is_new, num_worlds = self._number < 0, told["num_worlds"]
+        if num_worlds != len(before.arrays.mask) or (told["begins"] and not is_new):
+            self._run_worlds(before.of_number(num_worlds))
             before.close()
-        if self._number < 0 or self._worlds is not before:
-            self._number = int(told["number"])
+            if not is_new:
+                self._kept.begin_anew(self._worlds, self._logs)
+        if is_new or self._worlds is not before:
+            self._number = told["number"]
             self._taken = ActionsTaken(self._worlds.arrays, self._number)
+        if is_new:
             self._kept = KeptStates(self._worlds, self._logs, links, self._number)
             links.urgent = self._hear
         self._tells = told["first"] == self._number
@@ -267,9 +285,13 @@ class NodeProgram:
             links.drop(number)
         zones = told["zones"]
         others = [node for node, some in enumerate(zones) if some and node != self._number]
-        self._meet({node: (host, port) for node, (host, port) in told["places"]}, others)
-        self._worlds.simulation.divide(read_zones(told["partition"]))
+        self._meet(told["places"], others)
+        self._worlds.simulation.zones.set_zones(partition)
         self._share(zones, told["runs"], told["hostings"], frame.number)
+        state, mine = told["state"], zones[self._number]
+        if told["begins"]:  # what is kept elsewhere has come when the SYNC after it comes
+            self._peers.keep_own(self._worlds.simulation.everywhere)
+            self._kept.keep(state, self._living)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
         for node in others:
@@ -277,20 +299,17 @@ class NodeProgram:
                 found = links.next(node)
                 if found.kind is FrameKind.SYNC and found.number == frame.number:
                     break
-        state, mine = int(told["state"]), zones[self._number]
-        if told["begins"]:
-            self._peers.keep_own(self._worlds.simulation.everywhere)
-            self._kept.keep(state, self._living)
-        else:
+        if not told["begins"]:
             if len(data) > at:
-                self._kept.take_over(state, data[at:])
+                with reading(COORDINATOR):
+                    self._kept.take_over(state, data[at:])
             adopted = [number for number, heir in told["heirs"] if heir == self._number]
             donors = [donor for donor, taker in told["donors"] if taker == self._number]
             takers = [taker for donor, taker in told["donors"] if donor == self._number]
             self._kept.load(state, adopted, donors, takers, mine, self._generation, self._check)
         self._hosts.report()
 
-    def _meet(self, places: Mapping[int, tuple[str, int]], others: Sequence[int]) -> None:
+    def _meet(self, places: Mapping[int, Place], others: Sequence[int]) -> None:
         """Connect with new nodes, by their places; of two of them the higher one calls.
 
         Raises:
@@ -306,8 +325,11 @@ class NodeProgram:
                 found = call_node(self._system, places[other], self._secret, number, times, other)
                 links.add(other, found)
         if is_new:
-            callers = [node for node in others if node not in places or node > number]
+            links.wanted = callers = [
+                node for node in others if node not in places or node > number
+            ]
             called = calls_of(self._system, self._listener, callers, times, MEETING_S, self._check)
+            links.wanted = ()
             for other, connection in called.items():
                 links.add(other, connection)
 
@@ -318,7 +340,10 @@ class NodeProgram:
             raise RecoveryOrderedError(None)
 
     def _perform(self, frame: NodeFrame) -> None:
-        task, payload, at = command_of(frame.data)
+        with reading(COORDINATOR):
+            if frame.kind is not FrameKind.COMMAND:
+                raise MessageError(f"it sends no frame of kind {frame.kind.name} here")
+            task, payload, at = command_of(frame.data)
         self._kept.settle()
         if frame.number:
             self._kept.keep(frame.number, self._living)
@@ -330,19 +355,26 @@ class NodeProgram:
     def _step(self, payload: None, data: memoryview, at: int) -> None:
         worlds = self._worlds
         at = self._await_actions(data, at)
-        at = self._inputs.take(Task.STEP, data, at)
-        self._hosts.lease(data[at:])
+        with reading(COORDINATOR):
+            at = self._inputs.take(Task.STEP, data, at)
+            leased = unpacked(data[at:])
+        self._hosts.lease(leased)
         self._peers.begin_step()
         worlds.step(self._commands)
         self._hosts.report([self._results_of(worlds.simulation.everywhere, of_step=True)])
 
     def _reset(self, payload: Any, data: memoryview, at: int) -> None:
-        self._inputs.take(Task.RESET, data, at)
-        WORLD_TASKS[Task.RESET].perform(self._worlds, payload)
+        task = WORLD_TASKS[Task.RESET]
+        with reading(COORDINATOR):
+            self._inputs.take(Task.RESET, data, at)
+            told = task.read(payload, 0)
+        task.method(self._worlds, **told)
         self._hosts.report([self._results_of(self._worlds.arrays.chosen, of_step=False)])
 
     def _load(self, payload: Any, data: memoryview, at: int) -> None:
-        WORLD_TASKS[Task.LOAD].perform(self._worlds, saved_of(payload))
+        with reading(COORDINATOR):
+            saved = saved_of(payload)
+        WORLD_TASKS[Task.LOAD].perform(self._worlds, saved)
         self._hosts.report()
 
     def _cut(self, payload: Any, data: memoryview, at: int) -> None:
@@ -377,7 +409,8 @@ class NodeProgram:
         """
         taken, owner = self._taken, self._peers.owner
         taken.begin(owner)
-        wrong, end = taken.take(data, at, owner)
+        with reading(COORDINATOR):
+            wrong, end = taken.take(data, at, owner)
         if len(wrong):
             said = refusal(wrong, owner)
             self._links.send(COORDINATOR, FrameKind.NOT_MINE, self._generation, said)
@@ -385,7 +418,8 @@ class NodeProgram:
             while self._actions:
                 late = self._actions.popleft()
                 if late.number == self._generation:
-                    taken.take(late.data, 0, owner)
+                    with reading(COORDINATOR):
+                        taken.take(late.data, 0, owner)
             if taken.are_due:
                 self._links.heed()
                 self._links.pump(None)
@@ -419,12 +453,13 @@ class NodeProgram:
         return self._generation
 
 
-def _ignore(number: int, frame: NodeFrame) -> None:
+def _ignore(number: int, frame: NodeFrame) -> Exception | None:
     """Before a node has begun, it hears no messages of the protocol."""
+    return None
 
 
 def run_node(
-    place: tuple[str, int],  # where the caller listens
+    place: Place,  # where the caller listens
     secret: bytes,
     number: int,  # that it would have; ANYONE: any
     note: Callable[[str], None] = lambda text: None,  # what is told of its life
@@ -441,8 +476,8 @@ def run_node(
         MessageError: what listens there does not know the secret, or speaks another version.
         NodeRefusedError: the caller does not want it.
     """
-    connection = system.call(place, secret, number, None)
-    address = str(connection.getsockname()[0])
+    connection = system.open(place, secret, number, None)
+    address = connection.address
     links = Links(_ignore, system)
     links.add(COORDINATOR, connection)
     node = NodeProgram(system, links, address, secret)
@@ -473,7 +508,7 @@ def run_node(
         links.close()
 
 
-def run_on_ray(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> None:
+def run_on_ray(recipe: str, place: Place, secret: bytes, number: int) -> None:
     """The same as an actor, which Ray starts again if it ends before it is needed no more."""
     if not run_node(place, secret, number):
         os._exit(1)

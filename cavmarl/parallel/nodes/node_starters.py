@@ -1,4 +1,4 @@
-"""What starts nodes: this machine, Ray, or a command by hand on any machine."""
+"""What starts nodes: this machine, Ray, MPI, or a command by hand on any machine."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 from cavmarl.config.workers import WorkersConfig
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.backend_name import RAY, BackendName
-from cavmarl.parallel.network.listener import Listener
+from cavmarl.parallel.network.mpi_transport import MPI, mpi_transport
 from cavmarl.parallel.network.ray_actors import RayActors
+from cavmarl.parallel.network.tcp_transport import TcpListener
+from cavmarl.parallel.network.transport import Place, TransportListener
 from cavmarl.parallel.nodes.node_process import run_on_ray
-from cavmarl.parallel.nodes.node_system import NodeListener
+from cavmarl.parallel.nodes.node_system import MACHINE, Machine, NodeSystem
 from cavmarl.parallel.processes.watchdog import is_stopped
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
@@ -25,10 +27,10 @@ MIN_KEY = 32  # characters of a key file
 END_S = 5.0  # for nodes to end by themselves
 
 
-Route: TypeAlias = Callable[[tuple[str, int]], tuple[str, int]]
+Route: TypeAlias = Callable[[Place], Place]
 
 
-def straight(place: tuple[str, int]) -> tuple[str, int]:
+def straight(place: Place) -> Place:
     """Where to call in order to reach a place: there."""
     return place
 
@@ -70,8 +72,8 @@ class LocalNodes:
     def __init__(
         self,
         nodes: int,
-        listener: Listener,
-        place: tuple[str, int],
+        listener: TcpListener,
+        place: Place,
         max_retries: int,  # of nodes that are killed or stopped before they have begun
     ) -> None:
         self.count = nodes
@@ -148,7 +150,7 @@ class RayNodes:
     def __init__(
         self,
         actors: RayActors,
-        listener: Listener,
+        listener: TcpListener,
         max_retries: int,  # of nodes that are lost while they are given their zones
     ) -> None:
         self._actors = actors
@@ -179,6 +181,39 @@ class RayNodes:
         self._actors.close()
 
 
+class MpiNodes:
+    """The other ranks of an MPI run, which has no failover.
+
+    Raises:
+        ConfigError: this process is not rank 0, or there are too few others.
+    """
+
+    def __init__(self, nodes: int) -> None:
+        self.count = nodes
+        mpi_transport().check_caller(nodes)
+
+    def trouble(self, begun: Collection[int]) -> str | None:
+        return None
+
+    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
+        mpi_transport().is_broken = True
+        return f"rank {number + 1} was lost before it had begun: MPI has no failover"
+
+    def replace(self, number: int, is_silent: bool) -> None:
+        """Raises WorkerDeathError: none takes the place of a lost rank."""
+        mpi_transport().is_broken = True
+        cause = "it says nothing" if is_silent else "its connection has ended"
+        raise WorkerDeathError(
+            number, f"rank {number + 1} of MPI, which has no failover", 0, "step", [cause]
+        )
+
+    def stopped(self) -> set[int]:
+        return set()  # they may be on other machines
+
+    def close(self) -> None:
+        """They end with the connection."""
+
+
 class JoinedNodes:
     """Nodes that are started by hand: `cavmarl node --join`."""
 
@@ -203,41 +238,48 @@ class JoinedNodes:
 
 
 Start: TypeAlias = Callable[
-    [BackendName, int, WorkersConfig, Path, Route], tuple[NodeStarter, NodeListener]
+    [BackendName, int, WorkersConfig, Path, Route], tuple[NodeStarter, TransportListener]
 ]
 """Begins to start nodes; arguments as of `start_nodes`."""
 
 
 def start_nodes(
-    backend: BackendName,  # nodes of this machine, of Ray, or that are started by hand
+    backend: BackendName,  # nodes of this machine, Ray or MPI, or that are started by hand
     num_worlds: int,  # so many actors of Ray are of use where the backend does not say how many
     settings: WorkersConfig,
     base_dir: Path,  # the folder that a relative key file starts from
     route: Route,  # for nodes of this machine
-) -> tuple[NodeStarter, NodeListener]:
+) -> tuple[NodeStarter, TransportListener]:
     """Begin to start nodes; they call the listener.
 
     Raises:
-        ConfigError: a key file that cannot be.
-        MissingExtraError: Ray is not installed.
+        ConfigError: a key file that cannot be, or MPI without as many other ranks.
+        MissingExtraError: Ray, or mpi4py, is not installed.
         WorkerError: the port cannot be listened on, or nodes cannot be started.
     """
     nodes = backend.count or 1
     if backend.kind == RAY:
         at_most = backend.count or num_worlds
         actors = RayActors(run_on_ray, lambda workers: "", backend.count, at_most)
-        listener = Listener(actors.address)
+        listener = TcpListener(actors.address)
         return RayNodes(actors, listener, settings.max_retries), listener
     if backend.address is None:
-        listener = Listener(LOOPBACK)
+        listener = TcpListener(LOOPBACK)
         return LocalNodes(nodes, listener, route(listener.place), settings.max_retries), listener
+    if backend.address == MPI:
+        return MpiNodes(nodes), mpi_transport().listen("", b"")
     host, port = backend.address
     if not settings.key_file:
         raise ConfigError(
             f"backend = '{backend}' without workers.key_file: name the file with the key that "
             "nodes have to know"
         )
-    return JoinedNodes(nodes), Listener(host, read_key(base_dir / settings.key_file), port)
+    return JoinedNodes(nodes), TcpListener(host, read_key(base_dir / settings.key_file), port)
+
+
+def system_of(backend: BackendName) -> NodeSystem:
+    """Return the system that such nodes are on."""
+    return Machine(mpi_transport()) if backend.is_mpi else MACHINE
 
 
 def read_key(path: Path) -> bytes:

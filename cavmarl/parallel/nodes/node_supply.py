@@ -33,7 +33,7 @@ class NodeSupply:
 
     Raises:
         ConfigError: a setting that nodes cannot have.
-        MissingExtraError: Ray is not installed.
+        MissingExtraError: Ray, or mpi4py, is not installed.
         WorkerError: a node cannot be started.
     """
 
@@ -66,7 +66,7 @@ class NodeSupply:
             "in_next_step": in_next_step,
             "lease_ticks": lease_ticks(config),
         }
-        self.newcomers = Newcomers(listener, job, files, self._room, system)
+        self.newcomers = Newcomers(listener, job, files, self._room, world.partition.count, system)
 
     @property
     def is_here(self) -> bool:

@@ -7,13 +7,17 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from cavmarl.core.errors import MessageError, WorkerError
+from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
-from cavmarl.parallel.nodes.links import LinkLostError, Links, SilenceError
+from cavmarl.parallel.nodes.links import Links, SilenceError
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices
 
 LOOK_S = 0.5  # between looks; a process that is stopped at two of them is given up
 PONG_S = 1.0  # for a living node to answer
 MISSED_S = 0.1  # to hear which others miss a node
 VAIN = 5  # times that all nodes answer and yet nothing comes of a command
+
+MOST_NODES = 1 << 32
 
 Found = TypeVar("Found")
 
@@ -43,7 +47,9 @@ class NodeWatch:
 
     def hear_pong(self, number: int, frame: NodeFrame) -> None:
         if frame.number == self._pings:
-            self._answered[number] = list(said_by(frame))
+            awaited = said_by(frame)
+            check_indices("node", (peer for peer in awaited if peer != COORDINATOR), MOST_NODES)
+            self._answered[number] = awaited
 
     def wait(
         self,
@@ -54,8 +60,8 @@ class NodeWatch:
         """What comes of waiting, again and again as long as all nodes answer meanwhile.
 
         Raises:
-            SilentNodeError: one does not, its process is stopped, or another one waits for it in
-                vain.
+            SilentNodeError: one does not, its process is stopped, another one waits for it in
+                vain, or it has not answered another one in two silences.
             WorkerError: all answer, and nothing comes of it.
         """
         silence: SilenceError | None = None
@@ -63,8 +69,10 @@ class NodeWatch:
             try:
                 return self._wait(timeout_s, wait)
             except SilenceError as error:
-                silence = error
+                before, silence = silence, error
                 self._ask(living)
+                for number in sorted(set(before.awaited if before else ()) & set(error.awaited)):
+                    raise SilentNodeError(number, MessageError("it answers no offers")) from error
         raise WorkerError(f"{silence}, {VAIN} times, though all nodes live") from silence
 
     def _wait(self, timeout_s: float, wait: Callable[[float], Found]) -> Found:
@@ -82,7 +90,8 @@ class NodeWatch:
         try:
             return wait(left_s)
         except SilenceError as silence:
-            raise SilenceError(f"nothing has come for {timeout_s:g} s") from silence
+            text = f"nothing has come for {timeout_s:g} s"
+            raise SilenceError(text, silence.awaited) from silence
 
     def _ask(self, living: Sequence[int]) -> None:
         """Ask all nodes whether they live, and which nodes they wait for."""
@@ -105,6 +114,8 @@ class NodeWatch:
     def most_missed(self, lost: LinkLostError) -> LinkLostError:
         """The node that has ended, or else the one that cannot be reached by most others."""
         links = self._links
+        if not self._missed:  # what it sent cannot be
+            return lost
         until_s = links.now_s() + MISSED_S
         while lost.peer in links.numbers and (left_s := until_s - links.now_s()) > 0:
             try:

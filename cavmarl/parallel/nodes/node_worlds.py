@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot, idle_snapshot
 from cavmarl.balance.probe import MEASURED
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
@@ -27,7 +27,7 @@ from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.commanded_worlds import CommandedWorlds
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.agent_stream import ResultStream
-from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand
+from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand, ZoneRects
 from cavmarl.parallel.nodes.node_cuts import read_zones
 from cavmarl.parallel.nodes.node_frames import (
     pieces_of,
@@ -37,16 +37,18 @@ from cavmarl.parallel.nodes.node_frames import (
 from cavmarl.parallel.nodes.node_loads import (
     TO_BALANCE,
     TO_SHOW,
+    TOTALS,
     MachineAsked,
     NodeLoad,
     since,
 )
 from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_asked
-from cavmarl.parallel.nodes.node_pool import NodePool
+from cavmarl.parallel.nodes.node_pool import Found, NodePool, Read, unread
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.nodes.peer_faults import check_indices, read_json
+from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.tasks import Task
 from cavmarl.parallel.work_shares import Part, parts_of
@@ -98,11 +100,11 @@ class NodeWorlds(CommandedWorlds):
         self.placement = StepPlacement(world, 1, nodes, is_here=False)
         zones = parts_of(self.plans, count)[0].zones
         self._network: NetworkSimulator | None = None
-        self._writers: dict[Task, Callable[[Sequence[memoryview]], None]] = {
-            Task.RESET: self._write_begun,
-            Task.STEP: self._write_stepped,
-            Task.SUGGEST: self._write_suggested,
-            Task.WRITE_STATES: self._write_states,
+        self._readers: dict[Task, Read[Any]] = {
+            Task.RESET: self._read_begun,
+            Task.STEP: self._read_stepped,
+            Task.SUGGEST: self._read_suggested,
+            Task.WRITE_STATES: self._of_first(self._read_states),
         }
         runs = share.runs if share else prepare_runs(config.zones, num_worlds)
         self._supply = share.supply if share else NodeSupply(
@@ -148,9 +150,17 @@ class NodeWorlds(CommandedWorlds):
         if not is_due(self._steps_begun, self.world.config.zones.repartition_steps):
             return
         if proposal := self.ask(Task.PROPOSE):
-            zones, *figures = proposal
+            zones, figures = proposal
             self._order(Task.CUT, zones)
             self.recuts.append(Recut(self._steps_begun - 1, *figures))
+
+    def _read_proposal(self, said: Any) -> tuple[ZoneRects, list[Any]] | None:
+        if said is None:
+            return None
+        zones, *figures = said
+        if read_zones(zones).count != self.world.partition.count or len(figures) != 4:
+            raise MessageError(f"it proposes {said!r}")
+        return zones, figures
 
     def connect_network(self, network: NetworkSimulator) -> None:
         """From now on let a network simulator of this process decide receptions.
@@ -181,12 +191,22 @@ class NodeWorlds(CommandedWorlds):
         states = {one.worker: one for one in (*idle.workers, *seen.workers)}
         return replace(seen, workers=tuple(states[node] for node in sorted(states)))
 
-    def _costs(self) -> list[Any]:
+    def _costs(self) -> list[tuple[list[tuple[int, float]], list[int]]]:
         """Return what each node has spent on its zones since it was asked last.
 
         Of each node: pairs of a zone and s of processor time, and the vehicles of each world.
         """
-        return [json.loads(bytes(data)) for data in self._run(Task.COSTS)]
+        return self._run(Task.COSTS, None, self._read_costs)
+
+    def _read_costs(
+        self, number: int, data: memoryview
+    ) -> tuple[list[tuple[int, float]], list[int]]:
+        of_zones, running = read_json(data, list)
+        found = [(zone, float(spent_s)) for zone, spent_s in of_zones]
+        check_indices("zone", (zone for zone, _ in found), self._spent_s.shape[1])
+        if len(running) != len(self.arrays.mask):
+            raise MessageError(f"it tells of {len(running)} worlds")
+        return found, list(map(int, running))
 
     def world_costs_s(self) -> NDArray[np.float64]:
         """Return the processor time (W,) of each world; worlds share it by their vehicles."""
@@ -215,17 +235,25 @@ class NodeWorlds(CommandedWorlds):
 
     def perform(self, task: Task, payload: Any = None) -> None:
         """Let all nodes do a task, and write what comes out to `arrays`."""
-        results = self._run(task, worlds_payload(payload) if task == Task.LOAD else payload)
-        if write := self._writers.get(task):
-            write(results)
+        told = worlds_payload(payload) if task == Task.LOAD else payload
+        results = self._run(task, told, self._readers.get(task, unread))
+        arrays = self.arrays
+        if task == Task.STEP:
+            self._ticks_done += self._ticks_per_step
+        elif task == Task.RESET and not arrays.chosen.all():
+            arrays.observations[~arrays.mask] = 0.0
+        elif task == Task.SUGGEST:
+            arrays.suggested[...] = 0.0
+            for where, found in results:
+                arrays.suggested.reshape(-1, 2)[where] = found
 
     def _settle(self, parts: list[Part]) -> None:
         """The pool has noted it when zones have moved."""
 
-    def _run(self, task: Task, payload: Any = None) -> list[memoryview]:
-        """Let all nodes do a task; what each has found."""
+    def _run(self, task: Task, payload: Any, read: Read[Found]) -> list[Found]:
+        """Let all nodes do a task; return what is read of what each has found."""
         try:
-            return self.pool.run(self._command(task, payload))
+            return self.pool.run(self._command(task, payload), read)
         except NetworkFailedError as failed:
             raise failed.error from None
 
@@ -242,37 +270,38 @@ class NodeWorlds(CommandedWorlds):
 
     def ask(self, task: Task, payload: Any = None) -> Any:
         """Return what the first node answers, which has the whole worlds meanwhile."""
-        return json.loads(bytes(self._run(task, payload)[0]))
+        read = self._read_proposal if task == Task.PROPOSE else _ANSWERS[task]
+        first = self._of_first(lambda data: read(json.loads(bytes(data))))
+        return self._run(task, payload, first)[0]
 
-    def _write_begun(self, results: Sequence[memoryview]) -> None:
-        arrays = self.arrays
-        self._write(results, arrays.chosen, of_step=False)
-        if not arrays.chosen.all():
-            arrays.observations[~arrays.mask] = 0.0
+    def _of_first(self, read: Callable[[memoryview], Any]) -> Read[Any]:
+        """Return what reads the answer of the first node; the others have nothing to say."""
+        return lambda number, data: read(data) if number == self.pool.first else None
 
-    def _write_stepped(self, results: Sequence[memoryview]) -> None:
-        self._ticks_done += self._ticks_per_step
-        self._write(results, self._everywhere, of_step=True)
+    def _read_begun(self, number: int, data: memoryview) -> None:
+        self._write(self.arrays.chosen, False, number, data)
+
+    def _read_stepped(self, number: int, data: memoryview) -> None:
+        self._write(self._everywhere, True, number, data)
 
     def _write(
-        self, results: Sequence[memoryview], chosen: NDArray[np.bool_], of_step: bool
+        self, chosen: NDArray[np.bool_], of_step: bool, number: int, data: memoryview
     ) -> None:
         pool = self.pool
-        for n, (number, data) in enumerate(zip(pool.tellers, results, strict=True)):
-            self._results.take(data, chosen, of_step, n == 0, number, pool.owner)
+        self._results.take(data, chosen, of_step, number == pool.teller, number, pool.owner)
 
-    def _write_suggested(self, results: Sequence[memoryview]) -> None:
+    def _read_suggested(self, number: int, data: memoryview) -> tuple[NDArray[Any], NDArray[Any]]:
         suggested = self.arrays.suggested
-        suggested[...] = 0.0
-        for data in results:
-            num = len(data) // (8 + suggested.itemsize * 2)
-            where = np.frombuffer(data, np.int64, num)
-            found = np.frombuffer(data, suggested.dtype, 2 * num, 8 * num)
-            suggested.reshape(-1, 2)[where] = found.reshape(-1, 2)
+        num, rest = divmod(len(data), 8 + suggested.itemsize * 2)
+        where = np.frombuffer(data, np.int64, num)
+        check_indices("agent", where, suggested.size // 2)
+        if rest:
+            raise MessageError(f"{len(data)} bytes tell of no suggestions")
+        return where, np.frombuffer(data, suggested.dtype, 2 * num, 8 * num).reshape(-1, 2)
 
-    def _write_states(self, results: Sequence[memoryview]) -> None:
-        found = np.frombuffer(results[0], self.arrays.states.dtype)
-        self.arrays.states[...] = found.reshape(self.arrays.states.shape)
+    def _read_states(self, data: memoryview) -> None:
+        states = self.arrays.states
+        states[...] = np.frombuffer(data, states.dtype).reshape(states.shape)
 
     def node_loads(self) -> list[NodeLoad]:
         """What each node has done since this was asked last, by rising numbers.
@@ -281,8 +310,7 @@ class NodeWorlds(CommandedWorlds):
         """
         found = []
         ticks, self._ticks_told = self._ticks_done - self._ticks_told, self._ticks_done
-        for data in self._run(Task.LOADS):
-            node, *now = json.loads(bytes(data))
+        for node, now in self._run(Task.LOADS, None, _read_totals):
             before = self._told.get(node)
             is_same = before is not None and before[0] <= now[0]
             found.append(since(node, ticks, now, before if is_same else None))
@@ -297,14 +325,14 @@ class NodeWorlds(CommandedWorlds):
         here: dict[str, list[int]] = {socket.gethostname(): [os.getpid()]}
         for machine, pid in self.pool.machines:
             here.setdefault(machine, []).append(pid)
-        asked = MachineAsked(purpose, here)
-        found = [json.loads(bytes(data)) for data in self._run(Task.LOADS, asked)]
-        states = tuple(Candidate(node, Utilisation(*shares)) for node, shares, _ in found)
-        source = next((source for *_, source in found if source != NO_GPU), NO_GPU)
+        found = self._run(Task.LOADS, MachineAsked(purpose, here), _read_watched)
+        states = tuple(candidate for candidate, _ in found)
+        source = next((source for _, source in found if source != NO_GPU), NO_GPU)
         return LoadSnapshot(states, source, MEASURED)
 
     def save_worlds(self) -> list[bytes]:
-        return saved_of(self.ask(Task.SAVE))
+        saved: list[bytes] = self.ask(Task.SAVE)
+        return saved
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are.
@@ -353,6 +381,31 @@ def empty_arrays(world: World, num_worlds: int) -> StepArrays:
     """Return arrays for the inputs and outputs of a step."""
     layout = layout_of(world.config, world.capacity, num_worlds).items()
     return StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
+
+
+_ANSWERS: Mapping[Task, Callable[[Any], Any]] = {
+    Task.STATE_HASH: str,
+    Task.TRAFFIC_STATS: dict,
+    Task.DRIVEN: lambda said: [Driven(*row) for row in said],
+    Task.SIGNAL_PHASES: lambda said: np.array(said, dtype=np.int32),
+    Task.SAVE: saved_of,
+    Task.CHECK: str,
+}
+"""Reads what the first node answers."""
+
+
+def _read_totals(number: int, data: memoryview) -> tuple[int, list[Any]]:
+    """What a node has done; see `node_loads.totals`."""
+    said = read_json(data, list)
+    if len(said) != 1 + TOTALS or said[0] != number:
+        raise MessageError(f"it tells {said!r} of its load")
+    return number, list(map(float, said[1:5])) + list(map(int, said[5:]))
+
+
+def _read_watched(number: int, data: memoryview) -> tuple[Candidate, str]:
+    """How busy the machine of a node is, and the source of that."""
+    _, shares, source = read_json(data, list)
+    return Candidate(number, Utilisation(*shares)), str(source)
 
 
 def check_nodes(world: World, nodes: int) -> None:

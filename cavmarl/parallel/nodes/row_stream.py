@@ -16,9 +16,10 @@ from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.records.arrays import Gate, RoadArrays, Zoned
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.parallel.nodes.link import Bytes
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.roads.routing import PLAN
 from cavmarl.zones.kernels.ghost_forecast import PLACES, Forecast
+from cavmarl.zones.kernels.row_bounds import Bounds
 from cavmarl.zones.kernels.row_frames import (
     AFTER,
     ID,
@@ -57,8 +58,14 @@ def _ghosts(words: Array) -> Ghosts:
     return Ghosts(words, words.view(np.float64))
 
 
-def forecast_of(roads: RoadArrays, dt: float, ticks_per_step: int) -> Forecast:
-    """What is foreseen on some roads, in ticks of `dt` seconds."""
+def forecast_of(
+    roads: RoadArrays,
+    dt: float,  # s of a tick
+    ticks_per_step: int,
+    of_rows: Bounds,  # see `RowChecks`
+    of_ghosts: Bounds,  # likewise
+) -> Forecast:
+    """What is foreseen on some roads, and what is not taken."""
     lanes, links = roads.lanes, roads.links
     beyond = np.zeros(len(lanes))
     inside = lanes["internal"]
@@ -69,7 +76,8 @@ def forecast_of(roads: RoadArrays, dt: float, ticks_per_step: int) -> Forecast:
     way_to_go = VEHICLE.itemsize // 8 + _word(PLAN, "to_go")
     assert all(_word(VEHICLE, name) == place for name, place in PLACES.items())
     return Forecast(
-        dt, ticks_per_step, way_to_go, limits, beyond, words, words.view(np.float64)
+        dt, ticks_per_step, way_to_go, limits, beyond, of_rows, of_ghosts, words,
+        words.view(np.float64),
     )  # fmt: skip
 
 

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
-from cavmarl.core.errors import MessageError, ProtocolError
+from cavmarl.core.errors import MessageError
 from cavmarl.core.records.arrays import Gate
-from cavmarl.handoff.coordinator.coordinator import Coordinator
+from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.kernels.invariant_checks import owned_sum
 from cavmarl.handoff.zone_view import TransferInFlight
@@ -29,8 +30,16 @@ from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import COORDINATOR, Done, Message, Prepare, Removed
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
+from cavmarl.parallel.nodes.peer_faults import (
+    LinkLostError,
+    check_indices,
+    read_json,
+    reading,
+)
+from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
@@ -56,7 +65,7 @@ NOTHING = Report([], [], False, [])
 class ZoneHosts:
     """Those of one node, of W worlds."""
 
-    coordinators: tuple[Coordinator, ...] = ()  # they are in another process
+    coordinators: tuple[LocalCoordinator, ...] = ()  # they are in another process
     needs_ghosts = True
 
     def __init__(
@@ -68,6 +77,7 @@ class ZoneHosts:
         limits: Limits,
         links: Links,  # to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) of agents: what they do, what is kept of them
+        checks: RowChecks,  # of vehicles that are offered
         generation: int = 0,  # how often nodes have been lost
         is_checked: bool = False,  # whether the caller checks what zones own
         ticks: int = 1,  # of a lease
@@ -77,7 +87,7 @@ class ZoneHosts:
         self._owned_sum = specialized(owned_sum)
         self._carried = carried
         self._come: dict[tuple[int, int], memoryview] = {}  # world, vehicle → what is to be kept
-        self._division = division
+        self._division, self._checks = division, checks
         self._zones = frozenset(zones)
         self._node_of = node_of
         self._links = links
@@ -110,19 +120,23 @@ class ZoneHosts:
             if frame.kind is FrameKind.RECOVER:
                 raise RecoveryOrderedError(frame)
             if frame.kind is not FrameKind.LEASE:
-                raise ProtocolError(f"a frame of kind {frame.kind.name}, where a lease was due")
+                error = MessageError(f"a frame of kind {frame.kind.name}, where a lease was due")
+                raise LinkLostError(COORDINATOR, error)
+            with reading(COORDINATOR):
+                leased = unpacked(frame.data)
             if frame.number:
-                self.lease(frame.data)
+                self.lease(leased)
             else:
-                self.note(frame.data)
+                self.note(leased)
         self._enter_lease()
         self._left = self._ticks - 1
 
-    def lease(self, data: memoryview) -> None:
+    def lease(self, messages: Sequence[tuple[int, Message]]) -> None:
         """Take STEP messages; zones of worlds without any go on with what they own."""
-        told = set()
-        for w, message in unpacked(data):
-            told.add(w)
+        told = {w for w, _ in messages}
+        with reading(COORDINATOR):
+            check_indices("world", told, len(self._endpoints))
+        for w, message in messages:
             self._take(w, message)
         for w, endpoints in enumerate(self._endpoints):
             if not (w in told or self._leases[w] or self._is_quiet[w]):
@@ -136,9 +150,9 @@ class ZoneHosts:
     def _is_leased(self, w: int) -> bool:
         return self._is_quiet[w] or len(self._leases[w]) == len(self._zones)
 
-    def note(self, data: memoryview) -> None:
+    def note(self, messages: Sequence[tuple[int, Message]]) -> None:
         """Let a lease of no ticks begin and end: births come on record, and can be offered."""
-        self.lease(data)
+        self.lease(messages)
         self._enter_lease()
         self._stirred = [True] * len(self._stirred)
         self.report()
@@ -179,6 +193,13 @@ class ZoneHosts:
             self._targets[w] = {}
             self._stirred[w] = True
 
+    def save(self, w: int) -> None:
+        """The coordinator, in another process, knows the owners."""
+
+    def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
+        """Ownership begins anew, with the vehicles where they are."""
+        self.reset(np.ones(len(self._stirred), dtype=np.bool_))
+
     def in_flight(self, w: int) -> list[TransferInFlight]:
         return [
             TransferInFlight(vehicle, zone, target, "offered")
@@ -212,7 +233,7 @@ class ZoneHosts:
         endpoints = self._endpoints[w].values()
         if self._began[w] or self._stirred[w] or self._gone[w] or self._births[w]:
             return False
-        if self._is_checked or self._division.near(w, everybody=False):
+        if self._is_checked or self._division.changes.near(w, everybody=False):
             return False
         if any(endpoint.offers.open for endpoint in endpoints):
             return False
@@ -253,14 +274,14 @@ class ZoneHosts:
         everybody, self._stirred[w] = self._stirred[w] or began, False
         approaches: dict[int, list[Approach]] = {zone: [] for zone in endpoints}
         movers, is_late = [], False
-        for entry in division.near(w, everybody):
+        for entry in division.changes.near(w, everybody):
             endpoint = endpoints.get(entry.source)
             if not entry.crossed or endpoint is None:
                 continue
             if began or entry.vehicle not in endpoint.owned:
                 is_late = True
             else:
-                state = division.state(w, entry.source, entry.row)
+                state = division.changes.state(w, entry.source, entry.row)
                 approaches[entry.source].append(Approach(entry.vehicle, entry.target, state))
                 self._targets[w][entry.vehicle] = entry.target
                 movers.append((entry.vehicle, entry.target, state_digest(state).hex()))
@@ -272,7 +293,12 @@ class ZoneHosts:
 
     def hear(self, number: int, frame: NodeFrame) -> None:
         """Take messages of other nodes as soon as they come."""
-        for w, message in unpacked(frame.data):
+        messages = unpacked(frame.data)
+        check_indices("world", (w for w, _ in messages), len(self._endpoints))
+        for w, message in messages:
+            for offer in message.entries if isinstance(message, Prepare) else ():
+                record = self._division.codec.record(offer.state, offer.vehicle)
+                self._checks.check_state(record)
             self._take(w, message)
 
     def _take(self, w: int, message: Message) -> None:
@@ -309,18 +335,18 @@ class ZoneHosts:
         for zone, advance in leases.items():
             for vehicle in advance.leave:
                 self._send_agent(w, zone, vehicle)
-                division.give_up(w, zone, vehicle)
+                division.changes.give_up(w, zone, vehicle)
                 left.add(vehicle)
         for zone, advance in leases.items():
             owned = self._endpoints[w][zone].owned
             for vehicle, state in advance.enter:
-                division.take_over(w, zone, vehicle, owned[vehicle], state)
+                division.changes.take_over(w, zone, vehicle, owned[vehicle], state)
                 if vehicle not in left:
                     self._take_agent(w, vehicle)
 
     def _agent(self, w: int, vehicle: int) -> int:
         """The agent whose vehicle it is; -1: none."""
-        zone, row = self._division.find(w, vehicle)
+        zone, row = self._division.changes.find(w, vehicle)
         return int(self._division.owned(w, zone)["agent"][row])
 
     def _send_agent(self, w: int, zone: int, vehicle: int) -> None:
@@ -339,9 +365,13 @@ class ZoneHosts:
         agent = self._agent(w, vehicle)
         if agent < 0:
             return
-        while (w, vehicle) not in self._come:
-            self._links.heed()
-            self._links.pump(None)
+        if (w, vehicle) not in self._come:
+            others = {node for zone, node in enumerate(self._node_of) if zone not in self._zones}
+            self._links.wanted = others  # all but the silent one have sent their next share
+            while (w, vehicle) not in self._come:
+                self._links.heed()
+                self._links.pump(None)
+            self._links.wanted = ()
         data, at = self._come.pop((w, vehicle)), 0
         for array in self._carried:
             kept = array[w, agent : agent + 1]
@@ -353,6 +383,10 @@ class ZoneHosts:
         if frame.number == self._generation:
             w, _ = _LENGTH.unpack_from(frame.data)
             vehicle = int(np.frombuffer(frame.data, np.int64, 1, _LENGTH.size)[0])
+            check_indices("world", [w], len(self._endpoints))
+            size = sum(array[0, 0].nbytes for array in self._carried)
+            if len(frame.data) != _LENGTH.size + 8 + size:
+                raise MessageError(f"{len(frame.data)} bytes are not what is kept of an agent")
             self._come[w, vehicle] = frame.data[_LENGTH.size + 8 :]
 
 
@@ -409,5 +443,11 @@ def read_report(
     messages = unpacked(data[at : at + size])
     end = at + size + length
     said = bytes(data[at + size : end]).rstrip()
-    reports = [Report(*report) for report in json.loads(said)] if said else [NOTHING] * num_worlds
+    reports = [NOTHING] * num_worlds
+    if said:
+        reports = [Report(*report) for report in read_json(said, list)]
+        if len(reports) != num_worlds:
+            raise MessageError(f"it tells of {len(reports)} worlds: there are {num_worlds}")
+    if len(data) < end:
+        raise MessageError(f"a report of {end} bytes has {len(data)}")
     return messages, reports, data[end:]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from cavmarl.core.errors import WorkerDeathError
+from cavmarl.core.errors import MessageError, WorkerDeathError
+from cavmarl.parallel.nodes.peer_faults import check_indices, read_json
 
 Zones = list[list[int]]  # of each node
 
@@ -21,6 +22,35 @@ class ZoneMoves(NamedTuple):
 def living_of(zones: Sequence[Sequence[int]]) -> list[int]:
     """The nodes that host some, by rising numbers."""
     return [number for number, some in enumerate(zones) if some]
+
+
+def read_order(data: memoryview, zones: int) -> dict[str, Any]:
+    """What the caller says of nodes that are lost or new, checked against the zones there are.
+
+    Raises:
+        MessageError: it tells of zones, nodes or worlds that there are not.
+    """
+    told: dict[str, Any] = read_json(data, dict)
+    nodes = len(told["zones"])
+    hosted = [zone for some in told["zones"] for zone in some]
+    check_indices("zone", hosted, zones)
+    if sorted(hosted) != list(range(zones)):
+        raise MessageError(f"it gives nodes the zones {hosted}: there are {zones}")
+    pairs = [*told["heirs"], *told["donors"]]
+    named = [told["number"], told["first"], *told["lost"], *(n for pair in pairs for n in pair)]
+    check_indices("node", [*named, *(node for node, _ in told["places"])], nodes)
+    told["places"] = {node: (str(host), int(port)) for node, (host, port) in told["places"]}
+    num_worlds = told["num_worlds"]
+    check_indices("number", [num_worlds - 1], 1 << 62)
+    counts = {len(told["runs"]), len(told["hostings"])}
+    if any(len(pair) != 2 for pair in pairs) or counts != {num_worlds}:
+        raise MessageError("it tells of other worlds or nodes than there are")
+    for some in told["hostings"]:
+        check_indices("number", (n for numbers in some for n in numbers), 1 << 62)
+        if [len(numbers) for numbers in some] != [4] * zones:
+            raise MessageError(f"it tells of {len(some)} zones: there are {zones}")
+    told["state"], told["begins"] = int(told["state"]), bool(told["begins"])
+    return told
 
 
 def moves_of(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import mmap
-import zlib
 from collections.abc import Iterator, Sequence
 from operator import is_
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from xxhash import xxh3_64_intdigest
 
-from cavmarl.core.compiled import IS_PLAIN, kernel, specialized
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.shared_memory import Segment
 
@@ -36,11 +35,10 @@ class Image:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._memory: mmap.mmap | None = None
-        self._map_words(np.zeros(0, dtype=np.int64))
+        self._words = np.zeros(0, dtype=np.int64)
         self._begin = 0  # of the first array
         self._places: list[_Place] = []
         self._written: Arrays = ()  # the last time
-        self._seal = specialized(_sealed)
         self._copies: list[tuple[Array, Array]] = []  # to where, from where
 
     def write(self, arrays: Arrays) -> None:
@@ -53,10 +51,7 @@ class Image:
             self._find_places(arrays)
         for target, source in self._copies:
             target[...] = source
-        if IS_PLAIN:
-            self._words[1] = _checksum(self._words[2 : self._words.item(0)])
-        else:
-            self._seal(self._unsigned)
+        self._words[1] = _checksum(self._words[2 : self._words.item(0)])
 
     def _find_places(self, arrays: Arrays) -> None:
         shapes = [array.shape for array in arrays]
@@ -143,33 +138,7 @@ class Image:
     def _map_all(self) -> None:
         """Map the segment as large as it is by now, whichever process extended it."""
         self._memory = self._segment.map()
-        self._map_words(np.frombuffer(self._memory, dtype=np.int64))
-
-    def _map_words(self, words: NDArray[np.int64]) -> None:
-        self._words = words
-        self._unsigned = words.view(np.uint64)
-
-
-@kernel
-def _mixed(words: NDArray[np.uint64]) -> np.uint64:
-    """FNV-1a over whole words, in four rows side by side: a changed word always changes it."""
-    prime = np.uint64(0x100000001B3)
-    a = b = c = d = np.uint64(0xCBF29CE484222325)
-    fours = words.size // 4 * 4
-    for n in range(0, fours, 4):
-        a = (a ^ words[n]) * prime
-        b = (b ^ words[n + 1]) * prime
-        c = (c ^ words[n + 2]) * prime
-        d = (d ^ words[n + 3]) * prime
-    for n in range(fours, words.size):
-        a = (a ^ words[n]) * prime
-    return (((((a * prime) ^ b) * prime) ^ c) * prime) ^ d
-
-
-@kernel
-def _sealed(words: NDArray[np.uint64]) -> None:
-    """Write the checksum of an image into it."""
-    words[1] = _mixed(words[2 : int(words[0])])
+        self._words = np.frombuffer(self._memory, dtype=np.int64)
 
 
 def _num_words(array: Array) -> int:
@@ -185,13 +154,6 @@ def _num_same(shapes: Sequence[tuple[int, ...]], places: Sequence[_Place]) -> in
 
 
 def _checksum(words: NDArray[np.int64]) -> int:
-    if IS_PLAIN:
-        return zlib.crc32(words.data)
-    return int(np.uint64(_mixed(words.view(np.uint64))).view(np.int64))
-
-
-def load_kernels() -> None:
-    """Have the checksum ready, for this process and those that it forks."""
-    words = np.full(_HEAD, _HEAD, dtype=np.int64)
-    _checksum(words)
-    _sealed(words.view(np.uint64))
+    """XXH3 of 64 bits, as a word has it."""
+    found = xxh3_64_intdigest(words.data)
+    return found - (found >> 63 << 64)

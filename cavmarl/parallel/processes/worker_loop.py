@@ -29,7 +29,6 @@ import numpy as np
 from cavmarl.core.processes import die_with_parent
 from cavmarl.core.tracebacks import traceback_text
 from cavmarl.parallel.processes import process_barrier as barrier
-from cavmarl.parallel.processes import state_image as images
 from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, Meeting, present_core
 from cavmarl.parallel.processes.shared_huge_pages import collapse_heap
 from cavmarl.parallel.processes.shared_memory import Segment
@@ -96,7 +95,6 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
         recipe = _read(start["recipe"], start["recipe_bytes"])
         jobs = make_jobs(recipe)
         barrier.load_kernels()
-        images.load_kernels()
         _refuse_threads()
     except Exception as error:
         _say(pool, describe(error))

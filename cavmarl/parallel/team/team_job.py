@@ -41,7 +41,7 @@ class LeaderJob(CheckpointJob):
         self._zones = zones
         self._hosts = _hosts(zones)
         self._spent_s = spent_s
-        worlds.simulation.host(self._lead)
+        worlds.simulation.zones.use_team(self._lead)
 
     def _lead(self, shards: Sequence[Shard], gathering: tuple[float, float]) -> Leader:
         commands = [(self._commands,), *((entry,) for entry in self._log.entries)]

@@ -28,7 +28,7 @@ _REQUIRED = {
 
 
 @dataclass(frozen=True)
-class Phase:
+class ProgramPhase:
     """One <phase>."""
 
     duration_s: float  # stated; SUMO's defaults fill in what is not
@@ -48,7 +48,7 @@ class SignalProgram:
     kind: str  # SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …
     offset_s: float  # by which all phases are late
     place: str  # file and line, for complaints
-    phases: list[Phase] = field(default_factory=list)  # in their order
+    phases: list[ProgramPhase] = field(default_factory=list)  # in their order
     params: dict[str, str] = field(default_factory=dict)  # <param> by key
 
 
@@ -139,7 +139,7 @@ class _AdditionalHandler(ContentHandler):
         self.reader.end(name)
 
 
-def _phase(attrs: Mapping[str, str], place: str) -> Phase:
+def _phase(attrs: Mapping[str, str], place: str) -> ProgramPhase:
     duration = _seconds(attrs, "duration", place)
     # As SUMO reads it: with the shortest duration alone, the longest is open.
     longest = math.inf if "minDur" in attrs else duration
@@ -147,7 +147,7 @@ def _phase(attrs: Mapping[str, str], place: str) -> Phase:
         following = tuple(int(number) for number in attrs.get("next", "").split())
     except ValueError as error:
         raise MapError(f"{place} has next='{attrs['next']}', which are no phases") from error
-    return Phase(
+    return ProgramPhase(
         duration,
         _seconds(attrs, "minDur", place, duration),
         _seconds(attrs, "maxDur", place, longest),

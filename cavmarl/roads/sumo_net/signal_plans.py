@@ -12,7 +12,13 @@ import numpy as np
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
-from cavmarl.roads.sumo_net.programs import OFF, Phase, SignalProgram, Timetable, read_programs
+from cavmarl.roads.sumo_net.programs import (
+    OFF,
+    ProgramPhase,
+    SignalProgram,
+    Timetable,
+    read_programs,
+)
 from cavmarl.roads.sumo_net.reader import source_hash
 from cavmarl.roads.sumo_net.signal_rows import SignalRows
 
@@ -133,7 +139,7 @@ def _off(network: RoadNetwork, rows: SignalRows, signal_id: str) -> SignalProgra
     for link in network.links[network.links["signal"] == row]:
         if link["state"] == ord("o"):
             letters[link["signal_index"]] = "o"
-    phase = Phase(1.0, 1.0, 1.0, "".join(letters))
+    phase = ProgramPhase(1.0, 1.0, 1.0, "".join(letters))
     return SignalProgram(signal_id, OFF, "static", 0.0, OFF, [phase])
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
-from cavmarl.roads.sumo_net.programs import Phase, SignalProgram
+from cavmarl.roads.sumo_net.programs import ProgramPhase, SignalProgram
 
 # Trains switch these; no train runs here, so their links are read as links without a signal.
 RAIL_KINDS = ("rail_signal", "rail_crossing")
@@ -124,7 +124,7 @@ class SignalRows:
         return self.num_controllers - 1
 
     def _add_phase(
-        self, program: SignalProgram, phase: Phase, number: int, first: int, num_links: int
+        self, program: SignalProgram, phase: ProgramPhase, number: int, first: int, num_links: int
     ) -> None:
         signal_id = program.signal_id
         if len(phase.state) != num_links:

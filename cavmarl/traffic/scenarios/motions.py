@@ -161,7 +161,7 @@ class Ride:
     def _claims(
         self, network: RoadNetwork, u: float, speed: float, length: float
     ) -> Iterator[tuple[float, int]]:
-        """The links that it is on, or will be on soon, as `kernels.approach` lists them."""
+        """The links that it is on, or will be on soon, as `junctions.approach` lists them."""
         reach = registration_distance_m(speed)
         line_m, ahead = 0.0, 0
         for before, after in pairwise(self.lanes):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS, STANDING_MPS
+from cavmarl.zones.kernels.row_bounds import Bounds
 
 # Which words of a VEHICLE record fields are; the lane is in the low half of its word.
 PLACES = {
@@ -40,6 +41,8 @@ class Forecast(NamedTuple):
     way_to_go: int  # the word of a row with its step that is the step's `to_go`
     limits: Floats  # (lanes,) m/s
     beyond: Floats  # (lanes,) m from a lane's start that its link has before it, to the link's end
+    row_bounds: Bounds  # of the indices in a row
+    bounds: Bounds  # of those in a row with its step
     words: Words  # scratch: a row and its step, as foreseen
     floats: Floats  # the same
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.zones.kernels.ghost_forecast import Forecast, foresee, is_told
+from cavmarl.zones.kernels.row_bounds import is_bounded
 
 ID = 0  # the word of a row that names the vehicle
 AFTER = 2  # words of a ghost behind its row and its step
@@ -265,9 +266,15 @@ def take_frame(
         leaving = frame[1 + 2 * num_worlds + w]
         if passing.num[w] + leaving > passing.rows.shape[1]:
             return NO_FRAME
-        words += leaving * row
+        for _ in range(leaving):
+            if not is_bounded(frame[words : words + row], law.row_bounds):
+                return NO_FRAME
+            words += row
     if not _unpack(law, before, now, total, frame, like, words):
         return NO_FRAME
+    for n in range(total):
+        if not is_bounded(now.words[n], law.bounds) or not _is_of_world(now.words[n], num_worlds):
+            return NO_FRAME
     for w in range(num_worlds):
         both.running[w] += frame[1 + w]
         passing.counts[w, COUNT_REROUTED] += frame[1 + num_worlds + w]
@@ -284,6 +291,11 @@ def take_frame(
                 n += 1
             first += 2
     return int(total)
+
+
+@inlined_kernel
+def _is_of_world(ghost: Words, num_worlds: int) -> bool:
+    return bool(0 <= ghost[ghost.size - 1] < num_worlds)
 
 
 @inlined_kernel

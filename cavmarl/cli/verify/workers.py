@@ -1,18 +1,19 @@
-"""What `cavmarl verify --kill` does and prints: workers are killed, and results stay the same."""
+"""`cavmarl verify workers`: worker processes are killed, and results stay the same."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import grid, write_json
-from cavmarl.config.world_spec import WorldSpec
+from cavmarl.cli.output import JsonPath, PolicyName, about, grid, with_world, write_json
+from cavmarl.cli.verify import options
+from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
@@ -22,14 +23,39 @@ BOUNDS_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 WIDTH = 30  # letters of the longest bar
 
 
-def verify_with_kills(
-    console: Console, world: WorldSpec, kills: int, json_path: Path | None, **arguments: Any
+@with_world()
+def verify_workers(
+    world: WorldSpec,
+    kill: Annotated[
+        int, about("Number of workers to kill or to stop at random times.", metavar="N")
+    ] = 10,
+    backend: Annotated[
+        str | None, about("Where the worlds run: processes:N [default: processes:2].")
+    ] = None,
+    workers: Annotated[int | None, about("Short form: N for --backend processes:N.")] = None,
+    worlds: Annotated[
+        int | None, about("Number of parallel worlds [default: two for each worker].")
+    ] = None,
+    zones: options.ZoneCount = None,
+    steps: Annotated[
+        int | None, about("Number of steps to compare [default: three for each kill].")
+    ] = None,
+    policy: PolicyName = "idm",
+    json_path: JsonPath = None,
 ) -> None:
-    """Kill and stop workers beside undisturbed worlds; exit code 1 if anything differs."""
+    """Kill and stop worker processes, and compare their worlds with undisturbed ones.
+
+    If a result or a state differs, print the step and exit with 1.
+    """
     from cavmarl.verify.worker_kills import verify_kills
 
-    with counting(console, f"{kills} workers of {world.env} are killed or stopped") as progress:
-        found = verify_kills(world, kills, progress=progress, **arguments)
+    world = with_sensors_of_drivers(world, [policy])
+    console = Console()
+    with counting(console, f"{kill} workers of {world.env} are killed or stopped") as progress:
+        found = verify_kills(
+            world, kill, backend=backend, workers=workers, worlds=worlds, zones=zones,
+            steps=steps, policy=policy, progress=progress,
+        )  # fmt: skip
     write_json(json_path, found.to_dict())
     _print(console, found)
     if not found.holds:

@@ -1,0 +1,65 @@
+"""What a `Simulation` does once, before its first step: SUMO, coordinators, warm kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.engine.sumo_phases import SumoPhases
+from cavmarl.engine.tick import Tick
+from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
+from cavmarl.handoff.coordinator.handoff_log import HandoffLog
+from cavmarl.ownership.messages import Switch
+from cavmarl.ownership.transfers import TransferLog
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.sumo.sumo_demand import SumoDemand
+from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
+from cavmarl.zones.reach import longest_move_m
+
+
+def add_sumo(tick: Tick, demand: object, network: RoadNetwork) -> None:
+    """Let SUMO run beside the worlds, if the demand is of SUMO."""
+    if isinstance(demand, SumoDemand):
+        travel, zoned = tick.traffic.travel, tick.division.zoned
+        traffic = SumoTraffic(demand, network, travel, travel.num_fixed, zoned, blank_vehicle())
+        tick.sumo = SumoPhases(traffic)
+
+
+def add_coordinators(
+    tick: Tick, config: EnvConfig, network: RoadNetwork, runs: Sequence[OpenRun] | None
+) -> tuple[TransferLog, ...]:
+    """Let coordinators decide ownership, if there are several zones or they are watched.
+
+    Returns:
+        a log of transfers for each world; none without coordinators.
+    """
+    zones = config.zones
+    if tick.division.count == 1 and not (zones.journal or zones.check_invariants):
+        return ()
+    reach_m = longest_move_m(network, tick.traffic.travel, config.clock.sim_dt_s)
+    setup = make_coordinators(zones, tick.division, reach_m, runs=runs)
+    tick.coordination = setup.coordination
+    return setup.transfers
+
+
+def call_rare_kernels(tick: Tick) -> None:
+    """Call the kernels that a first step may leave out, so that all of them are loaded."""
+    gate, division = tick.gate, tick.division
+    tick.let_in()
+    tick.traffic.accept(gate, tick.worlds, tick.peers.running())
+    tick.admit()
+    tick.executor.leave(gate)
+    tick.executor.retire(gate)
+    tick.executor.forget(gate)
+    tick.executor.gather(*division.gathering)
+    division.rehearse_gathering()
+    tick.traffic.settle(gate, tick.worlds)
+    division.changes.near(0, everybody=True)
+    with suppress(ConfigError):
+        division.changes.hand_over(0, Switch(-1, 0, 0, 0, False))
+    book = HandoffLog(division, 0)
+    book.release(book.hand_over(True, sum(division.counts(0)), ()))
+    book.reset(0)

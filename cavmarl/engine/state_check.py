@@ -1,0 +1,224 @@
+"""Checks a saved state before anything of it reaches the worlds.
+
+A state comes from a file, from a worker that has died, or from another node. Kernels go by its
+numbers without a look at how long the tables are that they name places in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.records.arrays import Common, Gate, RoadArrays
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    LANE_BEST,
+    LANE_GIVEN,
+    POS_GIVEN,
+    POS_LAST,
+    SPEED_AVERAGE,
+    SPEED_GIVEN,
+)
+from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
+from cavmarl.engine.component import Attached
+from cavmarl.handoff.division import Division
+from cavmarl.shards.state import Use, names_of
+from cavmarl.traffic.departure_queue import DEPARTURE
+from cavmarl.traffic.native import NativeTraffic
+
+Array = NDArray[Any]
+
+_LARGEST = 1e12
+_CODES = {
+    "lane_code": (LANE_BEST, LANE_GIVEN),
+    "pos_code": (POS_GIVEN, POS_LAST),
+    "speed_code": (SPEED_GIVEN, SPEED_AVERAGE),
+}
+_NUMBERS = ("pos", "speed", "speed_factor")
+
+
+class StateForm(NamedTuple):
+    """What a saved state of these worlds looks like."""
+
+    roads: RoadArrays
+    division: Division
+    traffic: NativeTraffic
+    attached: tuple[Attached, ...]
+    fixed: Sequence[Array]  # arrays of the dtypes and shapes of the first ones
+    rerouting: Sequence[Array]  # likewise, of vehicles that find their own ways; or none
+
+    def check(self, saved: Sequence[Array]) -> None:
+        """See that worlds can go on from a state.
+
+        Args:
+            saved: what `world_snapshot.save` returned.
+
+        Raises:
+            ConfigError: they cannot; the message says why.
+        """
+        if wrong := self._wrong(saved):
+            raise ConfigError(
+                f"the state is damaged, or one of other worlds: {wrong}; use the environment and "
+                "the version that saved it"
+            )
+
+    def check_share(self, share: Sequence[Array]) -> None:
+        """See that a state of one world has arrays of the right shapes. Raises ConfigError."""
+        num_worlds, queue = self.division.num_worlds, len(self.fixed)
+        grown, words = queue + 3, queue + len(self.rerouting) + 1
+        rows = np.zeros((num_worlds, 0))
+        likes = [*self.fixed, rows, *self.rerouting, rows, np.zeros(num_worlds)]
+        for n, (array, like) in enumerate(zip(share, likes, strict=False)):
+            shape = (len(like) // num_worlds, *like.shape[1:])
+            if n in (queue, words) or (n == grown and self.rerouting):
+                shape = (1, *array.shape[1:])
+            if array.shape != shape:
+                raise ConfigError(
+                    f"the state is damaged, or one of other worlds: array {n} has the shape "
+                    f"{array.shape}, not {shape}"
+                )
+
+    def _wrong(self, saved: Sequence[Array]) -> str:
+        num_worlds, zones = self.division.num_worlds, self.division.count
+        num_fixed, num_more = len(self.fixed), len(self.rerouting)
+        number = num_fixed + 1 + num_more + 2 + num_worlds * zones
+        if len(saved) != number:
+            return f"it has {len(saved)} arrays, not {number}"
+        rest = list(saved)
+        fixed, rest = rest[:num_fixed], rest[num_fixed:]
+        (queue,), rest = rest[:1], rest[1:]
+        rerouting, rest = rest[:num_more], rest[num_more:]
+        (words, contacts), vehicles = rest[:2], rest[2:]
+        names = [*names_of(Common, Use.SAVED), *names_of(Gate, Use.SAVED)]
+        for n, (array, like) in enumerate(zip(fixed, self.fixed, strict=True)):
+            if array.dtype != like.dtype or array.shape != like.shape:
+                name = names[n] if n < len(names) else f"array {n}"
+                return f"{name} is {array.dtype} {array.shape}, not {like.dtype} {like.shape}"
+        if queue.dtype != DEPARTURE or queue.ndim != 2 or len(queue) != num_worlds:
+            return f"the queue is {queue.dtype} {queue.shape}"
+        if words.dtype != np.int64 or words.ndim != 2 or len(words) != num_worlds:
+            return f"what is known of owners is {words.dtype} {words.shape}"
+        if contacts.dtype != np.int64 or contacts.shape != (num_worlds,) or (contacts < 0).any():
+            return "contacts are no numbers of each world"
+        if any(rows.dtype != VEHICLE or rows.ndim != 1 for rows in vehicles):
+            return "vehicles are no records of them"
+        named = dict(zip(names, fixed, strict=False))
+        return (
+            self._wrong_rerouting(rerouting)
+            or self._wrong_common(named)
+            or self._wrong_attached(fixed[len(fixed) - self._num_attached :])
+            or self._wrong_vehicles(named, queue, rerouting, vehicles)
+        )
+
+    @property
+    def _num_attached(self) -> int:
+        return sum(1 for part in self.attached for _ in part.arrays())
+
+    def _wrong_attached(self, arrays: Sequence[Array]) -> str:
+        at = 0
+        for part in self.attached:
+            number = sum(1 for _ in part.arrays())
+            if wrong := part.wrong(arrays[at : at + number]):
+                return wrong
+            at += number
+        return ""
+
+    def _wrong_rerouting(self, saved: Sequence[Array]) -> str:
+        if not self.rerouting:
+            return ""
+        for array, like in zip(saved, self.rerouting, strict=True):
+            if array.dtype != like.dtype or array.shape[:1] != like.shape[:1]:
+                return f"what rerouting knows is {array.dtype} {array.shape}"
+        past, sums, looks, steps = saved
+        if [past.shape, sums.shape, steps.shape] != [
+            self.rerouting[n].shape for n in (0, 1, 3)
+        ] or looks.ndim != 2:
+            return "what rerouting knows has other shapes"
+        edges, lanes, links = map(len, (self.roads.edges, self.roads.lanes, self.roads.links))
+        if _outside(looks["goal"], 0, edges) or _outside(looks["seen"], -1, edges):
+            return "rerouting drives to an edge that is none"
+        if _outside(steps["next"], -1, lanes) or _outside(steps["link"], -1, links):
+            return "a way that was found leads to a lane or link that is none"
+        return ""
+
+    def _wrong_common(self, named: dict[str, Array]) -> str:
+        roads = self.roads
+        phases, controllers = named["signal_phase"], named["controllers"]
+        if _outside(phases, 0, max(len(roads.phases), 1)):
+            return "signal_phase is out of all phases"
+        if phases.size:
+            ends = roads.phases["first_state"][phases] + roads.signals["num_links"]
+            if (ends > len(roads.phase_states)).any():
+                return "signal_phase is one of another signal"
+        if controllers.size:
+            programs = roads.programs[roads.programs["controller"] >= 0]
+            own = programs[np.argsort(programs["controller"])]
+            first, phase = own["first_phase"], controllers["phase"]
+            if ((phase != 0) & ((phase < first) | (phase >= first + own["num_phases"]))).any():
+                return "a controller has a phase of another program"
+        if np.isnan(named["detected_s"]).any() or not np.isfinite(named["pending"]).all():
+            return "detected_s or pending is no number"
+        for name, least in (
+            ("ticks", 0), ("cues", -1), ("next_order", 0), ("num_queue", 0), ("next_id", 0),
+            ("num_entered", 0), ("counts", 0),
+        ):  # fmt: skip
+            if (named[name] < least).any():
+                return f"{name} is below {least}"
+        return "sums are no numbers" if np.isnan(named["sums"]).any() else ""
+
+    def _wrong_vehicles(
+        self,
+        named: dict[str, Array],
+        queue: Array,
+        rerouting: Sequence[Array],
+        vehicles: Sequence[Array],
+    ) -> str:
+        zones, tail = self.division.count, rerouting[-1] if rerouting else None
+        capacity = self.traffic.capacity
+        if (named["num_queue"] > queue.shape[1]).any():
+            return "num_queue is more than there are in the queue"
+        for w, key in enumerate(named["keys"].tolist()):
+            num_orders = self.traffic.num_orders(key)
+            if named["next_order"][w] > num_orders or queue.shape[1] > capacity + num_orders:
+                return f"world {w} has more departures than there are"
+            rows = np.concatenate(vehicles[w * zones : (w + 1) * zones])
+            waiting = queue[w, : named["num_queue"][w]]
+            if len(rows) > capacity:
+                return f"world {w} has {len(rows)} vehicles, and room for {capacity}"
+            next_id = named["next_id"][w]
+            if (rows["id"] >= next_id).any() or (waiting["id"] >= next_id).any():
+                return f"world {w} has vehicles whose ids are still to come"
+            check = self.division.row_check
+            wrong = check.wrong(rows, tail, num_orders) or _wrong_codes(waiting)
+            wrong = wrong or check.wrong(_as_vehicles(waiting), tail, num_orders)
+            if wrong:
+                return f"world {w}: {wrong}"
+        return ""
+
+
+def _as_vehicles(waiting: NDArray[np.void]) -> NDArray[np.void]:
+    """VEHICLE (n,) of vehicles that wait to enter, with what is known of them."""
+    rows = blank_vehicle().repeat(len(waiting))
+    for name in ("id", "way", "agent", "order", "vtype", "goal", "lane", "stop", "stops_end"):
+        rows[name] = waiting[name]
+    rows["driver"] = np.where(waiting["agent"] >= 0, DRIVER_AGENT, DRIVER_BACKGROUND)
+    return rows
+
+
+def _wrong_codes(waiting: NDArray[np.void]) -> str:
+    for name, (low, high) in _CODES.items():
+        if _outside(waiting[name], low, high + 1):
+            return f"a vehicle in the queue has a {name} that is none"
+    for name in _NUMBERS:
+        if not (np.abs(waiting[name]) <= _LARGEST).all():
+            return f"a vehicle in the queue has a {name} that is none"
+    return ""
+
+
+def _outside(numbers: Array, low: int, end: int) -> bool:
+    return bool(((numbers < low) | (numbers >= end)).any())

@@ -1,0 +1,118 @@
+"""`OwnerChanges`: vehicles of a division change the zone that owns them, between two ticks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cavmarl.core.compiled import specialized
+from cavmarl.core.errors import ConfigError
+from cavmarl.handoff.coordinator.coordinator import Near
+from cavmarl.ownership.messages import Birth, Switch
+from cavmarl.shards.shard import Shard
+from cavmarl.zones.kernels.borders import give_up, pass_on, take_over
+from cavmarl.zones.kernels.handoff import hand_over, look, release
+from cavmarl.zones.kernels.zone_lookup import zone_of
+
+if TYPE_CHECKING:
+    from cavmarl.handoff.division import Division
+
+
+class OwnerChanges:
+    """Finds vehicles near a border and moves their rows from owner to owner.
+
+    Attributes:
+        hand_over_all: the kernel `hand_over`, for the arrays of these worlds.
+        release_all: the kernel `release`, for the arrays of these worlds.
+    """
+
+    def __init__(self, division: Division, shards: Sequence[Shard]) -> None:
+        self._division = division
+        self._shards = shards
+        self._look = specialized(look)
+        self._pass_on = specialized(pass_on)
+        self._give_up = specialized(give_up)
+        self._take_over = specialized(take_over)
+        self.hand_over_all = specialized(hand_over)
+        self.release_all = specialized(release)
+
+    def near(self, w: int, everybody: bool) -> list[Near]:
+        """Vehicles of a world near a border, by its committed rows."""
+        division = self._division
+        if everybody:
+            self._look(
+                division.zones, division.borders, division.zoned, division.side, w, True, 0,
+                division.book,
+            )  # fmt: skip
+        num = division.book.num_near.item(w)
+        if num == 0:
+            return []
+        return [Near(*entry) for entry in division.book.near[w, :num].tolist()]
+
+    def find(self, w: int, vehicle: int) -> tuple[int, int]:
+        """The zone that owns a vehicle, and its committed row there."""
+        for shard in self._shards:
+            worlds = shard.worlds
+            found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
+            if len(found):
+                return shard.zone, int(found[0])
+        raise ConfigError(f"vehicle {vehicle} is in no zone of world {w}")
+
+    def state(self, w: int, zone: int, row: int) -> bytes:
+        """The whole state of an owned vehicle of a zone, by its committed row."""
+        worlds = self._shards[zone].worlds
+        return self._division.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
+
+    def hand_over(
+        self,
+        w: int,
+        switch: Switch,  # the vehicle, its source and its target
+        hint: int = 0,  # the row where the old one probably keeps it
+    ) -> int:  # the row where the new one keeps it
+        """Let a vehicle change its owner, which goes on with the old one's committed row."""
+        place = self._pass_on(
+            switch.vehicle, switch.source, hint, switch.target, switch.epoch,
+            self._division.zoned, self._division.side, w,
+        )  # fmt: skip
+        if place == -1:
+            raise ConfigError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
+        if place == -2:
+            raise self.unseen(switch.vehicle, switch.target)
+        return place
+
+    def give_up(self, w: int, zone: int, vehicle: int) -> None:
+        """Let another process's zone have a vehicle of a zone of this one; it stays as a ghost."""
+        if not self._give_up(vehicle, zone, 0, self._division.zoned, self._division.side, w):
+            raise ConfigError(f"zone {zone} does not own vehicle {vehicle}")
+
+    def take_over(self, w: int, zone: int, vehicle: int, epoch: int, state: bytes) -> None:
+        """Go on with a vehicle of another zone, of which a zone of this process has a ghost."""
+        place = self._take_over(vehicle, zone, epoch, self._division.zoned, self._division.side, w)
+        if place < 0:
+            raise self.unseen(vehicle, zone)
+        worlds = self._shards[zone].worlds
+        self._division.codec.unpack(state, vehicle, int(worlds.ticks[w]), worlds.rows, w, place)
+        row = worlds.rows[w, place]
+        row["owner"], row["epoch"] = zone, epoch
+
+    @staticmethod
+    def unseen(vehicle: int, zone: int) -> ConfigError:
+        """What is wrong where a zone has no ghost of a vehicle that enters it."""
+        return ConfigError(
+            f"vehicle {vehicle} entered zone {zone}, which has not seen it come: the halo is too "
+            "narrow"
+        )
+
+    def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
+        """Give vehicles that are not on record yet to the zones that they are in now."""
+        settled = []
+        for vehicle, zone, state in births:
+            _, row = self.find(w, vehicle)
+            place = self._division.owned(w, zone)[row]
+            target = zone_of(self._division.zones, place["x"], place["y"])
+            if target != zone:
+                self.hand_over(w, Switch(vehicle, zone, target, 0, False), row)
+            settled.append(Birth(vehicle, target, state))
+        return settled

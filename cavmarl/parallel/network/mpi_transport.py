@@ -1,0 +1,336 @@
+"""`MpiTransport`: connections between the ranks of an MPI run.
+
+A place is `mpi` and a rank. Ranks trust each other: MPI has started all of them, and no secret is
+asked for. MPI has no failover: when it loses a rank it ends the run.
+
+A message with the tag 0 is about connections; another one has bytes, and its tag is the number of
+the connection's end at the rank that it goes to.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from functools import cache
+from itertools import count
+from typing import Any, Literal
+
+from cavmarl.core.errors import ConfigError, WorkerError, require
+from cavmarl.parallel.network.transport import (
+    READS,
+    Bytes,
+    Connection,
+    Place,
+    TransportListener,
+    TransportPoll,
+)
+
+MPI: Literal["mpi"] = "mpi"
+CALLER = 0  # the rank of the program whose worlds the other ranks host
+ABOUT = 0  # the tag of messages about connections
+LISTENER = 0  # the number by which a poll tells of the listener
+LOOKS = 500  # without a nap between them
+NAP_S = 50e-6
+END_S = 60.0  # for the others to end after the caller
+PRINTED_S = 0.3  # for what this process has printed to come through, before the run is ended
+HOW = f"mpirun -n 1 python PROGRAM : -n NODES cavmarl node --{MPI}"
+_ABOUT = struct.Struct("<IIII")
+
+
+class _About(IntEnum):
+    """What a message says of a connection."""
+
+    OPEN = 0  # a number that is said to the listener; the opener's end
+    ACCEPT = 1  # the end here; the opener's end
+    CLOSE = 2  # nothing; the end that it is said to
+    GONE = 3  # nothing: the whole process ends
+
+
+class MpiConnection:
+    """A `Connection` to another rank."""
+
+    address, keeps_bytes = MPI, False
+
+    def __init__(self, transport: MpiTransport, rank: int, number: int, far: int) -> None:
+        self.rank, self.number, self.far = rank, number, far
+        self.come: deque[memoryview] = deque()
+        self.has_ended = False  # the other end
+        self._transport = transport
+
+    @property
+    def closed(self) -> bool:
+        return self.has_ended and not self.come
+
+    def send(self, pieces: Sequence[Bytes]) -> int:
+        if self.has_ended:
+            raise BrokenPipeError(f"rank {self.rank} has ended the connection")
+        data = b"".join(pieces)
+        self._transport.send(self.rank, self.far, data)
+        return len(data)
+
+    def receive(self, room: memoryview) -> int:
+        if not self.come:
+            return 0
+        piece = self.come[0]
+        got = min(len(room), len(piece))
+        room[:got] = piece[:got]
+        if got < len(piece):
+            self.come[0] = piece[got:]
+        else:
+            self.come.popleft()
+        return got
+
+    def fileno(self) -> int:
+        return self.number
+
+    def is_ready(self) -> bool:
+        return self.has_ended or bool(self.come)
+
+    def close(self) -> None:
+        self._transport.forget(self)
+
+
+class MpiListener:
+    """A `TransportListener`: every rank may call."""
+
+    def __init__(self, place: Place) -> None:
+        self.place = place
+        self.callers: list[tuple[int, Connection]] = []
+        self.is_open = True
+
+    def fileno(self) -> int:
+        return LISTENER
+
+    def is_ready(self) -> bool:
+        return bool(self.callers)
+
+    def admit(self) -> list[tuple[int, Connection]]:
+        found, self.callers = self.callers, []
+        return found
+
+    def close(self) -> None:
+        self.is_open = False
+        for _, connection in self.admit():
+            connection.close()
+
+
+class MpiPoll:
+    """A `TransportPoll`. MPI has nothing that a process can sleep on: it looks again and again."""
+
+    def __init__(self, take: Callable[[], None]) -> None:
+        self._take = take  # takes what has come
+        self._ones: dict[int, MpiConnection | MpiListener] = {}
+
+    def register(self, one: Any, events: int) -> None:
+        self._ones[one.fileno()] = one
+
+    def modify(self, one: Any, events: int) -> None:
+        """All that is sent is taken at once."""
+
+    def unregister(self, one: Any) -> None:
+        del self._ones[one.fileno()]
+
+    def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
+        until_s = None if timeout_ms is None else time.monotonic() + 1e-3 * timeout_ms
+        for look in count():
+            self._take()
+            ready = [(number, READS) for number, one in self._ones.items() if one.is_ready()]
+            if ready or (until_s is not None and time.monotonic() >= until_s):
+                return ready
+            _rest(look)
+        raise AssertionError
+
+
+class MpiTransport:
+    """A `Transport` between the ranks of this run.
+
+    Attributes:
+        rank: of this process.
+        ranks: how many there are.
+        wait_s: for a rank to answer the first call of this one; None: as long as it takes.
+        is_broken: whether a rank is lost, so that the run has to be ended when this process ends.
+
+    Raises:
+        MissingExtraError: mpi4py is not installed.
+    """
+
+    def __init__(self) -> None:
+        require("mpi4py", "mpi")
+        from mpi4py import MPI as mpi
+
+        self._mpi, self._comm, self._status = mpi, mpi.COMM_WORLD, mpi.Status()
+        self.rank, self.ranks = self._comm.Get_rank(), self._comm.Get_size()
+        self.wait_s: float | None = None
+        self.is_broken = self._has_left = False
+        self._listener = MpiListener((MPI, self.rank))
+        self._numbers = count(1)
+        self._ends: dict[int, MpiConnection] = {}
+        self._gone: set[int] = set()  # ranks that have ended
+        self._sent: deque[tuple[Any, bytes]] = deque()  # requests, and what they send
+        atexit.register(self._end)
+
+    def open(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Connection:
+        end = self._new(place[1], far=0)
+        self._say(end.rank, _About.OPEN, number, end.number)
+        answer_s = self.wait_s if answer_s is None else answer_s
+        until_s = None if answer_s is None else time.monotonic() + answer_s
+        for look in count():
+            self.take()
+            if end.far:
+                break
+            if end.has_ended:
+                raise EOFError(f"rank {end.rank} of MPI has ended, or wants no more")
+            if until_s is not None and time.monotonic() > until_s:
+                end.close()
+                raise ConnectionRefusedError(f"rank {end.rank} of MPI does not answer")
+            _rest(look)
+        return end
+
+    def listen(self, address: str, secret: bytes) -> TransportListener:
+        if not self._listener.is_open:
+            self._listener = MpiListener((MPI, self.rank))
+        return self._listener
+
+    def poll(self) -> TransportPoll:
+        return MpiPoll(self.take)
+
+    def _new(self, rank: int, far: int) -> MpiConnection:
+        end = MpiConnection(self, rank, next(self._numbers), far)
+        end.has_ended = rank in self._gone
+        self._ends[end.number] = end
+        return end
+
+    def forget(self, end: MpiConnection) -> None:
+        """End a connection; what still comes for it is dropped."""
+        if self._ends.pop(end.number, None) is not None and end.far and not end.has_ended:
+            self._say(end.rank, _About.CLOSE, 0, end.far)
+
+    def _say(self, rank: int, what: _About, first: int, second: int) -> None:
+        if not self._has_left:
+            self.send(rank, ABOUT, _ABOUT.pack(what, first, second, 0))
+
+    def send(self, rank: int, tag: int, data: bytes) -> None:
+        """Send a message.
+
+        Raises:
+            OSError: MPI cannot, or this process ends.
+        """
+        if self._has_left:
+            raise BrokenPipeError("this process ends")
+        try:
+            self._sent.append((self._comm.Isend([data, self._mpi.BYTE], rank, tag), data))
+        except self._mpi.Exception as error:
+            raise OSError(f"rank {rank} cannot be reached: {error}") from error
+
+    def take(self) -> None:
+        """Take all messages that have come.
+
+        Raises:
+            WorkerError: MPI has lost a rank.
+        """
+        mpi, status = self._mpi, self._status
+        if mpi.Is_finalized():
+            return
+        try:
+            while (message := self._comm.Improbe(status=status)) is not None:
+                data = bytearray(status.Get_count(mpi.BYTE))
+                rank, tag = status.Get_source(), status.Get_tag()
+                message.Recv([data, mpi.BYTE])
+                if tag != ABOUT:
+                    if tag in self._ends:
+                        self._ends[tag].come.append(memoryview(data))
+                else:
+                    self._hear(rank, *_ABOUT.unpack(data)[:3])
+            while self._sent and self._sent[0][0].Test():
+                self._sent.popleft()
+        except mpi.Exception as error:
+            self.is_broken = True
+            raise WorkerError(f"MPI has lost a rank, and has no failover: {error}") from error
+
+    def _hear(self, rank: int, what: int, first: int, second: int) -> None:
+        """Take what is said of a connection."""
+        end = self._ends.get(second)
+        if what == _About.OPEN:
+            end = self._new(rank, far=second)
+            self._say(rank, _About.ACCEPT, end.number, second)
+            if self._listener.is_open:
+                self._listener.callers.append((first, end))
+            else:
+                end.close()
+        elif what == _About.ACCEPT and end is not None:
+            end.far = first
+        elif what == _About.ACCEPT:  # it has been waited for too long
+            self._say(rank, _About.CLOSE, 0, first)
+        elif what == _About.CLOSE and end is not None:
+            end.has_ended = True
+        elif what == _About.GONE:
+            self._gone.add(rank)
+            for one in self._ends.values():
+                one.has_ended |= one.rank == rank
+
+    def check_caller(self, nodes: int) -> None:
+        """Refuse a rank that cannot be the caller of so many nodes.
+
+        Raises:
+            ConfigError: it is another rank than the caller's, or there are too few beside it.
+        """
+        if self.rank != CALLER:
+            raise ConfigError(
+                f"backend = 'nodes:{nodes}@{MPI}': this is rank {self.rank}, the caller is rank "
+                f"{CALLER}; "
+                f"start the others as nodes: {HOW}"
+            )
+        if nodes >= self.ranks:
+            raise ConfigError(
+                f"backend = 'nodes:{nodes}@{MPI}': {self.ranks - 1} ranks are beside this "
+                f"one; start as many as nodes: {HOW}"
+            )
+
+    def _end(self) -> None:
+        """End with all other ranks; end them, if one of them is lost.
+
+        MPI ends well only when each message has been received, and a rank says nothing after GONE.
+        What Python destroys later, as environments that were not closed, finds MPI at its end.
+        """
+        mpi = self._mpi
+        if mpi.Is_finalized():
+            return
+        others = set(range(self.ranks)) - {self.rank}
+        until_s = None
+        try:
+            for rank in others:
+                self._say(rank, _About.GONE, 0, 0)
+            self._has_left = True
+            for look in count():
+                self.take()
+                if self.is_broken or (others <= self._gone and not self._sent):
+                    break
+                if until_s is None and CALLER in (self.rank, *self._gone):
+                    until_s = time.monotonic() + END_S
+                self.is_broken = until_s is not None and time.monotonic() > until_s
+                _rest(look)
+        except (OSError, WorkerError):
+            self.is_broken = True
+        if self.is_broken:
+            time.sleep(PRINTED_S)
+            self._comm.Abort(1)
+        mpi.Finalize()
+
+
+@cache
+def mpi_transport() -> MpiTransport:
+    """That of this process."""
+    return MpiTransport()
+
+
+def _rest(look: int) -> None:
+    """Leave the core to others, for longer after many looks."""
+    if look < LOOKS:
+        os.sched_yield()
+    else:
+        time.sleep(NAP_S)

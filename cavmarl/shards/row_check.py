@@ -1,0 +1,207 @@
+"""Checks vehicles that come from outside before a kernel goes by their indices.
+
+Rows come in saved states, in states that nodes keep, and with vehicles that change their zone.
+Kernels follow their indices into the tables of the network and of the ways without a look at how
+long these are.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import (
+    AUTHORITATIVE,
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    DRIVER_SUMO,
+    HOLD_EXIT_BLOCKED,
+)
+from cavmarl.driving.vehicles import VEHICLE
+from cavmarl.traffic.native import NativeTraffic
+
+Mask = NDArray[np.bool_]
+Numbers = NDArray[np.int64]
+
+_LARGEST = 1e12  # of any number in metres or seconds
+_LONGEST_WAY = 200_000  # lanes
+_ENDLESS = ("to_go", "step_to_go")  # infinite where there is no way
+_FLOATS = tuple(name for name in VEHICLE.names or () if VEHICLE[name].kind == "f")
+_INT32 = tuple(name for name in VEHICLE.names or () if VEHICLE[name] == np.int32)
+_MOST = np.iinfo(np.int32).max
+
+
+class RowCheck:
+    """Says what is wrong with vehicles of worlds, if anything is.
+
+    Args:
+        roads: the network.
+        traffic: types of vehicles and ways.
+        num_agents: that an episode of a world can have.
+        num_zones: of a world.
+    """
+
+    def __init__(
+        self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int, num_zones: int
+    ) -> None:
+        self._roads = roads
+        self._travel = travel = traffic.travel
+        none = np.zeros(0, dtype=np.int32)
+        self._step_lanes = none if traffic.schedule is None else traffic.schedule.step_lanes
+        self._is_moved = traffic.sumo is not None
+        num_lanes, num_links = len(roads.lanes), len(roads.links)
+        self._num_lanes = num_lanes
+        self._num_goals, self._plan_steps = len(traffic.plans), traffic.plans.size
+        bounds = {
+            "lane": (0, num_lanes - 1),
+            "side_lane": (-1, num_lanes - 1),
+            "target_lane": (-1, num_lanes - 1),
+            "vtype": (0, len(travel.types) - 1),
+            "driver": (DRIVER_BACKGROUND, DRIVER_SUMO),
+            "link": (-1, num_links - 1),
+            "stopped_at": (-1, num_links - 1),
+            "hold": (0, HOLD_EXIT_BLOCKED),
+            "blinker": (-1, 1),
+            "stop": (-1, len(travel.stops)),
+            "stops_end": (-1, len(travel.stops)),
+            "agent": (-1, num_agents - 1),
+            "leg": (0, _MOST),
+            "order": (-1, _MOST),
+            "owner": (0, num_zones - 1),
+            "epoch": (0, _MOST),
+            "transfer": (AUTHORITATIVE, AUTHORITATIVE),
+        }
+        self._low = np.array([bounds.get(name, (-_MOST - 1, 0))[0] for name in _INT32])
+        self._high = np.array([bounds.get(name, (0, _MOST))[1] for name in _INT32])
+        types = travel.types
+        self._radius_m = 0.5 * float(np.hypot(types["length"], types["width"]).max()) + 1e-6
+        self._height_m = float(types["height"].max()) + 1e-6
+
+    def wrong(
+        self,
+        rows: NDArray[np.void],  # VEHICLE (n,)
+        tail: NDArray[np.void] | None = None,  # PLAN (n,) the last ways; None: those of now
+        num_orders: int = _MOST,  # of the world's demand
+    ) -> str:
+        """What is wrong with some of these vehicles of one world; empty: nothing."""
+        if not len(rows):
+            return ""
+        rows = np.ascontiguousarray(rows)
+        return (
+            self._wrong_ints(rows)
+            or self._wrong_floats(rows)
+            or self._wrong_goals(rows)
+            or self._wrong_identity(rows, num_orders)
+            or self._wrong_ways(rows, tail)
+        )
+
+    def _wrong_ints(self, rows: NDArray[np.void]) -> str:
+        ints = np.stack([rows[name] for name in _INT32], axis=1)
+        outside = (ints < self._low) | (ints > self._high)
+        if not outside.any():
+            return ""
+        row, column = np.argwhere(outside)[0].tolist()
+        low, high = self._low.item(column), self._high.item(column)
+        return _of(rows[row], _INT32[column], f"out of {low} to {high}")
+
+    def _wrong_floats(self, rows: NDArray[np.void]) -> str:
+        floats = np.stack([rows[name] for name in _FLOATS], axis=1)
+        usual = np.abs(floats) <= _LARGEST
+        usual[:, _ENDLESS_COLUMNS] |= floats[:, _ENDLESS_COLUMNS] == np.inf
+        if not usual.all():
+            row, column = np.argwhere(~usual)[0].tolist()
+            return _of(rows[row], _FLOATS[column], "no number of a vehicle")
+        radii_m = 0.5 * np.hypot(rows["length"], rows["width"])
+        sizes = np.stack([rows["length"], rows["width"], rows["height"]])
+        wrong = (sizes <= 0.0).any(axis=0) | (radii_m > self._radius_m)
+        wrong |= rows["height"] > self._height_m
+        if not wrong.any():
+            return ""
+        return _of(rows[np.argmax(wrong)], "length", "with width and height the size of no type")
+
+    def _wrong_goals(self, rows: NDArray[np.void]) -> str:
+        """`goal` names a plan of an agent, a plan or detour of others, or a frame of a script."""
+        travel, driver = self._travel, rows["driver"]
+        detours = self._num_goals
+        if travel.first_detour:
+            detours = (travel.num_fixed - travel.first_detour) // self._num_lanes
+        low = np.array([-1, 0, 0, -1])
+        high = np.array([detours, self._num_goals, len(travel.scripts.frames), 0])
+        wrong = (rows["goal"] < low[driver]) | (rows["goal"] >= high[driver])
+        wrong |= (driver == DRIVER_AGENT) & (rows["agent"] < 0)
+        wrong |= rows["stop"] > rows["stops_end"]
+        if not wrong.any():
+            return ""
+        return _of(rows[np.argmax(wrong)], "goal", "or its driver, agent or stop, do not fit")
+
+    def _wrong_identity(self, rows: NDArray[np.void], num_orders: int) -> str:
+        for what, numbers in (
+            ("id", rows["id"]),
+            ("agent", rows["agent"][rows["agent"] >= 0]),
+        ):
+            if len(np.unique(numbers)) < len(numbers):
+                return f"two vehicles have the same {what}"
+        wrong = (rows["id"] < 0) | (rows["tick"] < 0) | (rows["order"] >= num_orders)
+        return _of(rows[np.argmax(wrong)], "order", "or id or tick, is none") if wrong.any() else ""
+
+    def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
+        """See that a way begins at a step of its lane; follow it where lanes are not known."""
+        lane, way = self._own_lanes(rows["lane"]), rows["way"]
+        at = way + lane
+        if wrong := self._wrong_places(rows, lane, way):
+            return wrong
+        travel, lanes = self._travel, self._num_lanes
+        planned = (at < self._plan_steps) & (at % lanes == lane)
+        if travel.first_detour:
+            of_routes = (at >= self._plan_steps) & (at < travel.first_detour)
+            planned[of_routes] = (
+                self._step_lanes[at[of_routes] - self._plan_steps] == lane[of_routes]
+            )
+            behind = at - travel.first_detour
+            planned |= (behind >= 0) & (at < travel.num_fixed) & (behind % lanes == lane)
+        drives = (rows["driver"] == DRIVER_BACKGROUND) | (rows["driver"] == DRIVER_AGENT)
+        follow = drives & ~planned
+        if self._is_moved:  # SUMO tells the routes again after the load
+            follow &= at < travel.num_fixed
+        rows, lane, way = rows[follow], lane[follow], way[follow]
+        for _ in range(_LONGEST_WAY):
+            if not len(rows):
+                return ""
+            step = self._steps(way + lane, tail)
+            goes_on = step["next"] >= 0
+            rows, step, way = rows[goes_on], step[goes_on], way[goes_on] + step["shift"][goes_on]
+            if (step["next"] >= lanes).any():
+                return _of(rows[np.argmax(step["next"] >= lanes)], "way", "leads to no lane")
+            lane = self._own_lanes(step["next"])
+            if wrong := self._wrong_places(rows, lane, way):
+                return wrong
+        return _of(rows[0], "way", "does not end")
+
+    def _steps(self, at: Numbers, tail: NDArray[np.void] | None) -> NDArray[np.void]:
+        steps = self._travel.steps
+        found = steps[at]
+        if tail is not None:
+            first = len(steps) - len(tail)
+            found[at >= first] = tail[at[at >= first] - first]
+        return found
+
+    def _wrong_places(self, rows: NDArray[np.void], lane: Numbers, way: Numbers) -> str:
+        """All lanes of an edge have a step there: a vehicle may change to any of them."""
+        edges = self._roads.edges[self._roads.lanes["edge"][lane]]
+        first = way + edges["first_lane"]
+        wrong = (first < 0) | (first + edges["num_lanes"] > len(self._travel.steps))
+        return _of(rows[np.argmax(wrong)], "way", "leads out of all ways") if wrong.any() else ""
+
+    def _own_lanes(self, lane: NDArray[np.int32]) -> Numbers:
+        """The lanes whose steps count: inside a junction that of the lane behind it."""
+        lanes = self._roads.lanes
+        behind = self._roads.links["to_lane"][lanes["link"][lane]]
+        return np.where(lanes["internal"][lane], behind, lane).astype(np.int64)
+
+
+_ENDLESS_COLUMNS = [_FLOATS.index(name) for name in _ENDLESS]
+
+
+def _of(row: np.void, name: str, what: str) -> str:
+    return f"vehicle {int(row['id'])} has {name} = {row[name].item()}, {what}"

@@ -1,0 +1,305 @@
+"""Forged states are refused by a typed error, and worlds stay as they were."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl import CavVectorEnv
+from cavmarl.core.errors import ConfigError, MessageError
+from cavmarl.driving.vehicles import VEHICLE
+from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.traffic.departure_queue import DEPARTURE
+from tests.support.actuated import actuated_grid
+from tests.support.replayed import BUSY
+from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
+from tests.support.vec_runs import Make
+
+Array = NDArray[Any]
+State: TypeAlias = list[Array]
+Forge = Callable[[State], None]
+
+MANY = 1 << 30
+ROW = {
+    "lane": (-1, MANY),
+    "side_lane": (-2, MANY),
+    "target_lane": (-2, MANY),
+    "vtype": (-1, 1),
+    "driver": (-1, 2, 4),
+    "link": (-2, MANY),
+    "stopped_at": (-2, MANY),
+    "hold": (-1, 4),
+    "blinker": (-2, 2),
+    "stop": (-2, MANY),
+    "stops_end": (-2, MANY),
+    "agent": (-2, 6),
+    "goal": (-2, MANY),
+    "leg": (-1,),
+    "order": (-2, 0),
+    "way": (-MANY, MANY),
+    "id": (-1, MANY),
+    "owner": (-1, 2),
+    "epoch": (-1,),
+    "transfer": (1,),
+    "tick": (-1,),
+    "x": (np.nan, np.inf, 1e30),
+    "s": (np.nan, -np.inf),
+    "speed": (np.nan,),
+    "heading": (np.inf,),
+    "to_go": (np.nan,),
+    "length": (0.0, -1.0, 100.0, np.nan),
+    "height": (30.0,),
+}
+WAITING = {
+    "lane": (-1, MANY),
+    "vtype": (-1, 1),
+    "agent": (-2, 6),
+    "goal": (-2, MANY),
+    "order": (-2, 0),
+    "way": (-MANY, MANY),
+    "stop": (-2, MANY),
+    "id": (-1, MANY),
+    "lane_code": (-6, 1),
+    "pos_code": (-1, 6),
+    "speed_code": (-1, 7),
+    "pos": (np.nan,),
+    "speed_factor": (np.inf,),
+}
+
+
+def _busy(make: Make, **more: Any) -> CavVectorEnv:
+    vec = make("grid4x4", num_envs=2, zones=2, overrides=dict(BUSY), **more)
+    vec.reset(seed=1)
+    for _ in range(12):
+        vec.step(vec.suggest_actions())
+    return vec
+
+
+def _worlds(vec: CavVectorEnv) -> LocalWorlds:
+    assert isinstance(vec.worlds, LocalWorlds)
+    return vec.worlds
+
+
+def _refused(vec: CavVectorEnv, forge: Forge) -> None:
+    """A state is refused that is like the present one but for what `forge` changes."""
+    worlds = _worlds(vec)
+    before = [array.copy() for array in worlds.save()]
+    forged = [array.copy() for array in before]
+    forge(forged)
+    with pytest.raises(ConfigError, match="the state "):
+        worlds.load(forged)
+    assert _same(worlds.save(), before)
+
+
+def _same(one: State, other: State) -> bool:
+    return all(_content(a) == _content(b) for a, b in zip(one, other, strict=True))
+
+
+def _content(array: Array) -> list[bytes]:
+    """The bytes of each field; what lies between fields is not copied."""
+    names = array.dtype.names
+    return [array.tobytes()] if names is None else [array[name].tobytes() for name in names]
+
+
+def _index(state: State, dtype: np.dtype[Any], last: bool = False) -> int:
+    found = [n for n, array in enumerate(state) if array.dtype == dtype and array.size]
+    return found[-1 if last else 0]
+
+
+def test_rows_with_an_index_out_of_range(make: Make) -> None:
+    vec = _busy(make)
+    for name, values in ROW.items():
+        for value in values:
+
+            def forge(state: State, name: str = name, value: float = value) -> None:
+                state[_index(state, VEHICLE, last=True)][name][-1] = value
+
+            _refused(vec, forge)
+
+
+def test_waiting_vehicles_with_an_index_out_of_range(make: Make) -> None:
+    vec = _busy(make)
+    worlds = _worlds(vec)
+    while not (worlds.simulation.gate.num_queue > 0).any():
+        vec.step(vec.suggest_actions())
+    world = int(np.argmax(worlds.simulation.gate.num_queue > 0))
+    for name, values in WAITING.items():
+        for value in values:
+
+            def forge(state: State, name: str = name, value: float = value) -> None:
+                state[_index(state, DEPARTURE)][name][world, 0] = value
+
+            _refused(vec, forge)
+
+
+def test_arrays_of_other_shapes_and_numbers(make: Make) -> None:
+    vec = _busy(make)
+    count = len(_worlds(vec).save())
+    for n in range(count):
+
+        def shorten(state: State, n: int = n) -> None:
+            state[n] = np.zeros((0, *state[n].shape[1:]), dtype=state[n].dtype)
+
+        def retype(state: State, n: int = n) -> None:
+            state[n] = np.zeros(state[n].shape, dtype=np.complex128)
+
+        if n < count - 4:  # a zone may have no vehicles
+            _refused(vec, shorten)
+        if n > 3:
+            _refused(vec, retype)
+    _refused(vec, lambda state: state.append(np.zeros(1)))
+    _refused(vec, State.clear)
+    _refused(vec, lambda state: state.__delitem__(-1))
+
+
+def test_two_vehicles_that_are_one(make: Make) -> None:
+    def twice(name: str) -> Forge:
+        def forge(state: State) -> None:
+            rows = state[_index(state, VEHICLE, last=True)]
+            rows[name][:2] = rows[name][-1]
+            rows["driver"][:2], rows["goal"][:2] = rows["driver"][-1], rows["goal"][-1]
+
+        return forge
+
+    vec = _busy(make)
+    _refused(vec, twice("id"))
+
+
+def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
+    vec = make(str(actuated_grid(tmp_path)), num_envs=2, zones=2, agents=3, background=30)
+    vec.reset(seed=2)
+    for _ in range(20):
+        vec.step(vec.suggest_actions())
+    worlds = _worlds(vec)
+    simulation = worlds.simulation
+    common = {
+        "ticks": -1,
+        "signal_phase": MANY,
+        "pending": np.nan,
+        "detected_s": np.nan,
+        "cues": -2,
+    }
+    gate = {"next_order": 1, "num_queue": MANY, "next_id": 0, "num_entered": -1, "counts": -1}
+    for source, values in ((simulation.shards[0].worlds, common), (simulation.gate, gate)):
+        for name, value in values.items():
+            array = getattr(source, name)
+            if not array.size:
+                continue
+            place = next(n for n, saved in enumerate(worlds.save()) if saved is array)
+
+            def forge(state: State, place: int = place, value: float = value) -> None:
+                state[place][...] = value
+
+            _refused(vec, forge)
+    controllers = simulation.shards[0].worlds.controllers
+    place = next(n for n, saved in enumerate(worlds.save()) if saved is controllers)
+    assert controllers.size
+    _refused(vec, lambda state: state[place]["phase"].fill(MANY))
+    words = len(worlds.save()) - 2 * 2 - 2
+    rng = np.random.default_rng(0)
+    size = worlds.save()[words].shape[1]
+    for n in range(9):  # how long its parts are
+
+        def lengthen(state: State, n: int = n) -> None:
+            state[words][0, n] = MANY
+
+        def deny(state: State, n: int = n) -> None:
+            state[words][0, n] = -1
+
+        _refused(vec, lengthen)
+        _refused(vec, deny)
+    for _ in range(200):  # refused, or of no consequence for the vehicles
+        state = [array.copy() for array in worlds.save()]
+        state[words][0, rng.integers(size)] = rng.integers(-MANY, MANY)
+        hashes = [vec.state_hash(w) for w in range(2)]
+        before = [array.copy() for array in worlds.save()]
+        try:
+            worlds.load(state)
+        except ConfigError:
+            assert _same(worlds.save(), before)
+        assert [vec.state_hash(w) for w in range(2)] == hashes
+        worlds.load(before)
+
+
+def test_ways_that_were_found(make: Make, tmp_path: Path) -> None:
+    files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
+    overrides = {
+        "traffic.demand": [str(path) for path in files],
+        "clock.sim_dt_s": 0.2,
+        "clock.ctrl_dt_s": 1.0,
+        "horizon_s": 600.0,
+        "population.mode": "respawn",
+    }
+    vec = make(str(make_map(tmp_path)), agents=1, background=0, overrides=overrides)
+    vec.reset(seed=1)
+    worlds = _worlds(vec)
+    for step in range(400):
+        vec.step(vec.suggest_actions())
+        if step % 40 == 39:
+            worlds.load([array.copy() for array in worlds.save()])
+    assert vec.traffic_stats()["rerouted"] > 0
+    steps = next(n for n, a in enumerate(worlds.save()) if "turnarounds" in (a.dtype.names or ()))
+    for name, value in (("next", MANY), ("next", -2), ("link", MANY), ("link", -2)):
+
+        def forge(state: State, name: str = name, value: int = value) -> None:
+            state[steps][name] = value
+
+        _refused(vec, forge)
+
+
+def test_messages_with_reports_that_are_not_there(make: Make) -> None:
+    overrides = {"v2x.enabled": True}
+    vec = make("grid4x4", agents=4, background=20, overrides=overrides)
+    vec.reset(seed=1)
+    for _ in range(5):
+        vec.step(vec.suggest_actions())
+    worlds = _worlds(vec)
+    mail = worlds.simulation.messages.mail
+    saved = {id(array): n for n, array in enumerate(worlds.save())}
+    for array in (mail.num_packets, mail.num_reports, mail.num_last):
+        place = saved.get(id(array))
+        if place is not None:
+            _refused(vec, lambda state, place=place: state[place].fill(-1))
+            _refused(vec, lambda state, place=place: state[place].fill(MANY))
+    if id(mail.packets) in saved:
+        place = saved[id(mail.packets)]
+        _refused(vec, lambda state: state[place]["first"].fill(MANY))
+
+
+def test_files_of_one_world(make: Make) -> None:
+    vec = _busy(make)
+    worlds = _worlds(vec)
+    saved, hashes = worlds.save_worlds(), [vec.state_hash(w) for w in range(2)]
+    like = worlds.share_of(0)
+    arrays = from_bytes(saved[0], [*like[:-2], like[-1]])
+    for n, array in enumerate(arrays):
+        shape = (2, *array.shape[1:])
+        for other in (np.zeros(shape, array.dtype), np.zeros_like(array[:0])):
+            if n == len(arrays) - 1 or other.shape == array.shape:
+                continue
+            forged = [*arrays[:n], other, *arrays[n + 1 :]]
+            assert worlds.refusal([to_bytes(forged), saved[1]]).startswith("the state ")
+            with pytest.raises(ConfigError, match="the state "):
+                worlds.load_worlds([to_bytes(forged), saved[1]])
+    assert [vec.state_hash(w) for w in range(2)] == hashes
+
+
+def test_a_vehicle_that_changes_its_zone(make: Make) -> None:
+    simulation = _worlds(_busy(make)).simulation
+    codec, rows = simulation.division.codec, simulation.shards[0].worlds.rows
+    tick = int(simulation.ticks()[0])
+    vehicle = int(rows["id"][0, 0])
+    for name, values in ROW.items():
+        for value in values:
+            if name in ("id", "order", "transfer", "agent", "owner"):
+                continue
+            forged = rows[0, :1].copy().reshape(1, 1)
+            forged[name] = value
+            with pytest.raises(MessageError):
+                codec.unpack(codec.pack(forged, 0, 0, tick), vehicle, tick, rows.copy(), 0, 0)
