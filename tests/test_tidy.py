@@ -27,11 +27,11 @@ WIDE_CLASSES: set[str] = set()
 
 ATTRIBUTES = 20  # that a class and its bases set
 LARGE_CLASSES = {
+    "cavmarl.handoff.division.Division",
     "cavmarl.ownership.trace_check.TraceChecker",
     "cavmarl.parallel.nodes.node_peers.NodePeers",
     "cavmarl.parallel.nodes.node_pool.NodePool",
     "cavmarl.parallel.nodes.node_process.NodeProgram",
-    "cavmarl.parallel.nodes.node_worlds.NodeWorlds",
     "cavmarl.parallel.nodes.zone_hosts.ZoneHosts",
     "cavmarl.shards.shard.Shard",
     "cavmarl.traffic.sumo.sumo_child.SumoSimulation",

@@ -70,8 +70,8 @@ def about_file(text: str, *names: str) -> Any:
 Backend = Annotated[
     str | None,
     about(
-        "Where the worlds run: local, processes:N, nodes:N, nodes:N@HOST:PORT, ray:N or ray "
-        "[default: local]."
+        "Where the worlds run: local, processes:N, nodes:N, nodes:N@HOST:PORT, nodes:N@mpi, ray:N "
+        "or ray [default: local]."
     ),
 ]
 Workers = Annotated[int | None, about("Short form: N for --backend processes:N, 0 for local.")]

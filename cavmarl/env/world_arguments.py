@@ -26,8 +26,9 @@ class WorldArguments(TypedDict, total=False):
         backend: where the worlds run (docs/workers.md). Results do not depend on it.
             "local": in the caller's process. "processes:N": in N worker processes of this machine.
             "nodes:N": in N processes that share nothing (docs/nodes.md), started on this machine.
-            "nodes:N@HOST:PORT": in N nodes that are started by hand and join there. "ray:N": in N
-            actors of a Ray cluster (docs/cluster.md), "ray": in as many as are of use.
+            "nodes:N@HOST:PORT": in N nodes that are started by hand and join there.
+            "nodes:N@mpi": in N other ranks of an MPI run. "ray:N": in N actors of a Ray cluster
+            (docs/cluster.md), "ray": in as many as are of use.
             The name of a registered backend: there, "name:N" with N workers.
         workers: short form: N for "processes:N", 0 for "local".
         nodes: short form: N for "nodes:N".
