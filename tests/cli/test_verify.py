@@ -51,7 +51,7 @@ def test_each_check_has_the_options_that_apply(
     own = {
         "zones": {"--zones", "--worlds", "--layout", "--journal", "--check"},
         "nodes": {"--zones", "--worlds", "--nodes", "--kill", "--faults", "--mix", "--check"},
-        "workers": {"--zones", "--worlds", "--workers", "--kill", "--hosts"},
+        "workers": {"--zones", "--worlds", "--workers", "--kill", "--backend"},
         "determinism": set[str](),
     }
     assert options >= own[check]
