@@ -39,12 +39,9 @@ class RowCheck:
         roads: the network.
         traffic: types of vehicles and ways.
         num_agents: that an episode of a world can have.
-        num_zones: of a world.
     """
 
-    def __init__(
-        self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int, num_zones: int
-    ) -> None:
+    def __init__(self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int) -> None:
         self._roads = roads
         self._travel = travel = traffic.travel
         none = np.zeros(0, dtype=np.int32)
@@ -68,7 +65,7 @@ class RowCheck:
             "agent": (-1, num_agents - 1),
             "leg": (0, _MOST),
             "order": (-1, _MOST),
-            "owner": (0, num_zones - 1),
+            "owner": (0, _MOST),  # of other zones, perhaps: a load writes it anew
             "epoch": (0, _MOST),
             "transfer": (AUTHORITATIVE, AUTHORITATIVE),
         }
