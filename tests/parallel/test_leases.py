@@ -118,7 +118,7 @@ def test_an_offer_that_comes_before_the_lease_of_its_episode_is_answered_after_i
     hosts.report()
     table, row = coordinator._worlds[0].directory.table, division.owned(0, 0)[0]
     before, row["id"] = int(row["id"]), 10**6
-    state = division.state(0, 0, 0)
+    state = division.changes.state(0, 0, 0)
     row["id"] = before
     offer = Offer(10**6, 0, state_digest(state), state)
     prepare = Prepare(
