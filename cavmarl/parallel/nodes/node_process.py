@@ -131,8 +131,8 @@ class NodeProgram:
         settings, division = simulation.config.zones, simulation.division
         self._hosts = ZoneHosts(
             division, mine, nodes_of(zones), told, limits_of(settings, division.codec.schema),
-            self._links, carried, self._peers.checks, generation, settings.check_invariants,
-            self._lease_ticks,
+            self._links, carried, self._peers.checks, generation=generation,
+            is_checked=settings.check_invariants, ticks=self._lease_ticks,
         )  # fmt: skip
         self._run_own()
 

@@ -78,6 +78,7 @@ class ZoneHosts:
         links: Links,  # to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) of agents: what they do, what is kept of them
         checks: RowChecks,  # of vehicles that are offered
+        *,
         generation: int = 0,  # how often nodes have been lost
         is_checked: bool = False,  # whether the caller checks what zones own
         ticks: int = 1,  # of a lease
