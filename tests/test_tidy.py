@@ -27,6 +27,7 @@ WIDE_CLASSES: set[str] = set()
 
 ATTRIBUTES = 20  # that a class and its bases set
 LARGE_CLASSES = {
+    "cavmarl.handoff.division.Division",
     "cavmarl.ownership.trace_check.TraceChecker",
     "cavmarl.parallel.nodes.node_peers.NodePeers",
     "cavmarl.parallel.nodes.node_pool.NodePool",
@@ -62,8 +63,8 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 109_000
-REACHABLE_LINES = 72_500  # from `make_vec` and `parallel_env`
+PACKAGE_LINES = 111_000
+REACHABLE_LINES = 74_500  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
 SHARED_MODULE_NAMES: set[str] = set()
