@@ -62,8 +62,8 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 109_000
-REACHABLE_LINES = 72_500  # from `make_vec` and `parallel_env`
+PACKAGE_LINES = 111_000
+REACHABLE_LINES = 74_500  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
 SHARED_MODULE_NAMES: set[str] = set()

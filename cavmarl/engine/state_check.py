@@ -27,6 +27,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.engine.component import Attached
 from cavmarl.handoff.division import Division
+from cavmarl.shards.row_check import MOST
 from cavmarl.shards.state import Use, names_of
 from cavmarl.traffic.departure_queue import DEPARTURE
 from cavmarl.traffic.native import NativeTraffic
@@ -194,8 +195,10 @@ class StateForm(NamedTuple):
             if (rows["id"] >= next_id).any() or (waiting["id"] >= next_id).any():
                 return f"world {w} has vehicles whose ids are still to come"
             check = self.division.row_check
-            wrong = check.wrong(rows, tail, num_orders) or _wrong_codes(waiting)
-            wrong = wrong or check.wrong(_as_vehicles(waiting), tail, num_orders)
+            # SUMO numbers its vehicles as they come, however many there will be.
+            numbers = num_orders if self.traffic.sumo is None else MOST
+            wrong = check.wrong(rows, tail, numbers) or _wrong_codes(waiting)
+            wrong = wrong or check.wrong(_as_vehicles(waiting), tail, numbers)
             if wrong:
                 return f"world {w}: {wrong}"
         return ""

@@ -200,6 +200,7 @@ class Division:
         for w, rows in enumerate(vehicles):
             first.rows[w, : len(rows)] = rows
             first.num_owned[w] = first.num_rows[w] = len(rows)
+            first.rows["owner"][w, : len(rows)] = 0
             if len(self._shards) > 1:
                 first.rows["epoch"][w, : len(rows)] = 0
         self.distribute(np.ones(len(vehicles), dtype=np.bool_))

@@ -88,7 +88,7 @@ def divide(
             zeros=zeros,
         )
         shards.append(shard)
-    row_check = RowCheck(shards[0].roads, traffic, outputs.present.shape[1], partition.count)
+    row_check = RowCheck(shards[0].roads, traffic, outputs.present.shape[1])
     division = Division(
         shards,
         zoned=zoned,

@@ -11,9 +11,9 @@ A tick costs what changes in it: vehicles that stay where they are are never loo
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.ledger import OwnedTally, SeenIds, state_digest
@@ -33,10 +33,36 @@ from cavmarl.ownership.messages import (
     Reset,
     Step,
 )
-from cavmarl.ownership.table import Table
 from cavmarl.ownership.trace import TraceEntry, describe
 
 Holding = tuple[int, int, int, int, bytes]
+
+
+class KnownOwners(Protocol):
+    """What a log has led to; see `ownership.table`, which the judge does not use."""
+
+    @property
+    def hosts(self) -> Mapping[int, tuple[Any, int]]: ...
+
+    @property
+    def episode(self) -> int: ...
+
+    @property
+    def tick(self) -> int: ...
+
+    @property
+    def run(self) -> bytes: ...
+
+    @property
+    def owners(self) -> Mapping[int, Any]: ...
+
+    @property
+    def seen(self) -> Any: ...
+
+    @property
+    def tallies(self) -> Mapping[Any, Any]: ...
+
+
 """(zone, incarnation, vehicle, epoch, digest) of a state at a host."""
 
 Owner = tuple[int, int]
@@ -133,7 +159,7 @@ class TraceChecker:
         self._heard.clear()
         self._holdings.clear()
 
-    def go_on(self, table: Table) -> None:
+    def go_on(self, table: KnownOwners) -> None:
         """Know what a log says that led to a table, of a coordinator without messages."""
         self._incarnations = {zone: number for zone, (_, number) in table.hosts.items() if number}
         self._episode, self._tick = table.episode - 1, 0

@@ -29,7 +29,7 @@ _LONGEST_WAY = 200_000  # lanes
 _ENDLESS = ("to_go", "step_to_go")  # infinite where there is no way
 _FLOATS = tuple(name for name in VEHICLE.names or () if VEHICLE[name].kind == "f")
 _INT32 = tuple(name for name in VEHICLE.names or () if VEHICLE[name] == np.int32)
-_MOST = np.iinfo(np.int32).max
+MOST = np.iinfo(np.int32).max
 
 
 class RowCheck:
@@ -39,12 +39,9 @@ class RowCheck:
         roads: the network.
         traffic: types of vehicles and ways.
         num_agents: that an episode of a world can have.
-        num_zones: of a world.
     """
 
-    def __init__(
-        self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int, num_zones: int
-    ) -> None:
+    def __init__(self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int) -> None:
         self._roads = roads
         self._travel = travel = traffic.travel
         none = np.zeros(0, dtype=np.int32)
@@ -66,23 +63,23 @@ class RowCheck:
             "stop": (-1, len(travel.stops)),
             "stops_end": (-1, len(travel.stops)),
             "agent": (-1, num_agents - 1),
-            "leg": (0, _MOST),
-            "order": (-1, _MOST),
-            "owner": (0, num_zones - 1),
-            "epoch": (0, _MOST),
+            "leg": (0, MOST),
+            "order": (-1, MOST),
+            "owner": (0, MOST),  # of other zones, perhaps: a load writes it anew
+            "epoch": (0, MOST),
             "transfer": (AUTHORITATIVE, AUTHORITATIVE),
         }
-        self._low = np.array([bounds.get(name, (-_MOST - 1, 0))[0] for name in _INT32])
-        self._high = np.array([bounds.get(name, (0, _MOST))[1] for name in _INT32])
+        self._low = np.array([bounds.get(name, (-MOST - 1, 0))[0] for name in _INT32])
+        self._high = np.array([bounds.get(name, (0, MOST))[1] for name in _INT32])
         types = travel.types
-        self._radius_m = 0.5 * float(np.hypot(types["length"], types["width"]).max()) + 1e-6
+        self._radius_m = 0.5 * float(_diagonals_m(types).max()) + 1e-6
         self._height_m = float(types["height"].max()) + 1e-6
 
     def wrong(
         self,
         rows: NDArray[np.void],  # VEHICLE (n,)
         tail: NDArray[np.void] | None = None,  # PLAN (n,) the last ways; None: those of now
-        num_orders: int = _MOST,  # of the world's demand
+        num_orders: int = MOST,  # of the world's demand
     ) -> str:
         """What is wrong with some of these vehicles of one world; empty: nothing."""
         if not len(rows):
@@ -112,7 +109,7 @@ class RowCheck:
         if not usual.all():
             row, column = np.argwhere(~usual)[0].tolist()
             return _of(rows[row], _FLOATS[column], "no number of a vehicle")
-        radii_m = 0.5 * np.hypot(rows["length"], rows["width"])
+        radii_m = 0.5 * _diagonals_m(rows)
         sizes = np.stack([rows["length"], rows["width"], rows["height"]])
         wrong = (sizes <= 0.0).any(axis=0) | (radii_m > self._radius_m)
         wrong |= rows["height"] > self._height_m
@@ -201,6 +198,11 @@ class RowCheck:
 
 
 _ENDLESS_COLUMNS = [_FLOATS.index(name) for name in _ENDLESS]
+
+
+def _diagonals_m(bodies: NDArray[np.void]) -> NDArray[np.float64]:
+    length, width = bodies["length"].astype(np.float64), bodies["width"].astype(np.float64)
+    return np.asarray(np.sqrt(length * length + width * width), dtype=np.float64)
 
 
 def _of(row: np.void, name: str, what: str) -> str:

@@ -44,7 +44,7 @@ ROW = {
     "order": (-2, 0),
     "way": (-MANY, MANY),
     "id": (-1, MANY),
-    "owner": (-1, 2),
+    "owner": (-1,),
     "epoch": (-1,),
     "transfer": (1,),
     "tick": (-1,),

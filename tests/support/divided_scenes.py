@@ -104,6 +104,7 @@ class DividedScene:
             simulation.gate.next_id[0] = len(rows)
             saved = [array.copy() for array in simulation.save()]
             zones = simulation.division.count
+            saved[-zones - 2][...] = 0  # the owners of these vehicles are not on record
             saved[-zones:] = [rows, *(rows[:0] for _ in range(1, zones))]
             simulation.load(saved)
 

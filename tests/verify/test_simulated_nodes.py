@@ -14,7 +14,7 @@ from cavmarl.cli import app
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError, WorkerDeathError, WorkerError
 from cavmarl.engine.world_setup import World, make_world
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.owner_changes import OwnerChanges
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.agent_stream import AgentStream
@@ -203,12 +203,11 @@ def test_frames_that_are_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert one_line("damage", seeds=12).wrong or one_line("duplicate", seeds=40).wrong
 
 
-@pytest.mark.parametrize("mix", ["lose", "duplicate", "reorder"])
-def test_frames_that_are_not_counted(monkeypatch: pytest.MonkeyPatch, mix: str) -> None:
-    """The campaign finds it: a frame is missing, comes twice or comes out of turn."""
+def test_frames_that_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The campaign finds it: a frame comes twice. Missing ones are found by what frames say."""
     checksum = "cavmarl.parallel.nodes.link.xxh3_64_intdigest"
     monkeypatch.setattr(checksum, lambda data, seed=0: xxh3_64_intdigest(data))
-    assert one_line(mix, seeds=8).wrong
+    assert one_line("duplicate", seeds=8).wrong
 
 
 def test_a_state_that_is_not_gone_back_to(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,12 +267,14 @@ def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """An epoch that no record has is noticed, though the vehicles move as they should."""
     checked: dict[str, Any] = {**SMALL, "steps": 30, "overrides": {CHECKED: True}}
     assert verify_simulated_nodes("merge", [3], mixes=["kill"], seeds=1, **checked).holds
-    take_over = Division.take_over
+    take_over = OwnerChanges.take_over
 
-    def later(self: Division, w: int, zone: int, vehicle: int, epoch: int, state: bytes) -> None:
+    def later(
+        self: OwnerChanges, w: int, zone: int, vehicle: int, epoch: int, state: bytes
+    ) -> None:
         take_over(self, w, zone, vehicle, epoch + 1, state)
 
-    monkeypatch.setattr(Division, "take_over", later)
+    monkeypatch.setattr(OwnerChanges, "take_over", later)
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **checked)
     assert "on record are" in found.lines[0].wrong[0]
     unchecked = {**checked, "overrides": {}}
