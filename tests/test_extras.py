@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,6 +45,23 @@ def reached(extra: str) -> set[str]:
 def test_errors_name_extras_that_there_are() -> None:
     named = list(named_extras())
     assert len(named) > 50
+    assert not [(extra, file) for extra, file in named if extra not in EXTRAS]
+
+
+def extras_of_pages() -> Iterator[tuple[str, str]]:
+    """Yield (extra, file) of each extra that a page or a program tells the reader to install."""
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    for path in (*pages, *(ROOT / "examples").rglob("*.*"), *(ROOT / "train").rglob("*.py")):
+        text = path.read_text(encoding="utf-8", errors="ignore")
+        installed = re.findall(r"(?:\.|cavmarl)\[([a-z0-9]+(?:, ?[a-z0-9]+)*)\]", text)
+        for extra in (*re.findall(r"extra `(\w+)`", text), *re.split(r", ?", ",".join(installed))):
+            if extra:
+                yield extra, path.relative_to(ROOT).as_posix()
+
+
+def test_pages_name_extras_that_there_are() -> None:
+    named = list(extras_of_pages())
+    assert ("train", "README.md") in named
     assert not [(extra, file) for extra, file in named if extra not in EXTRAS]
 
 

@@ -18,10 +18,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from cavmarl.core.cache_folder import cache_dir
-from cavmarl.core.compiled.signatures import CALLS_SETTING, example_arguments, signature_of
+from cavmarl.core.compiled.signatures import CALLS_SETTING
 from cavmarl.core.errors import KernelError
 from cavmarl.prebuild.call_list import (
     KernelCall,
+    can_be_made,
     marked,
     merged,
     read_manifest,
@@ -75,20 +76,12 @@ def record(folder: Path) -> None:
     """Write the list anew: recorded calls, and those of the old list that can still be made."""
     known = called_kernels()
     plain = _calls_of_plain_worlds()
-    found = {*recorded_calls(folder), *plain, *filter(_can_be_made, read_manifest())}
+    found = {*recorded_calls(folder), *plain, *filter(can_be_made, read_manifest())}
     calls = merged(marked((call for call in found if call.name in known), plain))
     write_manifest(calls)
     print(f"{len(calls)} calls of {len({call.name for call in calls})} kernels")
     if missing := known - {call.name for call in calls}:
         print(f"never called: {', '.join(sorted(missing))}")
-
-
-def _can_be_made(call: KernelCall) -> bool:
-    """Return whether the types of a call still exist as the list describes them."""
-    try:
-        return signature_of(example_arguments(call.kinds)) == call.kinds
-    except (ImportError, AttributeError, TypeError):
-        return False
 
 
 _PLAIN_WORLD = """

@@ -8,10 +8,14 @@ once.
 from __future__ import annotations
 
 import functools
+import importlib
+import inspect
 import json
 from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from cavmarl.core.compiled.signatures import example_arguments, signature_of
 
 MANIFEST = Path(__file__).with_name("kernel_calls.json")
 _READONLY = " readonly"
@@ -75,6 +79,28 @@ def recorded_calls(folder: Path) -> set[KernelCall]:
             name, kinds = json.loads(line)
             found.add(KernelCall(name, json.dumps(kinds)))
     return found
+
+
+def can_be_made(call: KernelCall) -> bool:
+    """Return whether a kernel still takes such arguments, and their types are as described."""
+    module, _, name = call.name.rpartition(".")
+    try:
+        kernel = getattr(importlib.import_module(module), name)
+        takes = [str(one.annotation) for one in inspect.signature(kernel).parameters.values()]
+        return (
+            len(takes) == len(call.kinds)
+            and all(map(_fits, takes, call.kinds))
+            and signature_of(example_arguments(call.kinds)) == call.kinds
+        )
+    except (ImportError, AttributeError, TypeError):
+        return False
+
+
+def _fits(annotation: str, kind: Any) -> bool:
+    """Return whether a parameter may take a bundle of this kind; other kinds are not compared."""
+    is_bundle = isinstance(kind, dict) and "bundle" in kind
+    is_named = annotation != str(inspect.Parameter.empty)
+    return not (is_bundle and is_named) or kind["bundle"].rpartition(":")[2] in annotation
 
 
 def merged(calls: Iterable[KernelCall]) -> set[KernelCall]:

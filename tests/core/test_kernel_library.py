@@ -22,6 +22,7 @@ from cavmarl.core.math.bearings import rough_atan2
 from cavmarl.driving.driver_models import REGISTERED_MODELS, register_driver_model
 from cavmarl.prebuild.call_list import (
     KernelCall,
+    can_be_made,
     marked,
     merged,
     read_manifest,
@@ -225,10 +226,15 @@ def test_each_kernel_that_python_calls_is_in_the_list() -> None:
 
 @compiled_only
 def test_each_call_of_the_list_can_be_made_again() -> None:
-    from cavmarl.core.compiled.signatures import example_arguments
-
-    for call in read_manifest():
-        assert signature_of(example_arguments(call.kinds)) == call.kinds, call.name
+    calls = read_manifest()
+    assert [call.name for call in calls if not can_be_made(call)] == []
+    by_name = {call.name.rpartition(".")[2]: call for call in calls}
+    gate, ticks = by_name["call_orders"].kinds
+    keys, worlds = by_name["assign_lanes"].kinds[3], by_name["populate"].kinds[4]
+    name = by_name["call_orders"].name
+    assert can_be_made(KernelCall(name, json.dumps([gate, ticks])))
+    assert not can_be_made(KernelCall(name, json.dumps([gate, ticks, keys]))), "another parameter"
+    assert not can_be_made(KernelCall(name, json.dumps([gate, worlds]))), "another bundle"
 
 
 def test_a_plain_world_needs_some_of_them() -> None:

@@ -49,8 +49,9 @@ print("equal:", same(found, drive(whole)), flush=True)
 
 
 def mpirun(*words: str) -> subprocess.CompletedProcess[str]:
-    """What an MPI run prints; it ends within a time."""
-    return subprocess.run(
+    """What an MPI run prints; it ends within a time, and leaves no shared memory behind."""
+    before = set(Path("/dev/shm").glob("mpich*"))
+    done = subprocess.run(
         [str(MPIRUN), *words],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
@@ -58,6 +59,8 @@ def mpirun(*words: str) -> subprocess.CompletedProcess[str]:
         text=True,
         timeout=RUN_S,
     )
+    assert set(Path("/dev/shm").glob("mpich*")) <= before
+    return done
 
 
 @pytest.fixture

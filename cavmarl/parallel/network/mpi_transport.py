@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import struct
 import time
 from collections import deque
@@ -18,6 +19,7 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import cache
 from itertools import count
+from pathlib import Path
 from typing import Any, Literal
 
 from cavmarl.core.errors import ConfigError, WorkerError, require
@@ -40,6 +42,7 @@ END_S = 60.0  # for the others to end after the caller
 PRINTED_S = 0.3  # for what this process has printed to come through, before the run is ended
 HOW = f"mpirun -n 1 python PROGRAM : -n NODES cavmarl node --{MPI}"
 _ABOUT = struct.Struct("<IIII")
+_SHARED = re.compile(r"/dev/shm/mpich_shm_\w+(?= *$)", re.MULTILINE)
 
 
 class _About(IntEnum):
@@ -172,6 +175,7 @@ class MpiTransport:
         self._ends: dict[int, MpiConnection] = {}
         self._gone: set[int] = set()  # ranks that have ended
         self._sent: deque[tuple[Any, bytes]] = deque()  # requests, and what they send
+        _unlink_shared_memory()
         atexit.register(self._end)
 
     def open(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Connection:
@@ -320,6 +324,18 @@ class MpiTransport:
             time.sleep(PRINTED_S)
             self._comm.Abort(1)
         mpi.Finalize()
+
+
+def _unlink_shared_memory() -> None:
+    """Remove the names of the memory that the ranks of this machine share.
+
+    All ranks have attached it when MPI has started. MPICH removes the names when it ends well, and
+    leaves them behind when a rank is killed or the run is aborted.
+    """
+    maps = Path("/proc/self/maps")
+    if maps.exists():  # Linux
+        for path in set(_SHARED.findall(maps.read_text())):
+            Path(path).unlink(missing_ok=True)
 
 
 @cache
