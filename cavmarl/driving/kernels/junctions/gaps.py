@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
@@ -177,7 +177,7 @@ def _is_committed(foe: np.void, front: float) -> bool:
 @kernel
 def _is_harmless(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     row: np.void,
     link: int,
@@ -223,7 +223,7 @@ def _is_harmless(
 
 
 @inlined_kernel
-def _brisk(travel: Travel, row: np.void) -> float:
+def _brisk(travel: TripTables, row: np.void) -> float:
     """How hard a vehicle speeds up, in m/s²: long ones less."""
     brisk: float = BRISK_ACCEL
     if row["driver"] != DRIVER_AGENT:
@@ -308,7 +308,7 @@ def _comes(
 @kernel
 def _blocks_inside(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     link: int,
     distance: float,
@@ -354,7 +354,7 @@ def _blocks_inside(
 @kernel
 def foe_blocks(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     row: np.void,
     link: int,

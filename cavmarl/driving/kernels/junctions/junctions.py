@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
@@ -69,7 +69,7 @@ STOP_SIGN_M = MOST_BACK_M + 2.0 * LINE_MARGIN_M
 @kernel
 def _blocked_by_foes(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     link: int,
@@ -134,7 +134,7 @@ def _blocked_by_foes(
 
 @kernel
 def _exit_blocked(
-    roads: RoadArrays, travel: Travel, row: np.void, link: int, way: int, scratch: Scratch
+    roads: RoadArrays, travel: TripTables, row: np.void, link: int, way: int, scratch: Scratch
 ) -> bool:
     """Whether a row could not clear the junction behind the last standing vehicle on its way.
 
@@ -175,7 +175,7 @@ def _exit_blocked(
 @kernel
 def may_enter(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     i: int,  # the row that asks
     link: int,  # LINK row
@@ -306,7 +306,7 @@ def behind_merging(
 @kernel
 def waits_inside(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     link: int,
@@ -357,7 +357,7 @@ def before_waiting(
 @kernel
 def constraint_inside(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     i: int,  # the row that asks
     link: int,  # that it drives on
