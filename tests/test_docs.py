@@ -237,26 +237,7 @@ def default_text(value: object) -> str:
 def test_commands_of_pages_are_understood(page: Path) -> None:
     """Each command is there, and has the options that it is given."""
     for line in commands_of(page.read_text(encoding="utf-8")):
-        command = whole_command()
-        context = command.make_context("cavmarl", [], resilient_parsing=True)
-        words = shlex.split(line.replace("…", ""), comments=True)[1:]
-        while hasattr(command, "get_command") and words and not words[0].startswith("-"):
-            found = command.get_command(context, words[0])
-            assert found is not None, line
-            context = type(context)(found, parent=context, **found.context_settings)
-            command, words = found, words[1:]
-        try:
-            _, left, _ = command.make_parser(context).parse_args(words)
-        except USAGE as error:
-            if "requires an argument" not in str(error):  # as a page may name an option
-                raise
-            left = []
-        assert not left or context.ignore_unknown_options, line
-
-
-@cache
-def whole_command() -> Any:
-    return typer.main.get_command(app)
+        check_command(line)
 
 
 def commands_of(text: str) -> list[str]:

@@ -77,7 +77,7 @@ def test_zones_can_be_cut_by_what_was_measured(
         "50",
     )
     short = ("--steps", "5", "--before", "5")
-    assert run(*rush, *short, "--layout", "grid", "--cut-anew", str(path)) == 0
+    assert run(*rush, *short, "--layout", "grid", "--write-zones", str(path)) == 0
     said = capsys.readouterr().out.splitlines()[-1]
     assert f"of 50 vehicles are in other zones: {path}" in said
     assert run(*rush, *short, "--layout", str(path)) == 0
@@ -85,6 +85,6 @@ def test_zones_can_be_cut_by_what_was_measured(
         run("verify", "zones", "rush", "--zones", "4", "--layout", str(path), "--steps", "5") == 0
     )
     path.unlink()
-    assert run(*rush, *short, "--tolerance", "4", "--cut-anew", str(path)) == 0
+    assert run(*rush, *short, "--tolerance", "4", "--write-zones", str(path)) == 0
     assert "is not written" in capsys.readouterr().out
     assert not path.exists()
