@@ -35,8 +35,8 @@ def _writable(option: typer.CallbackParam, path: Path | None) -> Path | None:
         return None
     if not path.parent.is_dir():
         raise ConfigError(
-            f"{option.opts[0]} {path}: the folder {path.parent} does not exist; create it, or "
-            "name another file"
+            f"{option.opts[0]} {path}: cannot be written: there is no folder {path.parent}; create "
+            "it, or name another file"
         )
     try:
         there = path.exists()

@@ -130,7 +130,7 @@ def run(
 def sweep(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Names of scenarios [default: all]."),
+        typer.Argument(metavar="[NAME]...", help="Names of scenarios.", show_default="all"),
     ] = None,
     map_names: Annotated[
         list[str] | None,

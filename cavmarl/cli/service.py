@@ -71,7 +71,8 @@ def serve(
         int, about("Port to listen on; 0 picks a free port.", metavar="PORT", min=0, max=65535)
     ] = 8700,
     store: Annotated[
-        str, about("Event store: an SQLite file or postgresql://…", metavar="STORE")
+        str,
+        about("Event store: an SQLite file, or the URL of a PostgreSQL database.", metavar="STORE"),
     ] = "runs/service.sqlite",
     certificate: Certificate = None,
     key: Key = None,
