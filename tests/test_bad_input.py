@@ -150,7 +150,7 @@ def test_actions_for_an_agent_that_has_left_are_refused() -> None:
     env = make()
     gone = lose_one(env)
     before = env.state_hash()
-    with pytest.raises(ActionError, match=r"car_0.*not in the world.*late_actions = ignore"):
+    with pytest.raises(ActionError, match=r"car_0.*not in the episode.*late_actions = ignore"):
         env.step({**env.suggest_actions(), gone: FINE})
     assert env.state_hash() == before
 

@@ -352,7 +352,7 @@ def test_what_needs_the_worlds_here_is_refused(make: Make) -> None:
     with pytest.raises(ConfigError, match="cannot be copied"):
         vec.worlds.__reduce__()
     vec.reset(seed=0)
-    with pytest.raises(ConfigError, match="the state is one of other worlds"):
+    with pytest.raises(ConfigError, match="the saved state belongs to other worlds"):
         vec.worlds.load_worlds([b"nothing"])
     vec.step(vec.suggest_actions())
 
