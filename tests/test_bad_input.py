@@ -397,7 +397,7 @@ def test_names_that_no_file_can_have_are_refused(name: str) -> None:
         parallel_env(name)
     with pytest.raises(PolicyError):  # "" is the folder that one works in
         load_policy(name, parallel_env("ring"))
-    with pytest.raises((MapError, ConfigError), match=r"map\.source|can hold"):
+    with pytest.raises((MapError, ConfigError), match=r"map\.source|not allowed"):
         parallel_env("ring", overrides={"map.source": f"{name}.net.xml"})
-    with pytest.raises((DemandError, ConfigError), match=r"traffic\.demand|can hold"):
+    with pytest.raises((DemandError, ConfigError), match=r"traffic\.demand|not allowed"):
         parallel_env("ring", overrides={"traffic.demand": [f"{name}.rou.xml"]})
