@@ -69,7 +69,7 @@ def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
     ],
 )
 def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
+    with pytest.raises(ConfigError, match=f"^{key}: this view sets it"):
         gymnasium.make("cavmarl/ring-v5", **arguments)
 
 
