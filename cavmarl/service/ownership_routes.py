@@ -1,4 +1,4 @@
-"""Routes of divided worlds: which zone owns a vehicle, and where the nodes of zones meet."""
+"""Routes of divided worlds: owners of vehicles, and connections of the nodes of a session."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ownership = make_router("/v1/sessions/{number}", "ownership")
 async def get_transfers(
     identity: Readers, service: TheService, number: SessionId
 ) -> responses.Ownership:
-    """Owners of vehicles that have changed their zone, and vehicles that another has PREPARED."""
+    """Return the owners of transferred vehicles, and the vehicles with a prepared transfer."""
     session = service.broker.session(identity, number)
     owners = [
         responses.OwnerOfVehicle(
@@ -36,7 +36,7 @@ async def get_transfers(
 async def put_transfers(
     identity: Nodes, service: TheService, number: SessionId, body: requests.TransfersBody
 ) -> None:
-    """A node tells which vehicles have changed their zone since it told last."""
+    """Record the vehicles that have changed zone since the node's last report."""
     service.broker.hand_over(service.broker.hosted(identity, number), body)
 
 
@@ -44,9 +44,13 @@ async def put_transfers(
 async def put_door(
     identity: Nodes, service: TheService, number: SessionId, body: requests.DoorBody
 ) -> None:
-    """Where the node of a session awaits those that host zones of it."""
+    """Record where the node of a session waits for the nodes that host its zones."""
     session = service.broker.hosted(identity, number)
     node = service.broker.log.state.nodes[session.node or ""]
-    if body.host != node.address:  # others are sent there: nowhere but to the node itself
-        raise problem("refused", f"host: is '{body.host}', the node's address '{node.address}'")
+    if (
+        body.host != node.address
+    ):  # other nodes connect there, so it must be the address of the node itself
+        raise problem(
+            "refused", f"host: is '{body.host}', but must be the node's address '{node.address}'"
+        )
     service.broker.zone_nodes.open_door(session, body)

@@ -1,4 +1,4 @@
-"""What routes are made of: roles, names in paths, what is documented of all answers."""
+"""Parts shared by routes: roles, names in paths, and documentation of responses."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CONTENT = {  # of a request whose body is no document
 
 
 def make_router(prefix: str, tag: str) -> APIRouter:
-    """A router whose answers leave when what they tell of is on disk."""
+    """Return a router whose answers are sent when the events they refer to are on disk."""
     return APIRouter(prefix=prefix, route_class=DurableRoute, tags=[tag], responses=PROBLEM)
 
 
