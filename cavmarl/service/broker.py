@@ -26,7 +26,7 @@ from cavmarl.service.node_selection import (
     overloads,
     score_of,
 )
-from cavmarl.service.requests import BeatBody, NodeBody, TransfersBody
+from cavmarl.service.request_bodies import BeatBody, NodeBody, TransfersBody
 from cavmarl.service.service_records import (
     SESSION_OVER,
     IdentityRecord,

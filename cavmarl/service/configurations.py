@@ -16,7 +16,7 @@ from cavmarl.config.registry import agent_entries, entries, load_config
 from cavmarl.core.errors import CavmarlError
 from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
-from cavmarl.service.requests import ConfigurationBody
+from cavmarl.service.request_bodies import ConfigurationBody
 from cavmarl.service.service_records import IdentityRecord
 
 MOST_CONFIGURATIONS = 10_000  # configurations of one identity

@@ -21,14 +21,14 @@ from starlette.types import ASGIApp
 
 from cavmarl.client.world_protocol import SAVED_HEADER
 from cavmarl.core.errors import ServiceError, WorkerError
-from cavmarl.service import responses
+from cavmarl.service import response_bodies
 from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
 from cavmarl.service.auth import StrictRoute
 from cavmarl.service.error_names import problem
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.problem_json import serve_routes
-from cavmarl.service.requests import Whole
+from cavmarl.service.request_bodies import Whole
 from cavmarl.service.route_common import OCTETS, PROBLEM
 from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorld, SessionWorlds
 
@@ -134,7 +134,7 @@ async def open_worlds(
     session: str,
     configuration: Opened,
     save: Annotated[bool, Query(description="Leave their state with the service first")] = False,
-) -> responses.WorldDescription:
+) -> response_bodies.WorldDescription:
     """Create or find the worlds of a session; they continue from their saved state."""
     link, worlds = _link(request), _worlds(request)
     if session not in worlds:
@@ -150,7 +150,7 @@ async def open_worlds(
         link.expect(session)
     elif save:
         await _save(link, worlds, session)
-    return responses.WorldDescription(**worlds[session].describe())
+    return response_bodies.WorldDescription(**worlds[session].describe())
 
 
 @router.post("/reset", response_class=Response, responses=ANSWER)
@@ -235,10 +235,10 @@ async def _tend(worlds: SessionWorlds, session: str) -> None:
 
 
 @router.get("/hash")
-async def get_hashes(request: Request, session: str, _: Opened) -> responses.WorldHashes:
+async def get_hashes(request: Request, session: str, _: Opened) -> response_bodies.WorldHashes:
     """Return the state hashes of the worlds."""
     worlds = _worlds(request)
-    return responses.WorldHashes(hashes=await in_turn(worlds, worlds[session].hashes))
+    return response_bodies.WorldHashes(hashes=await in_turn(worlds, worlds[session].hashes))
 
 
 @router.get("/suggestion", response_class=Response, responses=ANSWER)
@@ -249,21 +249,25 @@ async def get_suggestion(request: Request, session: str, _: Opened) -> Response:
 
 
 @router.get("/transfers")
-async def get_transfers(request: Request, session: str, _: Opened) -> responses.WorldTransfers:
+async def get_transfers(
+    request: Request, session: str, _: Opened
+) -> response_bodies.WorldTransfers:
     """Return the most recent ownership transfers of divided worlds."""
     worlds = _worlds(request)
-    return responses.WorldTransfers(transfers=await in_turn(worlds, worlds[session].transfers))
+    return response_bodies.WorldTransfers(
+        transfers=await in_turn(worlds, worlds[session].transfers)
+    )
 
 
 @router.get("/page")
-async def get_page(request: Request, session: str, _: Opened) -> responses.WorldPage:
+async def get_page(request: Request, session: str, _: Opened) -> response_bodies.WorldPage:
     """Serve a viewer page of the worlds on this node's machine, and return its address."""
     worlds = _worlds(request)
     told = await in_turn(worlds, worlds[session].page)
     tended: dict[str, asyncio.Task[None]] = request.app.state.tended
     if session not in tended or tended[session].done():
         tended[session] = asyncio.create_task(_tend(worlds, session))
-    return responses.WorldPage(**told)
+    return response_bodies.WorldPage(**told)
 
 
 @router.delete("", status_code=204)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cavmarl.service import requests, responses
+from cavmarl.service import request_bodies, response_bodies
 from cavmarl.service.auth import TheService
 from cavmarl.service.error_names import problem
 from cavmarl.service.route_common import Nodes, Readers, SessionId, make_router
@@ -13,28 +13,28 @@ ownership = make_router("/v1/sessions/{number}", "ownership")
 @ownership.get("/transfers")
 async def get_transfers(
     identity: Readers, service: TheService, number: SessionId
-) -> responses.Ownership:
+) -> response_bodies.Ownership:
     """Return the owners of transferred vehicles, and the vehicles with a prepared transfer."""
     session = service.broker.session(identity, number)
     owners = [
-        responses.OwnerOfVehicle(
+        response_bodies.OwnerOfVehicle(
             world=int(world), episode=table.episode, vehicle=vehicle, zone=zone, epoch=epoch
         )
         for world, table in session.owners.items()
         for vehicle, (zone, epoch) in table.zones.items()
     ]
     in_flight = [
-        responses.InFlight(
+        response_bodies.InFlight(
             world=world, vehicle=vehicle, source=source, target=target, state="PREPARED"
         )
         for world, vehicle, source, target in service.broker.prepared.get(number, ())
     ]
-    return responses.Ownership(number=session.told_number, owners=owners, in_flight=in_flight)
+    return response_bodies.Ownership(number=session.told_number, owners=owners, in_flight=in_flight)
 
 
 @ownership.put("/transfers", status_code=204)
 async def put_transfers(
-    identity: Nodes, service: TheService, number: SessionId, body: requests.TransfersBody
+    identity: Nodes, service: TheService, number: SessionId, body: request_bodies.TransfersBody
 ) -> None:
     """Record the vehicles that have changed zone since the node's last report."""
     service.broker.hand_over(service.broker.hosted(identity, number), body)
@@ -42,7 +42,7 @@ async def put_transfers(
 
 @ownership.put("/door", status_code=204)
 async def put_door(
-    identity: Nodes, service: TheService, number: SessionId, body: requests.DoorBody
+    identity: Nodes, service: TheService, number: SessionId, body: request_bodies.DoorBody
 ) -> None:
     """Record where the node of a session waits for the nodes that host its zones."""
     session = service.broker.hosted(identity, number)

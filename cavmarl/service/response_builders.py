@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from dataclasses import asdict
 
-from cavmarl.service import responses
+from cavmarl.service import response_bodies
 from cavmarl.service.auth import Service
 from cavmarl.service.broker import Broker
 from cavmarl.service.node_selection import NoNodeError, score_of
@@ -29,7 +29,7 @@ async def assigned(
     subject: str,  # name of the event if no node was found
     take: Callable[[], SessionRecord],
     wait_s: float,
-) -> responses.Assignment:
+) -> response_bodies.Assignment:
     """Return what a client needs to reach its world; wait for a node until a deadline."""
     broker = service.broker
     try:
@@ -42,14 +42,14 @@ async def assigned(
             session = await _awaited(broker, identity, subject, take, wait_s)
     node = broker.log.state.nodes[session.node or ""]
     lease_s = broker.rules.lease_s
-    return responses.Assignment(
+    return response_bodies.Assignment(
         session=session.id,
         requested=session.preferred,
         assigned=node.name,
         redirected=session.preferred not in (None, node.name),
         reason=session.reason,
         score=session.score,
-        excluded=[responses.Excluded(**one) for one in session.excluded],
+        excluded=[response_bodies.Excluded(**one) for one in session.excluded],
         excluded_count=session.excluded_count,
         scheme="https" if TLS in node.capabilities else "http",
         address=node.address,
@@ -93,12 +93,12 @@ async def _awaited(
         broker.waiting -= 1
 
 
-def node_answer(service: Service, node: NodeRecord) -> responses.NodeStatus:
+def node_answer(service: Service, node: NodeRecord) -> response_bodies.NodeStatus:
     """Return a node with the values of its last heartbeat."""
     live = service.broker.live[node.name]
-    return responses.NodeStatus(
+    return response_bodies.NodeStatus(
         **asdict(node),
-        load=None if live.use is None else responses.Load(**asdict(live.use)),
+        load=None if live.use is None else response_bodies.Load(**asdict(live.use)),
         score=score_of(node, live),
         sessions=len(live.hosted),
         zones_of=list(live.zones_of),
@@ -106,20 +106,20 @@ def node_answer(service: Service, node: NodeRecord) -> responses.NodeStatus:
     )
 
 
-def session_answer(service: Service, session: SessionRecord) -> responses.Session:
+def session_answer(service: Service, session: SessionRecord) -> response_bodies.Session:
     """Return a session or a job, without what only its node needs."""
     found = asdict(session)
     del found["saved_blob"], found["owners"]
     live = service.broker.live.get(session.node or "")
     progress = None if live is None else live.jobs.get(session.id)
-    return responses.Session(**found, progress=progress)
+    return response_bodies.Session(**found, progress=progress)
 
 
-def event_answer(line: LogEvent) -> responses.EventLine:
+def event_answer(line: LogEvent) -> response_bodies.EventLine:
     """Return a line of the log without its private part."""
     found = line._asdict()
     del found["private"]
-    return responses.EventLine(**found)
+    return response_bodies.EventLine(**found)
 
 
 async def event_stream(

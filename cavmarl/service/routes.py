@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
-from cavmarl.service import configurations, requests, responses
+from cavmarl.service import configurations, request_bodies, response_bodies
 from cavmarl.service.auth import TheService
 from cavmarl.service.error_names import problem
 from cavmarl.service.ownership_routes import ownership
@@ -50,25 +50,25 @@ IdempotencyKey = Annotated[
 
 
 @open_routes.get("/health")
-async def health(_: Anybody, service: TheService) -> responses.Health:
+async def health(_: Anybody, service: TheService) -> response_bodies.Health:
     """Return whether the service is running, and the number of its events."""
-    return responses.Health(status="ok", events=service.broker.log.sequence)
+    return response_bodies.Health(status="ok", events=service.broker.log.sequence)
 
 
 @open_routes.get("/keys")
-async def keys(_: Anybody, service: TheService) -> responses.PublicKeys:
+async def keys(_: Anybody, service: TheService) -> response_bodies.PublicKeys:
     """Return the public keys that verify tokens, as a JSON Web Key Set."""
-    return responses.PublicKeys(**service.access.public_keys())
+    return response_bodies.PublicKeys(**service.access.public_keys())
 
 
 @open_routes.post("/token")
 async def token(
-    _: Anybody, service: TheService, body: requests.SecretBody | requests.RefreshBody
-) -> responses.Tokens:
+    _: Anybody, service: TheService, body: request_bodies.SecretBody | request_bodies.RefreshBody
+) -> response_bodies.Tokens:
     """Return an access token and a refresh token for a secret or for a refresh token."""
-    if isinstance(body, requests.SecretBody):
-        return responses.Tokens(**service.access.exchange(body.secret))
-    return responses.Tokens(**service.access.refresh(body.refresh_token))
+    if isinstance(body, request_bodies.SecretBody):
+        return response_bodies.Tokens(**service.access.exchange(body.secret))
+    return response_bodies.Tokens(**service.access.refresh(body.refresh_token))
 
 
 @open_routes.delete("/token", status_code=204)
@@ -78,10 +78,10 @@ async def withdraw(identity: Everyone, service: TheService) -> None:
 
 
 @nodes.post(
-    "/{name}/beat", response_model=responses.Duties
+    "/{name}/beat", response_model=response_bodies.Duties
 )  # not validated again, as heartbeats are frequent
 async def beat(
-    identity: Nodes, service: TheService, name: NodeName, body: requests.BeatBody
+    identity: Nodes, service: TheService, name: NodeName, body: request_bodies.BeatBody
 ) -> JSONResponse:
     """Record a heartbeat of a node; the answer lists what it has to do."""
     found = service.broker.beat(identity, name, body)
@@ -91,61 +91,70 @@ async def beat(
 
 
 @nodes.get("")
-async def list_nodes(_: Readers, service: TheService) -> responses.NodeList:
+async def list_nodes(_: Readers, service: TheService) -> response_bodies.NodeList:
     """Return all nodes with the values of their last heartbeats."""
     known = service.broker.log.state.nodes.values()
-    return responses.NodeList(nodes=[node_answer(service, one) for one in known])
+    return response_bodies.NodeList(nodes=[node_answer(service, one) for one in known])
 
 
 @nodes.post("", status_code=201)
 async def register(
-    identity: Nodes, service: TheService, body: requests.NodeBody
-) -> responses.NodeStatus:
+    identity: Nodes, service: TheService, body: request_bodies.NodeBody
+) -> response_bodies.NodeStatus:
     """Register a node, or register it again after it left, failed or restarted."""
     return node_answer(service, service.broker.register(identity, body))
 
 
 @nodes.post("/{name}/drain")
-async def drain(identity: Drainers, service: TheService, name: NodeName) -> responses.NodeStatus:
+async def drain(
+    identity: Drainers, service: TheService, name: NodeName
+) -> response_bodies.NodeStatus:
     """Assign nothing more to a node, and move its sessions."""
     return node_answer(service, service.broker.drain(identity, name))
 
 
 @nodes.post("/{name}/resume")
-async def resume(identity: Operators, service: TheService, name: NodeName) -> responses.NodeStatus:
+async def resume(
+    identity: Operators, service: TheService, name: NodeName
+) -> response_bodies.NodeStatus:
     """Let a drained node accept sessions again."""
     return node_answer(service, service.broker.drain(identity, name, is_on=False))
 
 
 @nodes.delete("/{name}")
-async def leave(identity: Drainers, service: TheService, name: NodeName) -> responses.NodeStatus:
+async def leave(
+    identity: Drainers, service: TheService, name: NodeName
+) -> response_bodies.NodeStatus:
     """Remove a node."""
     return node_answer(service, service.broker.leave(identity, name))
 
 
 @worlds.post("/configurations", status_code=201)
 async def add_configuration(
-    identity: Clients, service: TheService, body: requests.ConfigurationBody
-) -> responses.Configuration:
+    identity: Clients, service: TheService, body: request_bodies.ConfigurationBody
+) -> response_bodies.Configuration:
     """Check and store a configuration; new content gets a new version."""
     found = configurations.add_configuration(service.broker.log, identity, body)
-    return responses.Configuration(**found)
+    return response_bodies.Configuration(**found)
 
 
 @worlds.get("/configurations/{sha256}")
 async def get_configuration(
-    _: Everyone, service: TheService, sha256: Annotated[requests.Sha256, Path()]
-) -> requests.ConfigurationBody:
+    _: Everyone, service: TheService, sha256: Annotated[request_bodies.Sha256, Path()]
+) -> request_bodies.ConfigurationBody:
     """Return a configuration by its hash."""
-    return requests.ConfigurationBody(
+    return request_bodies.ConfigurationBody(
         **configurations.read_configuration(service.broker.log, sha256)
     )
 
 
 @worlds.post("/sessions", status_code=201)
 async def open_session(
-    identity: Clients, service: TheService, body: requests.SessionBody, key: IdempotencyKey = ""
-) -> responses.Assignment:
+    identity: Clients,
+    service: TheService,
+    body: request_bodies.SessionBody,
+    key: IdempotencyKey = "",
+) -> response_bodies.Assignment:
     """Open a session on the node that eq. (1) and (2) choose, or on a preferred node."""
     found = configurations.read_configuration(service.broker.log, body.configuration)
 
@@ -164,8 +173,8 @@ async def open_session(
 
 @worlds.post("/sessions/{number}/resolve")
 async def resolve(
-    identity: Clients, service: TheService, number: SessionId, body: requests.ResolveBody
-) -> responses.Assignment:
+    identity: Clients, service: TheService, number: SessionId, body: request_bodies.ResolveBody
+) -> response_bodies.Assignment:
     """Return where a session is now, with a new lease."""
 
     def resolved() -> SessionRecord:
@@ -175,17 +184,17 @@ async def resolve(
 
 
 @worlds.get("/sessions")
-async def list_sessions(identity: Readers, service: TheService) -> responses.SessionList:
+async def list_sessions(identity: Readers, service: TheService) -> response_bodies.SessionList:
     """Return sessions and jobs: a client's own, or all of them."""
     found = service.broker.log.state.sessions.values()
     own = [one for one in found if identity.role != "client" or one.owner == identity.id]
-    return responses.SessionList(sessions=[session_answer(service, one) for one in own])
+    return response_bodies.SessionList(sessions=[session_answer(service, one) for one in own])
 
 
 @worlds.get("/sessions/{number}")
 async def get_session(
     identity: Readers, service: TheService, number: SessionId
-) -> responses.Session:
+) -> response_bodies.Session:
     """Return a session or a job."""
     return session_answer(service, service.broker.session(identity, number))
 
@@ -193,7 +202,7 @@ async def get_session(
 @worlds.delete("/sessions/{number}")
 async def close_session(
     identity: Clients, service: TheService, number: SessionId
-) -> responses.Session:
+) -> response_bodies.Session:
     """End a session or a job."""
     return session_answer(service, service.broker.close(identity, number))
 
@@ -219,7 +228,7 @@ async def put_state(
     service: TheService,
     request: Request,
     number: SessionId,
-    at: Annotated[requests.Whole, Query()],
+    at: Annotated[request_bodies.Whole, Query()],
 ) -> None:
     """Store the state of a session after a number of commands."""
     content = await request.body()
@@ -228,8 +237,8 @@ async def put_state(
 
 @worlds.post("/jobs", status_code=201)
 async def submit(
-    identity: Clients, service: TheService, body: requests.JobBody, key: IdempotencyKey = ""
-) -> responses.Session:
+    identity: Clients, service: TheService, body: request_bodies.JobBody, key: IdempotencyKey = ""
+) -> response_bodies.Session:
     """Evaluate drivers on a node; the job waits if no node is free."""
     if configurations.read_configuration(service.broker.log, body.configuration).get("nodes"):
         raise problem("refused", "nodes: an evaluation runs on one node; remove the key")
@@ -248,8 +257,8 @@ async def submit(
 
 @worlds.post("/jobs/{number}/outcome")
 async def finish(
-    identity: Nodes, service: TheService, number: SessionId, body: requests.OutcomeBody
-) -> responses.Session:
+    identity: Nodes, service: TheService, number: SessionId, body: request_bodies.OutcomeBody
+) -> response_bodies.Session:
     """Record the outcome of a job."""
     session = service.broker.hosted(identity, number)
     service.broker.finish(session, body.status, body.message)
@@ -281,15 +290,15 @@ async def get_result(
 async def events(
     identity: Readers,
     service: TheService,
-    after: Annotated[requests.Whole, Query()] = 0,
+    after: Annotated[request_bodies.Whole, Query()] = 0,
     limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
     subject: Annotated[str | None, Query(max_length=128)] = None,
-) -> responses.EventList:
+) -> response_bodies.EventList:
     """Return events after a sequence number: a client's own, or those of all subjects."""
     owner = identity.id if identity.role == "client" else None
     await service.broker.log.settle()
     found = service.broker.log.store.read(after, limit, owner=owner, subject=subject)
-    return responses.EventList(events=list(map(event_answer, found)))
+    return response_bodies.EventList(events=list(map(event_answer, found)))
 
 
 @records.get("/events/stream", response_class=StreamingResponse)
@@ -297,7 +306,7 @@ async def stream(
     identity: Readers,
     service: TheService,
     request: Request,
-    after: Annotated[requests.Whole, Query()] = 0,
+    after: Annotated[request_bodies.Whole, Query()] = 0,
 ) -> StreamingResponse:
     """Send events as server-sent events; `Last-Event-ID` continues an earlier stream."""
     last = request.headers.get("last-event-id", "")
@@ -315,22 +324,24 @@ async def metrics(_: Viewers, request: Request) -> PlainTextResponse:
 
 @records.post("/identities", status_code=201)
 async def add_identity(
-    identity: Admins, service: TheService, body: requests.IdentityBody
-) -> responses.NewIdentity:
+    identity: Admins, service: TheService, body: request_bodies.IdentityBody
+) -> response_bodies.NewIdentity:
     """Create an identity and return its secret, which is not shown again."""
     found, secret = service.access.add_identity(body.name, body.role, identity.id)
-    return responses.NewIdentity(identity=found.id, name=found.name, role=found.role, secret=secret)
+    return response_bodies.NewIdentity(
+        identity=found.id, name=found.name, role=found.role, secret=secret
+    )
 
 
 @records.get("/identities")
-async def list_identities(_: Admins, service: TheService) -> responses.IdentityList:
+async def list_identities(_: Admins, service: TheService) -> response_bodies.IdentityList:
     """Return all identities."""
     known = service.broker.log.state.identities.values()
     shown = [
-        responses.Identity(id=one.id, name=one.name, role=one.role, revoked=one.revoked)
+        response_bodies.Identity(id=one.id, name=one.name, role=one.role, revoked=one.revoked)
         for one in known
     ]
-    return responses.IdentityList(identities=shown)
+    return response_bodies.IdentityList(identities=shown)
 
 
 @records.delete("/identities/{number}", status_code=204)
@@ -344,6 +355,6 @@ async def revoke(
 
 
 @records.post("/keys", status_code=201)
-async def rotate(identity: Admins, service: TheService) -> responses.NewKey:
+async def rotate(identity: Admins, service: TheService) -> response_bodies.NewKey:
     """Sign tokens with a new key; tokens of the previous key stay valid."""
-    return responses.NewKey(key=service.access.rotate_key(identity.id))
+    return response_bodies.NewKey(key=service.access.rotate_key(identity.id))

@@ -45,7 +45,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
 
     Args:
         options: address, store and rules.
-        tell: called with lines for the person who started the service; one of them is the first
+        tell: called with lines to show on the terminal; one of them is the first
             admin's secret, which is shown nowhere else.
 
     Raises:

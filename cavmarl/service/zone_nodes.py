@@ -15,7 +15,7 @@ from typing import Any
 
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.node_selection import Chosen, LiveNode, NoNodeError
-from cavmarl.service.requests import DoorBody
+from cavmarl.service.request_bodies import DoorBody
 from cavmarl.service.service_records import SessionRecord
 
 Choose = Callable[[SessionRecord, Sequence[str]], Chosen]

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from cavmarl.service.requests import ConfigurationBody, Sha256
+from cavmarl.service.request_bodies import ConfigurationBody, Sha256
 from cavmarl.service.service_records import Role
 
 
