@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
+from cavmarl.core.records.codes import MODEL_IDM
+from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.kernels.models.idm import (
     ACCEL_LIMIT,
     ACCEL_MAX,
@@ -31,7 +32,7 @@ VTYPE = np.dtype(
         ("vclass", np.int32),  # index in VEHICLE_CLASSES
         ("permissions", np.uint32),  # bits of LANE["permissions"] of which one must be set
         ("model", np.int32),  # MODEL_*; written by `set_model`
-        ("as_sumo", np.bool_),  # whether its driver looks ahead and yields as SUMO's drivers do
+        ("as_sumo", np.bool_),  # looks ahead, yields, queues and resolves deadlocks as in SUMO
         ("length", np.float64),  # m
         ("width", np.float64),  # m
         ("height", np.float64),  # m
@@ -168,18 +169,14 @@ AGENT_TYPES = {
     "truck": AgentType("truck", 8.0, 2.5, 3.6, 1.5, 4.0, 6.0, 3.0, 25.0, 4.8, 0.7),
     "bus": AgentType("bus", 12.0, 2.55, 3.2, 1.2, 3.5, 5.5, 3.0, 27.8, 6.0, 0.75),
 }
-# Car-following models of drivers that are SUMO's in everything else, too: how far they look ahead,
-# and how they yield, queue and resolve deadlocks.
-AS_SUMO = frozenset({MODEL_KRAUSS})
-
 CAR_WHEELBASE_M = 5.0  # highway-env's car has its axles at its bumpers
 NO_LIMIT = 1e9  # of what a policy asks of a car, beyond `action`
 
 
 def set_model(types: NDArray[np.void] | np.void, model: int) -> None:
-    """Let the drivers of VTYPE rows, or of one row, follow by a model, MODEL_*."""
+    """Set the car-following model (MODEL_*) of VTYPE rows or of one row."""
     types["model"] = model
-    types["as_sumo"] = model in AS_SUMO
+    types["as_sumo"] = any(known.as_sumo for known in MODELS if known.code == model)
 
 
 def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void]:

@@ -74,13 +74,8 @@ from cavmarl.driving.kernels.lanes.lane_ends import (
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M, last_on
 from cavmarl.driving.kernels.lanes.route_following import next_step, next_step_from
 from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE, stays_aside
-from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
-    before_line,
-    no_constraint,
-    response,
-    wish,
-)
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import before_line, no_constraint, response, wish
 from cavmarl.driving.kernels.motion.ordered_stops import distance_to_stop
 from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed, speed_before_limit
 

@@ -34,7 +34,8 @@ from cavmarl.driving.kernels.junctions.swept_areas import LONG_FORK_M
 from cavmarl.driving.kernels.lanes.adjacent_leaders import askew_beside
 from cavmarl.driving.kernels.lanes.lane_index import ahead_on, behind_by, first_from, last_on
 from cavmarl.driving.kernels.lanes.route_following import next_step
-from cavmarl.driving.kernels.models.following import LINE_MARGIN_M, accel_behind, speed_behind
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import accel_behind, speed_behind
 
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
 LEADER_M = 150.0  # how far ahead a leader is looked for

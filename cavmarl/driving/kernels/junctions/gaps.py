@@ -35,7 +35,7 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import (
     STANDING_MPS,
     can_be_ignored,
 )
-from cavmarl.driving.kernels.models.following import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
 GENTLE_ACCEL = 1.8  # and, to be safe, with which it and others are out of it,

@@ -43,12 +43,8 @@ from cavmarl.driving.kernels.junctions.gaps import (
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
 from cavmarl.driving.kernels.junctions.swept_areas import MOST_BACK_M, wait_place
 from cavmarl.driving.kernels.lanes.route_following import next_step
-from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
-    before_line,
-    behind,
-    no_constraint,
-)
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
 
 # m/s², a driver stops for yellow where this braking is enough; Krauss's brakes as hard as it can
 COMFORT_STOP = 3.0

@@ -29,12 +29,8 @@ from cavmarl.driving.kernels.lanes.lane_index import (
 )
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.lanes.side_clearance import has_side_clearance
-from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
-    accel_behind,
-    no_constraint,
-    wish,
-)
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import accel_behind, no_constraint, wish
 from cavmarl.driving.kernels.motion.ordered_stops import STAY, change_for_stop
 
 LOOK_BACK_M = 60.0  # how far back a lane change looks for followers

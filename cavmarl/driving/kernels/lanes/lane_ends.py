@@ -16,12 +16,8 @@ from cavmarl.driving.kernels.lanes.lane_choice import LEAST_SWAP_M, MERGE_ROOM_S
 from cavmarl.driving.kernels.lanes.lane_index import beside_s, last_on
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.lanes.side_clearance import LONGEST_HALF_M
-from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
-    before_line,
-    behind,
-    no_constraint,
-)
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
 
 
 @kernel
