@@ -136,9 +136,7 @@ def test_accel_behind_is_the_wish_for_the_constraint_of_the_leader(name: str) ->
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("dt", [0.05, 0.1, 0.2])
 @pytest.mark.parametrize("speed", [5.0, 14.0, 25.0])
-def test_a_driver_stops_just_before_a_line(
-    name: str, dt: float, speed: float
-) -> None:
+def test_a_driver_stops_just_before_a_line(name: str, dt: float, speed: float) -> None:
     kind = KINDS[name]
     gap, hardest, desired = 90.0, 0.0, speed
     for _ in range(round(60.0 / dt)):
