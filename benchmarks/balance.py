@@ -21,7 +21,7 @@ from cavmarl.cli.output import Seed, Settings, about, parse_settings
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
-from cavmarl.evaluate.driven_worlds import world_maker
+from cavmarl.evaluate.built_in_runs import world_maker
 from cavmarl.evaluate.shard_costs import measure_rounds
 from cavmarl.evaluate.statistics import Interval
 from cavmarl.roads.cache import load_network

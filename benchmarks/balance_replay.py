@@ -112,7 +112,7 @@ def _strategy(name: str, trace: LoadTrace, rule: BalanceRule, warm: int) -> Stat
         warm,
         calibrated=name == "calibrated",
         predicted=name == "predicted",
-        recut=name == "re-cut",
+        repartitioned=name == "repartitioned",
     )
 
 

@@ -10,14 +10,14 @@ import numpy as np
 from benchmarks.cost_models import LoggedTick, ShardContent, calibrate, fit_costs
 from benchmarks.load_traces import LoadTrace
 from cavmarl.balance.balancer import Balancer
+from cavmarl.balance.cost_filter import NEWEST
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
-from cavmarl.balance.smoothing import NEWEST
 from cavmarl.handoff.repartition_plan import propose_zones, vehicle_costs
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 __all__ = ["STRATEGIES", "LoadStrategy", "Placed", "StaticPlacement"]
 
-STRATEGIES = ("static", "balanced", "calibrated", "predicted", "re-cut")
+STRATEGIES = ("static", "balanced", "calibrated", "predicted", "repartitioned")
 RECUT_EVERY = 10  # rounds
 
 
@@ -72,8 +72,8 @@ class LoadStrategy(StaticPlacement):
         warm: rounds before anything that was learnt is used.
         calibrated: fit the score's weights to what workers took.
         predicted: cost of the coming round from what is in the zones now.
-        recut: cut the map anew where moving shards does not help, at most every `RECUT_EVERY`
-            rounds.
+        repartitioned: cut the map anew where moving shards does not help, at most every
+            `RECUT_EVERY` rounds.
     """
 
     def __init__(
@@ -84,11 +84,11 @@ class LoadStrategy(StaticPlacement):
         *,
         calibrated: bool = False,
         predicted: bool = False,
-        recut: bool = False,
+        repartitioned: bool = False,
     ) -> None:
         super().__init__(trace, rule)
         self._warm = warm
-        self._calibrated, self._predicted, self._recut = calibrated, predicted, recut
+        self._calibrated, self._predicted, self._recut = calibrated, predicted, repartitioned
         self._ticks: list[LoggedTick] = []
         self._contents: list[ShardContent] = []
         self._measured_s: list[float] = []

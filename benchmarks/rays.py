@@ -18,9 +18,9 @@ from benchmarks.program import run
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, one_core, silent, take_turns
 from cavmarl.cli.output import about
 from cavmarl.config.registry import load_config
-from cavmarl.engine.rig_component import MountedSensors
+from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.simulation import Simulation
-from cavmarl.evaluate.driven_worlds import DrivenWorld, world_maker
+from cavmarl.evaluate.built_in_runs import DrivenWorld, world_maker
 from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.registry import mount
 
@@ -121,8 +121,8 @@ def _driven(agents: int, rig: dict[str, dict[str, Any]]) -> Simulation:
     return simulation
 
 
-def _mounted(simulation: Simulation) -> MountedSensors:
-    return next(part for part in simulation.attached if isinstance(part, MountedSensors))
+def _mounted(simulation: Simulation) -> RigComponent:
+    return next(part for part in simulation.attached if isinstance(part, RigComponent))
 
 
 class _Sensors:

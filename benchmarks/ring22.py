@@ -19,7 +19,7 @@ from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import Seed, about
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
-from cavmarl.evaluate.driven_worlds import DrivenWorld
+from cavmarl.evaluate.built_in_runs import DrivenWorld
 from cavmarl.policies.loading import driver_keys, load_policy, policy_files
 
 ENV = "ring22"

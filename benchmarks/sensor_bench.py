@@ -18,7 +18,7 @@ from cavmarl.config.registry import load_config
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.machine import describe_machine
-from cavmarl.evaluate.fresh import call_in_fresh_process
+from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_shares import (

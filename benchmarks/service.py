@@ -24,10 +24,10 @@ from cavmarl.cli.output import Seed, about
 from cavmarl.client import Client
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.access import Access
-from cavmarl.service.bodies import BeatBody, NodeBody
 from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
+from cavmarl.service.requests import BeatBody, NodeBody
 
 CONFIGURATION = "0" * 64
 NODES_AN_IDENTITY = 100  # whose requests are limited together

@@ -25,7 +25,7 @@ from cavmarl.cli.output import Agents, Background, Seed, Settings, about, parse_
 from cavmarl.config.zones import MAX_ZONES, ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.simulation import Simulation
-from cavmarl.evaluate.driven_worlds import world_maker
+from cavmarl.evaluate.built_in_runs import world_maker
 
 TURN_S = 10
 PARTS = 5  # of a turn, of all worlds in between

@@ -14,7 +14,7 @@ from itertools import pairwise
 from benchmarks.stopwatch import Stopwatch
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
-from cavmarl.evaluate.driven_worlds import DrivenWorld
+from cavmarl.evaluate.built_in_runs import DrivenWorld
 from cavmarl.zones.partition.zone_statistics import imbalance
 
 __all__ = ["PHASES", "Pair", "Turn", "TwinWorlds"]

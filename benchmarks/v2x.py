@@ -19,7 +19,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
-from cavmarl.evaluate.driven_worlds import DrivenWorld
+from cavmarl.evaluate.built_in_runs import DrivenWorld
 from cavmarl.shards.shard import common_of
 from cavmarl.v2x.bus import Bus, V2xStatistics
 

@@ -29,12 +29,12 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_frame import SEEN, WorldFrame
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.vector import make_vec
-from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.frame_messages import FrameEncoder
+from cavmarl.viewer.live_env import ShownEnv
 from cavmarl.viewer.map_geometry import map_origin
-from cavmarl.viewer.shown_env import ShownEnv
-from cavmarl.viewer.stage import first_stage
+from cavmarl.viewer.subscribers import Audience
 from cavmarl.viewer.vehicle_details import hello_of
+from cavmarl.viewer.viewed_world import first_stage
 from cavmarl.viewer.web_options import WebOptions
 from cavmarl.viewer.web_server import WebServer
 

@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from cavmarl.rewards.registered_terms import register_term
     from cavmarl.sensors.observed.feature import Feature
     from cavmarl.sensors.registry import register_sensor
-    from cavmarl.viewer.shown_env import show
+    from cavmarl.viewer.live_env import show
 
 __version__ = "0.1.0"
 
@@ -142,7 +142,7 @@ _LATE = {
     "register_driver_model": "driving.driver_models",
     "register_sensor": "sensors.registry",
     "register_term": "rewards.registered_terms",
-    "show": "viewer.shown_env",
+    "show": "viewer.live_env",
 }
 
 

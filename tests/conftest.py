@@ -50,12 +50,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object], context: object) -> None:
-    from cavmarl.evaluate import fresh
+    from cavmarl.evaluate import subprocess_calls
     from cavmarl.evaluate.traffic import sumo_side
     from cavmarl.parallel.nodes import node_starters
     from cavmarl.parallel.processes import fork_server
 
-    for module in (fork_server, node_starters, fresh):
+    for module in (fork_server, node_starters, subprocess_calls):
         patch.setattr(module, "start_python", start)
     patch.setattr(sumo_side, "get_context", lambda how: context)
 

@@ -27,7 +27,7 @@ WIDE_CLASSES: set[str] = set()
 
 ATTRIBUTES = 20  # that a class and its bases set
 LARGE_CLASSES = {
-    "cavmarl.handoff.division.Division",
+    "cavmarl.handoff.division.ZonedShards",
     "cavmarl.ownership.trace_check.TraceChecker",
     "cavmarl.parallel.nodes.node_peers.NodePeers",
     "cavmarl.parallel.nodes.node_pool.NodePool",
@@ -54,8 +54,8 @@ PASSED_ON = {
     "cavmarl.cosim.followers.follower_connection._Patient.recv_into",
     "cavmarl.cosim.followers.follower_connection._Patient.sendmsg",
     "cavmarl.driving.kernels.models.registered_models._generate_call",
-    "cavmarl.evaluate.fresh._tell",
-    "cavmarl.evaluate.fresh.call_in_fresh_process",
+    "cavmarl.evaluate.subprocess_calls._tell",
+    "cavmarl.evaluate.subprocess_calls.call_in_fresh_process",
     "cavmarl.parallel.network.encryption.EncryptedSocket.sendmsg",
     "cavmarl.policies.driver_network.LayerTable.add",
     "cavmarl.render.topdown.TopDownRenderer.frame",

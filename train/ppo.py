@@ -31,10 +31,10 @@ from cavmarl.learning import options
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import Trips, describe, progress_bar
+from cavmarl.learning.observation_norm import Scales
 from cavmarl.learning.opponents import Opponents
 from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.learning.scales import Scales
 from cavmarl.parallel.local_worlds import kept_elsewhere
 from cavmarl.policies.loading import driver_keys, policy_files
 from cavmarl.policies.network_files import NetworkConfig

@@ -155,8 +155,8 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         }
 
     def _tensors(self, agents: Mapping[str, Any], worlds: Mapping[str, Tensor]) -> TensorDict:
-        of_agents = TensorDict(agents, (*self.batch_size, self._vec.num_agents))
-        return TensorDict({GROUP: of_agents, **worlds}, self.batch_size, device=self.device)
+        agent_arrays = TensorDict(agents, (*self.batch_size, self._vec.num_agents))
+        return TensorDict({GROUP: agent_arrays, **worlds}, self.batch_size, device=self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """As `CavVectorEnv.close`."""

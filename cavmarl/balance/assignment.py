@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 
+from cavmarl.balance.contiguous_split import divide_row, slide
+from cavmarl.balance.initial_placement import spread, string
 from cavmarl.balance.load_score import Candidate, Rejection, admissible, find_rejections
+from cavmarl.balance.local_search import refine
 from cavmarl.balance.problem import Problem
-from cavmarl.balance.refining import refine
 from cavmarl.balance.shard_placement import Placement, Workers
-from cavmarl.balance.sliding import divide_row, slide
-from cavmarl.balance.spreading import spread, string
 
 
 def workers_of(problem: Problem) -> tuple[Workers, tuple[Rejection, ...]]:

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from cavmarl.balance.balance_plan import Plan, make_plan
+from cavmarl.balance.cost_filter import SmoothCosts
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
-from cavmarl.balance.smoothing import SmoothCosts
 from cavmarl.core.errors import ConfigError
 
 

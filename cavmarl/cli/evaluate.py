@@ -101,7 +101,7 @@ def evaluate(
 
 def _watched(stack: ExitStack, options: WebOptions, vec: CavVectorEnv) -> Callable[[], None]:
     """Serve a page that shows the worlds of an evaluation until `stack` ends."""
-    from cavmarl.viewer.shown_env import ShownEnv
+    from cavmarl.viewer.live_env import ShownEnv
 
     shown = ShownEnv(vec, options, title="evaluation", looks_itself=False, tell=say)
     stack.callback(shown.close)
@@ -188,7 +188,7 @@ def place_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
 
 def map_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
     """What a driver does on each map, the worst first."""
-    from cavmarl.evaluate.by_map import SHOWN
+    from cavmarl.evaluate.map_table import SHOWN
     from cavmarl.evaluate.metrics import METRICS
 
     shown = [metric for metric in METRICS if metric.name in SHOWN]

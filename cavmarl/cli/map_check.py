@@ -19,7 +19,7 @@ from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.check_page import write_check_page
 from cavmarl.maps.defects import SEARCHES, Defect, find_defects
-from cavmarl.maps.mending import mend
+from cavmarl.maps.repair import mend
 from cavmarl.roads.cache import load_network
 
 _SHOWN = 12

@@ -64,7 +64,7 @@ def plan(
     from cavmarl.balance.balance_plan import make_plan
     from cavmarl.balance.plan_text import describe_plan
     from cavmarl.balance.problem import BalanceRule, Problem
-    from cavmarl.evaluate.driven_worlds import world_maker
+    from cavmarl.evaluate.built_in_runs import world_maker
     from cavmarl.evaluate.shard_costs import measure_shards
 
     if again is not None:

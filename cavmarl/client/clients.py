@@ -12,8 +12,8 @@ from typing import Any, Self, TypeVar
 
 import httpx
 
-from cavmarl.client.flows import Ask, Flow, Rest, ServiceFlows, Told, check
-from cavmarl.client.world_flows import RECOVERY_S, WorldFlows
+from cavmarl.client.service_protocol import Ask, Flow, Rest, ServiceFlows, Told, check
+from cavmarl.client.world_protocol import RECOVERY_S, WorldFlows
 from cavmarl.core.errors import ServiceError
 
 T = TypeVar("T")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.core.compiled.bound_call import CallSequence, bind
-from cavmarl.core.math.tallies import any_positive, clear, totals
+from cavmarl.core.math.counters import any_positive, clear, totals
 from cavmarl.engine.tick import Tick
 from cavmarl.shards.shard import Commands
 from cavmarl.shards.shard_group import ShardGroup
@@ -19,7 +19,7 @@ class CompiledStep:
     """The ticks of a step, from the first to the sensing at its end."""
 
     def __init__(self, tick: Tick, group: ShardGroup) -> None:
-        self.gate = tick.gate
+        self.departures = tick.departures
         self.group = group
         self._tick = tick
         self._ticks = CallSequence()
@@ -56,32 +56,32 @@ class CompiledStep:
 
     def _add_leave(self, sequence: CallSequence) -> None:
         """Append what `Tick.leave` calls."""
-        tick, calls = self._tick, self.group.gate_calls(self.gate)
+        tick, calls = self._tick, self.group.departure_calls(self.departures)
         worlds, traffic = tick.worlds, tick.traffic
         sequence.call(tick.occasions)
         with sequence.only_if(tick.occasions, 0):
             sequence.call(calls.choose_goals(traffic.demand, len(traffic.plans)))
         with sequence.only_if(tick.occasions, 1):
             sequence.call(calls.leave)
-            some_pass = bind(any_positive, self.gate.num_passing)
+            some_pass = bind(any_positive, self.departures.num_passing)
             sequence.call(some_pass)
             with sequence.only_if(some_pass):
-                sequence.call(traffic.calls(self.gate, worlds.ticks, worlds.keys).settle)
+                sequence.call(traffic.calls(self.departures, worlds.ticks, worlds.keys).settle)
 
     def _add_enter(self, sequence: CallSequence) -> None:
         """Append what `Tick.let_in` calls."""
-        tick, calls = self._tick, self.group.gate_calls(self.gate)
-        gate, worlds = self.gate, tick.worlds
-        traffic = tick.traffic.calls(gate, worlds.ticks, worlds.keys)
-        if gate.orders.shape[1]:
+        tick, calls = self._tick, self.group.departure_calls(self.departures)
+        departures, worlds = self.departures, tick.worlds
+        traffic = tick.traffic.calls(departures, worlds.ticks, worlds.keys)
+        if departures.orders.shape[1]:
             sequence.call(traffic.call_orders)
-        some_wait = bind(any_positive, gate.num_queue)
+        some_wait = bind(any_positive, departures.num_queue)
         sequence.call(some_wait)
         with sequence.only_if(some_wait):
             sequence.call(calls.rank_lanes)
             sequence.call(traffic.assign_lanes)
             sequence.call(calls.propose(tick.traffic.demand))
-            some_pass = bind(any_positive, gate.num_passing)
+            some_pass = bind(any_positive, departures.num_passing)
             sequence.call(some_pass)
             with sequence.only_if(some_pass):
                 sequence.call(
@@ -89,7 +89,7 @@ class CompiledStep:
                 )
                 sequence.call(traffic.accept)
                 sequence.call(calls.admit)
-                sequence.call(bind(clear, gate.num_passing))
+                sequence.call(bind(clear, departures.num_passing))
 
     def _add_sense(self, sequence: CallSequence) -> None:
         """Append what `Tick.sense` calls."""
@@ -122,6 +122,6 @@ def compiled_step(tick: Tick, last: CompiledStep | None) -> CompiledStep | None:
         or group.calls.has_registered
     ):
         return None
-    if last is None or last.gate is not tick.gate or last.group is not group:
+    if last is None or last.departures is not tick.departures or last.group is not group:
         return CompiledStep(tick, group)
     return last

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.memory import Zeros
-from cavmarl.core.records.arrays import Outputs, Travel
-from cavmarl.handoff.division import Division
+from cavmarl.core.records.arrays import Outputs, TripTables
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands, Shard
@@ -29,14 +29,14 @@ class ComponentContext(NamedTuple):
     network: RoadNetwork
     num_worlds: int  # W
     shards: Sequence[Shard]  # one a zone; their rows are what a part reads
-    division: Division  # all of them together
-    travel: Travel
+    division: ZonedShards  # all of them together
+    travel: TripTables
     outputs: Outputs  # what the agents get
     zeros: Zeros  # makes the arrays that outlive a tick
     frames: Frames  # what the rigs of the agents get
 
 
-class Attached(Protocol):
+class Component(Protocol):
     """A part that acts in each tick of W worlds.
 
     A tick may be begun again, with everything in `arrays` as it was before.

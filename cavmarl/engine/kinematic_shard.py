@@ -14,7 +14,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.rng import world_key
-from cavmarl.core.records.arrays import Common
+from cavmarl.core.records.arrays import SharedState
 from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.shared_outputs import SharedOutputs
@@ -129,7 +129,7 @@ class KinematicShard:
             self._executor.begin_step(self._commands)
         self._executor.advance(self._commands)
         self._tick.leave()
-        self._tick.gate.num_queue[:] = 0  # those that would follow are others' to spawn
+        self._tick.departures.num_queue[:] = 0  # those that would follow are others' to spawn
         self._is_moved = True
 
     def upsert_ghosts(self, vehicles: NDArray[np.void]) -> None:
@@ -203,7 +203,7 @@ class KinematicShard:
                 (self._commands.controls, saved["controls"]),
                 (self._shared.outputs.observations, saved["observations"]),
                 (self._shared.outputs.present, saved["present"]),
-                *((getattr(common, name), saved[f"common_{name}"]) for name in Common._fields),
+                *((getattr(common, name), saved[f"common_{name}"]) for name in SharedState._fields),
             ]
             if any(_plain(target).shape != array.shape for target, array in targets):
                 raise ValueError("arrays of another size")

@@ -1,4 +1,4 @@
-"""`MountedSensors`: lets the rig of all agents sense after each tick, as an `Attached` part."""
+"""`RigComponent`: lets the rig of all agents sense after each tick, as a `Component` part."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from cavmarl.sensors.mounted.sensor_rig import Rig
 from cavmarl.shards.shard import Commands
 
 
-class MountedSensors:
-    """The rig of an environment; see `Attached`.
+class RigComponent:
+    """The rig of an environment; see `Component`.
 
     Attributes:
         platform: what the sensors are mounted on.

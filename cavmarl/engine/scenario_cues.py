@@ -10,19 +10,21 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
 from cavmarl.driving.kernels.motion.scripted_rows import note_cues
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.shards.shard import Commands, Shard
 
 
 class Cues:
-    """Looks at the agents of all zones at the beginning of each tick; `Attached` to the worlds.
+    """Looks at the agents of all zones at the beginning of each tick; `Component` to the worlds.
 
     Which cues have come is among what all shards have in common, `Worlds.cues`.
     """
 
     reads_all: tuple[str, ...] = ("begin",)
 
-    def __init__(self, cues: NDArray[np.void], shards: Sequence[Shard], division: Division) -> None:
+    def __init__(
+        self, cues: NDArray[np.void], shards: Sequence[Shard], division: ZonedShards
+    ) -> None:
         self._cues = cues
         self._worlds = shards[0].worlds
         self._division = division

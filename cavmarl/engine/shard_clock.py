@@ -18,7 +18,8 @@ from cavmarl.shards.shard_group import ShardGroup
 class ShardClock(PhaseExecutor):
     """Runs the phases of a tick zone by zone and adds up what each zone takes.
 
-    What is done once for all zones (ghosts, the gate, signals, owners) is in no zone's time.
+    What is done once for all zones (ghosts, the departure queue, signals, owners) is in no zone's
+    time.
     """
 
     def __init__(

@@ -11,7 +11,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled.bound_call import BoundCall, bind, keep_last
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
-from cavmarl.core.records.arrays import Common, Outputs
+from cavmarl.core.records.arrays import Outputs, SharedState
 from cavmarl.engine.kernels.outputs import clear_outputs, settle_outputs
 from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import RoadNetwork
@@ -44,7 +44,7 @@ class SharedOutputs:
         self.chosen = np.ones(num_worlds, dtype=np.bool_)
         self.signal_switch = keep_last(self._bind_signal_switch)
 
-    def _bind_signal_switch(self, common: Common) -> BoundCall[None]:
+    def _bind_signal_switch(self, common: SharedState) -> BoundCall[None]:
         return bind(
             switch_signals,
             roads=self._roads,
@@ -74,7 +74,7 @@ class SharedOutputs:
             chosen=self.chosen,
         )
 
-    def switch_signals(self, common: Common) -> None:
+    def switch_signals(self, common: SharedState) -> None:
         """Bring the signals to the present tick, after `detect` of all shards."""
         if self.has_signals:
             self.signal_switch(common)()

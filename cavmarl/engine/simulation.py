@@ -129,8 +129,8 @@ class Simulation(WorldViews):
             worlds.keys[w] = world_key(self._seed, number, int(self._episodes[w]))
             worlds.ticks[w] = 0
         self._episodes[chosen] += 1
-        tick.gate = tick.traffic.draw_orders(tick.gate, worlds, chosen)
-        tick.traffic.populate(tick.gate, worlds, chosen)
+        tick.departures = tick.traffic.draw_orders(tick.departures, worlds, chosen)
+        tick.traffic.populate(tick.departures, worlds, chosen)
         tick.sumo.reset(chosen, worlds)
         tick.division.distribute(chosen)
         tick.peers.keep_own(chosen)
@@ -212,16 +212,16 @@ class Simulation(WorldViews):
         tick = self._tick
         tick.sumo.catch_up(self._shard.worlds)
         tick.peers.keep_own(self.everywhere)
-        tick.peers.take_up(tick.gate, tick.division.side)
+        tick.peers.take_up(tick.departures, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
         """`load` where other processes hold zones: each goes on with its own, one is `home`."""
         self._put_back(saved, home)
         tick = self._tick
         tick.sumo.catch_up(self._shard.worlds)
-        tick.gate.num_passing[:] = 0
-        tick.peers.take_up(tick.gate, tick.division.side)
-        tick.peers.share_rows(tick.gate, tick.division.side)
+        tick.departures.num_passing[:] = 0
+        tick.peers.take_up(tick.departures, tick.division.side)
+        tick.peers.share_rows(tick.departures, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
         self.check(saved)
@@ -229,7 +229,7 @@ class Simulation(WorldViews):
         ownership = self._saved_ownership(rest)
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
-        self._tick.gate = snapshot.load(self._parts(), rest, ownership, home)
+        self._tick.departures = snapshot.load(self._parts(), rest, ownership, home)
 
     def check(self, saved: Sequence[NDArray[Any]]) -> None:
         """See that worlds can go on from what `save` gave. Raises ConfigError: they cannot."""
@@ -266,12 +266,12 @@ class Simulation(WorldViews):
         return snapshot.Parts(
             worlds=self._shard.worlds,
             division=tick.division,
-            gate=tick.gate,
+            departures=tick.departures,
             traffic=tick.traffic,
             outputs=self.outputs,
             coordination=tick.coordination,
             partition=self.partition,
-            recut_steps=self.zones.recut_steps,
+            repartition_steps_done=self.zones.repartition_steps_done,
             has_past=self._carried_from < self.outputs.observations.shape[2],
             attached=tick.attached,
             sumo=tick.sumo.traffic,

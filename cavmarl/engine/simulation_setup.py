@@ -47,16 +47,16 @@ def add_coordinators(
 
 def call_rare_kernels(tick: Tick) -> None:
     """Call the kernels that a first step may leave out, so that all of them are loaded."""
-    gate, division = tick.gate, tick.division
+    departures, division = tick.departures, tick.division
     tick.let_in()
-    tick.traffic.accept(gate, tick.worlds, tick.peers.running())
+    tick.traffic.accept(departures, tick.worlds, tick.peers.running())
     tick.admit()
-    tick.executor.leave(gate)
-    tick.executor.retire(gate)
-    tick.executor.forget(gate)
+    tick.executor.leave(departures)
+    tick.executor.retire(departures)
+    tick.executor.forget(departures)
     tick.executor.gather(*division.gathering)
     division.rehearse_gathering()
-    tick.traffic.settle(gate, tick.worlds)
+    tick.traffic.settle(departures, tick.worlds)
     division.changes.near(0, everybody=True)
     with suppress(ConfigError):
         division.changes.hand_over(0, Switch(-1, 0, 0, 0, False))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
-from cavmarl.core.records.arrays import Common, Gate, RoadArrays
+from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, SharedState
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
@@ -25,8 +25,8 @@ from cavmarl.core.records.codes import (
     SPEED_GIVEN,
 )
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
-from cavmarl.engine.component import Attached
-from cavmarl.handoff.division import Division
+from cavmarl.engine.component import Component
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.shards.row_check import MOST
 from cavmarl.shards.state import Use, names_of
 from cavmarl.traffic.departure_queue import DEPARTURE
@@ -47,9 +47,9 @@ class StateForm(NamedTuple):
     """What a saved state of these worlds looks like."""
 
     roads: RoadArrays
-    division: Division
+    division: ZonedShards
     traffic: NativeTraffic
-    attached: tuple[Attached, ...]
+    attached: tuple[Component, ...]
     fixed: Sequence[Array]  # arrays of the dtypes and shapes of the first ones
     rerouting: Sequence[Array]  # likewise, of vehicles that find their own ways; or none
 
@@ -95,7 +95,7 @@ class StateForm(NamedTuple):
         (queue,), rest = rest[:1], rest[1:]
         rerouting, rest = rest[:num_more], rest[num_more:]
         (words, contacts), vehicles = rest[:2], rest[2:]
-        names = [*names_of(Common, Use.SAVED), *names_of(Gate, Use.SAVED)]
+        names = [*names_of(SharedState, Use.SAVED), *names_of(DepartureQueue, Use.SAVED)]
         for n, (array, like) in enumerate(zip(fixed, self.fixed, strict=True)):
             if array.dtype != like.dtype or array.shape != like.shape:
                 name = names[n] if n < len(names) else f"array {n}"

@@ -94,29 +94,34 @@ class SumoPhases:
 
     def follow(self, tick: Tick) -> None:
         """Let SUMO take its step; then its vehicles move to their new places, or leave."""
-        sumo, gate, worlds, side = self._sumo, tick.gate, tick.worlds, tick.division.next_side
+        sumo, departures, worlds, side = (
+            self._sumo,
+            tick.departures,
+            tick.worlds,
+            tick.division.next_side,
+        )
         tick.note_phase(SUMO)
         with tick.all_rows(True, side):
             sumo.step(worlds, side)
             if not sumo.drives:
-                sumo.send_on(gate, worlds, side)
+                sumo.send_on(departures, worlds, side)
                 return
         tick.note_phase(MIRROR)
         if sumo.mirror(worlds, side):
-            tick.executor.dismiss(gate)
-            tick.coordination.left(gate)
-            sumo.forgive(gate)
-        tick.peers.share_leavers(gate)
-        if any(gate.num_passing.tolist()):
-            tick.traffic.settle(gate, worlds)
+            tick.executor.dismiss(departures)
+            tick.coordination.left(departures)
+            sumo.forgive(departures)
+        tick.peers.share_leavers(departures)
+        if any(departures.num_passing.tolist()):
+            tick.traffic.settle(departures, worlds)
 
     def let_in(self, tick: Tick) -> None:
         """Add the vehicles that SUMO has let in: as its own, or to the queue as ours."""
-        sumo, gate, worlds = self._sumo, tick.gate, tick.worlds
+        sumo, departures, worlds = self._sumo, tick.departures, tick.worlds
         tick.meet()
         if not sumo.drives:
-            sumo.order(gate, worlds)
-        elif sumo.let_in(gate, worlds, tick.peers.running()):
+            sumo.order(departures, worlds)
+        elif sumo.let_in(departures, worlds, tick.peers.running()):
             tick.admit()
 
     def switch_signals(self, tick: Tick) -> None:

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled.bound_call import bind
-from cavmarl.core.math.tallies import count_tick, occasions
-from cavmarl.core.records.arrays import Gate, Worlds
-from cavmarl.engine.component import Attached
+from cavmarl.core.math.counters import count_tick, occasions
+from cavmarl.core.records.arrays import DepartureQueue, Worlds
+from cavmarl.engine.component import Component
 from cavmarl.engine.peers import NoPeers, Peers
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.step_trace import Traced
 from cavmarl.engine.sumo_phases import GlobalTraffic, NoSumo, SumoPhases
-from cavmarl.handoff.coordinator.coordinators import Coordination, NoCoordination
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.coordinator.coordinators import NoOwnershipRuntime, OwnershipRuntime
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.shards.executor import Executor, TeamExecutor
 from cavmarl.shards.shard import Commands, Shard, common_of
 from cavmarl.shards.shard_group import ShardGroup
@@ -30,7 +30,7 @@ class Tick:
 
     Attributes:
         executor: runs the phases of the shards, in this process or in several.
-        gate: through which vehicles come and go; a reset may replace it.
+        departures: through which vehicles come and go; a reset may replace it.
         coordination: decides which zone owns which vehicle.
         peers: the processes that run the other zones.
         sumo: the simulator beside these worlds.
@@ -40,20 +40,20 @@ class Tick:
     def __init__(
         self,
         shards: Sequence[Shard],  # one a zone
-        division: Division,  # of all shards
+        division: ZonedShards,  # of all shards
         traffic: NativeTraffic,  # departures, routes and arrivals
         shared: SharedOutputs,  # signals and outputs of all shards
-        gate: Gate,
-        attached: tuple[Attached, ...],  # components that act in each tick beside the traffic
+        departures: DepartureQueue,
+        attached: tuple[Component, ...],  # components that act in each tick beside the traffic
     ) -> None:
         self.shards = shards
         self.division = division
         self.traffic = traffic
         self.shared = shared
-        self.gate = gate
+        self.departures = departures
         self.attached = attached
         self.executor: Executor = ShardGroup(shards)
-        self.coordination: Coordination = NoCoordination()
+        self.coordination: OwnershipRuntime = NoOwnershipRuntime()
         self.peers: Peers = NoPeers(division)
         self.sumo: GlobalTraffic = NoSumo()
         self.meet: Callable[[], None] = _no_wait
@@ -104,13 +104,13 @@ class Tick:
 
     def all_rows(self, needed: bool, side: int) -> AbstractContextManager[None]:
         """Return the time in which the vehicles of all zones are in this process, if needed."""
-        return self.peers.everybody(self.gate, side) if needed else nullcontext()
+        return self.peers.everybody(self.departures, side) if needed else nullcontext()
 
     def begin_step(self, commands: Commands) -> None:
         """Open the accounts of the step, and queue the vehicles that the caller inserts."""
         self.executor.begin_step(commands)
         if commands.inserted.size:
-            self.traffic.insert(self.gate, self.worlds, commands.inserted)
+            self.traffic.insert(self.departures, self.worlds, commands.inserted)
 
     def _advance(self, commands: Commands) -> None:
         """Advance → leave → exchange → resolve → enter → commit → signals."""
@@ -121,9 +121,9 @@ class Tick:
             self.division.exchange()
         else:
             self.division.count_rows()
-        self.peers.share_rows(self.gate, self.division.next_side)
-        if any(self.gate.num_passing.tolist()):
-            self.traffic.settle(self.gate, self.worlds)
+        self.peers.share_rows(self.departures, self.division.next_side)
+        if any(self.departures.num_passing.tolist()):
+            self.traffic.settle(self.departures, self.worlds)
         self.executor.resolve()
         if self._gathers:
             self.division.note_gathered()  # others may still be about their contacts
@@ -144,59 +144,59 @@ class Tick:
 
     def leave(self) -> None:
         """Pick new goals, let arrived vehicles leave, answer requests for routes."""
-        traffic, gate, worlds = self.traffic, self.gate, self.worlds
+        traffic, departures, worlds = self.traffic, self.departures, self.worlds
         begins_second, some_arrived = self.occasions()
         if begins_second:
-            self.executor.choose_goals(traffic.demand, len(traffic.plans), gate)
+            self.executor.choose_goals(traffic.demand, len(traffic.plans), departures)
         if some_arrived:
-            self.executor.leave(gate)
-            if any(gate.num_passing.tolist()):
-                self.coordination.left(gate)
+            self.executor.leave(departures)
+            if any(departures.num_passing.tolist()):
+                self.coordination.left(departures)
                 if self.peers.are_none:  # if not, those of all zones settle after `share_rows`
-                    traffic.settle(gate, worlds)
+                    traffic.settle(departures, worlds)
         if begins_second and traffic.rerouting is not None:
             with (
                 self.all_rows(True, self.division.next_side),
                 self.division.everybody_next() as everybody,
             ):
-                traffic.rerouting.act(gate, everybody)
+                traffic.rerouting.act(departures, everybody)
 
     def _enter(self) -> None:
         """Waiting departures that find a gap enter `next_rows`."""
         self.sumo.let_in(self)
-        self.traffic.call_orders(self.gate, self.worlds)
-        if any(self.gate.num_queue.tolist()):
+        self.traffic.call_orders(self.departures, self.worlds)
+        if any(self.departures.num_queue.tolist()):
             self.let_in()
 
     def let_in(self) -> None:
         """Rank → assign → propose, and if any departure has found a gap, accept → admit."""
-        traffic, gate, worlds, peers = self.traffic, self.gate, self.worlds, self.peers
-        peers.clear_ranks(gate)
-        self.executor.rank_lanes(gate)
-        peers.share_ranks(gate)
-        traffic.assign_lanes(gate, worlds)
-        self.executor.propose(traffic.demand, gate)
-        peers.share_proposals(gate)
-        if any(gate.num_passing.tolist()):
-            traffic.accept(gate, worlds, peers.running())
+        traffic, departures, worlds, peers = self.traffic, self.departures, self.worlds, self.peers
+        peers.clear_ranks(departures)
+        self.executor.rank_lanes(departures)
+        peers.share_ranks(departures)
+        traffic.assign_lanes(departures, worlds)
+        self.executor.propose(traffic.demand, departures)
+        peers.share_proposals(departures)
+        if any(departures.num_passing.tolist()):
+            traffic.accept(departures, worlds, peers.running())
             self.admit()
 
     def admit(self) -> None:
         """Admitted vehicles become rows of the zones that they are in."""
-        self.executor.admit(self.gate)
-        self.coordination.entered(self.gate)
-        self.gate.num_passing[:] = 0
+        self.executor.admit(self.departures)
+        self.coordination.entered(self.departures)
+        self.departures.num_passing[:] = 0
 
     def retire_agents(self) -> None:
         """Between two steps: take out the agents whose trip ended in the last one."""
-        gate = self.gate
-        self.executor.retire(gate)
-        if any(gate.num_passing.tolist()):
-            self.coordination.left(gate)
-        self.peers.share_leavers(gate)
-        if any(gate.num_passing.tolist()):
-            self.executor.forget(gate)
-            self.traffic.settle(gate, self.worlds)
+        departures = self.departures
+        self.executor.retire(departures)
+        if any(departures.num_passing.tolist()):
+            self.coordination.left(departures)
+        self.peers.share_leavers(departures)
+        if any(departures.num_passing.tolist()):
+            self.executor.forget(departures)
+            self.traffic.settle(departures, self.worlds)
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that runs phases, to time them."""

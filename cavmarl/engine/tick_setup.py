@@ -5,18 +5,18 @@ from __future__ import annotations
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.memory import Zeros
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.engine.component import Attached, ComponentContext
-from cavmarl.engine.rig_component import MountedSensors
+from cavmarl.engine.component import Component, ComponentContext
+from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.scenario_cues import Cues
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.tick import Tick
-from cavmarl.engine.v2x_component import Messaging
+from cavmarl.engine.v2x_component import V2xComponent
 from cavmarl.handoff.shard_setup import divide
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.registry import frame_layout, frames_in
 from cavmarl.traffic.demand import DemandFile
-from cavmarl.traffic.departure_queue import make_gate
+from cavmarl.traffic.departure_queue import make_departure_queue
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.traffic.scenarios.library import plan_scene
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
@@ -69,19 +69,19 @@ def make_tick(
             frames=frames,
         )
     )
-    gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)
-    return Tick(shards, division, traffic, shared, gate, attached)
+    departures = make_departure_queue(num_worlds, traffic.capacity, network.arrays, blank.dtype)
+    return Tick(shards, division, traffic, shared, departures, attached)
 
 
-def attach(host: ComponentContext) -> tuple[Attached, ...]:
+def attach(host: ComponentContext) -> tuple[Component, ...]:
     """The parts that the environment asks for, in the order in which they act."""
-    parts: list[Attached] = []
+    parts: list[Component] = []
     if host.config.scenario.name:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
     if host.config.rig:
-        parts.append(MountedSensors(host))
+        parts.append(RigComponent(host))
     if host.config.v2x.enabled:
-        parts.append(Messaging(host))
+        parts.append(V2xComponent(host))
     return tuple(parts)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cavmarl.core.records.arrays import Gate
+from cavmarl.core.records.arrays import DepartureQueue
 from cavmarl.core.records.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
@@ -16,7 +16,7 @@ from cavmarl.core.records.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,15 @@ class TrafficStats:
     mean_delay_s: float
 
 
-def count_traffic(gate: Gate, division: Division, world: int) -> TrafficStats:
+def count_traffic(departures: DepartureQueue, division: ZonedShards, world: int) -> TrafficStats:
     """Counts and means of one world since its reset."""
-    counts, sums = gate.counts[world], gate.sums[world]
+    counts, sums = departures.counts[world], departures.sums[world]
     rows = division.vehicles(world)
     arrived = int(counts[COUNT_ARRIVED])
     trips = max(arrived, 1)
     return TrafficStats(
         departed=int(counts[COUNT_DEPARTED]),
-        waiting=int(gate.num_queue[world]),
+        waiting=int(departures.num_queue[world]),
         running=len(rows),
         arrived=arrived,
         contacts=int(division.contacts()[world]),

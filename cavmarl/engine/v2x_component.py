@@ -1,4 +1,4 @@
-"""`Messaging`: the bus of messages as a part that acts in each tick."""
+"""`V2xComponent`: the bus of messages as a part that acts in each tick."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from cavmarl.engine.component import ComponentContext
 
 
-class Messaging:
-    """Lets the stations of W worlds send and receive at the end of each tick; an `Attached`.
+class V2xComponent:
+    """Lets the stations of W worlds send and receive at the end of each tick; a `Component`.
 
     What is received in a tick is in the inboxes when agents sense, at its end.
     """
@@ -60,6 +60,6 @@ class Messaging:
 
 
 def without_network(attached: Iterable[object]) -> AbstractContextManager[None]:
-    """Return the time in which no network simulator is asked; see `Bus.unheard`."""
-    buses = (part.bus for part in attached if isinstance(part, Messaging))
-    return next((bus.unheard() for bus in buses), nullcontext())
+    """Return the time in which no network simulator is asked; see `Bus.muted`."""
+    buses = (part.bus for part in attached if isinstance(part, V2xComponent))
+    return next((bus.muted() for bus in buses), nullcontext())

@@ -26,7 +26,7 @@ from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.horizon import horizon_of
+from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.roads.joined_maps import join
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import map_name, source_hash

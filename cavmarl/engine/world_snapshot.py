@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
+from cavmarl.core.records.arrays import DepartureQueue, Outputs, SharedState, Worlds
 from cavmarl.driving.vehicles import STATE_FIELDS
-from cavmarl.engine.component import Attached
+from cavmarl.engine.component import Component
 from cavmarl.engine.state_check import StateForm
-from cavmarl.handoff.coordinator.coordinators import Coordination
+from cavmarl.handoff.coordinator.coordinators import OwnershipRuntime
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership, zone_table
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.shards.state import Use, arrays_of
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
@@ -33,25 +33,25 @@ class Parts(NamedTuple):
     """The parts that keep the state of W worlds."""
 
     worlds: Worlds  # of the first shard
-    division: Division  # of all shards
-    gate: Gate  # through which vehicles come and go
+    division: ZonedShards  # of all shards
+    departures: DepartureQueue  # through which vehicles come and go
     traffic: NativeTraffic  # what comes
     outputs: Outputs  # what agents have got; the frames of the next observation, too
-    coordination: Coordination  # decides ownership
+    coordination: OwnershipRuntime  # decides ownership
     partition: ZonePartition  # the zones
-    recut_steps: int  # that have been made, where zones are cut anew from time to time
+    repartition_steps_done: int  # that have been made, where zones are cut anew from time to time
     has_past: bool  # an observation takes something from the one before
-    attached: tuple[Attached, ...]  # what acts in each tick beside the traffic
+    attached: tuple[Component, ...]  # what acts in each tick beside the traffic
     sumo: SumoTraffic | None  # beside the worlds; None: there is none
 
 
 def save(parts: Parts) -> list[Array]:
     """The arrays; some of them are views, to be copied before the next tick."""
-    worlds, gate = parts.worlds, parts.gate
-    waiting = int(gate.num_queue.max(initial=0))
+    worlds, departures = parts.worlds, parts.departures
+    waiting = int(departures.num_queue.max(initial=0))
     return [
         *_fixed(parts),
-        gate.queue[:, :waiting],
+        departures.queue[:, :waiting],
         *_of_rerouting(parts),
         _stacked([_ownership(parts, w)[np.newaxis] for w in range(len(worlds.ticks))]),
         parts.division.contacts(),
@@ -68,7 +68,7 @@ def load(
     saved: Sequence[Array],
     ownership: Sequence[SavedOwnership] | None,  # of each world, as `ownership_of` gives it
     home: int | None = None,  # the zone of this process, if others hold some; see `put_back`
-) -> Gate:  # the gate, or a larger one
+) -> DepartureQueue:  # the departure queue, or a larger one
     """Put everything in its place: vehicles in the zones that they are in, or that owned them.
 
     Raises:
@@ -79,11 +79,11 @@ def load(
     parts.division.align()
     for array in _fixed(parts):
         array[...] = next(rest)
-    # What is ordered follows from the keys; what has been ordered so far is in the gate.
-    gate = parts.traffic.draw_orders(parts.gate, parts.worlds, everywhere)
+    # What is ordered follows from the keys; what has been ordered so far is in the departure queue.
+    departures = parts.traffic.draw_orders(parts.departures, parts.worlds, everywhere)
     queue = next(rest)
-    gate.queue[:, : queue.shape[1]] = queue
-    gate.num_passing[:] = 0
+    departures.queue[:, : queue.shape[1]] = queue
+    departures.num_passing[:] = 0
     for array in _of_rerouting(parts):
         _put(array, next(rest))
     next(rest)  # the words of ownership
@@ -102,7 +102,7 @@ def load(
         parts.division.put_back(owned, contacts, 0, keeps_epochs=goes_on)
         ownership = ownership if goes_on else None
     parts.coordination.go_on(ownership)
-    return gate
+    return departures
 
 
 def form_of(parts: Parts) -> StateForm:
@@ -157,14 +157,14 @@ def _ownership(parts: Parts, w: int) -> Array:
     saved = parts.coordination.save(w)
     if saved is None:
         return np.zeros(0, dtype=np.int64)
-    numbers = saved.numbers._replace(recut_steps=parts.recut_steps)
+    numbers = saved.numbers._replace(repartition_steps_done=parts.repartition_steps_done)
     return saved._replace(zones=zone_table(parts.partition), numbers=numbers).pack()
 
 
 def share_of(parts: Parts, w: int) -> list[Array]:
     """What `save` would give if there were no world but one; some are views, to be copied."""
-    gate, rerouting = parts.gate, parts.traffic.rerouting
-    waiting = gate.queue[w : w + 1, : gate.num_queue.item(w)]
+    departures, rerouting = parts.departures, parts.traffic.rerouting
+    waiting = departures.queue[w : w + 1, : departures.num_queue.item(w)]
     owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
     if parts.sumo is not None:
         waiting, owned = waiting.copy(), [rows.copy() for rows in owned]
@@ -225,8 +225,8 @@ def _stacked(shares: Sequence[Array]) -> Array:
 
 def _fixed(parts: Parts) -> Iterator[Array]:
     """The arrays whose shapes follow from the environment, (W, …)."""
-    yield from arrays_of(parts.worlds, Common, Use.SAVED)
-    yield from arrays_of(parts.gate, Gate, Use.SAVED)
+    yield from arrays_of(parts.worlds, SharedState, Use.SAVED)
+    yield from arrays_of(parts.departures, DepartureQueue, Use.SAVED)
     for array in arrays_of(parts.outputs, Outputs, Use.SAVED):
         if array is not parts.outputs.observations or parts.has_past:
             yield array
@@ -247,7 +247,7 @@ def _put(target: Array, saved: Array) -> None:
 
 def digest_world(parts: Parts, world: int) -> str:
     """Hex digest of one world, whatever the order of rows; see `Simulation.state_hash`."""
-    worlds, gate, rerouting = parts.worlds, parts.gate, parts.traffic.rerouting
+    worlds, departures, rerouting = parts.worlds, parts.departures, parts.traffic.rerouting
     sumo = parts.sumo
     rows = parts.division.vehicles(world)
     rows = rows[np.argsort(rows["id"])]
@@ -260,14 +260,14 @@ def digest_world(parts: Parts, world: int) -> str:
         digest.update(np.ascontiguousarray(rows[name]).tobytes())
     agents = rows["agent"][rows["agent"] >= 0]
     digest.update(worlds.pending[world, agents].tobytes())
-    queue = gate.queue[world, : gate.num_queue[world]]
+    queue = departures.queue[world, : departures.num_queue[world]]
     if sumo is not None:
         queue = queue.copy()
         sumo.shift(queue, -world)
     for name in queue.dtype.names or ():
         digest.update(np.ascontiguousarray(queue[name]).tobytes())
-    common = arrays_of(worlds, Common, Use.DIGESTED)
-    for array in (*common, *arrays_of(gate, Gate, Use.DIGESTED)):
+    common = arrays_of(worlds, SharedState, Use.DIGESTED)
+    for array in (*common, *arrays_of(departures, DepartureQueue, Use.DIGESTED)):
         digest.update(array[world].tobytes())
     if rerouting is not None:
         for array in rerouting.state(world, parts.division.vehicles(world)):

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.core.records.arrays import Gate, Outputs, Travel, Worlds
-from cavmarl.engine.component import Attached
-from cavmarl.engine.rig_component import MountedSensors
+from cavmarl.core.records.arrays import DepartureQueue, Outputs, TripTables, Worlds
+from cavmarl.engine.component import Component
+from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
-from cavmarl.engine.v2x_component import Messaging
+from cavmarl.engine.v2x_component import V2xComponent
 from cavmarl.engine.zone_hosting import ZoneHosting
 from cavmarl.handoff.coordinator.coordinator import Coordinator
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shards.shard import Shard
 from cavmarl.traffic.scenarios.scene import Scene
@@ -76,14 +76,14 @@ class WorldViews:
     def messages(self) -> Bus:
         """What vehicles and roadside units tell each other."""
         for part in self._tick.attached:
-            if isinstance(part, Messaging):
+            if isinstance(part, V2xComponent):
                 return part.bus
         raise ConfigError("no messages are sent here: set v2x.enabled to true")
 
     @property
-    def gate(self) -> Gate:
+    def departures(self) -> DepartureQueue:
         """Departures waiting in each world, and counts since its reset; resets may replace it."""
-        return self._tick.gate
+        return self._tick.departures
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
@@ -96,7 +96,7 @@ class WorldViews:
         return self._shard.travel.types
 
     @property
-    def travel(self) -> Travel:
+    def travel(self) -> TripTables:
         """Types and ways of all vehicles."""
         return self._shard.travel
 
@@ -111,7 +111,7 @@ class WorldViews:
         return self._tick.traffic.plans
 
     @property
-    def division(self) -> Division:
+    def division(self) -> ZonedShards:
         """The shards together, and the rows that go between them."""
         return self._tick.division
 
@@ -136,7 +136,7 @@ class WorldViews:
         return self._tick.coordination.coordinators
 
     @property
-    def attached(self) -> tuple[Attached, ...]:
+    def attached(self) -> tuple[Component, ...]:
         """What acts in each tick beside the traffic."""
         return self._tick.attached
 
@@ -149,12 +149,12 @@ class WorldViews:
         return self._tick.division.whole()
 
     @property
-    def mounted(self) -> MountedSensors | None:
+    def mounted(self) -> RigComponent | None:
         """The rigs of the agents; None: they have none."""
-        rigs = (part for part in self._tick.attached if isinstance(part, MountedSensors))
+        rigs = (part for part in self._tick.attached if isinstance(part, RigComponent))
         return next(rigs, None)
 
-    def of_agents(self) -> list[NDArray[Any]]:
+    def agent_arrays(self) -> list[NDArray[Any]]:
         """What is kept of agents, (W, A, …); over nodes each has it of the vehicles it has."""
         rig = () if self.mounted is None else self.mounted.arrays()
         return [self._tick.shards[0].worlds.pending, self.outputs.observations, *rig]
@@ -174,12 +174,12 @@ class WorldViews:
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         tick = self._tick
-        longest = int(tick.gate.num_queue.max(initial=0))
+        longest = int(tick.departures.num_queue.max(initial=0))
         if longest == 0:
             return np.zeros(self.num_worlds, dtype=np.bool_)
-        waiting = np.arange(longest) < tick.gate.num_queue[:, None]
-        found = np.any(waiting & (tick.gate.queue["agent"][:, :longest] >= 0), axis=1)
+        waiting = np.arange(longest) < tick.departures.num_queue[:, None]
+        found = np.any(waiting & (tick.departures.queue["agent"][:, :longest] >= 0), axis=1)
         return np.asarray(found, dtype=np.bool_)
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
-        return count_traffic(self._tick.gate, self._tick.division, world)
+        return count_traffic(self._tick.departures, self._tick.division, world)

@@ -12,10 +12,10 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.peers import Peers
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.tick import Tick
-from cavmarl.handoff.coordinator.coordinators import Coordination, Coordinators
+from cavmarl.handoff.coordinator.coordinators import OwnershipRuntime, WorldCoordinators
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership, zone_table
 from cavmarl.handoff.division import ZoneLoads
-from cavmarl.handoff.repartitioning import Recut, Recutter
+from cavmarl.handoff.repartitioning import Repartition, Repartitioner
 from cavmarl.handoff.zone_view import ZoneView, view_zones
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shards.executor import Executor, TeamExecutor
@@ -34,7 +34,7 @@ class ZoneHosting:
     def __init__(self, tick: Tick, partition: ZonePartition) -> None:
         self.partition = partition
         self._tick = tick
-        self._recutter: Recutter | None = None
+        self._repartitioner: Repartitioner | None = None
 
     def let_zones_change(self, network: RoadNetwork, settings: ZonesConfig) -> None:
         """Look for better zones every `zones.repartition_steps` steps, if that is set."""
@@ -42,9 +42,9 @@ class ZoneHosting:
         if (
             settings.repartition_steps
             and self.partition.count > 1
-            and isinstance(coordination, Coordinators)
+            and isinstance(coordination, WorldCoordinators)
         ):
-            self._recutter = Recutter(
+            self._repartitioner = Repartitioner(
                 network,
                 self._tick.division,
                 coordination,
@@ -54,8 +54,8 @@ class ZoneHosting:
 
     def before_step(self) -> None:
         """Take other zones, if it is time and they share out the vehicles better."""
-        if self._recutter is not None:
-            partition = self._recutter.before_step(self.partition)
+        if self._repartitioner is not None:
+            partition = self._repartitioner.before_step(self.partition)
             if partition is not None:
                 self.partition = partition
                 self._tick.executor = ShardGroup(self._tick.shards)
@@ -73,11 +73,11 @@ class ZoneHosting:
         self.refuse_changes("the zones of one world over workers")
         self._tick.host(make)
 
-    def host_zones(self, peers: Peers, coordination: Coordination, executor: Executor) -> None:
+    def host_zones(self, peers: Peers, coordination: OwnershipRuntime, executor: Executor) -> None:
         """From now on run only the zones of this executor; other processes (peers) run the rest."""
         tick = self._tick
         tick.peers, tick.coordination, tick.executor = peers, coordination, executor
-        self._recutter = None  # no process has the places of all vehicles
+        self._repartitioner = None  # no process has the places of all vehicles
 
     def set_zones(self, partition: ZonePartition) -> None:
         """Say where zones are, before they have their vehicles."""
@@ -98,7 +98,7 @@ class ZoneHosting:
         tick.division.place(vehicles, contacts)
         tick.peers.keep_own(everywhere)
         tick.coordination.reset(everywhere)
-        tick.peers.take_up(tick.gate, tick.division.side)
+        tick.peers.take_up(tick.departures, tick.division.side)
 
     def measure_costs(self, every: int = 1) -> ShardClock:
         """From now on measure the processor time of each zone, in one tick of `every`."""
@@ -113,30 +113,30 @@ class ZoneHosting:
         Other zones than the present ones are taken only if zones may change while worlds run.
         """
         if saved.zones.tobytes() != zone_table(self.partition).tobytes():
-            if self._recutter is None:
+            if self._repartitioner is None:
                 return False
             self.set_zones(saved.partition())
             self._tick.executor = ShardGroup(self._tick.shards)
-        if self._recutter is not None:
-            self._recutter.steps = saved.numbers.recut_steps
+        if self._repartitioner is not None:
+            self._repartitioner.steps = saved.numbers.repartition_steps_done
         return True
 
     @property
-    def recut_steps(self) -> int:
+    def repartition_steps_done(self) -> int:
         """Steps that count towards the next look for better zones; 0: zones never change."""
-        return 0 if self._recutter is None else self._recutter.steps
+        return 0 if self._repartitioner is None else self._repartitioner.steps
 
     def refuse_changes(self, what: str) -> None:
         """Raise ConfigError if zones may change while the worlds run."""
-        if self._recutter is not None:
+        if self._repartitioner is not None:
             raise ConfigError(
                 f"zones.repartition_steps: {what} needs zones that stay; leave one out"
             )
 
     @property
-    def recuts(self) -> Sequence[Recut]:
+    def repartitions(self) -> Sequence[Repartition]:
         """When other zones were taken; see `zones.repartition_steps`."""
-        return () if self._recutter is None else self._recutter.recuts
+        return () if self._repartitioner is None else self._repartitioner.repartitions
 
     def loads(self) -> ZoneLoads:
         """Return how many vehicles and ghosts each zone has."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.evaluate.kernels.watching import locate_agents, watch_encroachments
+from cavmarl.evaluate.kernels.near_misses import locate_agents, watch_encroachments
 from cavmarl.evaluate.recorder import MESSAGE_COLUMNS, Recorder
 from cavmarl.roads.network import RoadNetwork
 

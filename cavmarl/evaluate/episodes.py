@@ -20,15 +20,15 @@ from cavmarl.evaluate.border_terms import BorderTerms
 from cavmarl.evaluate.encounters import EncounterWatch, MessageRecord
 from cavmarl.evaluate.failure_clips import Failure
 from cavmarl.evaluate.recorder import SLOWEST, Recorder
-from cavmarl.evaluate.run_watch import RunWatch, recording_path
-from cavmarl.evaluate.standing import StandingWatch
+from cavmarl.evaluate.run_extras import RunWatch, recording_path
+from cavmarl.evaluate.stuck_trips import StandingWatch
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
 from cavmarl.evaluate.transfer_rows import TransferRecorder
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.loading import load_policy
 from cavmarl.policies.policy import Policy
 from cavmarl.recordings.extra_tables import RecordOptions
-from cavmarl.roads.kernels.map_draw import map_of
+from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.zones.partition.zone_statistics import imbalance
 
 MAX_VEHICLES = 100_000  # of the worlds that are stepped together

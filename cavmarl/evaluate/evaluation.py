@@ -38,7 +38,6 @@ from cavmarl.evaluate.episodes import (
     worlds_at_once,
 )
 from cavmarl.evaluate.failure_page import write_failures
-from cavmarl.evaluate.fresh import call_in_fresh_process
 from cavmarl.evaluate.provenance.manifest import (
     close_manifest,
     describe_policies,
@@ -47,6 +46,7 @@ from cavmarl.evaluate.provenance.manifest import (
     write_text,
 )
 from cavmarl.evaluate.report import EvaluationReport, make_report
+from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 from cavmarl.evaluate.tables import (
     EPISODE,
     METRICS_VERSION,

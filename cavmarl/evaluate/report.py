@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.evaluate.by_map import rows_by_map
 from cavmarl.evaluate.episodes import Speed
+from cavmarl.evaluate.map_table import rows_by_map
 from cavmarl.evaluate.metrics import METRICS, Metric, least_value, metric_values
 from cavmarl.evaluate.statistics import (
     Interval,

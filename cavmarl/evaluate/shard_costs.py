@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.balance.problem import ShardCost
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
-from cavmarl.evaluate.driven_worlds import DrivenWorld
+from cavmarl.evaluate.built_in_runs import DrivenWorld
 
 PARTS = 5
 

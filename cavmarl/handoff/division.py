@@ -1,4 +1,4 @@
-"""`Division`: the shards of one set of worlds, and the rows that go between them.
+"""`ZonedShards`: the shards of one set of worlds, and the rows that go between them.
 
 Ghosts go each tick to every zone that may see them (decision 012). A vehicle changes its owner
 between two ticks, when the coordinator says so: its old shard keeps it as a ghost, the new one has
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
 from cavmarl.core.compiled.bound_call import bind
-from cavmarl.core.math.tallies import totals
-from cavmarl.core.records.arrays import Worlds, Zoned
+from cavmarl.core.math.counters import totals
+from cavmarl.core.records.arrays import Worlds, ZoneState
 from cavmarl.handoff.owner_changes import OwnerChanges
 from cavmarl.shards.executor import Executor
 from cavmarl.shards.kernels.group_phases import count_rows
@@ -26,7 +26,7 @@ from cavmarl.shards.shard import Shard
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, note_gathered, take_own
-from cavmarl.zones.kernels.handoff import BorderRecords, make_book
+from cavmarl.zones.kernels.ownership_changes import BorderRecords, make_book
 from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.partition.zone_statistics import imbalance
@@ -45,7 +45,7 @@ class ZoneLoads(NamedTuple):
         return np.array([imbalance(owned) for owned in self.owned.T.tolist()])
 
 
-class Division:
+class ZonedShards:
     """Which zones own and see which vehicles.
 
     Attributes:
@@ -59,7 +59,7 @@ class Division:
     def __init__(
         self,
         shards: Sequence[Shard],  # one a zone, in the order of zones
-        zoned: Zoned,  # their rows
+        zoned: ZoneState,  # their rows
         partition: ZonePartition,
         halo: Halo,  # what each zone sees over its borders
         sight: Visibility,  # what says so for other zones
@@ -259,7 +259,7 @@ class Division:
         return [shard.worlds.ticks.item(w) for shard in self._shards]
 
     @property
-    def zoned(self) -> Zoned:
+    def zoned(self) -> ZoneState:
         return self._zoned
 
     @property

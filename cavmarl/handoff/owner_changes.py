@@ -13,11 +13,11 @@ from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.shards.shard import Shard
 from cavmarl.zones.kernels.borders import give_up, pass_on, take_over
-from cavmarl.zones.kernels.handoff import hand_over, look, release
+from cavmarl.zones.kernels.ownership_changes import hand_over, look, release
 from cavmarl.zones.kernels.zone_lookup import zone_of
 
 if TYPE_CHECKING:
-    from cavmarl.handoff.division import Division
+    from cavmarl.handoff.division import ZonedShards
 
 
 class OwnerChanges:
@@ -28,7 +28,7 @@ class OwnerChanges:
         release_all: the kernel `release`, for the arrays of these worlds.
     """
 
-    def __init__(self, division: Division, shards: Sequence[Shard]) -> None:
+    def __init__(self, division: ZonedShards, shards: Sequence[Shard]) -> None:
         self._division = division
         self._shards = shards
         self._look = specialized(look)

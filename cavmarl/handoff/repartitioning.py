@@ -1,4 +1,4 @@
-"""`Recutter`: cuts worlds anew while they run, where their vehicles have gathered in a few zones.
+"""`Repartitioner`: repartition running worlds whose vehicles have gathered in a few zones.
 
 An extension, off by default: the paper's zones are fixed. Between two ticks the plane is divided
 otherwise; in the next one each vehicle that is in another zone than its owner's is handed over as
@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cavmarl.handoff.coordinator.coordinators import Coordinators
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.coordinator.coordinators import WorldCoordinators
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.repartition_plan import Proposal, propose_zones
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
-class Recut(NamedTuple):
+class Repartition(NamedTuple):
     """Worlds have been cut anew."""
 
     step: int  # after which one, of all that these worlds have made
@@ -31,7 +31,7 @@ class Recut(NamedTuple):
 
 def propose_cut(
     network: RoadNetwork,
-    division: Division,  # with the vehicles of all zones
+    division: ZonedShards,  # with the vehicles of all zones
     partition: ZonePartition,  # its zones now
     tolerance: float,  # by which share of the mean the fullest zone has to become emptier
 ) -> Proposal | None:
@@ -48,18 +48,18 @@ def is_due(step: int, every: int) -> bool:
     return every > 0 and step > 1 and (step - 1) % every == 0
 
 
-class Recutter:
+class Repartitioner:
     """Looks every so many steps whether other zones would share out the vehicles better."""
 
     def __init__(
         self,
         network: RoadNetwork,
-        division: Division,
-        coordination: Coordinators,
+        division: ZonedShards,
+        coordination: WorldCoordinators,
         every: int,  # steps between checks
         tolerance: float,  # by which share of the mean the fullest zone has to become emptier
     ) -> None:
-        self.recuts: list[Recut] = []  # what has been done
+        self.repartitions: list[Repartition] = []  # what has been done
         self.steps = 0  # that have begun
         self._network = network
         self._division = division
@@ -82,8 +82,8 @@ class Recutter:
             return None
         self.cut(proposal.partition)
         ms = 1e3 * (time.perf_counter() - began)
-        self.recuts.append(
-            Recut(self.steps - 1, proposal.before, proposal.after, proposal.moved, ms)
+        self.repartitions.append(
+            Repartition(self.steps - 1, proposal.before, proposal.after, proposal.moved, ms)
         )
         return proposal.partition
 

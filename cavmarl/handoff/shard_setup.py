@@ -12,7 +12,7 @@ from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.limits import Limits
@@ -21,7 +21,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.observed import carried_from, largest_radius_m, sensing_reach_m
 from cavmarl.sensors.registry import rig_reach_m
 from cavmarl.shards.row_check import RowCheck
-from cavmarl.shards.shard import Shard, make_zoned
+from cavmarl.shards.shard import Shard, make_zone_state
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.zones.kernels.borders import Borders
@@ -42,7 +42,7 @@ def divide(
     num_worlds: int,  # how many worlds are stepped together
     zeros: Zeros = huge_zeros,  # makes the arrays that shards write
     late_ticks: int = 0,  # for so many more a vehicle that has crossed may stay with its zone
-) -> tuple[list[Shard], Division]:
+) -> tuple[list[Shard], ZonedShards]:
     """One shard a zone, and the division that knows them all.
 
     Raises:
@@ -71,7 +71,7 @@ def divide(
         _needed_m(config, 0.0, fastest_mps, late_ticks),
     )
     halo = sight.halo(partition)
-    zoned = make_zoned(partition.count, num_worlds, traffic.capacity, zeros)
+    zoned = make_zone_state(partition.count, num_worlds, traffic.capacity, zeros)
     shards: list[Shard] = []
     for zone in range(partition.count):
         shard = Shard(
@@ -89,7 +89,7 @@ def divide(
         )
         shards.append(shard)
     row_check = RowCheck(shards[0].roads, traffic, outputs.present.shape[1])
-    division = Division(
+    division = ZonedShards(
         shards,
         zoned=zoned,
         partition=partition,
@@ -143,7 +143,7 @@ def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
     return config.zones.halo_m is None and not free
 
 
-def neighbours_of(division: Division) -> Neighbours:
+def neighbours_of(division: ZonedShards) -> Neighbours:
     """Between which zones the protocol lets vehicles change, while they are not cut anew."""
     near = (frozenset(np.flatnonzero(row).tolist()) for row in division.neighbours)
     return Neighbours(tuple(near), division.may_teleport)

@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
-from cavmarl.core.whole_file import write_whole
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.policies.network_files import (
     CONTINUOUS_ACTIONS,
     MAX_DEVIATIONS,

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.errors import TrainingError
-from cavmarl.core.whole_file import write_whole
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
 
 _HEAD = b"cavmarl checkpoint 1\n"  # then a SHA-256 of the rest

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, Self, TypeVar
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.config.io import validate
+from cavmarl.core.atomic_file import remove_dead_drafts
 from cavmarl.core.errors import ConfigError, TrainingError
-from cavmarl.core.whole_file import remove_dead_drafts
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.maps.components import strong_components
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.horizon import horizon_of
+from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")

@@ -18,9 +18,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
-from cavmarl.core.whole_file import draft_folder
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument

@@ -145,7 +145,7 @@ class LocalWorlds:
         """Write which agents act next and what is over; whether an episode is."""
         simulation = self.simulation
         return self._report_continuation(
-            simulation.outputs, simulation.gate, self._steps, self._horizon, self._results
+            simulation.outputs, simulation.departures, self._steps, self._horizon, self._results
         )
 
     def _end(self, over: NDArray[np.bool_], some_over: bool) -> None:

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.errors import RecordingError
 from cavmarl.core.processes import is_fork, refuse_fork
-from cavmarl.core.whole_file import write_whole
 from cavmarl.engine.world_frame import FrameEvent, WorldFrame, events_between
 from cavmarl.recordings.extra_tables import ExtraRows, extra_table, take_rows
 from cavmarl.recordings.frame_memory import FrameMemory

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.cache_folder import cache_dir, tell_unwritable
 from cavmarl.core.mapped_file import mapped
-from cavmarl.core.whole_file import write_whole
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import (
     CONFLICT,

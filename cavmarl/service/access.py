@@ -20,9 +20,9 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from jwt.algorithms import OKPAlgorithm
 
+from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
-from cavmarl.service.infrastructure import IdentityRecord, Role, SessionRecord
-from cavmarl.service.refusals import problem
+from cavmarl.service.service_records import IdentityRecord, Role, SessionRecord
 
 ISSUER = "cavmarl"
 AUDIENCE = "cavmarl.service"

@@ -18,8 +18,8 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.guards import Service, rule_of
-from cavmarl.service.problems import answer, serve_routes
+from cavmarl.service.auth import Service, rule_of
+from cavmarl.service.problem_json import answer, serve_routes
 from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_metrics import ServiceMetrics
 

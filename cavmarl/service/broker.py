@@ -14,14 +14,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cavmarl.balance.load_score import Utilisation
-from cavmarl.service.bodies import BeatBody, NodeBody, TransfersBody
+from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
-from cavmarl.service.infrastructure import (
-    SESSION_OVER,
-    IdentityRecord,
-    NodeRecord,
-    SessionRecord,
-)
 from cavmarl.service.job_queue import JobQueue
 from cavmarl.service.node_reports import NodeReports
 from cavmarl.service.node_selection import (
@@ -32,7 +26,13 @@ from cavmarl.service.node_selection import (
     overloads,
     score_of,
 )
-from cavmarl.service.refusals import problem
+from cavmarl.service.requests import BeatBody, NodeBody, TransfersBody
+from cavmarl.service.service_records import (
+    SESSION_OVER,
+    IdentityRecord,
+    NodeRecord,
+    SessionRecord,
+)
 from cavmarl.service.zone_nodes import ZoneNodes
 
 SHOWN_EXCLUSIONS = 10  # in an event
@@ -121,7 +121,7 @@ class Broker:
         live.heard_s, live.beat = self._clock_s(), body.sequence
         live.use = Utilisation(body.cpu, body.ram, body.gpu)
         live.counters, live.jobs = dict(body.counters), dict(body.jobs)
-        live.unheard.clear()
+        live.muted.clear()
         live.refresh()
         resources = overloads(live.use)
         if resources != node.excluded:
@@ -390,7 +390,7 @@ class Broker:
         self._tell(session, "redirected" if redirected else "assigned", data)
         live = self.live[chosen.node]
         live.hosted.add(number)
-        live.unheard.add(number)
+        live.muted.add(number)
         live.refresh()
         if session.zone_nodes:
             self.zone_nodes.gather(session)
@@ -399,7 +399,7 @@ class Broker:
         if session.node is not None:
             live = self.live[session.node]
             live.hosted.discard(session.id)
-            live.unheard.discard(session.id)
+            live.muted.discard(session.id)
             live.refresh()
         blob = session.saved_blob
         self.zone_nodes.end(session)
@@ -428,7 +428,7 @@ class Broker:
     def _empty(self, name: str) -> None:
         live = self.live[name]
         live.hosted.clear()
-        live.unheard.clear()
+        live.muted.clear()
         live.zones_of.clear()
         live.use = None
         live.refresh()

@@ -14,10 +14,10 @@ from typing import Any
 
 from cavmarl.config.registry import agent_entries, entries, load_config
 from cavmarl.core.errors import CavmarlError
-from cavmarl.service.bodies import ConfigurationBody
+from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
-from cavmarl.service.infrastructure import IdentityRecord
-from cavmarl.service.refusals import problem
+from cavmarl.service.requests import ConfigurationBody
+from cavmarl.service.service_records import IdentityRecord
 
 MOST_CONFIGURATIONS = 10_000  # of one identity
 MOST_VEHICLES = 200_000  # in all worlds of a session: more may take more memory than a node has

@@ -13,7 +13,7 @@ from typing import Any
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.event_store import EventStore, digest_of
-from cavmarl.service.infrastructure import Infrastructure, LogEvent
+from cavmarl.service.service_records import Infrastructure, LogEvent
 
 SERVICE = "service"
 

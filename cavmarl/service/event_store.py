@@ -37,7 +37,7 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from cavmarl.core.errors import ServiceError, require
-from cavmarl.service.infrastructure import LogEvent
+from cavmarl.service.service_records import LogEvent
 
 SCHEMA = "cavmarl.service/1"
 _LOCK_KEY = 0x6361766D  # of PostgreSQL's advisory lock

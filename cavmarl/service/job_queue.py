@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from cavmarl.service.event_log import EventLog
-from cavmarl.service.infrastructure import SessionRecord
 from cavmarl.service.node_selection import Chosen, NoNodeError
 from cavmarl.service.rate_limit import RateLimit
+from cavmarl.service.service_records import SessionRecord
 
 FAILURES_HZ, FAILURES = 100.0, 50.0  # attempts in vain: a second, and at once
 

@@ -18,17 +18,17 @@ from fastapi.openapi.models import HTTPBearer
 from fastapi.security.base import SecurityBase
 from starlette.types import ASGIApp
 
-from cavmarl.client.world_flows import SAVED_HEADER
+from cavmarl.client.world_protocol import SAVED_HEADER
 from cavmarl.core.errors import ServiceError, WorkerError
-from cavmarl.service import answers
+from cavmarl.service import responses
 from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
-from cavmarl.service.bodies import Whole
-from cavmarl.service.guards import StrictRoute
+from cavmarl.service.auth import StrictRoute
+from cavmarl.service.error_names import problem
 from cavmarl.service.node_link import NodeLink
-from cavmarl.service.problems import serve_routes
-from cavmarl.service.refusals import problem
-from cavmarl.service.route_parts import OCTETS, PROBLEM
+from cavmarl.service.problem_json import serve_routes
+from cavmarl.service.requests import Whole
+from cavmarl.service.route_common import OCTETS, PROBLEM
 from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorld, SessionWorlds
 
 MAX_ACTIONS_BYTES = 16 * 1024 * 1024
@@ -131,7 +131,7 @@ async def open_worlds(
     session: str,
     configuration: Opened,
     save: Annotated[bool, Query(description="Leave their state with the service first")] = False,
-) -> answers.WorldDescription:
+) -> responses.WorldDescription:
     """Make the worlds of a session, or find them here; they go on from their saved state."""
     link, worlds = _link(request), _worlds(request)
     if session not in worlds:
@@ -147,7 +147,7 @@ async def open_worlds(
         link.expect(session)
     elif save:
         await _save(link, worlds, session)
-    return answers.WorldDescription(**worlds[session].describe())
+    return responses.WorldDescription(**worlds[session].describe())
 
 
 @router.post("/reset", response_class=Response, responses=ANSWER)
@@ -230,10 +230,10 @@ async def _tend(worlds: SessionWorlds, session: str) -> None:
 
 
 @router.get("/hash")
-async def get_hashes(request: Request, session: str, _: Opened) -> answers.WorldHashes:
+async def get_hashes(request: Request, session: str, _: Opened) -> responses.WorldHashes:
     """Digests of the worlds."""
     worlds = _worlds(request)
-    return answers.WorldHashes(hashes=await in_turn(worlds, worlds[session].hashes))
+    return responses.WorldHashes(hashes=await in_turn(worlds, worlds[session].hashes))
 
 
 @router.get("/suggestion", response_class=Response, responses=ANSWER)
@@ -244,21 +244,21 @@ async def get_suggestion(request: Request, session: str, _: Opened) -> Response:
 
 
 @router.get("/transfers")
-async def get_transfers(request: Request, session: str, _: Opened) -> answers.WorldTransfers:
+async def get_transfers(request: Request, session: str, _: Opened) -> responses.WorldTransfers:
     """The newest changes of owner in divided worlds."""
     worlds = _worlds(request)
-    return answers.WorldTransfers(transfers=await in_turn(worlds, worlds[session].transfers))
+    return responses.WorldTransfers(transfers=await in_turn(worlds, worlds[session].transfers))
 
 
 @router.get("/page")
-async def get_page(request: Request, session: str, _: Opened) -> answers.WorldPage:
+async def get_page(request: Request, session: str, _: Opened) -> responses.WorldPage:
     """A page of the viewer that shows the worlds; it is served on the node's machine alone."""
     worlds = _worlds(request)
     told = await in_turn(worlds, worlds[session].page)
     tended: dict[str, asyncio.Task[None]] = request.app.state.tended
     if session not in tended or tended[session].done():
         tended[session] = asyncio.create_task(_tend(worlds, session))
-    return answers.WorldPage(**told)
+    return responses.WorldPage(**told)
 
 
 @router.delete("", status_code=204)

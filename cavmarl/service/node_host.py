@@ -17,9 +17,9 @@ from typing import Any
 import uvicorn
 
 from cavmarl.core.errors import CavmarlError, ServiceError
-from cavmarl.core.listening import listen
+from cavmarl.core.server_address import listen
 from cavmarl.evaluate.evaluation import evaluate
-from cavmarl.evaluate.fresh import call_in_fresh_process
+from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.node_app import in_turn, make_node_app
 from cavmarl.service.node_link import NodeLink, is_final

@@ -23,7 +23,7 @@ from cavmarl.balance.load_score import (
     select,
 )
 from cavmarl.core.errors import NoAdmissibleWorkerError, ServiceError
-from cavmarl.service.infrastructure import NodeRecord, SessionRecord
+from cavmarl.service.service_records import NodeRecord, SessionRecord
 
 
 class Exclusion(NamedTuple):
@@ -48,7 +48,7 @@ class LiveNode:
     beat: int = -1  # sequence number of its last beat
     use: Utilisation | None = None  # None: no beat yet
     hosted: set[str] = field(default_factory=set)  # ids of sessions that are assigned to it
-    unheard: set[str] = field(default_factory=set)  # of these, since its last beat
+    muted: set[str] = field(default_factory=set)  # of these, since its last beat
     zones_of: list[str] = field(default_factory=list)  # sessions, a time for each part that it has
     counters: dict[str, float] = field(default_factory=dict)  # that it tells for /metrics
     jobs: dict[str, list[int]] = field(default_factory=dict)  # steps done, and to be, of its jobs
@@ -169,7 +169,7 @@ def _reason_against(
 def _candidate(node: NodeRecord, known: LiveNode, rule: LoadRule) -> Candidate:
     use = known.use
     assert use is not None
-    reserved = use.cpu + len(known.unheard) / node.slots
+    reserved = use.cpu + len(known.muted) / node.slots
     cpu = max(use.cpu, min(reserved, rule.thresholds[0]))
     busy = len(known.hosted) + len(known.zones_of)
     return Candidate(known.number, Utilisation(cpu, use.ram, use.gpu), busy)

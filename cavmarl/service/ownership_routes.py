@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from cavmarl.service import answers, bodies
-from cavmarl.service.guards import TheService
-from cavmarl.service.refusals import problem
-from cavmarl.service.route_parts import Nodes, Readers, SessionId, make_router
+from cavmarl.service import requests, responses
+from cavmarl.service.auth import TheService
+from cavmarl.service.error_names import problem
+from cavmarl.service.route_common import Nodes, Readers, SessionId, make_router
 
 ownership = make_router("/v1/sessions/{number}", "ownership")
 
@@ -13,28 +13,28 @@ ownership = make_router("/v1/sessions/{number}", "ownership")
 @ownership.get("/transfers")
 async def get_transfers(
     identity: Readers, service: TheService, number: SessionId
-) -> answers.Ownership:
+) -> responses.Ownership:
     """Owners of vehicles that have changed their zone, and vehicles that another has PREPARED."""
     session = service.broker.session(identity, number)
     owners = [
-        answers.OwnerOfVehicle(
+        responses.OwnerOfVehicle(
             world=int(world), episode=table.episode, vehicle=vehicle, zone=zone, epoch=epoch
         )
         for world, table in session.owners.items()
         for vehicle, (zone, epoch) in table.zones.items()
     ]
     in_flight = [
-        answers.InFlight(
+        responses.InFlight(
             world=world, vehicle=vehicle, source=source, target=target, state="PREPARED"
         )
         for world, vehicle, source, target in service.broker.prepared.get(number, ())
     ]
-    return answers.Ownership(number=session.told_number, owners=owners, in_flight=in_flight)
+    return responses.Ownership(number=session.told_number, owners=owners, in_flight=in_flight)
 
 
 @ownership.put("/transfers", status_code=204)
 async def put_transfers(
-    identity: Nodes, service: TheService, number: SessionId, body: bodies.TransfersBody
+    identity: Nodes, service: TheService, number: SessionId, body: requests.TransfersBody
 ) -> None:
     """A node tells which vehicles have changed their zone since it told last."""
     service.broker.hand_over(service.broker.hosted(identity, number), body)
@@ -42,7 +42,7 @@ async def put_transfers(
 
 @ownership.put("/door", status_code=204)
 async def put_door(
-    identity: Nodes, service: TheService, number: SessionId, body: bodies.DoorBody
+    identity: Nodes, service: TheService, number: SessionId, body: requests.DoorBody
 ) -> None:
     """Where the node of a session awaits those that host zones of it."""
     session = service.broker.hosted(identity, number)

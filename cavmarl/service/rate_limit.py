@@ -6,7 +6,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 
-from cavmarl.service.refusals import problem
+from cavmarl.service.error_names import problem
 
 MOST_BUCKETS = 10_000
 

@@ -7,19 +7,18 @@ from typing import Annotated
 from fastapi import Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
-from cavmarl.service import answers, bodies, configurations
-from cavmarl.service.guards import TheService
-from cavmarl.service.infrastructure import SessionRecord
+from cavmarl.service import configurations, requests, responses
+from cavmarl.service.auth import TheService
+from cavmarl.service.error_names import problem
 from cavmarl.service.ownership_routes import ownership
-from cavmarl.service.refusals import problem
-from cavmarl.service.route_answers import (
+from cavmarl.service.response_builders import (
     assigned,
     event_answer,
     event_stream,
     node_answer,
     session_answer,
 )
-from cavmarl.service.route_parts import (
+from cavmarl.service.route_common import (
     BYTES,
     CONTENT,
     Admins,
@@ -36,6 +35,7 @@ from cavmarl.service.route_parts import (
     Viewers,
     make_router,
 )
+from cavmarl.service.service_records import SessionRecord
 
 open_routes = make_router("/v1", "open")
 nodes = make_router("/v1/nodes", "nodes")
@@ -50,25 +50,25 @@ IdempotencyKey = Annotated[
 
 
 @open_routes.get("/health")
-async def health(_: Anybody, service: TheService) -> answers.Health:
+async def health(_: Anybody, service: TheService) -> responses.Health:
     """Whether the service is there, and how many events it has."""
-    return answers.Health(status="ok", events=service.broker.log.sequence)
+    return responses.Health(status="ok", events=service.broker.log.sequence)
 
 
 @open_routes.get("/keys")
-async def keys(_: Anybody, service: TheService) -> answers.PublicKeys:
+async def keys(_: Anybody, service: TheService) -> responses.PublicKeys:
     """The public keys that verify tokens: a JSON Web Key Set."""
-    return answers.PublicKeys(**service.access.public_keys())
+    return responses.PublicKeys(**service.access.public_keys())
 
 
 @open_routes.post("/token")
 async def token(
-    _: Anybody, service: TheService, body: bodies.SecretBody | bodies.RefreshBody
-) -> answers.Tokens:
+    _: Anybody, service: TheService, body: requests.SecretBody | requests.RefreshBody
+) -> responses.Tokens:
     """An access token and a refresh token for a secret, or for a refresh token."""
-    if isinstance(body, bodies.SecretBody):
-        return answers.Tokens(**service.access.exchange(body.secret))
-    return answers.Tokens(**service.access.refresh(body.refresh_token))
+    if isinstance(body, requests.SecretBody):
+        return responses.Tokens(**service.access.exchange(body.secret))
+    return responses.Tokens(**service.access.refresh(body.refresh_token))
 
 
 @open_routes.delete("/token", status_code=204)
@@ -77,9 +77,9 @@ async def withdraw(identity: Everyone, service: TheService) -> None:
     service.access.withdraw(identity)
 
 
-@nodes.post("/{name}/beat", response_model=answers.Duties)  # not checked again: it is often
+@nodes.post("/{name}/beat", response_model=responses.Duties)  # not checked again: it is often
 async def beat(
-    identity: Nodes, service: TheService, name: NodeName, body: bodies.BeatBody
+    identity: Nodes, service: TheService, name: NodeName, body: requests.BeatBody
 ) -> JSONResponse:
     """Say that a node is alive; the answer says what it has to do."""
     found = service.broker.beat(identity, name, body)
@@ -89,59 +89,61 @@ async def beat(
 
 
 @nodes.get("")
-async def list_nodes(_: Readers, service: TheService) -> answers.NodeList:
+async def list_nodes(_: Readers, service: TheService) -> responses.NodeList:
     """All nodes, with what their last beats said."""
     known = service.broker.log.state.nodes.values()
-    return answers.NodeList(nodes=[node_answer(service, one) for one in known])
+    return responses.NodeList(nodes=[node_answer(service, one) for one in known])
 
 
 @nodes.post("", status_code=201)
 async def register(
-    identity: Nodes, service: TheService, body: bodies.NodeBody
-) -> answers.NodeStatus:
+    identity: Nodes, service: TheService, body: requests.NodeBody
+) -> responses.NodeStatus:
     """Register a node, or register it anew after it has left, died or begun again."""
     return node_answer(service, service.broker.register(identity, body))
 
 
 @nodes.post("/{name}/drain")
-async def drain(identity: Drainers, service: TheService, name: NodeName) -> answers.NodeStatus:
+async def drain(identity: Drainers, service: TheService, name: NodeName) -> responses.NodeStatus:
     """Give a node nothing more, and move what it has."""
     return node_answer(service, service.broker.drain(identity, name))
 
 
 @nodes.post("/{name}/resume")
-async def resume(identity: Operators, service: TheService, name: NodeName) -> answers.NodeStatus:
+async def resume(identity: Operators, service: TheService, name: NodeName) -> responses.NodeStatus:
     """Let a drained node take sessions again."""
     return node_answer(service, service.broker.drain(identity, name, is_on=False))
 
 
 @nodes.delete("/{name}")
-async def leave(identity: Drainers, service: TheService, name: NodeName) -> answers.NodeStatus:
+async def leave(identity: Drainers, service: TheService, name: NodeName) -> responses.NodeStatus:
     """A node ends."""
     return node_answer(service, service.broker.leave(identity, name))
 
 
 @worlds.post("/configurations", status_code=201)
 async def add_configuration(
-    identity: Clients, service: TheService, body: bodies.ConfigurationBody
-) -> answers.Configuration:
+    identity: Clients, service: TheService, body: requests.ConfigurationBody
+) -> responses.Configuration:
     """Check and keep a configuration; another content is another version."""
     found = configurations.add_configuration(service.broker.log, identity, body)
-    return answers.Configuration(**found)
+    return responses.Configuration(**found)
 
 
 @worlds.get("/configurations/{sha256}")
 async def get_configuration(
-    _: Everyone, service: TheService, sha256: Annotated[bodies.Sha256, Path()]
-) -> bodies.ConfigurationBody:
+    _: Everyone, service: TheService, sha256: Annotated[requests.Sha256, Path()]
+) -> requests.ConfigurationBody:
     """A configuration by its hash."""
-    return bodies.ConfigurationBody(**configurations.read_configuration(service.broker.log, sha256))
+    return requests.ConfigurationBody(
+        **configurations.read_configuration(service.broker.log, sha256)
+    )
 
 
 @worlds.post("/sessions", status_code=201)
 async def open_session(
-    identity: Clients, service: TheService, body: bodies.SessionBody, key: IdempotencyKey = ""
-) -> answers.Assignment:
+    identity: Clients, service: TheService, body: requests.SessionBody, key: IdempotencyKey = ""
+) -> responses.Assignment:
     """Open a session on the node that eq. (1) and (2) choose, or on a preferred one."""
     found = configurations.read_configuration(service.broker.log, body.configuration)
 
@@ -160,8 +162,8 @@ async def open_session(
 
 @worlds.post("/sessions/{number}/resolve")
 async def resolve(
-    identity: Clients, service: TheService, number: SessionId, body: bodies.ResolveBody
-) -> answers.Assignment:
+    identity: Clients, service: TheService, number: SessionId, body: requests.ResolveBody
+) -> responses.Assignment:
     """Where a session is now, and a new lease of it."""
 
     def resolved() -> SessionRecord:
@@ -171,15 +173,17 @@ async def resolve(
 
 
 @worlds.get("/sessions")
-async def list_sessions(identity: Readers, service: TheService) -> answers.SessionList:
+async def list_sessions(identity: Readers, service: TheService) -> responses.SessionList:
     """Sessions and jobs: a client's own, or all."""
     found = service.broker.log.state.sessions.values()
     own = [one for one in found if identity.role != "client" or one.owner == identity.id]
-    return answers.SessionList(sessions=[session_answer(service, one) for one in own])
+    return responses.SessionList(sessions=[session_answer(service, one) for one in own])
 
 
 @worlds.get("/sessions/{number}")
-async def get_session(identity: Readers, service: TheService, number: SessionId) -> answers.Session:
+async def get_session(
+    identity: Readers, service: TheService, number: SessionId
+) -> responses.Session:
     """A session or a job."""
     return session_answer(service, service.broker.session(identity, number))
 
@@ -187,7 +191,7 @@ async def get_session(identity: Readers, service: TheService, number: SessionId)
 @worlds.delete("/sessions/{number}")
 async def close_session(
     identity: Clients, service: TheService, number: SessionId
-) -> answers.Session:
+) -> responses.Session:
     """End a session or a job."""
     return session_answer(service, service.broker.close(identity, number))
 
@@ -213,7 +217,7 @@ async def put_state(
     service: TheService,
     request: Request,
     number: SessionId,
-    at: Annotated[bodies.Whole, Query()],
+    at: Annotated[requests.Whole, Query()],
 ) -> None:
     """Save the state of a session after so many commands."""
     content = await request.body()
@@ -222,8 +226,8 @@ async def put_state(
 
 @worlds.post("/jobs", status_code=201)
 async def submit(
-    identity: Clients, service: TheService, body: bodies.JobBody, key: IdempotencyKey = ""
-) -> answers.Session:
+    identity: Clients, service: TheService, body: requests.JobBody, key: IdempotencyKey = ""
+) -> responses.Session:
     """Have a node evaluate drivers; where none can, the job waits for one."""
     if configurations.read_configuration(service.broker.log, body.configuration).get("nodes"):
         raise problem("refused", "nodes: an evaluation runs on one node; leave it out")
@@ -242,8 +246,8 @@ async def submit(
 
 @worlds.post("/jobs/{number}/outcome")
 async def finish(
-    identity: Nodes, service: TheService, number: SessionId, body: bodies.OutcomeBody
-) -> answers.Session:
+    identity: Nodes, service: TheService, number: SessionId, body: requests.OutcomeBody
+) -> responses.Session:
     """A node has ended a job."""
     session = service.broker.hosted(identity, number)
     service.broker.finish(session, body.status, body.message)
@@ -275,15 +279,15 @@ async def get_result(
 async def events(
     identity: Readers,
     service: TheService,
-    after: Annotated[bodies.Whole, Query()] = 0,
+    after: Annotated[requests.Whole, Query()] = 0,
     limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
     subject: Annotated[str | None, Query(max_length=128)] = None,
-) -> answers.EventList:
+) -> responses.EventList:
     """Events after a sequence number, of one subject or of all: a client's own, or everybody's."""
     owner = identity.id if identity.role == "client" else None
     await service.broker.log.settle()
     found = service.broker.log.store.read(after, limit, owner=owner, subject=subject)
-    return answers.EventList(events=list(map(event_answer, found)))
+    return responses.EventList(events=list(map(event_answer, found)))
 
 
 @records.get("/events/stream", response_class=StreamingResponse)
@@ -291,7 +295,7 @@ async def stream(
     identity: Readers,
     service: TheService,
     request: Request,
-    after: Annotated[bodies.Whole, Query()] = 0,
+    after: Annotated[requests.Whole, Query()] = 0,
 ) -> StreamingResponse:
     """Events as they come, as server-sent events; `Last-Event-ID` goes on where one ended."""
     last = request.headers.get("last-event-id", "")
@@ -309,22 +313,22 @@ async def metrics(_: Viewers, request: Request) -> PlainTextResponse:
 
 @records.post("/identities", status_code=201)
 async def add_identity(
-    identity: Admins, service: TheService, body: bodies.IdentityBody
-) -> answers.NewIdentity:
+    identity: Admins, service: TheService, body: requests.IdentityBody
+) -> responses.NewIdentity:
     """A new identity, and its secret, which is shown this once."""
     found, secret = service.access.add_identity(body.name, body.role, identity.id)
-    return answers.NewIdentity(identity=found.id, name=found.name, role=found.role, secret=secret)
+    return responses.NewIdentity(identity=found.id, name=found.name, role=found.role, secret=secret)
 
 
 @records.get("/identities")
-async def list_identities(_: Admins, service: TheService) -> answers.IdentityList:
+async def list_identities(_: Admins, service: TheService) -> responses.IdentityList:
     """All identities."""
     known = service.broker.log.state.identities.values()
     shown = [
-        answers.Identity(id=one.id, name=one.name, role=one.role, revoked=one.revoked)
+        responses.Identity(id=one.id, name=one.name, role=one.role, revoked=one.revoked)
         for one in known
     ]
-    return answers.IdentityList(identities=shown)
+    return responses.IdentityList(identities=shown)
 
 
 @records.delete("/identities/{number}", status_code=204)
@@ -338,6 +342,6 @@ async def revoke(
 
 
 @records.post("/keys", status_code=201)
-async def rotate(identity: Admins, service: TheService) -> answers.NewKey:
+async def rotate(identity: Admins, service: TheService) -> responses.NewKey:
     """Sign tokens with a new key; those of the key before stay valid."""
-    return answers.NewKey(key=service.access.rotate_key(identity.id))
+    return responses.NewKey(key=service.access.rotate_key(identity.id))

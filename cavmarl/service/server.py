@@ -11,13 +11,13 @@ import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.core.listening import is_loopback, listen, shown_host
+from cavmarl.core.server_address import is_loopback, listen, shown_host
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
+from cavmarl.service.auth import Service
 from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
-from cavmarl.service.guards import Service
 from cavmarl.service.rate_limit import RateLimit
 
 DEFAULT_STORE = Path("runs/service.sqlite")

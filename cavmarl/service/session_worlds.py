@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.client.world_flows import flatten, pack
+from cavmarl.client.world_protocol import flatten, pack
 from cavmarl.core.errors import CapacityError, ConfigError, MissingExtraError
 from cavmarl.env.vector import make_vec
 from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.service.configurations import world_keywords
-from cavmarl.service.refusals import problem
-from cavmarl.viewer.shown_env import ShownEnv
+from cavmarl.service.error_names import problem
+from cavmarl.viewer.live_env import ShownEnv
 from cavmarl.viewer.web_options import WebOptions
 
 SAVED_EVERY = 50  # commands

@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from cavmarl.service.bodies import DoorBody
 from cavmarl.service.event_log import EventLog
-from cavmarl.service.infrastructure import SessionRecord
 from cavmarl.service.node_selection import Chosen, LiveNode, NoNodeError
+from cavmarl.service.requests import DoorBody
+from cavmarl.service.service_records import SessionRecord
 
 Choose = Callable[[SessionRecord, Sequence[str]], Chosen]
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Demand, Gate
+from cavmarl.core.records.arrays import Demand, DepartureQueue
 from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands
 
@@ -18,21 +18,21 @@ class Executor(Protocol):
 
     def begin_step(self, commands: Commands) -> None: ...
     def advance(self, commands: Commands) -> None: ...
-    def dismiss(self, gate: Gate) -> None: ...
-    def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None: ...
-    def leave(self, gate: Gate) -> None: ...
+    def dismiss(self, departures: DepartureQueue) -> None: ...
+    def choose_goals(self, demand: Demand, num_goals: int, departures: DepartureQueue) -> None: ...
+    def leave(self, departures: DepartureQueue) -> None: ...
     def gather(self, touching_m: float, border_m: float) -> None: ...
     def resolve(self) -> None: ...
-    def rank_lanes(self, gate: Gate) -> None: ...
-    def propose(self, demand: Demand, gate: Gate) -> None: ...
-    def admit(self, gate: Gate) -> None: ...
+    def rank_lanes(self, departures: DepartureQueue) -> None: ...
+    def propose(self, demand: Demand, departures: DepartureQueue) -> None: ...
+    def admit(self, departures: DepartureQueue) -> None: ...
     def commit(self) -> None: ...
     def detect(self) -> None: ...
     def sense(self, chosen: NDArray[np.bool_]) -> None: ...
     def credit(self, chosen: NDArray[np.bool_]) -> None: ...
     def suggest(self, out: NDArray[np.float64]) -> None: ...
-    def retire(self, gate: Gate) -> None: ...
-    def forget(self, gate: Gate) -> None: ...
+    def retire(self, departures: DepartureQueue) -> None: ...
+    def forget(self, departures: DepartureQueue) -> None: ...
 
 
 class TeamExecutor(Executor, Protocol):
@@ -56,14 +56,14 @@ class PhaseExecutor(ABC):
     def advance(self, commands: Commands) -> None:
         self.run(Phase.ADVANCE, (commands,))
 
-    def dismiss(self, gate: Gate) -> None:
-        self.run(Phase.DISMISS, (gate,))
+    def dismiss(self, departures: DepartureQueue) -> None:
+        self.run(Phase.DISMISS, (departures,))
 
-    def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
-        self.run(Phase.CHOOSE_GOALS, (demand, num_goals, gate))
+    def choose_goals(self, demand: Demand, num_goals: int, departures: DepartureQueue) -> None:
+        self.run(Phase.CHOOSE_GOALS, (demand, num_goals, departures))
 
-    def leave(self, gate: Gate) -> None:
-        self.run(Phase.LEAVE, (gate,))
+    def leave(self, departures: DepartureQueue) -> None:
+        self.run(Phase.LEAVE, (departures,))
 
     def gather(self, touching_m: float, border_m: float) -> None:
         self.run(Phase.GATHER, (touching_m, border_m))
@@ -71,14 +71,14 @@ class PhaseExecutor(ABC):
     def resolve(self) -> None:
         self.run(Phase.RESOLVE, ())
 
-    def rank_lanes(self, gate: Gate) -> None:
-        self.run(Phase.RANK_LANES, (gate,))
+    def rank_lanes(self, departures: DepartureQueue) -> None:
+        self.run(Phase.RANK_LANES, (departures,))
 
-    def propose(self, demand: Demand, gate: Gate) -> None:
-        self.run(Phase.PROPOSE, (demand, gate))
+    def propose(self, demand: Demand, departures: DepartureQueue) -> None:
+        self.run(Phase.PROPOSE, (demand, departures))
 
-    def admit(self, gate: Gate) -> None:
-        self.run(Phase.ADMIT, (gate,))
+    def admit(self, departures: DepartureQueue) -> None:
+        self.run(Phase.ADMIT, (departures,))
 
     def commit(self) -> None:
         self.run(Phase.COMMIT, ())
@@ -95,8 +95,8 @@ class PhaseExecutor(ABC):
     def suggest(self, out: NDArray[np.float64]) -> None:
         self.run(Phase.SUGGEST, (out,))
 
-    def retire(self, gate: Gate) -> None:
-        self.run(Phase.RETIRE, (gate,))
+    def retire(self, departures: DepartureQueue) -> None:
+        self.run(Phase.RETIRE, (departures,))
 
-    def forget(self, gate: Gate) -> None:
-        self.run(Phase.FORGET, (gate,))
+    def forget(self, departures: DepartureQueue) -> None:
+        self.run(Phase.FORGET, (departures,))

@@ -52,22 +52,22 @@ class RegisteredOutputs:
                 self._write_agents(rows, np.flatnonzero(owned), w, outputs)
 
     def _write_agents(
-        self, rows: NDArray[np.void], of_agents: NDArray[np.int64], w: int, outputs: Outputs
+        self, rows: NDArray[np.void], agent_arrays: NDArray[np.int64], w: int, outputs: Outputs
     ) -> None:
         """Write those of the agents whose vehicles are these rows."""
-        agents = rows["agent"][of_agents]
+        agents = rows["agent"][agent_arrays]
         for call, reach_m, place in self._sensors:
-            numbers = call(self._view(rows, of_agents, reach_m))
+            numbers = call(self._view(rows, agent_arrays, reach_m))
             for agent, own in zip(agents.tolist(), numbers, strict=True):
                 seen = outputs.observations[w, agent]
                 seen[newest_frame(seen, self._stack) :][place] = own
         acted = outputs.acted[w, agents]
         if acted.any():
             for call, reach_m, column in self._terms:
-                numbers = call(self._view(rows, of_agents[acted], reach_m))
+                numbers = call(self._view(rows, agent_arrays[acted], reach_m))
                 outputs.terms[w, agents[acted], column] = numbers[:, 0]
 
     def _view(
-        self, rows: NDArray[np.void], of_agents: NDArray[np.int64], reach_m: float
+        self, rows: NDArray[np.void], agent_arrays: NDArray[np.int64], reach_m: float
     ) -> BatchView:
-        return batch_view(rows, of_agents, reach_m, self._network, self._step_s)
+        return batch_view(rows, agent_arrays, reach_m, self._network, self._step_s)

@@ -18,14 +18,14 @@ from cavmarl.core.math.buckets import make_lists
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import (
-    Common,
     LaneGrid,
     Outputs,
     RoadArrays,
     Scratch,
-    Travel,
+    SharedState,
+    TripTables,
     Worlds,
-    Zoned,
+    ZoneState,
 )
 from cavmarl.driving.kernels.junctions.approach import APPROACH
 from cavmarl.driving.kernels.lanes.lane_index import ENTRY
@@ -39,7 +39,7 @@ from cavmarl.v2x.kernels.v2x_records import REPORT, Mail
 from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
 
 CELL_M = 25.0  # of the spatial index over vehicles
-COMMON = Common._fields
+COMMON = SharedState._fields
 TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
@@ -85,8 +85,8 @@ class Shard:
         network: RoadNetwork,
         *,
         plans: NDArray[np.void],  # PLAN (G, L), the ways of agents
-        travel: Travel,
-        zoned: Zoned,  # the rows of all zones
+        travel: TripTables,
+        zoned: ZoneState,  # the rows of all zones
         # where the agents of all shards get what they sense, each at its own index
         outputs: Outputs,
         zone: int,
@@ -183,7 +183,7 @@ def make_worlds(
     network: RoadNetwork,
     num_agents: int = 0,
     latency_ticks: int = 0,
-    zoned: Zoned | None = None,
+    zoned: ZoneState | None = None,
     zone: int = 0,
     common: Worlds | None = None,
     zeros: Zeros = np.zeros,
@@ -197,7 +197,7 @@ def make_worlds(
     `zeros` makes them.
     """
     if zoned is None:
-        zoned = make_zoned(1, num_worlds, capacity)
+        zoned = make_zone_state(1, num_worlds, capacity)
     rows = zoned.rows[0, zone]
     worlds = Worlds(
         rows=rows,
@@ -225,18 +225,20 @@ def make_worlds(
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
 
 
-def common_of(worlds: Worlds) -> Common:
+def common_of(worlds: Worlds) -> SharedState:
     """What all shards have in common, of any of them."""
-    return Common(**{name: getattr(worlds, name) for name in COMMON})
+    return SharedState(**{name: getattr(worlds, name) for name in COMMON})
 
 
-def make_zoned(num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np.zeros) -> Zoned:
+def make_zone_state(
+    num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np.zeros
+) -> ZoneState:
     """Room for the rows of k zones of W worlds that hold `capacity` vehicles each."""
     # Memory that is never written is never taken.
     numbers = zeros((8, num_zones, num_worlds), dtype=np.int64)
     numbers[7] = -1
     everybody = (num_zones, num_worlds, capacity)
-    return Zoned(
+    return ZoneState(
         rows=zeros((2, *everybody), dtype=VEHICLE),
         num_owned=numbers[0],
         num_rows=numbers[1],

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled.bound_call import BoundCall, bind, keep_last
-from cavmarl.core.records.arrays import Demand, Gate
+from cavmarl.core.records.arrays import Demand, DepartureQueue
 from cavmarl.core.records.codes import INSERT_OPEN
 from cavmarl.shards.kernels.group_phases import (
     admit_each,
@@ -51,8 +51,8 @@ class ShardGroup:
         self.shards = tuple(shards)
         self.first = shards[0]
         self.calls = GroupCalls(self.shards)
-        # A reset may replace the gate.
-        self.gate_calls = keep_last(lambda gate: GateCalls(self.calls, gate))
+        # A reset may replace the departure queue.
+        self.departure_calls = keep_last(lambda departures: DepartureCalls(self.calls, departures))
 
     @property
     def sides(self) -> tuple[int, int]:
@@ -91,17 +91,17 @@ class ShardGroup:
             np.copyto(self.calls.controls, commands.controls)
         self.calls.advance()
 
-    def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
+    def choose_goals(self, demand: Demand, num_goals: int, departures: DepartureQueue) -> None:
         """Give the vehicles of the next rows that need it another goal."""
-        self.gate_calls(gate).choose_goals(demand, num_goals)()
+        self.departure_calls(departures).choose_goals(demand, num_goals)()
 
-    def leave(self, gate: Gate) -> None:
-        """Hand the background vehicles of the next rows that have arrived to the gate."""
-        self.gate_calls(gate).leave()
+    def leave(self, departures: DepartureQueue) -> None:
+        """Move background vehicles of the next rows that have arrived to the departure queue."""
+        self.departure_calls(departures).leave()
 
-    def dismiss(self, gate: Gate) -> None:
-        """Hand the vehicles of the next rows that SUMO has removed to the gate."""
-        self.gate_calls(gate).dismiss()
+    def dismiss(self, departures: DepartureQueue) -> None:
+        """Hand the vehicles of the next rows that SUMO has removed to the departure queue."""
+        self.departure_calls(departures).dismiss()
 
     def gather(self, touching_m: float, border_m: float) -> None:
         """Renew the ghosts of the next rows; see `zones.kernels.ghost_exchange.gather`."""
@@ -111,17 +111,17 @@ class ShardGroup:
         """Mark contacts between vehicles in the next rows."""
         self.calls.resolve()
 
-    def rank_lanes(self, gate: Gate) -> None:
+    def rank_lanes(self, departures: DepartureQueue) -> None:
         """Count vehicles around the places of these zones where departures may enter."""
-        self.gate_calls(gate).rank_lanes()
+        self.departure_calls(departures).rank_lanes()
 
-    def propose(self, demand: Demand, gate: Gate) -> None:
-        """Tell the gate which departures find a safe gap in these zones."""
-        self.gate_calls(gate).propose(demand)()
+    def propose(self, demand: Demand, departures: DepartureQueue) -> None:
+        """Tell the departure queue which departures find a safe gap in these zones."""
+        self.departure_calls(departures).propose(demand)()
 
-    def admit(self, gate: Gate) -> None:
-        """Take in departures that the gate has accepted, as owned or as ghosts."""
-        self.gate_calls(gate).admit()
+    def admit(self, departures: DepartureQueue) -> None:
+        """Take in departures that the departure queue has accepted, as owned or as ghosts."""
+        self.departure_calls(departures).admit()
 
     def commit(self) -> None:
         """Make the next rows the committed ones."""
@@ -156,13 +156,13 @@ class ShardGroup:
         for shard in self.shards:
             shard.suggest(out)
 
-    def retire(self, gate: Gate) -> None:
-        """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
-        self.gate_calls(gate).retire()
+    def retire(self, departures: DepartureQueue) -> None:
+        """Move the vehicles of agents whose trip has ended to the departure queue."""
+        self.departure_calls(departures).retire()
 
-    def forget(self, gate: Gate) -> None:
+    def forget(self, departures: DepartureQueue) -> None:
         """Drop the ghosts of vehicles that have been retired."""
-        self.gate_calls(gate).forget()
+        self.departure_calls(departures).forget()
 
 
 class GroupCalls:
@@ -355,11 +355,11 @@ class GroupCalls:
         )
 
 
-class GateCalls:
-    """The kernel calls of a group that need the gate."""
+class DepartureCalls:
+    """The kernel calls of a group that need the departure queue."""
 
-    def __init__(self, calls: GroupCalls, gate: Gate) -> None:
-        self.gate = gate
+    def __init__(self, calls: GroupCalls, departures: DepartureQueue) -> None:
+        self.departures = departures
         self._members = calls.members
         self._first = calls._first
         self._clock = self._first.config.clock
@@ -374,17 +374,17 @@ class GateCalls:
             roads=self._first.roads,
             travel=self._first.travel,
             num_goals=num_goals,
-            gate=self.gate,
+            departures=self.departures,
             dt=self._clock.sim_dt_s,
         )
 
     @cached_property
     def leave(self) -> BoundCall[None]:
-        return bind(leave_background_each, members=self._members, gate=self.gate)
+        return bind(leave_background_each, members=self._members, departures=self.departures)
 
     @cached_property
     def dismiss(self) -> BoundCall[None]:
-        return bind(dismiss_each, members=self._members, gate=self.gate)
+        return bind(dismiss_each, members=self._members, departures=self.departures)
 
     @cached_property
     def rank_lanes(self) -> BoundCall[None]:
@@ -393,7 +393,7 @@ class GateCalls:
             members=self._members,
             roads=self._first.roads,
             travel=self._first.travel,
-            gate=self.gate,
+            departures=self.departures,
             scratch=self._first.scratch,
         )
 
@@ -404,19 +404,21 @@ class GateCalls:
             demand=demand,
             roads=self._first.roads,
             travel=self._first.travel,
-            gate=self.gate,
+            departures=self.departures,
             scratch=self._first.scratch,
         )
 
     @cached_property
     def admit(self) -> BoundCall[None]:
-        return bind(admit_each, members=self._members, gate=self.gate)
+        return bind(admit_each, members=self._members, departures=self.departures)
 
     @cached_property
     def retire(self) -> BoundCall[None]:
         ticks = self._clock.ticks_per_step
-        return bind(retire_each, members=self._members, gate=self.gate, ticks_per_step=ticks)
+        return bind(
+            retire_each, members=self._members, departures=self.departures, ticks_per_step=ticks
+        )
 
     @cached_property
     def forget(self) -> BoundCall[None]:
-        return bind(forget_each, members=self._members, gate=self.gate)
+        return bind(forget_each, members=self._members, departures=self.departures)

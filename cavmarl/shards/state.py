@@ -1,7 +1,7 @@
 """The state of worlds: which arrays outlive a tick, and which part keeps which, in one table.
 
 What saves, moves or digests worlds takes its arrays from here. Beside these there
-are the owned rows, the arrays of rerouting, and those of attached parts (`Attached.arrays`).
+are the owned rows, the arrays of rerouting, and those of attached parts (`Component.arrays`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Common, Gate, Outputs
+from cavmarl.core.records.arrays import DepartureQueue, Outputs, SharedState
 
 
 class Use(Enum):
@@ -36,19 +36,19 @@ class StateArray(NamedTuple):
 
 
 STATE = (
-    StateArray(Common, "ticks", (S, D), 4),
-    StateArray(Common, "keys", (S, D), 5),
-    StateArray(Common, "signal_phase", (S, D), 1),
-    StateArray(Common, "controllers", (S, D), 2),
-    StateArray(Common, "detected_s", (S, D), 3),
-    StateArray(Common, "pending", (S,)),  # digested agent by agent
-    StateArray(Common, "cues", (S, D), 6),
-    StateArray(Gate, "next_order", (S, D), 8),
-    StateArray(Gate, "num_queue", (S,)),
-    StateArray(Gate, "next_id", (S, D), 7),
-    StateArray(Gate, "num_entered", (S, D), 9),
-    StateArray(Gate, "counts", (S,)),
-    StateArray(Gate, "sums", (S,)),
+    StateArray(SharedState, "ticks", (S, D), 4),
+    StateArray(SharedState, "keys", (S, D), 5),
+    StateArray(SharedState, "signal_phase", (S, D), 1),
+    StateArray(SharedState, "controllers", (S, D), 2),
+    StateArray(SharedState, "detected_s", (S, D), 3),
+    StateArray(SharedState, "pending", (S,)),  # digested agent by agent
+    StateArray(SharedState, "cues", (S, D), 6),
+    StateArray(DepartureQueue, "next_order", (S, D), 8),
+    StateArray(DepartureQueue, "num_queue", (S,)),
+    StateArray(DepartureQueue, "next_id", (S, D), 7),
+    StateArray(DepartureQueue, "num_entered", (S, D), 9),
+    StateArray(DepartureQueue, "counts", (S,)),
+    StateArray(DepartureQueue, "sums", (S,)),
     StateArray(Outputs, "observations", (S,)),  # saved where an observation has earlier frames
     StateArray(Outputs, "terms", (S,)),
     StateArray(Outputs, "rewards", (S,)),
@@ -68,5 +68,5 @@ def names_of(bundle: type[tuple[Any, ...]], use: Use) -> tuple[str, ...]:
 
 
 def arrays_of(source: Any, bundle: type[tuple[Any, ...]], use: Use) -> Iterator[NDArray[Any]]:
-    """Those of an object with the fields of a bundle; all shards have those of `Common`."""
+    """Those of an object with the fields of a bundle; all shards have those of `SharedState`."""
     return (getattr(source, name) for name in names_of(bundle, use))

@@ -1,4 +1,4 @@
-"""`DEPARTURE`: a vehicle that has been ordered and waits to enter; and the gate it waits at."""
+"""`DEPARTURE`, an ordered vehicle that waits to enter, and the departure queue it waits in."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.core.records import record
-from cavmarl.core.records.arrays import Gate, RoadArrays
+from cavmarl.core.records.arrays import DepartureQueue, RoadArrays
 from cavmarl.core.records.codes import NUM_COUNTS, NUM_SUMS
 
 DEPARTURE = record(
@@ -15,7 +15,7 @@ DEPARTURE = record(
     ("due", np.int64),  # tick
     ("way", np.int64),  # as VEHICLE["way"], on its first edge
     ("agent", np.int32),  # index of the agent that will drive it, or -1
-    ("order", np.int32),  # its own row in `Gate.orders`; -1: of the generator
+    ("order", np.int32),  # its own row in `DepartureQueue.orders`; -1: of the generator
     ("vtype", np.int32),  # VTYPE row
     ("goal", np.int32),  # row of the plans' table, or -1: the end of its route
     ("lane", np.int32),  # LANE where it enters, or any lane of that edge
@@ -30,11 +30,11 @@ DEPARTURE = record(
 )
 
 
-def make_gate(
+def make_departure_queue(
     num_worlds: int, capacity: int, roads: RoadArrays, vehicle: np.dtype[np.void]
-) -> Gate:
+) -> DepartureQueue:
     """The empty gates of `num_worlds` worlds that hold `capacity` records of vehicles each."""
-    return Gate(
+    return DepartureQueue(
         orders=np.zeros((num_worlds, 0), dtype=DEPARTURE),
         num_orders=np.zeros(num_worlds, dtype=np.int64),
         next_order=np.zeros(num_worlds, dtype=np.int64),
@@ -63,16 +63,16 @@ def _room(
     }
 
 
-def with_room(gate: Gate, num_orders: int) -> Gate:
-    """The gate with room for at least so many orders, all of which may wait at once."""
-    num_worlds, present = gate.orders.shape
+def with_room(departures: DepartureQueue, num_orders: int) -> DepartureQueue:
+    """The departure queue with room for at least so many orders, all of which may wait at once."""
+    num_worlds, present = departures.orders.shape
     more = num_orders - present
     if more <= 0:
-        return gate
+        return departures
     room = np.zeros((num_worlds, more), dtype=DEPARTURE)
-    queue = np.concatenate([gate.queue, room], axis=1)
-    return gate._replace(
-        orders=np.concatenate([gate.orders, room], axis=1),
+    queue = np.concatenate([departures.queue, room], axis=1)
+    return departures._replace(
+        orders=np.concatenate([departures.orders, room], axis=1),
         queue=queue,
-        **_room(num_worlds, queue.shape[1], gate.ranks.shape[2], gate.passing.dtype),
+        **_room(num_worlds, queue.shape[1], departures.ranks.shape[2], departures.passing.dtype),
     )

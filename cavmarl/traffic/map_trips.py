@@ -54,7 +54,7 @@ def together(parts: Sequence[NDArray[np.int32]]) -> TripTable:
 class DrawnTrips(NamedTuple):
     """Trips of one map, (P, 2) LANE and goal."""
 
-    of_agents: NDArray[np.int32]
+    agent_arrays: NDArray[np.int32]
     at_start: NDArray[np.int32]  # of background vehicles at reset
     entering: NDArray[np.int32]  # of those that enter later
     has_ways_in: bool  # whether those come on roads that lead into the map
@@ -112,7 +112,7 @@ class MapTrips:
         enter = entries if has_ways_in else anywhere
         return DrawnTrips(
             at_start=self._trips(plans, np.repeat(anywhere, copies), goals, ANY_LENGTH_M),
-            of_agents=self._trips(plans, start, targets, limits_m),
+            agent_arrays=self._trips(plans, start, targets, limits_m),
             entering=self._trips(plans, enter, goals, ANY_LENGTH_M),
             has_ways_in=has_ways_in,
         )

@@ -17,7 +17,7 @@ from cavmarl.config.traffic import TrafficConfig
 from cavmarl.core.compiled.bound_call import BoundCall, bind, keep_last
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
-from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
+from cavmarl.core.records.arrays import Demand, DepartureQueue, TripTables, Worlds
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
@@ -54,12 +54,12 @@ class TrafficCalls:
     def __init__(
         self,
         traffic: NativeTraffic,
-        gate: Gate,
+        departures: DepartureQueue,
         ticks: NDArray[np.int64],  # (W,) of the worlds
         keys: NDArray[np.uint64],  # (W,) of their random numbers
     ) -> None:
         self._traffic = traffic
-        self._gate = gate
+        self._departures = departures
         self._ticks = ticks
         self._keys = keys
         self.running = np.zeros(len(ticks), dtype=np.int64)
@@ -67,7 +67,7 @@ class TrafficCalls:
 
     @cached_property
     def call_orders(self) -> BoundCall[None]:
-        return bind(call_orders, gate=self._gate, ticks=self._ticks)
+        return bind(call_orders, departures=self._departures, ticks=self._ticks)
 
     @cached_property
     def settle(self) -> BoundCall[None]:
@@ -77,7 +77,7 @@ class TrafficCalls:
             demand=traffic.demand,
             roads=traffic.network.arrays,
             travel=traffic.travel,
-            gate=self._gate,
+            departures=self._departures,
             ticks=self._ticks,
             keys=self._keys,
             dt=traffic.dt,
@@ -93,7 +93,7 @@ class TrafficCalls:
             travel=traffic.travel,
             num_goals=len(traffic.plans),
             inserted=self.inserted,
-            gate=self._gate,
+            departures=self._departures,
             ticks=self._ticks,
             keys=self._keys,
         )
@@ -105,14 +105,14 @@ class TrafficCalls:
             assign_lanes,
             roads=traffic.network.arrays,
             travel=traffic.travel,
-            gate=self._gate,
+            departures=self._departures,
             keys=self._keys,
         )
 
     @cached_property
     def accept(self) -> BoundCall[None]:
         capacity = self._traffic.capacity
-        return bind(accept, gate=self._gate, running=self.running, capacity=capacity)
+        return bind(accept, departures=self._departures, running=self.running, capacity=capacity)
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ class NativeTraffic:
         return Cast.of(self.scene, self.network, goals, first_type, self.dt, agents)
 
     @cached_property
-    def travel(self) -> Travel:
+    def travel(self) -> TripTables:
         """Types and ways of all vehicles: the generator's, the demand file's, the actors', agents'.
 
         The car, which most agents have, is the generator's.
@@ -222,7 +222,7 @@ class NativeTraffic:
         return np.array([names[name] for name in self.population.types], dtype=np.int32)
 
     @cached_property
-    def _travel_of_others(self) -> Travel:
+    def _travel_of_others(self) -> TripTables:
         types = generated_types(model_code(self.traffic.model))
         steps = self.plans.reshape(-1)
         if self.sumo is not None:
@@ -233,14 +233,14 @@ class NativeTraffic:
             types = np.concatenate([types, actors])
             stops, num_fixed = self._barrier_stops, len(steps)
             steps = self._with_slots(steps)
-            return Travel(types, steps, stops, 0, 0.0, VIEW_M, VIEW_M, num_fixed, scripts)
+            return TripTables(types, steps, stops, 0, 0.0, VIEW_M, VIEW_M, num_fixed, scripts)
         types = np.concatenate([types, self.file.types, actors])
         steps = np.concatenate([steps, self.schedule.steps])
         num_fixed = len(steps)
         steps = self._with_slots(steps)
         first_detour = self.plans.size + self.schedule.first_detour
         begin_s = self.file.begin_ms / 1000.0
-        return Travel(
+        return TripTables(
             types,
             steps,
             np.concatenate([self.file.stops, self._barrier_stops]),
@@ -274,14 +274,14 @@ class NativeTraffic:
 
     def _travel_of_sumo(
         self, sumo: SumoDemand, types: NDArray[np.void], fixed: NDArray[np.void]
-    ) -> Travel:
+    ) -> TripTables:
         """The same with SUMO's types, room for its routes behind the fixed ways, and for stops."""
         steps = self.zeros(
             len(fixed) + RouteBook.room(self.network, self.num_worlds), dtype=fixed.dtype
         )
         steps[: len(fixed)] = fixed
         stops = self.zeros(0 if sumo.drives else StopBook.room(self.num_worlds), dtype=STOP)
-        return Travel(
+        return TripTables(
             np.concatenate([types, sumo.types]),
             steps,
             stops,
@@ -360,7 +360,7 @@ class NativeTraffic:
             self.network, lambda number: self._trips_of(number).drawn(self.plans, num_goals)
         )
         return Demand(
-            agent_trips=together([part.of_agents for part in parts]),
+            agent_trips=together([part.agent_arrays for part in parts]),
             start_trips=together([part.at_start for part in parts]),
             enter_trips=together([part.entering for part in parts]),
             enter_at_start=np.array([part.has_ways_in for part in parts]),
@@ -375,21 +375,23 @@ class NativeTraffic:
             agent_types=self._agent_type_rows,
         )
 
-    def draw_orders(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> Gate:
+    def draw_orders(
+        self, departures: DepartureQueue, worlds: Worlds, chosen: NDArray[np.bool_]
+    ) -> DepartureQueue:
         """Draw what the demand file orders in the chosen worlds' (W,) new episodes.
 
-        Returns the gate, or a larger one if there are more orders than ever before.
+        Returns the departure queue, or a larger one if there are more orders than ever before.
         """
         if self.schedule is None:
-            return gate
+            return departures
         for w in np.flatnonzero(chosen):
             orders = self.schedule.draw(int(worlds.keys[w]), self.horizon_s, self.dt)
-            gate = with_room(gate, len(orders))
-            gate.orders[w, : len(orders)] = orders
-            gate.num_orders[w] = len(orders)
+            departures = with_room(departures, len(orders))
+            departures.orders[w, : len(orders)] = orders
+            departures.num_orders[w] = len(orders)
             if self.rerouting is not None:
                 self.rerouting.begin(int(w), int(worlds.keys[w]), self.horizon_s)
-        return gate
+        return departures
 
     def num_orders(self, key: int) -> int:
         """How many departures the demand file orders in the episode of a key."""
@@ -397,44 +399,50 @@ class NativeTraffic:
             return 0
         return self.schedule.count(key, self.horizon_s)
 
-    def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:
+    def populate(
+        self, departures: DepartureQueue, worlds: Worlds, chosen: NDArray[np.bool_]
+    ) -> None:
         """Fill the chosen worlds (W,) for a new episode."""
-        populate(self.demand, self.network.arrays, self.travel, gate, worlds, chosen)
+        populate(self.demand, self.network.arrays, self.travel, departures, worlds, chosen)
         worlds.cues[chosen] = -1
         if self.cast is not None:
             for w in np.flatnonzero(chosen).tolist():
-                self.cast.enter(self.network.arrays, self.travel, gate, worlds, w, self.blank)
+                self.cast.enter(self.network.arrays, self.travel, departures, worlds, w, self.blank)
 
-    def settle(self, gate: Gate, worlds: Worlds) -> None:
+    def settle(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Count vehicles that have left, and order those that follow."""
-        self.calls(gate, worlds.ticks, worlds.keys).settle()
+        self.calls(departures, worlds.ticks, worlds.keys).settle()
 
-    def assign_lanes(self, gate: Gate, worlds: Worlds) -> None:
+    def assign_lanes(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Assign vehicles of the queue the lanes on which they try to enter."""
-        self.calls(gate, worlds.ticks, worlds.keys).assign_lanes()
+        self.calls(departures, worlds.ticks, worlds.keys).assign_lanes()
 
-    def call_orders(self, gate: Gate, worlds: Worlds) -> None:
+    def call_orders(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Put the orders that are due by the coming tick into the queue."""
-        if gate.next_order.tolist() != gate.num_orders.tolist():
-            self.calls(gate, worlds.ticks, worlds.keys).call_orders()
+        if departures.next_order.tolist() != departures.num_orders.tolist():
+            self.calls(departures, worlds.ticks, worlds.keys).call_orders()
 
-    def insert(self, gate: Gate, worlds: Worlds, inserted: NDArray[np.float64]) -> None:
+    def insert(
+        self, departures: DepartureQueue, worlds: Worlds, inserted: NDArray[np.float64]
+    ) -> None:
         """Put what is to enter in this step into the queue; `inserted` as in `Commands`."""
-        calls = self.calls(gate, worlds.ticks, worlds.keys)
+        calls = self.calls(departures, worlds.ticks, worlds.keys)
         np.copyto(calls.inserted, inserted)
         calls.insert()
 
-    def accept(self, gate: Gate, worlds: Worlds, running: NDArray[np.int64]) -> None:
+    def accept(
+        self, departures: DepartureQueue, worlds: Worlds, running: NDArray[np.int64]
+    ) -> None:
         """Choose among vehicles that could enter; `running` (W,) are in the worlds already."""
-        calls = self.calls(gate, worlds.ticks, worlds.keys)
+        calls = self.calls(departures, worlds.ticks, worlds.keys)
         np.copyto(calls.running, running)
         calls.accept()
 
     @cached_property
     def calls(
         self,
-    ) -> Callable[[Gate, NDArray[np.int64], NDArray[np.uint64]], TrafficCalls]:
-        """Return the kernel calls for a gate, and the ticks and keys of its worlds."""
+    ) -> Callable[[DepartureQueue, NDArray[np.int64], NDArray[np.uint64]], TrafficCalls]:
+        """Return the kernel calls for a departure queue, and the ticks and keys of its worlds."""
         return keep_last(partial(TrafficCalls, self))
 
     def _check_room(self) -> None:

@@ -1,8 +1,8 @@
 """`Rerouting`: vehicles of the demand that look for another way while the world runs.
 
 Two things make them: SUMO's rerouting device, which looks for the fastest way by the speeds of the
-last minutes, and <rerouter>s, which stand on edges. Both act once a second at the gate, in one
-place however the world is divided. Decision 011 says why it is done like this.
+last minutes, and <rerouter>s, which stand on edges. Both act once a second at the departure queue,
+in one place however the world is divided. Decision 011 says why it is done like this.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_REROUTER, uniform
 from cavmarl.core.records import record
-from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds
+from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, Worlds
 from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import Choices
@@ -49,7 +49,7 @@ class Rerouting:
     """
 
     def __init__(
-        self, schedule: Schedule, travel: Travel, slots: WaySlots, first_type: int, dt: float
+        self, schedule: Schedule, travel: TripTables, slots: WaySlots, first_type: int, dt: float
     ) -> None:
         self._roads: RoadArrays = schedule.demand.network.arrays
         self._travel = travel
@@ -97,12 +97,12 @@ class Rerouting:
         if self._measures:
             limit_speeds(self._roads, self._past[world], self._speed_sums[world])
 
-    def act(self, gate: Gate, worlds: Worlds) -> None:
+    def act(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Once a second, sample the speeds and let vehicles ask for ways; writes `next_rows`."""
         for w, tick in enumerate(worlds.ticks):
             if tick % self._ticks_per_s == 0:
                 self._sample(worlds, w, int(tick))
-                gate.counts[w, COUNT_REROUTED] += self._let_ask(worlds, w, int(tick))
+                departures.counts[w, COUNT_REROUTED] += self._let_ask(worlds, w, int(tick))
 
     def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
         """VEHICLE["way"] (n,) of a world as it would be in the first one."""

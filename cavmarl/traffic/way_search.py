@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import CapacityError
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.kernels.way_requests import (
@@ -130,7 +130,7 @@ class WaySearch:
     def __init__(
         self,
         roads: RoadArrays,
-        travel: Travel,
+        travel: TripTables,
         slots: WaySlots,
         world: int,
         rows: NDArray[np.void],

@@ -21,7 +21,7 @@ from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.math.walls import make_walls
-from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
+from cavmarl.core.records.arrays import RoadArrays, SharedState, ZoneState
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.channel import make_channel
 from cavmarl.v2x.kernels.v2x_exchange import exchange_messages, hand_out
@@ -82,8 +82,8 @@ class Bus:
         config: EnvConfig,
         network: RoadNetwork,
         types: NDArray[np.void],
-        zoned: Zoned,
-        common: Common,
+        zoned: ZoneState,
+        common: SharedState,
         zeros: Zeros = np.zeros,
     ) -> None:
         v2x, dt = config.v2x, config.clock.sim_dt_s
@@ -118,7 +118,7 @@ class Bus:
         self._network = network
 
     @contextmanager
-    def unheard(self) -> Iterator[None]:
+    def muted(self) -> Iterator[None]:
         """The time in which no network simulator is asked, and no station receives anything."""
         before, self._network = self._network, _Silence()
         try:
@@ -313,7 +313,9 @@ def _make_mail(
     )
 
 
-def _make_scratch(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: int) -> V2xScratch:
+def _make_scratch(
+    network: RoadNetwork, mail: Mail, zoned: ZoneState, num_receivers: int
+) -> V2xScratch:
     capacity, most = zoned.rows.shape[3], mail.packets.shape[2]
     largest = max(box.shape[2] for box in (mail.objects, mail.events, mail.signals))
 

@@ -24,7 +24,7 @@ from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
 from cavmarl.core.processes import start_dying_with_process, start_python
-from cavmarl.evaluate.fresh import told_error
+from cavmarl.evaluate.subprocess_calls import told_error
 from cavmarl.verify.differences import Arrays, Difference, find_difference
 
 HASH_SEEDS = ("0", "1", "4294967295")  # of the three processes

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from cavmarl.engine.world_frame import WorldFrame, events_between
-from cavmarl.viewer.audience import Audience, Wishes
 from cavmarl.viewer.frame_messages import FrameEncoder
 from cavmarl.viewer.run_clock import RunClock
+from cavmarl.viewer.subscribers import Audience, Wishes
 
 FRAMES_HZ = 20.0
 DETAILS_HZ = 5.0

@@ -9,9 +9,9 @@ import numpy as np
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
 from cavmarl.env.insertions import CLOSED, INSERTED, OPENED
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
-from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.map_geometry import map_origin
 from cavmarl.viewer.page_requests import PageRequest
+from cavmarl.viewer.subscribers import Audience
 from cavmarl.viewer.vehicle_details import Shown
 
 FARTHEST_M = 30.0  # from the middle of a lane

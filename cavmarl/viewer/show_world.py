@@ -10,15 +10,15 @@ from dataclasses import replace
 from typing import Protocol
 
 from cavmarl.core.errors import require
-from cavmarl.core.listening import is_loopback
+from cavmarl.core.server_address import is_loopback
 from cavmarl.env.parallel import CavEnv
 from cavmarl.policies.loading import load_policy
 from cavmarl.recordings.recording import Recording
+from cavmarl.viewer.live_recording import ShownRecording, recording_stages
+from cavmarl.viewer.live_run import ShownRun
 from cavmarl.viewer.run_loads import RunLoads
-from cavmarl.viewer.shown_recording import ShownRecording, recording_stages
-from cavmarl.viewer.shown_run import ShownRun
-from cavmarl.viewer.stage import Stage, first_stage
 from cavmarl.viewer.vehicle_details import hello_of
+from cavmarl.viewer.viewed_world import Stage, first_stage
 from cavmarl.viewer.web_options import WebOptions
 
 Tell = Callable[[str], None]

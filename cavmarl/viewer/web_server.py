@@ -20,10 +20,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from cavmarl.core.errors import MessageError, ServiceError
-from cavmarl.core.listening import is_loopback, listen, shown_host
-from cavmarl.viewer.audience import PageWatcher
+from cavmarl.core.server_address import is_loopback, listen, shown_host
 from cavmarl.viewer.page_requests import CONTROLS, MAX_TEXT, read_object, read_request
-from cavmarl.viewer.stage import Stage, welcome_of
+from cavmarl.viewer.subscribers import PageWatcher
+from cavmarl.viewer.viewed_world import Stage, welcome_of
 from cavmarl.viewer.web_options import WebOptions
 
 PAGE = files("cavmarl.viewer") / "page"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.elementary import hypot, sine
 from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
-from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.arrays import TripTables
 from cavmarl.core.records.rows import LOST_M, MERGES_M
 from cavmarl.driving.kernels.junctions.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.junctions.stop_line_registration import APPROACH_M
@@ -21,7 +21,7 @@ from cavmarl.roads.network import RoadNetwork
 ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside them
 
 
-def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
+def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
     A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks about
@@ -38,7 +38,7 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     return roads_m + _across_m(network) + bodies_m + ASIDE_M + travel.scripts.reach_m
 
 
-def longest_move_m(network: RoadNetwork, travel: Travel, dt: float) -> float:
+def longest_move_m(network: RoadNetwork, travel: TripTables, dt: float) -> float:
     """So far, in m, a vehicle moves in a tick of `dt` seconds, and no further.
 
     Along its lane at the speed that the dynamics do not exceed, sideways as a lane change goes,
@@ -53,7 +53,7 @@ def longest_move_m(network: RoadNetwork, travel: Travel, dt: float) -> float:
     return way_m + _kink_m(network) + jumps * jump_m + half_m
 
 
-def off_lane_m(network: RoadNetwork, travel: Travel) -> float:
+def off_lane_m(network: RoadNetwork, travel: TripTables) -> float:
     """So far, in m, the centre of a body is from its place in the middle of its lane at most.
 
     Beside it by a lane's width while it changes, off it by half its length where its bumpers are

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cavmarl.core.huge_pages import huge_copy
-from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.arrays import TripTables
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.visibility_scratch import make_scratch
 from cavmarl.zones.kernels.visibility_tests import AT_LINE_M, farthest_m, find_looks
@@ -22,7 +22,7 @@ class Visibility:
     """The distances that sight goes by, and what tells on which roads it ends earlier."""
 
     network: RoadNetwork
-    travel: Travel  # the types of vehicles, and how far they look
+    travel: TripTables  # the types of vehicles, and how far they look
     halo_m: float  # vehicles further away are not seen
     sure_m: float  # all nearer vehicles are seen; from `halo_m` on, roads are not asked
     outside_m: float  # how far outside of its zone a vehicle can be whose transfer is late

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavmarl.balance.balance_plan import Plan, make_plan
+from cavmarl.balance.cost_filter import SmoothCosts
 from cavmarl.balance.load_score import Candidate, LoadRule, Utilisation
 from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost
-from cavmarl.balance.smoothing import SmoothCosts
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 from tests.balance.shards import COSTS, busy, grid, least_makespan_s, row
 

@@ -87,8 +87,8 @@ def test_a_giant_zone_is_cut_where_moving_does_not_help(network: RoadNetwork) ->
     spread = replace(trace, rounds=(replace(trace.rounds[0], places=places),) * 24)
     found = replay_traces([spread], FREE)
     assert row_of(found, "balanced").ratio == 1.0
-    assert row_of(found, "re-cut").ratio < 0.6
-    assert row_of(found, "re-cut").handoffs > 0.0
+    assert row_of(found, "repartitioned").ratio < 0.6
+    assert row_of(found, "repartitioned").handoffs > 0.0
 
 
 def test_weights_are_learnt_from_what_slows_workers_down(network: RoadNetwork) -> None:

@@ -23,7 +23,9 @@ def test_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     main([])
     shown = capsys.readouterr().out
     assert {command.name for command in app.registered_commands} == set(KEPT)
-    assert {"sharding", "balance", "moving", "recut", "rays", "v2x", "sumo"} <= set(programs())
+    assert {"sharding", "balance", "moving", "repartition", "rays", "v2x", "sumo"} <= set(
+        programs()
+    )
     assert all(name in shown for name in KEPT | programs())
     with pytest.raises(SystemExit, match="no benchmark 'nothing'"):
         main(["nothing"])

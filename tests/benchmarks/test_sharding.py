@@ -13,7 +13,7 @@ from benchmarks.sharding import measure, measure_sharding
 from benchmarks.sharding_turns import PHASES
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.simulation import Simulation
-from cavmarl.evaluate.driven_worlds import world_maker
+from cavmarl.evaluate.built_in_runs import world_maker
 from tests.support.demand_worlds import GRID
 
 

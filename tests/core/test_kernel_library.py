@@ -229,12 +229,14 @@ def test_each_call_of_the_list_can_be_made_again() -> None:
     calls = read_manifest()
     assert [call.name for call in calls if not can_be_made(call)] == []
     by_name = {call.name.rpartition(".")[2]: call for call in calls}
-    gate, ticks = by_name["call_orders"].kinds
+    departures, ticks = by_name["call_orders"].kinds
     keys, worlds = by_name["assign_lanes"].kinds[3], by_name["populate"].kinds[4]
     name = by_name["call_orders"].name
-    assert can_be_made(KernelCall(name, json.dumps([gate, ticks])))
-    assert not can_be_made(KernelCall(name, json.dumps([gate, ticks, keys]))), "another parameter"
-    assert not can_be_made(KernelCall(name, json.dumps([gate, worlds]))), "another bundle"
+    assert can_be_made(KernelCall(name, json.dumps([departures, ticks])))
+    assert not can_be_made(KernelCall(name, json.dumps([departures, ticks, keys]))), (
+        "another parameter"
+    )
+    assert not can_be_made(KernelCall(name, json.dumps([departures, worlds]))), "another bundle"
 
 
 def test_a_plain_world_needs_some_of_them() -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.huge_pages import LEAST, huge_copy
 from cavmarl.core.mapped_file import file_of, let_go, mapped
-from cavmarl.core.whole_file import write_whole
 
 NUMBERS = np.arange(LEAST, dtype=np.int64)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.core.processes import start_dying_with_process, start_python
-from cavmarl.evaluate.fresh import call_in_fresh_process
+from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 
 READY = "print('ready', flush=True); input(); print('heard nothing', flush=True)"
 

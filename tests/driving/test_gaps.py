@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.arrays import TripTables
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
@@ -63,7 +63,7 @@ def blocks(network: RoadNetwork) -> Blocks:
         wait_s: float = 0.0,
         own: dict[str, float] | None = None,
         near: bool = True,
-        travel: Travel = CARS,
+        travel: TripTables = CARS,
         **foe_fields: float,
     ) -> int:
         """By how long and how far they are before what they share.

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import lane_pose, project
-from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.arrays import TripTables
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, DRIVER_SCRIPTED
 from cavmarl.driving.kernels.junctions.approach import register_links
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
@@ -49,7 +49,7 @@ def crossing() -> Actor:
 
 def scripted(
     *actors: Actor, goals: dict[int, int] | None = None
-) -> tuple[Travel, NDArray[np.void]]:
+) -> tuple[TripTables, NDArray[np.void]]:
     """What kernels take, and VEHICLE (n,) of the actors in their first places."""
     scripts, firsts = compile_scripts(ROADS, actors, [Cue(0.0, 0.0, 5.0)], goals or {}, DT)
     base = travel("grid4x4")
@@ -66,7 +66,7 @@ def scripted(
     return base._replace(types=types, scripts=scripts), rows
 
 
-def follow(tables: Travel, row: np.void, came: bool, ticks: int) -> list[tuple[float, float]]:
+def follow(tables: TripTables, row: np.void, came: bool, ticks: int) -> list[tuple[float, float]]:
     cues = np.array([0 if came else -1])
     places = []
     for _ in range(ticks):
@@ -114,7 +114,9 @@ def covered(row: np.void, at: tuple[float, float]) -> dict[int, tuple[float, flo
     return {lane: (min(places), max(places)) for lane, places in found.items()}
 
 
-def entries(tables: Travel, rows: NDArray[np.void]) -> dict[int, list[tuple[int, float, float]]]:
+def entries(
+    tables: TripTables, rows: NDArray[np.void]
+) -> dict[int, list[tuple[int, float, float]]]:
     """(id, start, end) on each lane, as the index has them."""
     room = _make_scratch(ROADS, len(rows), tables.scripts.room)
     index_lanes(ROADS.arrays, tables, rows, len(rows), room)
@@ -200,7 +202,7 @@ def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
     assert row["to_go"] == pytest.approx(STREETS.length_m(int(row["lane"])) - row["s"], abs=1e-6)
 
 
-def announced(tables: Travel, rows: NDArray[np.void]) -> list[tuple[int, float]]:
+def announced(tables: TripTables, rows: NDArray[np.void]) -> list[tuple[int, float]]:
     room = _make_scratch(ROADS, 1, tables.scripts.room)
     step, step_at = np.zeros(1, PLAN), np.zeros(1, np.int64)
     register_links(ROADS.arrays, tables, rows, 1, step, step_at, room)

@@ -38,11 +38,11 @@ def test_no_vehicle_is_lost(env: str, mode: str) -> None:
             assert stats.departed == stats.running + stats.arrived + stats.removed
             ids = simulation.vehicles(world)["id"]
             assert np.unique(ids).size == ids.size
-            ordered = simulation.gate.next_id[world]
+            ordered = simulation.departures.next_id[world]
             assert ordered == stats.departed + stats.waiting, "a departure was dropped"
             if mode != "closed":
                 drivers = simulation.vehicles(world)["driver"]
-                waiting = simulation.gate.queue[world, : stats.waiting]
+                waiting = simulation.departures.queue[world, : stats.waiting]
                 here = np.count_nonzero(drivers == DRIVER_BACKGROUND)
                 assert here + np.count_nonzero(waiting["agent"] < 0) == background
 
@@ -50,10 +50,10 @@ def test_no_vehicle_is_lost(env: str, mode: str) -> None:
 def test_those_for_whom_there_is_no_room_wait_and_enter_later() -> None:
     simulation = make_traffic("merge", background=120)
     start(simulation, seed=0)
-    first = set(simulation.gate.queue[0, : simulation.gate.num_queue[0]]["id"].tolist())
+    first = set(simulation.departures.queue[0, : simulation.departures.num_queue[0]]["id"].tolist())
     assert len(first) > 20
     for _ in minutes(simulation, 1.0):
-        queue = simulation.gate.queue[0, : simulation.gate.num_queue[0]]["id"]
+        queue = simulation.departures.queue[0, : simulation.departures.num_queue[0]]["id"]
         assert (np.diff(queue) > 0).all(), "the queue is in the order of ids"
     assert len(first & set(queue.tolist())) < 0.75 * len(first)
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.core.records.arrays import Gate, Outputs
+from cavmarl.core.records.arrays import DepartureQueue, Outputs
 from cavmarl.core.records.codes import (
     EVENT_ARRIVED,
     EVENT_COLLIDED,
@@ -14,7 +14,7 @@ from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_continuation
 from cavmarl.engine.world_setup import load_world
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.traffic.departure_queue import make_gate
+from cavmarl.traffic.departure_queue import make_departure_queue
 from tests.naive import step_results as naive
 
 WORLDS, AGENTS, TERMS, HORIZON = 5, 4, 3, 7
@@ -43,12 +43,12 @@ def outputs_of(rng: np.random.Generator) -> Outputs:
     )
 
 
-def gate_of(rng: np.random.Generator, network: RoadNetwork) -> Gate:
-    gate = make_gate(WORLDS, 6, network.arrays, blank_vehicle().dtype)
-    gate.num_queue[:] = rng.integers(0, 3, WORLDS)
-    gate.queue["agent"] = rng.integers(-1, 2, gate.queue.shape)
-    gate.counts[:] = rng.integers(0, 50, (WORLDS, NUM_COUNTS))
-    return gate
+def gate_of(rng: np.random.Generator, network: RoadNetwork) -> DepartureQueue:
+    departures = make_departure_queue(WORLDS, 6, network.arrays, blank_vehicle().dtype)
+    departures.num_queue[:] = rng.integers(0, 3, WORLDS)
+    departures.queue["agent"] = rng.integers(-1, 2, departures.queue.shape)
+    departures.counts[:] = rng.integers(0, 50, (WORLDS, NUM_COUNTS))
+    return departures
 
 
 def results_of() -> Results:
@@ -71,13 +71,13 @@ def results_of() -> Results:
 @pytest.mark.parametrize("seed", range(20))
 def test_report_is_that_of_one_array_after_the_other(seed: int, network: RoadNetwork) -> None:
     rng = np.random.default_rng(seed)
-    outputs, gate = outputs_of(rng), gate_of(rng, network)
+    outputs, departures = outputs_of(rng), gate_of(rng, network)
     steps = rng.integers(0, HORIZON + 1, WORLDS)
     expected_steps, found, expected = steps.copy(), results_of(), results_of()
     ended = report(outputs, steps, HORIZON, found)
     assert ended == naive.report(outputs, expected_steps, HORIZON, expected)
-    over = report_continuation(outputs, gate, steps, HORIZON, found)
-    assert over == naive.report_continuation(outputs, gate, expected_steps, HORIZON, expected)
+    over = report_continuation(outputs, departures, steps, HORIZON, found)
+    assert over == naive.report_continuation(outputs, departures, expected_steps, HORIZON, expected)
     np.testing.assert_array_equal(steps, expected_steps)
     for name in Results._fields:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)

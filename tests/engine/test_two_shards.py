@@ -13,7 +13,7 @@ from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.simulation import Simulation
-from cavmarl.shards.shard import COMMON, Commands, Shard, common_of, make_zoned
+from cavmarl.shards.shard import COMMON, Commands, Shard, common_of, make_zone_state
 from cavmarl.shards.shard_group import ShardGroup
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_layouts import cut_map
@@ -51,7 +51,7 @@ class Halves:
         shards = []
         partition = cut_map(whole.network, "strips", 2)
         halo = zone_halo(partition, EVERYWHERE_M)
-        zoned = make_zoned(2, whole.num_worlds, whole.capacity)
+        zoned = make_zone_state(2, whole.num_worlds, whole.capacity)
         for zone in range(2):
             shard = Shard(
                 whole.config,

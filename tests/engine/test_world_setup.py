@@ -16,7 +16,7 @@ from cavmarl.engine.world_setup import load_roads, load_world, load_zones
 from cavmarl.env.vector import make_vec
 from cavmarl.maps.check import check_map
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.horizon import horizon_of
+from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_layouts import cut_map
 from tests.support.driving import make_simulation, start

@@ -12,7 +12,13 @@ import pytest
 
 from cavmarl.core.errors import ConfigError, PolicyError, UnknownEnvironmentError
 from cavmarl.core.processes import start_python
-from cavmarl.evaluate import EvaluationReport, episodes, evaluate, fresh, load_report
+from cavmarl.evaluate import (
+    EvaluationReport,
+    episodes,
+    evaluate,
+    load_report,
+    subprocess_calls,
+)
 from cavmarl.evaluate.episodes import worlds_at_once
 from cavmarl.evaluate.evaluation import load_tables, run_seeds
 from cavmarl.evaluate.metrics import METRICS
@@ -37,7 +43,9 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("compared")
     policies = {"driver": "idm", "chance": "random_actions"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fresh, "start_python", start_python)  # no fork, as elsewhere in the tests
+        patch.setattr(
+            subprocess_calls, "start_python", start_python
+        )  # no fork, as elsewhere in the tests
         evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
     return folder
 

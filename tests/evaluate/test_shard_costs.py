@@ -7,7 +7,7 @@ import pytest
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
-from cavmarl.evaluate.driven_worlds import DrivenWorld, world_maker
+from cavmarl.evaluate.built_in_runs import DrivenWorld, world_maker
 from cavmarl.evaluate.shard_costs import measure_rounds, measure_shards
 
 

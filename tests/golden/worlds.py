@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 import cavmarl
-from cavmarl.core.whole_file import write_whole
+from cavmarl.core.atomic_file import write_whole
 
 # Names of cavmarl that a run needs.
 INFOS = ("mask", "acted", "terms", "arrivals", "episode_over", "vehicle_done", "final_observations")

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.config.registry import agent_entries
+from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.errors import CavmarlError
-from cavmarl.core.whole_file import draft_folder
 from cavmarl.evaluate.evaluation import load_report
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.zoo import RESULT_FOLDER, TABLES, entry_job

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.arrays import ZoneState
 from cavmarl.driving.vehicles import GHOST_FIELDS, VEHICLE
 from cavmarl.handoff.coordinator.row_digests import digest_tables
 from cavmarl.handoff.kernels.invariant_checks import (
@@ -25,7 +25,7 @@ from cavmarl.handoff.kernels.invariant_checks import (
     owner_hash,
     watch,
 )
-from cavmarl.shards.shard import make_zoned
+from cavmarl.shards.shard import make_zone_state
 from cavmarl.zones.kernels.zone_lookup import Halo, zone_of
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -50,7 +50,7 @@ class Looks:
     """A world that is looked at tick after tick, by the kernel and by its twin."""
 
     def __init__(self) -> None:
-        self.zoned: Zoned = make_zoned(PARTITION.count, 1, CAPACITY)
+        self.zoned: ZoneState = make_zone_state(PARTITION.count, 1, CAPACITY)
         self.words = self.zoned.rows.view(np.uint64).reshape(*self.zoned.rows.shape, len(MASKS))
         self.kept, self.unused = (make_kept(PARTITION.count, CAPACITY) for _ in range(2))
         self.strays = make_strays(PARTITION.count, CAPACITY)

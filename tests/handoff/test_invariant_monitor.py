@@ -10,7 +10,7 @@ import pytest
 from cavmarl.core.errors import ProtocolError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff import shard_setup as dividing
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.ownership.messages import Birth
 from cavmarl.zones.kernels.zone_lookup import is_inside, squared_distance
 from tests.support.driving import drive, make_simulation, start
@@ -76,7 +76,7 @@ class Meddling:
 
     def __init__(self, simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
         self.simulation, self._patch = simulation, monkeypatch
-        self.division: Division = simulation.division
+        self.division: ZonedShards = simulation.division
 
     def zone(self, zone: int) -> tuple[Any, int, int]:
         """Rows, owned ones and all of a zone."""

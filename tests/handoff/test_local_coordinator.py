@@ -16,7 +16,7 @@ from cavmarl.handoff.coordinator.journal_summary import owners_at
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.ownership.log_records import replay as replay_records
 from cavmarl.ownership.messages import Begin
-from cavmarl.zones.kernels.handoff import LATE
+from cavmarl.zones.kernels.ownership_changes import LATE
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.cli.test_main import run as command

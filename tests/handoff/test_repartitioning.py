@@ -1,4 +1,4 @@
-"""Zones re-cut while a world runs: results stay the same, and loads become more even."""
+"""Partitions that change while a world runs leave results the same and make loads more even."""
 
 from __future__ import annotations
 
@@ -36,44 +36,48 @@ def worlds(env: str, zones: int, mode: str = "respawn", **overrides: Any) -> Sim
 @pytest.mark.parametrize("zones", [2, 4, 9])
 @pytest.mark.parametrize(("env", "mode"), [("grid4x4", "respawn"), ("merge", "open")])
 def test_a_world_that_is_cut_anew_is_the_undivided_one(env: str, mode: str, zones: int) -> None:
-    whole, recut = worlds(env, 1, mode), worlds(env, zones, mode, **OFTEN)
+    whole, repartitioned = worlds(env, 1, mode), worlds(env, zones, mode, **OFTEN)
     for _ in range(80):
         drive(whole)
-        drive(recut)
+        drive(repartitioned)
         for w in range(2):
-            assert whole.state_hash(w) == recut.state_hash(w)
+            assert whole.state_hash(w) == repartitioned.state_hash(w)
         for name, expected in whole.outputs._asdict().items():
-            assert expected.tobytes() == getattr(recut.outputs, name).tobytes(), name
-    assert len(recut.zones.recuts) > 2
-    assert recut.migrations > sum(change.moved for change in recut.zones.recuts) // 2 > 0
+            assert expected.tobytes() == getattr(repartitioned.outputs, name).tobytes(), name
+    assert len(repartitioned.zones.repartitions) > 2
+    assert (
+        repartitioned.migrations
+        > sum(change.moved for change in repartitioned.zones.repartitions) // 2
+        > 0
+    )
 
 
 def test_who_enters_in_the_last_tick_before_the_cut_goes_to_its_new_zone() -> None:
-    recut = worlds("merge", 4, "open", **OFTEN)
+    repartitioned = worlds("merge", 4, "open", **OFTEN)
     entered = 0
     for _ in range(120):
-        drive(recut)
-        pending = [coordinator.notes()[0] for coordinator in recut.coordinators]
+        drive(repartitioned)
+        pending = [coordinator.notes()[0] for coordinator in repartitioned.coordinators]
         for w, births in enumerate(pending):
             for birth in births:
-                zone, row = recut.division.changes.find(w, birth.vehicle)
-                place = recut.division.owned(w, zone)[row]
-                assert zone == birth.zone == recut.partition.zone_of(place["x"], place["y"])
-                entered += len(recut.zones.recuts) > 0
+                zone, row = repartitioned.division.changes.find(w, birth.vehicle)
+                place = repartitioned.division.owned(w, zone)[row]
+                assert zone == birth.zone == repartitioned.partition.zone_of(place["x"], place["y"])
+                entered += len(repartitioned.zones.repartitions) > 0
     assert entered > 0
 
 
 def test_the_journal_of_a_world_that_is_cut_anew_tells_of_each_move(tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
-    recut = make_simulation(
+    repartitioned = make_simulation(
         "rush", mode="closed", agents=20, background=0,
         overrides={"zones.count": 4, "zones.journal": str(path), **OFTEN},
     )  # fmt: skip
-    start(recut, seed=1)
+    start(repartitioned, seed=1)
     for _ in range(30):
-        drive(recut)
+        drive(repartitioned)
     lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert sum(len(line.get("switches", ())) for line in lines) == recut.migrations > 20
+    assert sum(len(line.get("switches", ())) for line in lines) == repartitioned.migrations > 20
 
 
 def test_zones_that_are_even_stay() -> None:
@@ -83,7 +87,7 @@ def test_zones_that_are_even_stay() -> None:
     before = calm.partition
     for _ in range(30):
         drive(calm)
-    assert calm.zones.recuts == []
+    assert calm.zones.repartitions == []
     assert calm.partition is before
 
 
@@ -129,7 +133,7 @@ def test_zones_that_change_places_hand_over_what_no_vehicle_could_drive(
     path = tmp_path / "run.jsonl"
     strips = {"zones.layout": "strips", "zones.journal": str(path), "zones.count": 9, **OFTEN}
     strips["zones.repartition_steps"] = 6
-    whole, recut = (
+    whole, repartitioned = (
         make_simulation("grid4x4", mode="closed", agents=6, background=60, overrides=overrides)
         for overrides in ({}, strips)
     )
@@ -138,12 +142,12 @@ def test_zones_that_change_places_hand_over_what_no_vehicle_could_drive(
         return Proposal(ZonePartition(partition.bounds, partition.rects[::-1]), 2.0, 1.0, 60)
 
     monkeypatch.setattr(repartitioning, "propose_zones", turn)
-    for simulation in (whole, recut):
+    for simulation in (whole, repartitioned):
         start(simulation, seed=4)
     for _ in range(12):
         drive(whole)
-        drive(recut)
-        assert whole.state_hash() == recut.state_hash()
+        drive(repartitioned)
+        assert whole.state_hash() == repartitioned.state_hash()
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     (turned,) = [line for line in lines if line.get("teleports")]
     switches = {vehicle: (source, target) for vehicle, source, target, *_ in turned["switches"]}

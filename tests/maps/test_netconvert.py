@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from cavmarl.config.registry import find_entry
+from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.errors import ConfigError, MapError
-from cavmarl.core.whole_file import draft_folder
 from cavmarl.maps import netconvert_process
 from cavmarl.maps.netconvert import OSM_OPTIONS, build_network, map_file
 from cavmarl.roads.sumo_net.reader import read_network

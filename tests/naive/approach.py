@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.arrays import TripTables
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
 from cavmarl.roads.network import RoadNetwork
@@ -25,7 +25,7 @@ def link_into(roads: RoadNetwork, row: np.void) -> int:
     )
 
 
-def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entry]:
+def announcements(roads: RoadNetwork, travel: TripTables, row: np.void) -> list[Entry]:
     """What one vehicle announces."""
     lane, way, name = int(row["lane"]), int(row["way"]), int(row["id"])
     here = roads.lanes[lane]

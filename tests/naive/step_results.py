@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Gate, Outputs
+from cavmarl.core.records.arrays import DepartureQueue, Outputs
 from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_OF_FATE, EVENTS_THAT_END
 from cavmarl.engine.kernels.step_results import Results
 
@@ -23,12 +23,16 @@ def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Re
 
 
 def report_continuation(
-    outputs: Outputs, gate: Gate, steps: NDArray[np.int64], horizon: int, results: Results
+    outputs: Outputs,
+    departures: DepartureQueue,
+    steps: NDArray[np.int64],
+    horizon: int,
+    results: Results,
 ) -> bool:
-    results.arrivals[:] = gate.counts[:, COUNT_ARRIVED]
+    results.arrivals[:] = departures.counts[:, COUNT_ARRIVED]
     results.mask[:] = outputs.present & ~outputs.terminated
-    for w, waiting in enumerate(gate.num_queue):
-        waits = any(gate.queue["agent"][w, :waiting] >= 0)
+    for w, waiting in enumerate(departures.num_queue):
+        waits = any(departures.queue["agent"][w, :waiting] >= 0)
         results.episode_over[w] = steps[w] >= horizon or not (results.mask[w].any() or waits)
     return bool(results.episode_over.any())
 

@@ -96,8 +96,8 @@ def test_zones_that_are_cut_anew_are_gone_on_with(make: Make, tmp_path: Path) ->
     def run(name: str, workers: int, kills: bool = False) -> tuple[list[Any], dict[str, bytes]]:
         folder = tmp_path / name
         folder.mkdir()
-        recuts = {"zones.repartition_steps": 4, "zones.repartition_tolerance": 0.0}
-        settings = {**BUSY, **recuts, "zones.journal": str(folder / "run.jsonl")}
+        repartitions = {"zones.repartition_steps": 4, "zones.repartition_tolerance": 0.0}
+        settings = {**BUSY, **repartitions, "zones.journal": str(folder / "run.jsonl")}
         vec = make("grid4x4", zones=3, workers=workers, overrides=settings)
         found = _drive(vec, kills)
         vec.close()

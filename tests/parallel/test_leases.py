@@ -11,7 +11,7 @@ import pytest
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import load_config
 from cavmarl.engine.world_setup import make_world
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Offer, Prepare
@@ -78,7 +78,7 @@ class Wires:
         return 0.0
 
 
-def begun() -> tuple[ZoneHosts, NodeCoordinator, Division, Any]:
+def begun() -> tuple[ZoneHosts, NodeCoordinator, ZonedShards, Any]:
     """Hosts of two zones at one node, that have begun an episode and not reported it."""
     config, base_dir = load_config("grid4x4", zones=2, agents=1, background=20)
     worlds = LocalWorlds(make_world(config, base_dir), 1)

@@ -51,8 +51,8 @@ def test_zones_that_are_cut_anew_change_nothing(
     vec = make(**wanted, zones=4, nodes=nodes, overrides=overrides | OFTEN)
     assert same(drive(vec, steps=24), whole)
     worlds = over_nodes(vec)
-    assert len(worlds.recuts) > 2
-    assert all(cut.before > cut.after and cut.moved > 0 for cut in worlds.recuts)
+    assert len(worlds.repartitions) > 2
+    assert all(cut.before > cut.after and cut.moved > 0 for cut in worlds.repartitions)
     assert worlds.pool.recoveries == 0
 
 
@@ -67,7 +67,7 @@ def test_vehicles_that_look_for_their_way_are_where_they_were(make: Make, tmp_pa
     whole = drive(make(**wanted, overrides=named), steps=30)
     vec = make(**wanted, zones=3, nodes=2, overrides=named | OFTEN)
     assert same(drive(vec, steps=30), whole)
-    assert over_nodes(vec).recuts
+    assert over_nodes(vec).repartitions
 
 
 def test_nodes_that_are_lost_before_and_after_a_cut(
@@ -87,7 +87,7 @@ def test_nodes_that_are_lost_before_and_after_a_cut(
 
     assert same(drive(vec, steps=24, before=strike), whole)
     assert (worlds.pool.losses, worlds.pool.recoveries > 2) == (3, True)
-    assert len(worlds.recuts) > 1
+    assert len(worlds.repartitions) > 1
     assert worlds.pool.zones != first or worlds.pool.replacements
 
 
@@ -116,7 +116,7 @@ def test_a_cut_that_is_interrupted_is_as_if_it_had_not_been(
             vecs[1].step(actions)
         assert vecs[0].state_hash() == vecs[1].state_hash(), step
     assert interrupted == [4]
-    assert worlds.recuts
+    assert worlds.repartitions
 
 
 def test_the_journal_begins_anew_with_each_cut(make: Make, tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_the_journal_begins_anew_with_each_cut(make: Make, tmp_path: Path) -> No
     overrides = OFTEN | {"zones.journal": str(path)}
     vec = make("grid4x4", zones=4, nodes=2, overrides=overrides, **{**WANTED, "max_cycles": 40})
     drive(vec, steps=20)
-    cuts = len(over_nodes(vec).recuts)
+    cuts = len(over_nodes(vec).repartitions)
     vec.close()
     episodes = [record.episode for record in JournalReader(path) if isinstance(record, Reset)]
     assert episodes == sorted(set(episodes))
@@ -136,7 +136,7 @@ def test_pictures_have_the_zones_of_now(make: Make) -> None:
     vec = make("grid4x4", zones=4, nodes=2, overrides=OFTEN, render_mode="rgb_array", **WANTED)
     drive(vec, steps=8)
     before, now = vec.worlds.world.partition, over_nodes(vec).partition
-    assert over_nodes(vec).recuts
+    assert over_nodes(vec).repartitions
     vec.render()
     assert vec._session.present().partition.content_hash == now.content_hash != before.content_hash
 

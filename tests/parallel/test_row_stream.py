@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from cavmarl import make_vec
 from cavmarl.core.errors import MessageError
-from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.arrays import ZoneState
 from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.parallel.nodes.agent_stream import AgentStream
 from cavmarl.parallel.nodes.row_stream import RowStream, forecast_of, passing_of
-from cavmarl.shards.shard import make_zoned
-from cavmarl.traffic.departure_queue import make_gate
+from cavmarl.shards.shard import make_zone_state
+from cavmarl.traffic.departure_queue import make_departure_queue
 from tests.support.traffic import network
 
 CAPACITY = 40
 WORLDS = 2
-ROOM = 6  # vehicles that pass a gate
+ROOM = 6  # vehicles that pass a departure queue
 ROADS = network("merge")
 MINE, THEIRS = np.array([0]), np.array([1, 2])
 GHOSTS = 1 + 3 * WORLDS  # the word of a frame from which on it says how many there are
@@ -33,18 +33,18 @@ class Node:
     """What one of two nodes has of the worlds."""
 
     def __init__(self, zones: NDArray[np.int64], others: NDArray[np.int64]) -> None:
-        self.zoned = make_zoned(3, WORLDS, CAPACITY)
-        self.gate = make_gate(WORLDS, ROOM, ROADS.arrays, VEHICLE)
+        self.zoned = make_zone_state(3, WORLDS, CAPACITY)
+        self.departures = make_departure_queue(WORLDS, ROOM, ROADS.arrays, VEHICLE)
         self.running = np.zeros(WORLDS, dtype=np.int64)
         self.rerouted = np.zeros(WORLDS, dtype=np.int64)
         law = forecast_of(ROADS.arrays, 0.05, 1, *2 * [np.empty((0, 4), dtype=np.int64)])
         self._frames = RowStream(self.zoned, zones, others, self.running, self.rerouted, law)
 
     def packed(self) -> bytearray:
-        return bytearray(self._frames.packed(1, passing_of(self.gate)))
+        return bytearray(self._frames.packed(1, passing_of(self.departures)))
 
     def take(self, data: bytes | bytearray) -> None:
-        self._frames.take(memoryview(data), 1, passing_of(self.gate))
+        self._frames.take(memoryview(data), 1, passing_of(self.departures))
 
 
 def nodes() -> tuple[Node, Node]:
@@ -52,7 +52,7 @@ def nodes() -> tuple[Node, Node]:
     return Node(MINE, THEIRS), Node(THEIRS, MINE)
 
 
-def fill(zoned: Zoned, drawn: np.random.Generator, ids: NDArray[np.int64]) -> None:
+def fill(zoned: ZoneState, drawn: np.random.Generator, ids: NDArray[np.int64]) -> None:
     """Ghosts of these vehicles in some order, many words of them as they were."""
     for zone in THEIRS.tolist():
         for w in range(WORLDS):
@@ -71,13 +71,13 @@ def fill(zoned: Zoned, drawn: np.random.Generator, ids: NDArray[np.int64]) -> No
             zoned.num_near[zone, w] = drawn.integers(num + 1)
 
 
-def clear(zoned: Zoned) -> None:
+def clear(zoned: ZoneState) -> None:
     """What a tick does before ghosts are taken: owned rows stay."""
     zoned.num_owned[THEIRS] = 2
     zoned.num_rows[THEIRS] = zoned.num_near[THEIRS] = 2
 
 
-def found(zoned: Zoned, first: int) -> list[list[bytes]]:
+def found(zoned: ZoneState, first: int) -> list[list[bytes]]:
     """The ghosts of each zone and world behind its first rows, in no order; near ones apart."""
     parts = []
     for zone in THEIRS.tolist():
@@ -97,10 +97,10 @@ def found(zoned: Zoned, first: int) -> list[list[bytes]]:
 
 def leave(node: Node, drawn: np.random.Generator) -> None:
     """Some vehicles leave, and some take another way."""
-    gate = node.gate
-    gate.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
-    gate.passing["id"] = drawn.integers(1000, size=gate.passing.shape)
-    gate.counts[:, COUNT_REROUTED] += drawn.integers(3, size=WORLDS)
+    departures = node.departures
+    departures.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
+    departures.passing["id"] = drawn.integers(1000, size=departures.passing.shape)
+    departures.counts[:, COUNT_REROUTED] += drawn.integers(3, size=WORLDS)
 
 
 def test_what_is_taken_is_what_was_sent() -> None:
@@ -112,18 +112,18 @@ def test_what_is_taken_is_what_was_sent() -> None:
         near.zoned.num_owned[MINE] = tick, 7
         clear(far.zoned)
         far.running[:] = 100
-        first = far.gate.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
-        counted = far.gate.counts[:, COUNT_REROUTED].copy()
+        first = far.departures.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
+        counted = far.departures.counts[:, COUNT_REROUTED].copy()
         far.take(near.packed())
         assert found(far.zoned, 2) == found(near.zoned, 0)
         assert far.running.tolist() == [100 + tick, 107]
-        more = near.gate.counts[:, COUNT_REROUTED] - near.rerouted
-        assert (far.gate.counts[:, COUNT_REROUTED] - counted == more).all()
-        near.rerouted[:] = near.gate.counts[:, COUNT_REROUTED]
-        for w, num in enumerate(near.gate.num_passing.tolist()):
-            assert far.gate.num_passing[w] == first[w] + num
-            sent = far.gate.passing[w, first[w] : first[w] + num]
-            assert sent.tobytes() == near.gate.passing[w, :num].tobytes()
+        more = near.departures.counts[:, COUNT_REROUTED] - near.rerouted
+        assert (far.departures.counts[:, COUNT_REROUTED] - counted == more).all()
+        near.rerouted[:] = near.departures.counts[:, COUNT_REROUTED]
+        for w, num in enumerate(near.departures.num_passing.tolist()):
+            assert far.departures.num_passing[w] == first[w] + num
+            sent = far.departures.passing[w, first[w] : first[w] + num]
+            assert sent.tobytes() == near.departures.passing[w, :num].tobytes()
 
 
 def test_what_is_foreseen_is_not_sent() -> None:
@@ -201,7 +201,7 @@ def test_what_cannot_be_is_refused(harm: str) -> None:
     with pytest.raises(MessageError, match=f"^{len(data)} bytes are not"):
         far.take(data)
     assert (far.zoned.num_rows[THEIRS] == 2).all(), "nothing of it was put anywhere"
-    assert not far.gate.num_passing.any()
+    assert not far.departures.num_passing.any()
 
 
 def tables(num: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -126,9 +126,9 @@ def test_rows_with_an_index_out_of_range(make: Make) -> None:
 def test_waiting_vehicles_with_an_index_out_of_range(make: Make) -> None:
     vec = _busy(make)
     worlds = _worlds(vec)
-    while not (worlds.simulation.gate.num_queue > 0).any():
+    while not (worlds.simulation.departures.num_queue > 0).any():
         vec.step(vec.suggest_actions())
-    world = int(np.argmax(worlds.simulation.gate.num_queue > 0))
+    world = int(np.argmax(worlds.simulation.departures.num_queue > 0))
     for name, values in WAITING.items():
         for value in values:
 
@@ -185,8 +185,11 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
         "detected_s": np.nan,
         "cues": -2,
     }
-    gate = {"next_order": 1, "num_queue": MANY, "next_id": 0, "num_entered": -1, "counts": -1}
-    for source, values in ((simulation.shards[0].worlds, common), (simulation.gate, gate)):
+    departures = {"next_order": 1, "num_queue": MANY, "next_id": 0, "num_entered": -1, "counts": -1}
+    for source, values in (
+        (simulation.shards[0].worlds, common),
+        (simulation.departures, departures),
+    ):
         for name, value in values.items():
             array = getattr(source, name)
             if not array.size:

@@ -25,10 +25,10 @@ from cavmarl.cli import app
 from cavmarl.cli.output import parse_settings
 from cavmarl.cli.report_command import report_command
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
-from cavmarl.core.whole_file import draft_folder, write_whole
+from cavmarl.core.atomic_file import draft_folder, write_whole
 from cavmarl.evaluate import EvaluationReport, evaluate
 from cavmarl.evaluate.evaluation import load_report
-from cavmarl.evaluate.fresh import call_in_fresh_process
+from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 
 ROOT = Path(__file__).resolve().parents[2]
 EVALUATE, RING22 = "cavmarl evaluate ", "python -m benchmarks ring22 "

@@ -13,7 +13,7 @@ from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.core.math.rng import world_key
 from cavmarl.engine.world_setup import load_world
 from cavmarl.roads.joined_maps import _POINTERS, join
-from cavmarl.roads.kernels.map_draw import map_of
+from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.verify.equivalence import verify_zones
 from tests.support.traffic import network
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.sensors import LanesConfig, SensorsConfig
 from cavmarl.core.math.neighbors import fill_grid, make_grid
-from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.arrays import TripTables
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.motion.tracking import side_lane
@@ -32,7 +32,7 @@ def observe(name: str, rows: NDArray[np.void], i: int, phase: NDArray[np.int32])
 
 
 def observed(
-    roads: RoadNetwork, ways: Travel, rows: NDArray[np.void], i: int, phase: NDArray[np.int32]
+    roads: RoadNetwork, ways: TripTables, rows: NDArray[np.void], i: int, phase: NDArray[np.int32]
 ) -> list[float]:
     grid = make_grid(roads.extent_m, 25.0, len(rows))
     fill_grid(rows, len(rows), grid)

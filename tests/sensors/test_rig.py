@@ -40,7 +40,7 @@ TEN: dict[str, Any] = {
 @pytest.mark.parametrize(
     "rig",
     [{"rig": RIG}, TEN, {"rig": RIG, "zones.repartition_steps": 5}],
-    ids=["rig", "ten", "recut"],
+    ids=["rig", "ten", "repartition"],
 )
 def test_divided_worlds_sense_what_the_undivided_one_does(rig: dict[str, Any]) -> None:
     modes = {"observation.mode": "sensors", "observation.kind": "dict"}

@@ -17,7 +17,7 @@ from cavmarl.service.event_store import EventStore
 from cavmarl.service.node_host import run_evaluation
 from cavmarl.service.node_selection import NoNodeError
 from cavmarl.service.rate_limit import RateLimit
-from cavmarl.service.route_answers import session_answer
+from cavmarl.service.response_builders import session_answer
 from tests.support.fleet import Fleet
 
 

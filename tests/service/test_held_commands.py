@@ -7,12 +7,12 @@ from typing import Any
 import httpx
 import pytest
 
-from cavmarl.client.flows import Ask, Rest, ServiceFlows
-from cavmarl.client.world_flows import WorldFlows
+from cavmarl.client.service_protocol import Ask, Rest, ServiceFlows
+from cavmarl.client.world_protocol import WorldFlows
 
 
 def test_while_a_page_has_paused_commands_are_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cavmarl.client.world_flows.AGAIN_S", 0.0)
+    monkeypatch.setattr("cavmarl.client.world_protocol.AGAIN_S", 0.0)
     paused = {"title": "paused", "detail": "a page has paused the session"}
     answers = [httpx.Response(503, json=paused), httpx.Response(200, json={"hashes": ["1"]})]
     flows = WorldFlows(ServiceFlows("http://nowhere", ""))

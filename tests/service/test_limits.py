@@ -13,10 +13,10 @@ import httpx
 import pytest
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.bodies import ConfigurationBody
+from cavmarl.service.auth import MOST_HELD
 from cavmarl.service.configurations import MOST_CONFIGURATIONS, add_configuration
-from cavmarl.service.guards import MOST_HELD
-from cavmarl.service.infrastructure import ROLES
+from cavmarl.service.requests import ConfigurationBody
+from cavmarl.service.service_records import ROLES
 from tests.service.test_routes import ask, problem_of, token_of
 from tests.support.fleet import Fleet
 from tests.support.service import RunningService, running_service

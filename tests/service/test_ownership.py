@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.bodies import DoorBody, TransfersBody
-from cavmarl.service.infrastructure import KEPT_OWNERS, Infrastructure
+from cavmarl.service.requests import DoorBody, TransfersBody
+from cavmarl.service.service_records import KEPT_OWNERS, Infrastructure
 from cavmarl.service.session_worlds import SessionWorld
 from tests.support.fleet import Fleet
 

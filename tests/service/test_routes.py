@@ -12,10 +12,10 @@ import jwt
 import pytest
 from fastapi.routing import APIRoute
 
-from cavmarl.service.guards import open_to_all, rule_of
-from cavmarl.service.infrastructure import ROLES
-from cavmarl.service.refusals import PROBLEMS
+from cavmarl.service.auth import open_to_all, rule_of
+from cavmarl.service.error_names import PROBLEMS
 from cavmarl.service.routes import ROUTERS
+from cavmarl.service.service_records import ROLES
 from tests.support.generated import check_block
 from tests.support.service import RunningService, running_service
 

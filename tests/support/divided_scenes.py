@@ -101,7 +101,7 @@ class DividedScene:
         rows = np.concatenate(self.rows)
         self.names += self.departs
         for simulation in (self.whole, self.divided):
-            simulation.gate.next_id[0] = len(rows)
+            simulation.departures.next_id[0] = len(rows)
             saved = [array.copy() for array in simulation.save()]
             zones = simulation.division.count
             saved[-zones - 2][...] = 0  # the owners of these vehicles are not on record

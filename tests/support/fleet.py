@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.service.access import Access
-from cavmarl.service.bodies import BeatBody, NodeBody
 from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
-from cavmarl.service.infrastructure import IdentityRecord, Role
+from cavmarl.service.requests import BeatBody, NodeBody
+from cavmarl.service.service_records import IdentityRecord, Role
 
 CONFIGURATION = "0" * 64
 

@@ -18,7 +18,7 @@ from multiprocessing.reduction import DupFd
 from typing import IO, Any
 
 from cavmarl.core.processes import start_python
-from cavmarl.evaluate.fresh import PROGRAM
+from cavmarl.evaluate.subprocess_calls import PROGRAM
 from tests.support.world_hosts import FORKS
 
 __all__ = ["FORKS", "ForkedProcess", "start_forked"]

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from cavmarl.core.whole_file import write_whole
+from cavmarl.core.atomic_file import write_whole
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, is_right: bool = False) -> str:

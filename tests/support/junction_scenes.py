@@ -100,8 +100,8 @@ class Scene:
         car = on_lane(network, row, s, travel, goal=goals.index(goal), **fields)
         plan = self.simulation.plans[car[0]["goal"], row]
         car["to_go"] = plan["to_go"] - s
-        car["id"] = self.simulation.gate.next_id[0]
-        self.simulation.gate.next_id[0] += 1
+        car["id"] = self.simulation.departures.next_id[0]
+        self.simulation.departures.next_id[0] += 1
         worlds.rows[0, worlds.num_owned[0]] = car[0]
         worlds.num_owned[0] += 1
         worlds.num_rows[0] += 1
@@ -110,7 +110,7 @@ class Scene:
     def clear(self) -> None:
         """Take all cars out."""
         worlds = self.simulation.shards[0].worlds
-        worlds.num_owned[0] = worlds.num_rows[0] = self.simulation.gate.next_id[0] = 0
+        worlds.num_owned[0] = worlds.num_rows[0] = self.simulation.departures.next_id[0] = 0
         self.names.clear()
 
     def __getitem__(self, name: str) -> Any:

@@ -16,8 +16,8 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.cache_folder import cache_dir
-from cavmarl.core.whole_file import write_whole
 from cavmarl.maps.netconvert import build_network
 from cavmarl.roads.cache import pack_network, unpack_network
 from cavmarl.roads.network import RoadNetwork

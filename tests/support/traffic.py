@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.config.registry import load_config, resolve_map
-from cavmarl.core.records.arrays import Scratch, Travel
+from cavmarl.core.records.arrays import Scratch, TripTables
 from cavmarl.core.records.rows import SIZE_LENGTHS_M
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
 from cavmarl.driving.kernels.motion.motion import place_on_lane
@@ -44,9 +44,9 @@ def travel_by(
     steps: NDArray[np.void],
     types: NDArray[np.void] | None = None,
     stops: NDArray[np.void] | None = None,
-) -> Travel:
+) -> TripTables:
     """Ways (any shape of PLAN), with the generator's type and no stops unless others are given."""
-    return Travel(
+    return TripTables(
         generated_types() if types is None else types,
         steps.reshape(-1),
         np.zeros(0, STOP) if stops is None else stops,
@@ -60,7 +60,7 @@ def travel_by(
 
 
 @cache
-def travel(name: str) -> Travel:
+def travel(name: str) -> TripTables:
     """The generator's type and the ways to the four goals of `plans`."""
     return travel_by(plans(name))
 
@@ -73,7 +73,7 @@ def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
 
 
 def on_lane(
-    roads: RoadNetwork, lane: int, s: float, travel: Travel | None = None, **fields: object
+    roads: RoadNetwork, lane: int, s: float, travel: TripTables | None = None, **fields: object
 ) -> NDArray[np.void]:
     """VEHICLE (1,): a car on a lane, on its way to its goal if it has one; `fields` override."""
     row = blank_vehicle()

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Zoned
-from cavmarl.shards.shard import make_zoned
+from cavmarl.core.records.arrays import ZoneState
+from cavmarl.shards.shard import make_zone_state
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange
-from cavmarl.zones.kernels.handoff import BorderRecords, make_book
+from cavmarl.zones.kernels.ownership_changes import BorderRecords, make_book
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
@@ -19,14 +19,14 @@ SIDE = 1
 NO_BORDERS = Borders(0.0, 0.0, 0.0)
 
 
-def zoned_of(parts: Sequence[NDArray[np.void]], room: int = 0) -> Zoned:
+def zoned_of(parts: Sequence[NDArray[np.void]], room: int = 0) -> ZoneState:
     """One world whose zones own these rows, with what is no ghost behind them.
 
     Args:
         parts: the rows of each zone.
         room: rows of a zone; default: enough for a ghost of everybody.
     """
-    zoned = make_zoned(len(parts), 1, room or max(1, sum(map(len, parts))))
+    zoned = make_zone_state(len(parts), 1, room or max(1, sum(map(len, parts))))
     zoned.rows["id"] = zoned.border[:] = -7
     for numbers in (zoned.num_rows, zoned.num_near, zoned.num_border):
         numbers[:] = -7
@@ -43,7 +43,7 @@ def exchanged(
     touching_m: float = 0.0,
     borders: Borders = NO_BORDERS,
     book: BorderRecords | None = None,
-) -> Zoned:
+) -> ZoneState:
     """The same after the zones have exchanged their ghosts."""
     zoned = zoned_of(parts)
     if book is None:
@@ -53,7 +53,7 @@ def exchanged(
     return zoned
 
 
-def ghosts_of(zoned: Zoned, zone: int) -> NDArray[np.void]:
+def ghosts_of(zoned: ZoneState, zone: int) -> NDArray[np.void]:
     """What a zone sees of the others."""
     first, last = zoned.num_owned[zone, 0], zoned.num_rows[zone, 0]
     return zoned.rows[SIDE, zone, 0, first:last]

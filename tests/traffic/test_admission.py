@@ -1,4 +1,4 @@
-"""How departures of all zones are agreed at the gate."""
+"""How departures of all zones are agreed at the departure queue."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.records import codes
-from cavmarl.core.records.arrays import Gate
+from cavmarl.core.records.arrays import DepartureQueue
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.shards.shard import make_worlds
-from cavmarl.traffic.departure_queue import make_gate
+from cavmarl.traffic.departure_queue import make_departure_queue
 from cavmarl.traffic.kernels.admission import accept, admit, assign_lanes
 from cavmarl.zones.partition.zone_halo import zone_halo
 from tests.support.builders import vehicles
@@ -24,30 +24,30 @@ MAIN = [ROADS.lane_ids.index(f"main_in_{k}") for k in range(2)]
 FIRST_ID = 50
 
 
-def gate_of(num_queue: int) -> Gate:
-    """A gate where so many wait; the one at place q has the id 50 + q."""
-    gate = make_gate(1, 12, ROADS.arrays, VEHICLE)
-    gate.queue[0]["id"] = FIRST_ID + np.arange(12)
-    gate.queue[0]["lane"] = MAIN[0]
-    gate.queue[0]["lane_code"] = codes.LANE_GIVEN
-    gate.num_queue[0] = num_queue
-    return gate
+def gate_of(num_queue: int) -> DepartureQueue:
+    """A departures where so many wait; the one at place q has the id 50 + q."""
+    departures = make_departure_queue(1, 12, ROADS.arrays, VEHICLE)
+    departures.queue[0]["id"] = FIRST_ID + np.arange(12)
+    departures.queue[0]["lane"] = MAIN[0]
+    departures.queue[0]["lane_code"] = codes.LANE_GIVEN
+    departures.num_queue[0] = num_queue
+    return departures
 
 
-def offer(gate: Gate, xs: Sequence[tuple[int, float]]) -> None:
+def offer(departures: DepartureQueue, xs: Sequence[tuple[int, float]]) -> None:
     """Proposals as (place in the queue, x), in the order in which the zones made them."""
     for n, (q, x) in enumerate(xs):
-        gate.passing[0, n] = vehicles([(x, 0.0, 0.0)], id=FIRST_ID + q)[0]
-        gate.places[0, n] = q
-    gate.num_passing[0] = len(xs)
+        departures.passing[0, n] = vehicles([(x, 0.0, 0.0)], id=FIRST_ID + q)[0]
+        departures.places[0, n] = q
+    departures.num_passing[0] = len(xs)
 
 
-def passing(gate: Gate) -> list[int]:
-    return [int(k) for k in gate.passing[0, : gate.num_passing[0]]["id"]]
+def passing(departures: DepartureQueue) -> list[int]:
+    return [int(k) for k in departures.passing[0, : departures.num_passing[0]]["id"]]
 
 
-def waiting(gate: Gate) -> list[int]:
-    return [int(k) for k in gate.queue[0, : gate.num_queue[0]]["id"]]
+def waiting(departures: DepartureQueue) -> list[int]:
+    return [int(k) for k in departures.queue[0, : departures.num_queue[0]]["id"]]
 
 
 def running(number: int) -> NDArray[np.int64]:
@@ -55,41 +55,41 @@ def running(number: int) -> NDArray[np.int64]:
 
 
 def test_proposals_are_taken_in_the_order_of_the_queue_whichever_zone_made_them() -> None:
-    gate = gate_of(6)
-    offer(gate, [(3, 300.0), (5, 500.0), (0, 0.0), (2, 200.0)])
-    accept(gate, running(0), 100)
-    assert passing(gate) == [50, 52, 53, 55]
-    assert waiting(gate) == [51, 54]
-    assert gate.counts[0, codes.COUNT_DEPARTED] == 4
+    departures = gate_of(6)
+    offer(departures, [(3, 300.0), (5, 500.0), (0, 0.0), (2, 200.0)])
+    accept(departures, running(0), 100)
+    assert passing(departures) == [50, 52, 53, 55]
+    assert waiting(departures) == [51, 54]
+    assert departures.counts[0, codes.COUNT_DEPARTED] == 4
 
 
 @pytest.mark.parametrize("order", [(1, 0), (0, 1)])
 def test_of_two_that_would_touch_over_a_border_the_first_of_the_queue_enters(
     order: tuple[int, int],
 ) -> None:
-    gate = gate_of(3)
-    offer(gate, [(q, 4.0 * q) for q in order])
-    accept(gate, running(0), 100)
-    assert passing(gate) == [50]
-    assert waiting(gate) == [51, 52]
+    departures = gate_of(3)
+    offer(departures, [(q, 4.0 * q) for q in order])
+    accept(departures, running(0), 100)
+    assert passing(departures) == [50]
+    assert waiting(departures) == [51, 52]
 
 
 @pytest.mark.parametrize(("present", "enter"), [(8, 2), (9, 1), (10, 0)])
 def test_a_full_world_takes_no_more_than_fit(present: int, enter: int) -> None:
-    gate = gate_of(4)
-    offer(gate, [(3, 300.0), (1, 100.0), (2, 200.0)])
-    accept(gate, running(present), 10)
-    assert passing(gate) == [51, 52][:enter]
-    assert len(waiting(gate)) == 4 - enter
-    assert waiting(gate) == sorted(waiting(gate))
+    departures = gate_of(4)
+    offer(departures, [(3, 300.0), (1, 100.0), (2, 200.0)])
+    accept(departures, running(present), 10)
+    assert passing(departures) == [51, 52][:enter]
+    assert len(waiting(departures)) == 4 - enter
+    assert waiting(departures) == sorted(waiting(departures))
 
 
 def test_one_a_tick_tries_on_each_lane() -> None:
-    gate = gate_of(4)
-    gate.queue[0, :4]["lane"] = [MAIN[0], MAIN[0], MAIN[1], MAIN[0]]
+    departures = gate_of(4)
+    departures.queue[0, :4]["lane"] = [MAIN[0], MAIN[0], MAIN[1], MAIN[0]]
     worlds = make_worlds(1, 12, ROADS)
-    assign_lanes(ROADS.arrays, travel("merge"), gate, worlds.keys)
-    assert gate.tries[0, :4].tolist() == [MAIN[0], -1, MAIN[1], -1]
+    assign_lanes(ROADS.arrays, travel("merge"), departures, worlds.keys)
+    assert departures.tries[0, :4].tolist() == [MAIN[0], -1, MAIN[1], -1]
 
 
 def test_who_enters_is_owned_in_one_zone_and_a_ghost_near_it() -> None:
@@ -103,10 +103,10 @@ def test_who_enters_is_owned_in_one_zone_and_a_ghost_near_it() -> None:
         worlds = make_worlds(1, 12, ROADS)
         worlds.next_rows[0, :2] = vehicles([(0.0, 0.0, 0.0)] * 2, id=[1, 2])
         worlds.num_owned[0], worlds.num_rows[0] = 1, 2
-        gate = gate_of(0)
-        gate.passing[0, :3] = entering
-        gate.num_passing[0] = 3
-        admit(partition.arrays, halo, zone, gate, worlds)
+        departures = gate_of(0)
+        departures.passing[0, :3] = entering
+        departures.num_passing[0] = 3
+        admit(partition.arrays, halo, zone, departures, worlds)
         ids = worlds.next_rows[0, : worlds.num_rows[0]]["id"].tolist()
         assert ids[0] == 1
         assert 2 in ids[worlds.num_owned[0] :]

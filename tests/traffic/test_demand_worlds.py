@@ -91,8 +91,8 @@ def test_a_reset_with_the_seed_repeats_the_episode_and_without_it_goes_on(make: 
 def test_nobody_is_lost(make: Make) -> None:
     simulation = make()
     start(simulation, seed=3)
-    gate = simulation.gate
-    due = gate.orders[0, : gate.num_orders[0]]["due"]
+    departures = simulation.departures
+    due = departures.orders[0, : departures.num_orders[0]]["due"]
     assert (np.diff(due) >= 0).all()
     most_waiting = 0
     for _ in range(steps(simulation, 120.0)):
@@ -100,14 +100,19 @@ def test_nobody_is_lost(make: Make) -> None:
         stats = simulation.traffic_stats()
         assert stats.departed == stats.running + stats.arrived
         called = int(np.count_nonzero(due <= simulation.ticks()[0]))
-        assert stats.departed + stats.waiting == called == gate.next_order[0] == gate.next_id[0]
-        queue = gate.queue[0, : gate.num_queue[0]]
+        assert (
+            stats.departed + stats.waiting
+            == called
+            == departures.next_order[0]
+            == departures.next_id[0]
+        )
+        queue = departures.queue[0, : departures.num_queue[0]]
         assert stats.waiting == len(queue)
         assert (np.diff(queue["id"]) > 0).all()
         orders = simulation.vehicles()["order"]
         assert np.unique(orders).size == orders.size
         most_waiting = max(most_waiting, stats.waiting)
-    assert gate.counts[0, COUNT_DEPARTED] > 30
+    assert departures.counts[0, COUNT_DEPARTED] > 30
     if len(due) > 40:
         assert most_waiting > 0, "the queue was never used"
 
@@ -139,16 +144,16 @@ def test_two_processes_agree(tmp_path: Path) -> None:
 def test_the_hash_covers_who_waits_and_how_many_orders_were_called(tmp_path: Path) -> None:
     simulation = tiny("merge", tmp_path)
     start(simulation, seed=1)
-    gate = simulation.gate
-    while not gate.num_queue[0]:
+    departures = simulation.departures
+    while not departures.num_queue[0]:
         drive(simulation)
     before = simulation.state_hash()
-    for field in gate.queue.dtype.names or ():
-        value = gate.queue[field][0, 0].copy()
-        gate.queue[field][0, 0] += 1
+    for field in departures.queue.dtype.names or ():
+        value = departures.queue[field][0, 0].copy()
+        departures.queue[field][0, 0] += 1
         assert simulation.state_hash() != before, field
-        gate.queue[field][0, 0] = value
-    for array in (gate.next_order, gate.next_id):
+        departures.queue[field][0, 0] = value
+    for array in (departures.next_order, departures.next_id):
         array[0] += 1
         assert simulation.state_hash() != before
         array[0] -= 1

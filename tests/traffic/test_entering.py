@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import world_key
 from cavmarl.core.records import codes
-from cavmarl.core.records.arrays import Scratch, Travel
+from cavmarl.core.records.arrays import Scratch, TripTables
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M, index_lanes
 from cavmarl.driving.kernels.models.following import speed_behind
 from cavmarl.driving.vehicle_types import generated_types
@@ -68,7 +68,7 @@ def lane_of(
     vehicle: int = 50,
     *,
     taken: Sequence[int] = (),
-    travel: Travel = TRAVEL,
+    travel: TripTables = TRAVEL,
 ) -> int:
     waiting = departure(lane, lane_code=code, id=vehicle)
     edge = ROADS.edges[ROADS.lanes["edge"][lane]]

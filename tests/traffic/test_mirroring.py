@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.arrays import TripTables
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SUMO, EVENT_ARRIVED
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.world_setup import load_world
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
-from cavmarl.shards.shard import make_zoned
+from cavmarl.shards.shard import make_zone_state
 from cavmarl.traffic.demand import STOP
 from cavmarl.traffic.kernels.mirroring import Paths, list_others, mirror
 from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
@@ -44,19 +44,21 @@ def fronts(network: RoadNetwork, number: int) -> np.ndarray:
     return seen
 
 
-def nowhere(network: RoadNetwork) -> tuple[Travel, Paths]:
+def nowhere(network: RoadNetwork) -> tuple[TripTables, Paths]:
     """No ways at all: every path is of one edge that nobody is on."""
     steps = np.zeros(2 * len(network.lanes), dtype=PLAN)
     steps["next"] = -1
     stops = np.zeros(0, dtype=STOP)
-    travel = Travel(generated_types(), steps, stops, 0, 0.0, 100.0, 100.0, len(steps), NO_SCRIPTS)
+    travel = TripTables(
+        generated_types(), steps, stops, 0, 0.0, 100.0, 100.0, len(steps), NO_SCRIPTS
+    )
     first = np.array([0, 1], dtype=np.int64)
     return travel, Paths(first, np.array([-1], dtype=np.int32), np.zeros(1, dtype=np.int64), 0)
 
 
 def test_rows_stand_where_the_twin_says(network: RoadNetwork) -> None:
     seen = fronts(network, 200)
-    zoned = make_zoned(2, 1, 300)
+    zoned = make_zone_state(2, 1, 300)
     travel, paths = nowhere(network)
     for n, number in enumerate(seen["number"]):
         zone = n % 2
@@ -100,7 +102,7 @@ def came_by(network: RoadNetwork, seen: np.void) -> int:
 
 
 def test_others_are_all_whom_sumo_does_not_move(network: RoadNetwork) -> None:
-    zoned = make_zoned(3, 2, 10)
+    zoned = make_zone_state(3, 2, 10)
     for zone in range(3):
         for n in range(zone + 2):
             row = zoned.rows[0, zone, 1, n]

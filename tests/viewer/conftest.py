@@ -12,10 +12,10 @@ import pytest
 
 from cavmarl.env.parallel import parallel_env
 from cavmarl.policies.loading import load_policy
-from cavmarl.viewer.audience import Audience
-from cavmarl.viewer.shown_run import ShownRun
-from cavmarl.viewer.stage import first_stage
+from cavmarl.viewer.live_run import ShownRun
+from cavmarl.viewer.subscribers import Audience
 from cavmarl.viewer.vehicle_details import hello_of
+from cavmarl.viewer.viewed_world import first_stage
 from cavmarl.viewer.web_options import WebOptions
 from cavmarl.viewer.web_server import WebServer
 

@@ -12,8 +12,8 @@ import pytest
 
 from cavmarl.env.vector import make_vec
 from cavmarl.recordings.recording import Recording
+from cavmarl.viewer.live_recording import ShownRecording, recording_stages
 from cavmarl.viewer.show_world import serve_stages
-from cavmarl.viewer.shown_recording import ShownRecording, recording_stages
 from cavmarl.viewer.web_options import WebOptions
 from tests.support.chromium import chromium, until
 from tests.viewer.conftest import Served

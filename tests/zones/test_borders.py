@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Zoned
-from cavmarl.shards.shard import make_zoned
+from cavmarl.core.records.arrays import ZoneState
+from cavmarl.shards.shard import make_zone_state
 from cavmarl.zones.kernels.borders import NEAR, Borders, find_near, pass_on
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.naive import zones as naive
@@ -120,9 +120,9 @@ def test_rows_that_are_not_there_any_more_are_not_looked_at() -> None:
     assert out["row"][:found].tolist() == [0]
 
 
-def two_zones() -> Zoned:
+def two_zones() -> ZoneState:
     """Of three and two vehicles, which see each other's."""
-    zoned = make_zoned(2, 1, 6)
+    zoned = make_zone_state(2, 1, 6)
     zoned.rows["id"][SIDE, 0, 0, :5] = [10, 11, 12, 21, 20]
     zoned.rows["id"][SIDE, 1, 0, :5] = [20, 21, 12, 10, 11]
     zoned.num_owned[:, 0] = [3, 2]
@@ -130,7 +130,7 @@ def two_zones() -> Zoned:
     return zoned
 
 
-def ids(zoned: Zoned, zone: int, first: int, last: int) -> set[int]:
+def ids(zoned: ZoneState, zone: int, first: int, last: int) -> set[int]:
     return set(zoned.rows["id"][SIDE, zone, 0, first:last].tolist())
 
 

@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.core.records import codes
-from cavmarl.core.records.arrays import Gate, Worlds, Zoned
+from cavmarl.core.records.arrays import DepartureQueue, Worlds, ZoneState
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.shards.shard import make_worlds, make_zoned
-from cavmarl.traffic.departure_queue import make_gate
+from cavmarl.shards.shard import make_worlds, make_zone_state
+from cavmarl.traffic.departure_queue import make_departure_queue
 from cavmarl.traffic.kernels.leaving import drop_ghosts, leave
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, gather, note_gathered, take_own
-from cavmarl.zones.kernels.handoff import AT_ONCE, make_book
+from cavmarl.zones.kernels.ownership_changes import AT_ONCE, make_book
 from cavmarl.zones.kernels.zone_lookup import Halo
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -167,7 +167,7 @@ def test_more_ghosts_than_are_found_at_once_are_those_that_zones_gather() -> Non
     assert (sent.num_rows - sent.num_owned).sum() > 4 * AT_ONCE, "some zone sends them twice"
 
 
-def note_outer(zoned: Zoned, halo: Halo, parts: list[NDArray[np.void]]) -> None:
+def note_outer(zoned: ZoneState, halo: Halo, parts: list[NDArray[np.void]]) -> None:
     """Note who may be seen by other zones, as `advance` does."""
     for zone, rows in enumerate(parts):
         left, low, right, high = halo.inner[zone]
@@ -214,7 +214,7 @@ def test_a_world_of_one_zone_has_no_ghosts() -> None:
 
 def test_other_worlds_keep_their_ghosts() -> None:
     halo = zone_halo(four(), 5.0)
-    zoned = make_zoned(4, 3, 2)
+    zoned = make_zone_state(4, 3, 2)
     zoned.num_rows[:] = 2
     exchange(four().arrays, halo, 1.0, NO_BORDERS, zoned, SIDE, 1, 2, make_book(3, 2))
     assert zoned.num_rows.tolist() == [[2, 0, 2]] * 4
@@ -244,13 +244,13 @@ def test_others_than_those_that_are_noted_are_not_looked_at() -> None:
     assert zoned.num_rows.tolist() == [[3]] * 4
 
 
-def world(rows: NDArray[np.void], owned: int) -> tuple[Worlds, Gate]:
-    """One world with owned rows and ghosts, and its gate."""
+def world(rows: NDArray[np.void], owned: int) -> tuple[Worlds, DepartureQueue]:
+    """One world with owned rows and ghosts, and its departures."""
     roads = network("merge")
     worlds = make_worlds(1, len(rows), roads)
     worlds.rows[0] = rows
     worlds.num_owned[0], worlds.num_rows[0], worlds.num_through[0] = owned, len(rows), 1
-    return worlds, make_gate(1, len(rows), roads.arrays, VEHICLE)
+    return worlds, make_departure_queue(1, len(rows), roads.arrays, VEHICLE)
 
 
 def test_background_vehicles_leave_when_they_have_arrived() -> None:
@@ -259,9 +259,9 @@ def test_background_vehicles_leave_when_they_have_arrived() -> None:
     rows["events"] = codes.EVENT_ARRIVED
     rows["events"][1] = codes.EVENT_COLLIDED
     rows["driver"][2] = codes.DRIVER_AGENT
-    worlds, gate = world(rows, owned=4)
-    leave(gate, worlds, worlds.rows, codes.DRIVER_BACKGROUND, 1)
-    assert set(ids(gate.passing[0, : gate.num_passing[0]])) == {100, 103}
+    worlds, departures = world(rows, owned=4)
+    leave(departures, worlds, worlds.rows, codes.DRIVER_BACKGROUND, 1)
+    assert set(ids(departures.passing[0, : departures.num_passing[0]])) == {100, 103}
     assert (worlds.num_owned[0], worlds.num_rows[0]) == (2, 4)
     assert set(ids(worlds.rows[0, :2])) == {101, 102}
     assert set(ids(worlds.rows[0, 2:4])) == {104, 105}, "ghosts leave where they are owned"
@@ -276,10 +276,10 @@ def test_who_leaves_is_no_longer_noted_and_the_others_are_where_they_are(
     rows["x"] = np.arange(len(fates))
     rows["events"] = [codes.EVENT_ARRIVED * arrives for arrives, _ in fates]
     seen = {int(row["id"]) for row, (_, is_seen) in zip(rows, fates, strict=True) if is_seen}
-    worlds, gate = world(rows, owned=len(rows))
+    worlds, departures = world(rows, owned=len(rows))
     note(worlds.outer[0], rows, np.flatnonzero([is_seen for _, is_seen in fates]))
     worlds.num_outer[0] = len(seen)
-    leave(gate, worlds, worlds.rows, codes.DRIVER_BACKGROUND, 1)
+    leave(departures, worlds, worlds.rows, codes.DRIVER_BACKGROUND, 1)
     left = worlds.rows[0, : worlds.num_owned[0]]
     expected = np.zeros_like(worlds.outer[0])
     places = np.flatnonzero([int(row["id"]) in seen for row in left])
@@ -295,17 +295,17 @@ def test_agents_leave_when_their_trip_has_ended_and_they_have_acted() -> None:
     rows["events"][:3] = codes.EVENT_ARRIVED, codes.EVENT_COLLIDED, codes.EVENT_OFF_ROAD
     rows["events"][4] = codes.EVENT_COLLIDED
     rows["departed"][2] = 10 - TICKS_PER_STEP + 1
-    worlds, gate = world(rows, owned=5)
-    leave(gate, worlds, worlds.rows, codes.DRIVER_AGENT, TICKS_PER_STEP)
-    assert set(ids(gate.passing[0, : gate.num_passing[0]])) == {100, 101, 104}
+    worlds, departures = world(rows, owned=5)
+    leave(departures, worlds, worlds.rows, codes.DRIVER_AGENT, TICKS_PER_STEP)
+    assert set(ids(departures.passing[0, : departures.num_passing[0]])) == {100, 101, 104}
     assert set(ids(worlds.rows[0, : worlds.num_rows[0]])) == {102, 103}
 
 
 def test_ghosts_of_those_who_left_are_dropped_once() -> None:
-    worlds, gate = world(cars(6), owned=2)
-    gate.passing[0, :3]["id"] = [105, 102, 999]
-    gate.num_passing[0] = 3
-    drop_ghosts(gate, worlds, worlds.rows)
+    worlds, departures = world(cars(6), owned=2)
+    departures.passing[0, :3]["id"] = [105, 102, 999]
+    departures.num_passing[0] = 3
+    drop_ghosts(departures, worlds, worlds.rows)
     assert (worlds.num_owned[0], worlds.num_rows[0]) == (2, 4)
     assert ids(worlds.rows[0, :2]) == [100, 101]
     assert set(ids(worlds.rows[0, 2:4])) == {103, 104}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.evaluate.driven_worlds import DrivenWorld, world_maker
+from cavmarl.evaluate.built_in_runs import DrivenWorld, world_maker
 from cavmarl.zones.kernels.zone_lookup import Halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.visibility import Visibility

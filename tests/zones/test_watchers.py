@@ -19,7 +19,7 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import registratio
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, gather
-from cavmarl.zones.kernels.handoff import make_book
+from cavmarl.zones.kernels.ownership_changes import make_book
 from cavmarl.zones.kernels.zone_lookup import LOOK, Halo
 from cavmarl.zones.partition.zone_halo import inner_parts, lane_watchers, zone_halo
 from cavmarl.zones.partition.zone_layouts import cut_map

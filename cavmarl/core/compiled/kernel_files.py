@@ -20,10 +20,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.cache_folder import cache_dir, tell_unwritable
 from cavmarl.core.compiled.arguments import accepts
 from cavmarl.core.compiled.sources import module_digest
-from cavmarl.core.whole_file import write_whole
 
 if sys.platform != "win32":
     import fcntl

@@ -35,7 +35,7 @@ class RoadArrays(NamedTuple):
     phase_detectors: NDArray[np.int32]  # see PHASE["first_detector"]
     lane_place: NDArray[np.int32]  # (L,) the first PLACE of each lane, or -1
     places: NDArray[np.void]  # PLACE (num_places,) detectors that bodies on a lane can cover
-    maps: NDArray[np.void]  # MAP (M,), see `roads.kernels.map_draw`
+    maps: NDArray[np.void]  # MAP (M,), see `roads.kernels.map_choice`
 
 
 class LaneGrid(NamedTuple):
@@ -61,7 +61,7 @@ class Scripts(NamedTuple):
     reach_m: float  # the farthest from a body to the middle of a stretch that it covers
 
 
-class Travel(NamedTuple):
+class TripTables(NamedTuple):
     """What vehicles are and which ways there are; the same for all worlds of an environment."""
 
     types: NDArray[np.void]  # VTYPE (num_types,), by VEHICLE["vtype"]
@@ -77,7 +77,7 @@ class Travel(NamedTuple):
     tick_s: float = 0.1
 
 
-class Common(NamedTuple):
+class SharedState(NamedTuple):
     """What the shards of one process have in common of W worlds; see `Worlds`."""
 
     ticks: NDArray[np.int64]
@@ -115,13 +115,13 @@ class Worlds(NamedTuple):
     step: NDArray[
         np.void
     ]  # PLAN (W, C) of each row the step of its lane, see `route_following.own_step`
-    step_at: NDArray[np.int64]  # (W, C) 1 + which of `Travel.steps` that is, 0: none yet
+    step_at: NDArray[np.int64]  # (W, C) 1 + which of `TripTables.steps` that is, 0: none yet
     outer: NDArray[np.void]  # OUTER (W, C) owned next rows that other zones may see, rising
     num_outer: NDArray[np.int64]  # (W,) -1: not noted since rows changed
     cues: NDArray[np.int64]  # (W, T) the tick in which each cue of the script came, -1: not yet
 
 
-class Zoned(NamedTuple):
+class ZoneState(NamedTuple):
     """What all k zones have of W worlds, side by side; each shard's `Worlds` are views of it."""
 
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C) what `rows` and `next_rows` are views of
@@ -140,7 +140,7 @@ class Zoned(NamedTuple):
     spare: NDArray[np.void]  # VEHICLE (1,)
 
 
-class Gate(NamedTuple):
+class DepartureQueue(NamedTuple):
     """What one place keeps of each world, however it is divided: ids, the queue, the counts."""
 
     orders: NDArray[np.void]  # DEPARTURE (W, D) what a demand file orders, in order of `due`

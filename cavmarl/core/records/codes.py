@@ -90,14 +90,14 @@ ACTION_LANE_RIGHT = 2
 ACTION_FASTER = 3
 ACTION_SLOWER = 4
 
-# Gate.counts, since reset
+# DepartureQueue.counts, since reset
 COUNT_DEPARTED = 0  # vehicles that have entered
 COUNT_ARRIVED = 1  # vehicles that reached their goal
 COUNT_REMOVED = 2  # agents taken out after a collision or off the road
 COUNT_REROUTED = 3  # vehicles that left their route for another way
 NUM_COUNTS = 4
 
-# Gate.sums, over vehicles that arrived
+# DepartureQueue.sums, over vehicles that arrived
 SUM_DISTANCE_M = 0
 SUM_TIME_S = 1
 SUM_DELAY_S = 2  # time above what the way takes at the speed that limit and driver allow

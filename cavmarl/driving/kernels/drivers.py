@@ -17,7 +17,7 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.compiled.prefetch import SOON, prefetch
 from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
@@ -134,7 +134,7 @@ def _is_askew(row: np.void, leader: np.void) -> bool:
 @kernel
 def _at_line(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     kind: np.void,
@@ -194,7 +194,7 @@ def _at_line(
 @inlined_kernel
 def _road_ahead(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     k: int,
     step: np.void,
@@ -350,7 +350,7 @@ def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> Non
 @kernel
 def decide(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,), the committed state; read-only
     num: int,  # number of rows to decide for, the first of `rows`; the indices contain all rows
     driver: int,  # only for rows with this DRIVER_*

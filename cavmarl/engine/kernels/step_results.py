@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.core.records.arrays import Gate, Outputs
+from cavmarl.core.records.arrays import DepartureQueue, Outputs
 from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_OF_FATE, EVENTS_THAT_END
 
 
@@ -63,7 +63,7 @@ def report(
 @kernel
 def report_continuation(
     outputs: Outputs,  # of the step
-    gate: Gate,  # vehicles that wait, and how many have arrived
+    departures: DepartureQueue,  # vehicles that wait, and how many have arrived
     steps: NDArray[np.int64],  # (W,) since each world's reset
     horizon: int,  # steps of an episode
     results: Results,  # are written
@@ -74,14 +74,14 @@ def report_continuation(
     """
     some_over = False
     for w in range(steps.size):
-        results.arrivals[w] = gate.counts[w, COUNT_ARRIVED]
+        results.arrivals[w] = departures.counts[w, COUNT_ARRIVED]
         goes_on = False
         for agent in range(outputs.present.shape[1]):
             acts = outputs.present[w, agent] and not outputs.terminated[w, agent]
             results.mask[w, agent] = acts
             goes_on |= acts
-        for n in range(gate.num_queue[w]):
-            goes_on |= gate.queue[w, n]["agent"] >= 0
+        for n in range(departures.num_queue[w]):
+            goes_on |= departures.queue[w, n]["agent"] >= 0
         over = steps[w] >= horizon or not goes_on
         results.episode_over[w] = over
         some_over |= over

@@ -17,9 +17,9 @@ from os.path import isfile
 from pathlib import Path
 from typing import Any
 
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.errors import ManifestError
 from cavmarl.core.machine import describe_machine
-from cavmarl.core.whole_file import write_whole
 from cavmarl.policies.loading import policy_files
 
 MANIFEST_FILE = "manifest.json"

@@ -1,1 +1,1 @@
-"""Coordinators of divided worlds, their journal and the monitor of invariants."""
+"""WorldCoordinators of divided worlds, their journal and the monitor of invariants."""

@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ProtocolError
-from cavmarl.handoff.coordinator.coordinators import Coordinators
+from cavmarl.handoff.coordinator.coordinators import WorldCoordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
 from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor, OwnersOnRecord
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.handoff.coordinator.row_digests import RowDigests
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
@@ -27,7 +27,7 @@ from cavmarl.ownership.transfers import TransferLog
 class CoordinatorSetup(NamedTuple):
     """The coordinators of a divided environment."""
 
-    coordination: Coordinators  # of all worlds
+    coordination: WorldCoordinators  # of all worlds
     transfers: tuple[TransferLog, ...]  # world → what became of each hand-over
 
 
@@ -69,7 +69,7 @@ def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
 
 def make_coordinators(
     settings: ZonesConfig,  # journal, checks and deadlines
-    division: Division,  # of the shards, one a zone
+    division: ZonedShards,  # of the shards, one a zone
     longest_move_m: float,  # of a vehicle in a tick
     # one a world; None: they are chosen, and their journals must not be there
     runs: Sequence[OpenRun] | None = None,
@@ -91,7 +91,7 @@ def make_coordinators(
         if settings.check_invariants
         else None
     )
-    return CoordinatorSetup(Coordinators(division, coordinators, digests, monitor), transfers)
+    return CoordinatorSetup(WorldCoordinators(division, coordinators, digests, monitor), transfers)
 
 
 class _OwnersRows:
@@ -107,7 +107,7 @@ class _OwnersRows:
 def _coordinator(
     settings: ZonesConfig,
     w: int,
-    division: Division,
+    division: ZonedShards,
     limits: Limits,
     transfers: TransferLog,
     given: OpenRun | None,
@@ -124,7 +124,7 @@ def _coordinator(
 
 
 def _monitor(
-    division: Division,
+    division: ZonedShards,
     coordinators: Sequence[LocalCoordinator],
     limits: Limits,
     longest_move_m: float,

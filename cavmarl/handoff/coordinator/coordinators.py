@@ -1,4 +1,4 @@
-"""`Coordinators`: the coordinators of W worlds, and the rows that change hands as they say."""
+"""`WorldCoordinators`: the coordinators of W worlds, and the rows that change hands as they say."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Gate
+from cavmarl.core.records.arrays import DepartureQueue
 from cavmarl.handoff.coordinator.invariant_monitor import Departed, InvariantMonitor
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
 
-class Coordination(Protocol):
+class OwnershipRuntime(Protocol):
     """What decides ownership in W worlds, as a tick calls it.
 
     Attributes:
@@ -45,12 +45,12 @@ class Coordination(Protocol):
         """The rows are those of a committed tick; vehicles change their owner now."""
         ...
 
-    def left(self, gate: Gate) -> None:
-        """Vehicles in `gate.passing` have left the world."""
+    def left(self, departures: DepartureQueue) -> None:
+        """Vehicles in `departures.passing` have left the world."""
         ...
 
-    def entered(self, gate: Gate) -> None:
-        """Vehicles in `gate.passing` are new."""
+    def entered(self, departures: DepartureQueue) -> None:
+        """Vehicles in `departures.passing` are new."""
         ...
 
     def end(self) -> None:
@@ -60,7 +60,7 @@ class Coordination(Protocol):
     def in_flight(self, w: int) -> list[TransferInFlight]: ...
 
 
-class NoCoordination:
+class NoOwnershipRuntime:
     """One zone owns all vehicles, so nothing has to be decided."""
 
     coordinators: tuple[LocalCoordinator, ...] = ()
@@ -78,10 +78,10 @@ class NoCoordination:
     def begin(self, commands: Commands) -> None:
         """No vehicle changes its owner."""
 
-    def left(self, gate: Gate) -> None:
+    def left(self, departures: DepartureQueue) -> None:
         """Nothing is recorded of vehicles that leave."""
 
-    def entered(self, gate: Gate) -> None:
+    def entered(self, departures: DepartureQueue) -> None:
         """New vehicles are of the one zone."""
 
     def end(self) -> None:
@@ -92,14 +92,14 @@ class NoCoordination:
         return []
 
 
-class Coordinators:
-    """The coordinators of W worlds in this process; a `Coordination`."""
+class WorldCoordinators:
+    """The coordinators of W worlds in this process; an `OwnershipRuntime`."""
 
     needs_ghosts = True
 
     def __init__(
         self,
-        division: Division,  # whose rows change hands
+        division: ZonedShards,  # whose rows change hands
         coordinators: Sequence[LocalCoordinator],  # one a world
         digests: RowDigests | None = None,  # of zones' rows; None: not needed
         monitor: InvariantMonitor | None = None,  # checks every tick that is committed; None: none
@@ -193,16 +193,16 @@ class Coordinators:
     def in_flight(self, w: int) -> list[TransferInFlight]:
         return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
 
-    def left(self, gate: Gate) -> None:
+    def left(self, departures: DepartureQueue) -> None:
         for w, coordinator in enumerate(self.coordinators):
-            gone = gate.passing[w, : gate.num_passing[w]]
+            gone = departures.passing[w, : departures.num_passing[w]]
             if len(gone):
                 coordinator.left(zip(gone["id"].tolist(), gone["events"].tolist(), strict=True))
                 self._stirred[w] |= not coordinator.is_open
 
-    def entered(self, gate: Gate) -> None:
+    def entered(self, departures: DepartureQueue) -> None:
         for w, coordinator in enumerate(self.coordinators):
-            new = gate.passing[w, : gate.num_passing[w]]
+            new = departures.passing[w, : departures.num_passing[w]]
             if len(new):
                 zones = np.empty(len(new), dtype=np.int32)
                 zones_of(self._division.zones, new, len(new), zones)

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, ProtocolError
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.ownership.decisions import refused
 from cavmarl.ownership.messages import Birth, Switch
-from cavmarl.zones.kernels.handoff import NOT_OWNED
+from cavmarl.zones.kernels.ownership_changes import NOT_OWNED
 
 
 class OwnerChange(NamedTuple):
-    """A change of owner; see `zones.kernels.handoff.CHANGE`."""
+    """A change of owner; see `zones.kernels.ownership_changes.CHANGE`."""
 
     tick: int
     vehicle: int
@@ -49,7 +49,7 @@ class SavedBorders(NamedTuple):
 class HandoffLog:
     """Gives vehicles to the zones that they are in, and keeps what came of it until it is read."""
 
-    def __init__(self, division: Division, world: int) -> None:
+    def __init__(self, division: ZonedShards, world: int) -> None:
         self._division = division
         self._world = world
         self._book = division.book

@@ -20,7 +20,7 @@ from cavmarl.driving.vehicles import GHOST_FIELDS
 from cavmarl.handoff.coordinator.handoff_log import OwnerChange
 from cavmarl.handoff.coordinator.row_digests import digest_tables
 from cavmarl.handoff.coordinator.violations import Violations
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.kernels.invariant_checks import (
     ANY_LATE,
     FINDING,
@@ -150,7 +150,7 @@ class InvariantMonitor:
     """
 
     def __init__(
-        self, division: Division, records: Sequence[OwnersOnRecord], longest_move_m: float
+        self, division: ZonedShards, records: Sequence[OwnersOnRecord], longest_move_m: float
     ) -> None:
         self._division = division
         self._records = tuple(records)

@@ -32,7 +32,7 @@ from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import SeenIds, world_digest
 from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Reset, Switch, ZoneLedger
 from cavmarl.ownership.transfers import Transfer, TransferLog
-from cavmarl.zones.kernels.handoff import LATE
+from cavmarl.zones.kernels.ownership_changes import LATE
 
 
 class _News(NamedTuple):
@@ -125,7 +125,7 @@ class LocalCoordinator(Coordinator):
             switched=self.switched,
             seen_below=table.seen.floor,
             is_stirred=0,
-            recut_steps=0,
+            repartition_steps_done=0,
             near_tick=borders.tick,
             acknowledged=borders.acknowledged,
             aborted=borders.aborted,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError
 from cavmarl.handoff.coordinator.journal import JournalPlace
 from cavmarl.zones.kernels.borders import NEAR
-from cavmarl.zones.kernels.handoff import COMING
+from cavmarl.zones.kernels.ownership_changes import COMING
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 Words = NDArray[np.int64]
@@ -36,7 +36,7 @@ class OwnershipNumbers(NamedTuple):
     switched: int  # vehicles that have changed their owner
     seen_below: int  # all smaller ids have been in the episode
     is_stirred: int  # 1: rows have changed since the ghosts were renewed
-    recut_steps: int  # that the worlds have made, where zones are cut anew
+    repartition_steps_done: int  # that the worlds have made, where zones are cut anew
     # of the borders' records; see `BorderRecords`
     near_tick: int
     acknowledged: int

@@ -13,7 +13,7 @@ import numpy as np
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.driving.vehicles import GHOST_FIELDS
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.kernels.invariant_checks import KIND_FAR, KIND_TICK, CheckTime, Kept
 from cavmarl.ownership.messages import Birth
 from cavmarl.ownership.trace_check import Owner
@@ -26,7 +26,7 @@ Place = tuple[int, np.void]
 class Violations:
     """The state of a world that is wrong somewhere."""
 
-    def __init__(self, division: Division, w: int, clock: CheckTime, before: Kept) -> None:
+    def __init__(self, division: ZonedShards, w: int, clock: CheckTime, before: Kept) -> None:
         self._division = division
         self._w = w
         self._clock = clock

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.rng import mix
-from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.arrays import ZoneState
 from cavmarl.handoff.kernels.digests import row_digest
 from cavmarl.zones.kernels.zone_lookup import (
     Halo,
@@ -182,7 +182,7 @@ def _judge(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
 def watch(
     zones: ZoneArrays,
     halo: Halo,  # how far each zone sees over its borders
-    zoned: Zoned,  # the rows, owned ones and ghosts
+    zoned: ZoneState,  # the rows, owned ones and ghosts
     words: NDArray[np.uint64],  # (2, k, W, C, n) the rows as whole words
     side: int,  # where the committed rows are, 0 or 1
     w: int,

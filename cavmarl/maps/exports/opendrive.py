@@ -9,8 +9,8 @@ from xml.etree.ElementTree import Element, tostring
 
 import defusedxml.ElementTree
 
+from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.errors import MapError
-from cavmarl.core.whole_file import draft_folder
 from cavmarl.maps.exports.opendrive_curves import mend_curves
 from cavmarl.maps.exports.opendrive_trip import RoundTrip, roads_of_file, roads_of_map
 from cavmarl.maps.netconvert import OPENDRIVE_OPTIONS

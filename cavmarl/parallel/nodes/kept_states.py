@@ -171,15 +171,15 @@ class KeptStates:
         """
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
         first = self._first
-        kept = {id(array) for array in simulation.of_agents()}
-        of_agents = [n for n, array in enumerate(like) if id(array) in kept]
+        kept = {id(array) for array in simulation.agent_arrays()}
+        agent_arrays = [n for n, array in enumerate(like) if id(array) in kept]
         for n in range(first, len(saved)):
             if not len(other[n]):
                 continue
             saved[n] = other[n]
             w = (n - first) // zones
             agents = other[n]["agent"][other[n]["agent"] >= 0]
-            for k in of_agents:
+            for k in agent_arrays:
                 saved[k][w, agents] = other[k][w, agents]
         return other[first - 1]
 

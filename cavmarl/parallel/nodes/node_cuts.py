@@ -69,7 +69,7 @@ def read_neighbours(told: Sequence[Any], zones: int) -> Neighbours:
 
 
 def proposal_of(simulation: Simulation) -> list[Any] | None:
-    """Other zones, and what `Recut` says of them; where all vehicles are in this process."""
+    """Other zones, and what `Repartition` says of them; where all vehicles are in this process."""
     began = time.perf_counter()
     tolerance = simulation.config.zones.repartition_tolerance
     found = propose_cut(simulation.network, simulation.division, simulation.partition, tolerance)

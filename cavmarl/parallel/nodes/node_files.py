@@ -16,9 +16,9 @@ from cavmarl.config.registry import (
     resolve_programs,
     resolve_zones,
 )
+from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import MessageError, WorkerError
-from cavmarl.core.whole_file import write_whole
 
 _DIGEST = re.compile("[0-9a-f]{64}")
 

@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import forget
-from cavmarl.core.records.arrays import Gate, Outputs, Worlds
+from cavmarl.core.records.arrays import DepartureQueue, Outputs, Worlds
 from cavmarl.core.records.codes import (
     COUNT_REROUTED,
     LANE_FIRST,
@@ -86,7 +86,7 @@ class NodePeers:
         self._agents = AgentStream([getattr(simulation.outputs, name) for name in PIECES])
         self._sent = first_share
         self._is_stepping = False
-        self._gate: Gate | None = None
+        self._gate: DepartureQueue | None = None
         self._leaving: Passing  # of that
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
@@ -110,8 +110,8 @@ class NodePeers:
                     forget(array[num:])
         self._rerouted[chosen] = 0
 
-    def take_up(self, gate: Gate, side: int) -> None:
-        self._rerouted[:] = gate.counts[:, COUNT_REROUTED]
+    def take_up(self, departures: DepartureQueue, side: int) -> None:
+        self._rerouted[:] = departures.counts[:, COUNT_REROUTED]
         self._seen_s[...] = self._detected_s
         self.own[...] = False
         for zone in self._mine.tolist():
@@ -127,9 +127,9 @@ class NodePeers:
                 check_indices("agent", agents, self.owner.size)
             self.owner[agents] = number
 
-    def share_rows(self, gate: Gate, side: int) -> None:
-        if gate is not self._gate:
-            self._gate, self._leaving = gate, passing_of(gate)
+    def share_rows(self, departures: DepartureQueue, side: int) -> None:
+        if departures is not self._gate:
+            self._gate, self._leaving = departures, passing_of(departures)
         passing, send = self._leaving, self._links.send
         self._sent = due = self._sent + 1
         for to, rows in self._rows.items():
@@ -144,63 +144,67 @@ class NodePeers:
             self._count_own(self._zoned.num_owned, self._mine, self._running)
         return self._running
 
-    def clear_ranks(self, gate: Gate) -> None:
-        longest = int(gate.num_queue.max(initial=0))
-        gate.ranks[:, :longest] = -1
-        gate.last_s[:, :longest] = -np.inf
+    def clear_ranks(self, departures: DepartureQueue) -> None:
+        longest = int(departures.num_queue.max(initial=0))
+        departures.ranks[:, :longest] = -1
+        departures.last_s[:, :longest] = -np.inf
 
-    def share_ranks(self, gate: Gate) -> None:
-        longest = int(gate.num_queue.max(initial=0))
-        queue = gate.queue[:, :longest]
+    def share_ranks(self, departures: DepartureQueue) -> None:
+        longest = int(departures.num_queue.max(initial=0))
+        queue = departures.queue[:, :longest]
         asks = ~np.isin(queue["lane_code"], (LANE_GIVEN, LANE_FIRST, LANE_RANDOM))
         asks |= queue["pos_code"] == POS_LAST
-        asks &= np.arange(longest) < gate.num_queue[:, None]
+        asks &= np.arange(longest) < departures.num_queue[:, None]
         if not asks.any():
             return
-        ranks, last_s = gate.ranks[:, :longest][asks], gate.last_s[:, :longest][asks]
+        ranks, last_s = departures.ranks[:, :longest][asks], departures.last_s[:, :longest][asks]
         for number, data in self._swap([ranks.data, last_s.data]):
             with reading(number):
                 theirs, at = _read(data, 0, ranks.dtype, ranks.size)
                 theirs_s, _ = _read(data, at, last_s.dtype, last_s.size)
             np.maximum(ranks, theirs.reshape(ranks.shape), out=ranks)
             np.maximum(last_s, theirs_s.reshape(last_s.shape), out=last_s)
-        gate.ranks[:, :longest][asks] = ranks
-        gate.last_s[:, :longest][asks] = last_s
+        departures.ranks[:, :longest][asks] = ranks
+        departures.last_s[:, :longest][asks] = last_s
 
-    def share_proposals(self, gate: Gate) -> None:
-        places = [gate.places[w, :num] for w, num in enumerate(gate.num_passing.tolist())]
-        pieces = [*self._passing(gate), np.concatenate(places).data]
+    def share_proposals(self, departures: DepartureQueue) -> None:
+        places = [
+            departures.places[w, :num] for w, num in enumerate(departures.num_passing.tolist())
+        ]
+        pieces = [*self._passing(departures), np.concatenate(places).data]
         for number, data in self._swap(pieces):
-            before = gate.num_passing.copy()
+            before = departures.num_passing.copy()
             with reading(number):
-                at = self._add_passing(gate, data, 0)
+                at = self._add_passing(departures, data, 0)
                 for w in range(self._num_worlds):
-                    first, last = int(before[w]), int(gate.num_passing[w])
+                    first, last = int(before[w]), int(departures.num_passing[w])
                     found, at = _read(data, at, np.int64, last - first)
-                    check_indices("place in the queue", found, int(gate.num_queue[w]))
-                    gate.places[w, first:last] = found
+                    check_indices("place in the queue", found, int(departures.num_queue[w]))
+                    departures.places[w, first:last] = found
 
-    def share_leavers(self, gate: Gate) -> None:
-        for number, data in self._swap(self._passing(gate)):
+    def share_leavers(self, departures: DepartureQueue) -> None:
+        for number, data in self._swap(self._passing(departures)):
             with reading(number):
-                self._add_passing(gate, data, 0)
+                self._add_passing(departures, data, 0)
 
-    def _passing(self, gate: Gate) -> list[Bytes]:
-        """How many vehicles pass the gate of each world, and their rows."""
-        counts = gate.num_passing.copy()
-        rows = [gate.passing[w, :num] for w, num in enumerate(counts.tolist()) if num]
+    def _passing(self, departures: DepartureQueue) -> list[Bytes]:
+        """How many vehicles pass the departure queue of each world, and their rows."""
+        counts = departures.num_passing.copy()
+        rows = [departures.passing[w, :num] for w, num in enumerate(counts.tolist()) if num]
         return [counts.data, *map(_bytes, rows)]
 
-    def _add_passing(self, gate: Gate, data: memoryview, at: int) -> int:
+    def _add_passing(self, departures: DepartureQueue, data: memoryview, at: int) -> int:
         counts, at = _read(data, at, np.int64, self._num_worlds)
         for w, num in enumerate(counts.tolist()):
-            first = gate.num_passing.item(w)
-            check_indices("row of the gate", [num], 1 + gate.passing.shape[1] - first)
+            first = departures.num_passing.item(w)
+            check_indices(
+                "row of the departure queue", [num], 1 + departures.passing.shape[1] - first
+            )
             if num:
-                rows, at = _read(data, at, gate.passing.dtype, num)
+                rows, at = _read(data, at, departures.passing.dtype, num)
                 self.checks.check(rows)
-                gate.passing[w, first : first + num] = rows
-                gate.num_passing[w] = first + num
+                departures.passing[w, first : first + num] = rows
+                departures.num_passing[w] = first + num
         return at
 
     def share_detections(self, worlds: Worlds) -> None:
@@ -229,17 +233,17 @@ class NodePeers:
                 self._agents.take(data, number, self.owner)
 
     @contextmanager
-    def everybody(self, gate: Gate, side: int) -> Iterator[None]:
+    def everybody(self, departures: DepartureQueue, side: int) -> Iterator[None]:
         """Vehicles of another node are those of the first of its zones meanwhile."""
-        before = gate.counts[:, COUNT_REROUTED].copy()
+        before = departures.counts[:, COUNT_REROUTED].copy()
         with self._rows_of_all(side):
             yield
-        self._rerouted += gate.counts[:, COUNT_REROUTED] - before
+        self._rerouted += departures.counts[:, COUNT_REROUTED] - before
 
     @contextmanager
     def whole(self, simulation: Simulation) -> Iterator[None]:
         """The time in which each node has whole worlds; all have to call it."""
-        arrays = simulation.of_agents()
+        arrays = simulation.agent_arrays()
         mine = self._agents_of(simulation.division.side)
         with self._rows_of_all(simulation.division.side):
             pieces: list[Bytes] = [np.int64(len(mine)).tobytes(), mine.data]

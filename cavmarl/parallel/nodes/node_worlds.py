@@ -20,7 +20,7 @@ from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
-from cavmarl.handoff.repartitioning import Recut, is_due
+from cavmarl.handoff.repartitioning import Repartition, is_due
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.backend_name import BackendName
@@ -70,7 +70,7 @@ class NodeWorlds(CommandedWorlds):
 
     Attributes:
         pool: the nodes.
-        recuts: when worlds have been cut anew.
+        repartitions: when worlds have been cut anew.
 
     Raises:
         ConfigError: a setting that such worlds cannot have, or more nodes than zones.
@@ -123,7 +123,7 @@ class NodeWorlds(CommandedWorlds):
         self._ticks_per_step = config.clock.ticks_per_step
         self._ticks_done = self._ticks_told = 0
         self._steps_begun = 0  # since the worlds were made
-        self.recuts: list[Recut] = []
+        self.repartitions: list[Repartition] = []
         self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
         every = config.workers.balance_steps
         if every and share is None:
@@ -152,7 +152,7 @@ class NodeWorlds(CommandedWorlds):
         if proposal := self.ask(Task.PROPOSE):
             zones, figures = proposal
             self._order(Task.CUT, zones)
-            self.recuts.append(Recut(self._steps_begun - 1, *figures))
+            self.repartitions.append(Repartition(self._steps_begun - 1, *figures))
 
     def _read_proposal(self, said: Any) -> tuple[ZoneRects, list[Any]] | None:
         if said is None:

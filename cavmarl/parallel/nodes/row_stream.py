@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import huge_zeros
-from cavmarl.core.records.arrays import Gate, RoadArrays, Zoned
+from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, ZoneState
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.roads.routing import PLAN
@@ -92,7 +92,7 @@ class RowStream:
 
     def __init__(
         self,
-        zoned: Zoned,
+        zoned: ZoneState,
         zones: NDArray[np.int64],  # of this node
         others: NDArray[np.int64],  # of the other one
         running: NDArray[np.int64],  # (W,) see `Both`
@@ -161,9 +161,9 @@ class RowStream:
             taken.turn(num)
 
 
-def passing_of(gate: Gate) -> Passing:
-    """What leaves by a gate; views."""
-    return Passing(words_of(gate.passing), gate.num_passing, gate.counts)
+def passing_of(departures: DepartureQueue) -> Passing:
+    """What leaves by a departure queue; views."""
+    return Passing(words_of(departures.passing), departures.num_passing, departures.counts)
 
 
 def words_of(rows: Array) -> Array:

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError
-from cavmarl.core.records.arrays import Gate
+from cavmarl.core.records.arrays import DepartureQueue
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
-from cavmarl.handoff.division import Division
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.kernels.invariant_checks import owned_sum
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.codec import decode, encode
@@ -70,7 +70,7 @@ class ZoneHosts:
 
     def __init__(
         self,
-        division: Division,
+        division: ZonedShards,
         zones: Sequence[int],  # of this node
         node_of: Sequence[int],  # zone → the node that hosts it
         hostings: Sequence[Sequence[Hosting]],  # of each world, of these zones
@@ -168,19 +168,19 @@ class ZoneHosts:
     def end(self) -> None:
         """The tick is over here; `report` tells the coordinator."""
 
-    def entered(self, gate: Gate) -> None:
+    def entered(self, departures: DepartureQueue) -> None:
         division = self._division
         for w, births in enumerate(self._births):
-            new = gate.passing[w, : gate.num_passing[w]]
+            new = departures.passing[w, : departures.num_passing[w]]
             if len(new):
                 zones = np.empty(len(new), dtype=np.int32)
                 zones_of(division.zones, new, len(new), zones)
                 pairs = zip(new["id"].tolist(), zones.tolist(), strict=True)
                 births += [(vehicle, zone) for vehicle, zone in pairs if zone in self._zones]
 
-    def left(self, gate: Gate) -> None:
+    def left(self, departures: DepartureQueue) -> None:
         for w, gone in enumerate(self._gone):
-            rows = gate.passing[w, : gate.num_passing[w]]
+            rows = departures.passing[w, : departures.num_passing[w]]
             if len(rows):
                 gone.update(zip(rows["id"].tolist(), rows["events"].tolist(), strict=True))
                 self._stirred[w] = True

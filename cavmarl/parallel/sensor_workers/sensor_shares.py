@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.assignment import workers_of
+from cavmarl.balance.initial_placement import spread
 from cavmarl.balance.load_snapshot import idle_snapshot
+from cavmarl.balance.local_search import refine
 from cavmarl.balance.problem import Problem, ShardCost
-from cavmarl.balance.refining import refine
 from cavmarl.balance.shard_placement import Placement
-from cavmarl.balance.spreading import spread
 
 PIECES_A_WORKER = 4  # of the agents of one sensor, where there are so many
 LEAST_S = 2e-4  # that has to be saved to divide frames: what stands around is looked up twice then

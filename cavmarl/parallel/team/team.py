@@ -2,7 +2,7 @@
 
 The first of them leads: it runs the tick as one process would. Each phase that is mostly done zone
 by zone it announces to the others, the followers, runs it on its own zones, and goes on when they
-have run it on theirs. What is in between, gate, signals and owners, it does alone.
+have run it on theirs. What is in between, departures, signals and owners, it does alone.
 
 All arrays that shards write are shared (`shared_huge_pages`), and each row has one writer at a
 time. A follower keeps nothing from one phase to the next but scratch memory: what a phase needs to

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.rows import is_off_lanes
-from cavmarl.roads.kernels.map_draw import map_of
+from cavmarl.roads.kernels.map_choice import map_of
 
 # From a detector to the centre of any vehicle that is over it or has left it in this tick.
 DETECTOR_REACH_M = 30.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import hypot, tangent
-from cavmarl.core.math.spans import row_span
+from cavmarl.core.math.scanlines import row_span
 from cavmarl.sensors.kernels.panorama import (
     BICYCLE,
     BUILDING,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import Grid, fill_grid
-from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, TripTables, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame
 from cavmarl.sensors.kernels.highway_lidar import LidarCells, observe_lidar_cells
@@ -41,7 +41,7 @@ class OptionalSensors(NamedTuple):
 @kernel
 def observe_optional(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     lane_grid: LaneGrid,
     worlds: Worlds,
     grid: Grid,

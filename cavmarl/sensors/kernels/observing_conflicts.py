@@ -26,7 +26,7 @@ from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.walls import Walls, is_cut
 from cavmarl.core.records import record
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import (
     DRIVER_SCRIPTED,
     SIGNAL_GREEN_MAJOR,
@@ -90,7 +90,7 @@ def _bent(value: float, half: float) -> float:
 @kernel
 def _foresee(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     speed: float,
     num_links: int,
@@ -178,7 +178,7 @@ def forget_others(sensor: ConflictsSensor) -> None:
 @kernel
 def _foresee_other(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     other: np.void,
     body: np.void,
     at: int,
@@ -333,7 +333,7 @@ def _put(
 @kernel
 def _rank(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     grid: Grid,
     rows: NDArray[np.void],
     i: int,
@@ -371,7 +371,7 @@ def _rank(
 @kernel
 def observe_conflicts(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     grid: Grid,

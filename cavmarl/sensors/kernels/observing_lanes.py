@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.records.arrays import RoadArrays, Sensors, Travel
+from cavmarl.core.records.arrays import RoadArrays, Sensors, TripTables
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.driving.kernels.junctions.gaps import link_signal
@@ -46,7 +46,13 @@ def _scaled_speed(speed: float) -> np.float32:
 
 @kernel
 def _way_between(
-    roads: RoadArrays, travel: Travel, lane: int, way: int, s: float, target: int, target_s: float
+    roads: RoadArrays,
+    travel: TripTables,
+    lane: int,
+    way: int,
+    s: float,
+    target: int,
+    target_s: float,
 ) -> float:
     """Metres along a way from `s` of `lane` to `target_s` of lane `target`; inf: not on it."""
     start = -s
@@ -74,7 +80,7 @@ def _note_gap(out: NDArray[np.float32], slot: int, gap: float, speed: float) -> 
 @kernel
 def _observe_gap(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     other: np.void,
     lane: int,
@@ -105,7 +111,7 @@ def _observe_gap(
 
 @kernel
 def _next_link(
-    roads: RoadArrays, travel: Travel, row: np.void, range_m: float
+    roads: RoadArrays, travel: TripTables, row: np.void, range_m: float
 ) -> tuple[int, float]:
     """The link that a vehicle is on or comes to next, -1: none, and the way to its stop line."""
     lane = row["lane"]
@@ -179,7 +185,7 @@ def _held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
 @kernel
 def observe_lanes(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     grid: Grid,

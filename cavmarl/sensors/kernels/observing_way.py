@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import atan2, cos_sin
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import (
     SIGNAL_GREEN_MAJOR,
     SIGNAL_GREEN_MINOR,
@@ -81,7 +81,7 @@ def _observe_line(
 @kernel
 def observe_way(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     controllers: NDArray[np.void],
     row: np.void,
     phase: NDArray[np.int32],

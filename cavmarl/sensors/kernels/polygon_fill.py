@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.core.math.spans import row_span
+from cavmarl.core.math.scanlines import row_span
 
 # Of a face with a corner nearer than this, or behind the camera, all rows are tried.
 NEAR_M = 0.01

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import hypot
 from cavmarl.core.math.neighbors import Grid, fill_grid
-from cavmarl.core.math.spans import row_span
+from cavmarl.core.math.scanlines import row_span
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop

@@ -17,7 +17,7 @@ from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.math.neighbors import Grid, fill_grid, nearest_bodies
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.math.walls import is_cut
-from cavmarl.core.records.arrays import Outputs, RoadArrays, Sensors, Travel, Worlds
+from cavmarl.core.records.arrays import Outputs, RoadArrays, Sensors, TripTables, Worlds
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     EVENTS_THAT_END,
@@ -263,7 +263,7 @@ def observe_lidar(
 def sense(
     roads: RoadArrays,
     plans: NDArray[np.void],
-    travel: Travel,
+    travel: TripTables,
     worlds: Worlds,
     grid: Grid,
     sensors: Sensors,

@@ -12,17 +12,17 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 
 @kernel
 def gather_rows(
-    worlds: Worlds, of_agents: bool, rows: NDArray[np.void], num_rows: NDArray[np.int64]
+    worlds: Worlds, agent_arrays: bool, rows: NDArray[np.void], num_rows: NDArray[np.int64]
 ) -> None:
     """Put the owned rows of a zone behind those that are there.
 
-    `of_agents`: only those of agents; otherwise only the others. `num_rows`: (W,) how many there
+    `agent_arrays`: only those of agents; otherwise only the others. `num_rows`: (W,) how many there
     are.
     """
     for w in range(worlds.ticks.size):
         at = num_rows[w]
         for i in range(worlds.num_owned[w]):
-            if (worlds.rows[w, i]["driver"] == DRIVER_AGENT) == of_agents:
+            if (worlds.rows[w, i]["driver"] == DRIVER_AGENT) == agent_arrays:
                 rows[w, at] = worlds.rows[w, i]
                 at += 1
         num_rows[w] = at

@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from cavmarl.config.rig import MountedConfig, SampledConfig
 from cavmarl.core.compiled import specialized
 from cavmarl.core.math.neighbors import Grid
-from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, TripTables, Worlds
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.panorama import make_panorama
@@ -32,7 +32,7 @@ class SensedScene(NamedTuple):
     roads: RoadArrays  # of the whole map
     lane_grid: LaneGrid
     plans: NDArray[np.void]
-    travel: Travel  # types of vehicles
+    travel: TripTables  # types of vehicles
     worlds: Worlds  # the committed rows: first the zone's own, then ghosts
     grid: Grid  # scratch: the spatial index of one world; callers that ask it fill it
     before: NDArray[np.void]  # POSE (W, A) of all agents in the tick before

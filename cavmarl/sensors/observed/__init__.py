@@ -105,7 +105,7 @@ def largest_radius_m(types: NDArray[np.void]) -> float:
     """Half the diagonal of the largest body, in m: no part of one is further from its centre.
 
     Args:
-        types: VTYPE (num_types,), `Travel.types`: those of agents and of all others.
+        types: VTYPE (num_types,), `TripTables.types`: those of agents and of all others.
     """
     return 0.5 * float(hypot_all(types["length"], types["width"]).max())
 

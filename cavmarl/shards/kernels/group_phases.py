@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavmarl.core.compiled import kernel
-from cavmarl.core.records.arrays import Gate, Worlds, Zoned
+from cavmarl.core.records.arrays import DepartureQueue, Worlds, ZoneState
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, DRIVER_SUMO
 from cavmarl.rewards.kernels.reward import credit
 from cavmarl.roads.kernels.signal_phases import detect
@@ -22,27 +22,27 @@ from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
 
 
 @kernel
-def leave_background(gate: Gate, worlds: Worlds) -> None:
-    """Hand the background vehicles of the next rows that have arrived to the gate."""
-    leave(gate, worlds, worlds.next_rows, DRIVER_BACKGROUND, 1)
+def leave_background(departures: DepartureQueue, worlds: Worlds) -> None:
+    """Hand the background vehicles of the next rows that have arrived to the departure queue."""
+    leave(departures, worlds, worlds.next_rows, DRIVER_BACKGROUND, 1)
 
 
 @kernel
-def dismiss(gate: Gate, worlds: Worlds) -> None:
-    """Hand the vehicles of the next rows that SUMO has removed to the gate."""
-    leave(gate, worlds, worlds.next_rows, DRIVER_SUMO, 0)
+def dismiss(departures: DepartureQueue, worlds: Worlds) -> None:
+    """Hand the vehicles of the next rows that SUMO has removed to the departure queue."""
+    leave(departures, worlds, worlds.next_rows, DRIVER_SUMO, 0)
 
 
 @kernel
-def retire(gate: Gate, worlds: Worlds, ticks_per_step: int) -> None:
-    """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
-    leave(gate, worlds, worlds.rows, DRIVER_AGENT, ticks_per_step)
+def retire(departures: DepartureQueue, worlds: Worlds, ticks_per_step: int) -> None:
+    """Move the vehicles of agents whose trip has ended to the departure queue."""
+    leave(departures, worlds, worlds.rows, DRIVER_AGENT, ticks_per_step)
 
 
 @kernel
-def forget(gate: Gate, worlds: Worlds) -> None:
+def forget(departures: DepartureQueue, worlds: Worlds) -> None:
     """Drop the ghosts of vehicles that have been retired."""
-    drop_ghosts(gate, worlds, worlds.rows)
+    drop_ghosts(departures, worlds, worlds.rows)
 
 
 @kernel
@@ -51,7 +51,7 @@ def gather_ghosts(
     halo: Halo,
     touching_m: float,
     border_m: float,
-    zoned: Zoned,
+    zoned: ZoneState,
     next_side: int,
     zone: int,
 ) -> None:
@@ -95,7 +95,7 @@ def commit(members: Members) -> None:
 
 
 @kernel
-def count_rows(zoned: Zoned) -> None:
+def count_rows(zoned: ZoneState) -> None:
     """Note that an undivided world has no ghosts."""
     for zone in range(zoned.num_owned.shape[0]):
         for w in range(zoned.num_owned.shape[1]):

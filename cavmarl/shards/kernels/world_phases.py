@@ -13,7 +13,7 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.compiled.prefetch import SOON, prefetch
 from cavmarl.core.math.neighbors import Grid
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Scratch, Travel, Worlds
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Scratch, TripTables, Worlds
 from cavmarl.core.records.codes import (
     ACTION_FASTER,
     ACTION_IDLE,
@@ -111,7 +111,7 @@ def _delay(
 def _drive_agent(
     roads: RoadArrays,
     plans: NDArray[np.void],
-    travel: Travel,
+    travel: TripTables,
     lane_grid: LaneGrid,
     worlds: Worlds,
     w: int,
@@ -156,7 +156,7 @@ def _fetch_lanes(roads: RoadArrays, rows: NDArray[np.void], k: int, scratch: Scr
 
 @inlined_kernel
 def _decide_in_background(
-    roads: RoadArrays, travel: Travel, worlds: Worlds, w: int, dt: float, scratch: Scratch
+    roads: RoadArrays, travel: TripTables, worlds: Worlds, w: int, dt: float, scratch: Scratch
 ) -> bool:
     """Let the background vehicles of a world decide; whether there are any."""
     rows, num, owned = worlds.rows[w], worlds.num_rows[w], worlds.num_owned[w]
@@ -173,7 +173,7 @@ def _decide_in_background(
 @inlined_kernel
 def _drive_in_background(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     step: np.void,
     i: int,  # the row that was decided for
@@ -195,7 +195,7 @@ def _drive_in_background(
 def advance(
     roads: RoadArrays,
     plans: NDArray[np.void],  # PLAN (G, L)
-    travel: Travel,
+    travel: TripTables,
     lane_grid: LaneGrid,  # which lanes lie near a place
     worlds: Worlds,  # next_rows is written
     inner: NDArray[np.float64],  # the part of the zone that no other one sees; see `Halo`
@@ -286,7 +286,7 @@ def resolve(
 def suggest(
     roads: RoadArrays,
     plans: NDArray[np.void],  # PLAN (G, L)
-    travel: Travel,
+    travel: TripTables,
     worlds: Worlds,  # not written
     scratch: Scratch,
     discrete: bool,  # whether to answer with meta-actions

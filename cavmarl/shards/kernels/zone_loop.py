@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.neighbors import Grid
-from cavmarl.core.records.arrays import Common, Worlds, Zoned
+from cavmarl.core.records.arrays import SharedState, Worlds, ZoneState
 from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
 
 FRAME = np.dtype(
@@ -37,11 +37,13 @@ class Members(NamedTuple):
 
     numbers: NDArray[np.int64]  # (n,) their numbers, rising
     frames: NDArray[np.void]  # FRAME (n,) of the spatial index of each zone
-    sides: NDArray[np.int64]  # (2,) in which half of `Zoned.rows` the committed rows are, the next
+    sides: NDArray[
+        np.int64
+    ]  # (2,) in which half of `ZoneState.rows` the committed rows are, the next
     zones: ZoneArrays  # of the partition
     halo: Halo
-    zoned: Zoned
-    common: Common
+    zoned: ZoneState
+    common: SharedState
     grid: Grid  # scratch memory, as large as the largest zone needs it
 
 

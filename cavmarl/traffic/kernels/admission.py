@@ -1,9 +1,10 @@
-"""How waiting departures enter: the gate assigns lanes, the shards find gaps.
+"""How waiting departures enter: the departure queue assigns lanes, the shards find gaps.
 
 One tick lets at most one vehicle try on each lane, in the order of the queue. Five calls make it:
-`rank_lanes` (each shard: how crowded lanes are), `assign_lanes` (the gate), `propose` (each shard:
-departures that find a safe gap in its own zone), `accept` (the gate: in the order of the queue, as
-long as there is room) and `admit` (each shard: into its rows or among its ghosts).
+`rank_lanes` (each shard: how crowded lanes are), `assign_lanes` (the departure queue), `propose`
+(each shard: departures that find a safe gap in its own zone), `accept` (the departure queue: in the
+order of the queue, as long as there is room) and `admit` (each shard: into its rows or among its
+ghosts).
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
-from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
+from cavmarl.core.records.arrays import (
+    Demand,
+    DepartureQueue,
+    RoadArrays,
+    Scratch,
+    TripTables,
+    Worlds,
+)
 from cavmarl.core.records.codes import COUNT_DEPARTED, LANE_FIRST, LANE_GIVEN, LANE_RANDOM, POS_LAST
 from cavmarl.core.records.rows import SWEPT_BEYOND_M
 from cavmarl.driving.kernels.junctions.approach import register_links
@@ -45,10 +53,10 @@ def _zone_on(roads: RoadArrays, zones: ZoneArrays, lane: int, s: float) -> int:
 @kernel
 def rank_lanes(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     zones: ZoneArrays,
     zone: int,
-    gate: Gate,
+    departures: DepartureQueue,
     worlds: Worlds,
     scratch: Scratch,
 ) -> None:
@@ -57,13 +65,13 @@ def rank_lanes(
     A departure behind the last vehicle of a lane gets its place from the zone where the lane ends:
     it alone sees all that are in view of the end.
 
-    `zone`: the shard's own. `gate`: `ranks` and `last_s` are written where a place, or a lane's
-    end, lies in this zone. `worlds`: `next_rows` is read.
+    `zone`: the shard's own. `departures`: `ranks` and `last_s` are written where a place, or a
+    lane's end, lies in this zone. `worlds`: `next_rows` is read.
     """
     for w in range(worlds.ticks.shape[0]):
         indexed = False
-        for q in range(gate.num_queue[w]):
-            departure = gate.queue[w, q]
+        for q in range(departures.num_queue[w]):
+            departure = departures.queue[w, q]
             code = departure["lane_code"]
             chooses = not (code == LANE_GIVEN or code == LANE_FIRST or code == LANE_RANDOM)
             last = departure["pos_code"] == POS_LAST
@@ -82,10 +90,12 @@ def rank_lanes(
                     index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
                     indexed = True
                 if ranked:
-                    gate.ranks[w, q, lane - first] = crowd(scratch, lane, on_lane, travel.view_m)
+                    departures.ranks[w, q, lane - first] = crowd(
+                        scratch, lane, on_lane, travel.view_m
+                    )
                 if placed:
                     kind = travel.types[departure["vtype"]]
-                    gate.last_s[w, q, lane - first] = entry_place(
+                    departures.last_s[w, q, lane - first] = entry_place(
                         roads,
                         travel,
                         worlds.keys[w],
@@ -98,23 +108,27 @@ def rank_lanes(
 
 
 @kernel
-def assign_lanes(roads: RoadArrays, travel: Travel, gate: Gate, keys: NDArray[np.uint64]) -> None:
+def assign_lanes(
+    roads: RoadArrays, travel: TripTables, departures: DepartureQueue, keys: NDArray[np.uint64]
+) -> None:
     """Say on which lane each departure of the queue tries, -1: on none.
 
     A lane is taken whether or not there is room: the one that waits longer goes first.
 
-    `gate`: `tries` and `lane_taken` are written.
+    `departures`: `tries` and `lane_taken` are written.
     """
     for w in range(keys.size):
-        if gate.num_queue[w] == 0:
+        if departures.num_queue[w] == 0:
             continue
-        gate.lane_taken[:] = False
-        for q in range(gate.num_queue[w]):
-            departure = gate.queue[w, q]
-            lane = entry_lane(roads, travel, keys[w], departure, gate.ranks[w, q], gate.lane_taken)
-            gate.tries[w, q] = lane
+        departures.lane_taken[:] = False
+        for q in range(departures.num_queue[w]):
+            departure = departures.queue[w, q]
+            lane = entry_lane(
+                roads, travel, keys[w], departure, departures.ranks[w, q], departures.lane_taken
+            )
+            departures.tries[w, q] = lane
             if lane >= 0:
-                gate.lane_taken[lane] = True
+                departures.lane_taken[lane] = True
 
 
 @kernel
@@ -152,7 +166,7 @@ def _touches_any(rows: NDArray[np.void], num: int, own: np.void) -> bool:
 
 
 @kernel
-def _link_ahead(roads: RoadArrays, travel: Travel, row: np.void) -> int:
+def _link_ahead(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
     """The link at the end of an entrant's lane: of its way, else the first, -1 where none is."""
     _, _, link = next_step(roads, travel, row["lane"], row["way"])
     here = roads.lanes[row["lane"]]
@@ -175,7 +189,7 @@ def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
 
 
 @kernel
-def _may_be_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch) -> bool:
+def _may_be_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
     """Whether there are swept areas where a vehicle enters: ahead, or behind with one in them."""
     to_line = roads.lanes[row["lane"]]["length_m"] - row["s"]
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
@@ -202,7 +216,7 @@ def _may_be_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scra
 
 
 @kernel
-def _is_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch) -> bool:
+def _is_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
     """Whether a vehicle enters where another one sweeps, ahead or at the start of its lane."""
     here = roads.lanes[row["lane"]]
     half = 0.5 * row["length"]
@@ -223,34 +237,34 @@ def _is_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch)
 def propose(
     demand: Demand,
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     zones: ZoneArrays,
     zone: int,
-    gate: Gate,
+    departures: DepartureQueue,
     worlds: Worlds,
     scratch: Scratch,
 ) -> None:
-    """Put the departures that find a safe gap in this zone into `gate.passing`.
+    """Put the departures that find a safe gap in this zone into `departures.passing`.
 
-    `demand`: the generator's tables. `zone`: the shard's own. `gate`: `passing` and `places` are
-    written. `worlds`: `next_rows` is read.
+    `demand`: the generator's tables. `zone`: the shard's own. `departures`: `passing` and `places`
+    are written. `worlds`: `next_rows` is read.
     """
     for w in range(worlds.ticks.shape[0]):
-        if gate.num_queue[w] == 0:
+        if departures.num_queue[w] == 0:
             continue
         rows = worlds.next_rows[w]
         num = worlds.num_rows[w]
         key = worlds.keys[w]
         indexed = announced = False
-        for q in range(gate.num_queue[w]):
-            lane = gate.tries[w, q]
+        for q in range(departures.num_queue[w]):
+            lane = departures.tries[w, q]
             if lane < 0:
                 continue
-            departure = gate.queue[w, q]
+            departure = departures.queue[w, q]
             kind = travel.types[departure["vtype"]]
             if departure["pos_code"] == POS_LAST:
                 edge = roads.edges[roads.lanes[lane]["edge"]]
-                s = gate.last_s[w, q, lane - edge["first_lane"]]
+                s = departures.last_s[w, q, lane - edge["first_lane"]]
             else:
                 s = entry_place(roads, travel, key, departure, kind, lane, worlds.ticks[w], scratch)
             if _zone_on(roads, zones, lane, s) != zone:
@@ -263,9 +277,9 @@ def propose(
                 continue
             if follower_brakes(roads, travel, rows, departure, kind, lane, s, speed, scratch):
                 continue
-            n = gate.num_passing[w]
-            row = gate.passing[w, n]
-            gate.passing[w, n] = demand.blank[0]
+            n = departures.num_passing[w]
+            row = departures.passing[w, n]
+            departures.passing[w, n] = demand.blank[0]
             enter(roads, travel, worlds, w, departure, lane, s, speed, row)
             if _touches_any(rows, num, row):
                 continue
@@ -276,67 +290,70 @@ def propose(
                     announced = True
                 if _is_swept(roads, travel, row, scratch):
                     continue
-            gate.places[w, n] = q
-            gate.num_passing[w] = n + 1
+            departures.places[w, n] = q
+            departures.num_passing[w] = n + 1
 
 
 @kernel
-def accept(gate: Gate, running: NDArray[np.int64], capacity: int) -> None:
+def accept(departures: DepartureQueue, running: NDArray[np.int64], capacity: int) -> None:
     """Take the proposals in the order of the queue; the rest stays in it.
 
-    `gate`: `passing` keeps those taken; queue and counts are written. `running`: (W,) vehicles of
-    each world, in all zones. `capacity`: most that a world can hold.
+    `departures`: `passing` keeps those taken; queue and counts are written. `running`: (W,)
+    vehicles of each world, in all zones. `capacity`: most that a world can hold.
     """
     for w in range(running.size):
-        proposed = gate.num_passing[w]
+        proposed = departures.num_passing[w]
         taken = 0
         for n in range(proposed):
             found = n
             for m in range(n + 1, proposed):
-                if gate.places[w, m] < gate.places[w, found]:
+                if departures.places[w, m] < departures.places[w, found]:
                     found = m
-            q = gate.places[w, found]
-            gate.spare[0] = gate.passing[w, found]
-            gate.places[w, found] = gate.places[w, n]
-            gate.passing[w, found] = gate.passing[w, n]
-            row = gate.spare[0]
-            if running[w] + taken == capacity or _touches_any(gate.passing[w], taken, row):
+            q = departures.places[w, found]
+            departures.spare[0] = departures.passing[w, found]
+            departures.places[w, found] = departures.places[w, n]
+            departures.passing[w, found] = departures.passing[w, n]
+            row = departures.spare[0]
+            if running[w] + taken == capacity or _touches_any(departures.passing[w], taken, row):
                 continue
-            gate.passing[w, taken] = row
-            gate.places[w, taken] = q
+            departures.passing[w, taken] = row
+            departures.places[w, taken] = q
             taken += 1
-        gate.num_passing[w] = taken
-        gate.counts[w, COUNT_DEPARTED] += taken
-        _take_from_queue(gate, w, taken)
+        departures.num_passing[w] = taken
+        departures.counts[w, COUNT_DEPARTED] += taken
+        _take_from_queue(departures, w, taken)
 
 
 @kernel
-def _take_from_queue(gate: Gate, w: int, taken: int) -> None:
+def _take_from_queue(departures: DepartureQueue, w: int, taken: int) -> None:
     """Close the gaps that the accepted ones, whose places rise, leave in the queue."""
     if taken == 0:
         return
-    kept = gate.places[w, 0]
+    kept = departures.places[w, 0]
     n = 0
-    for q in range(kept, gate.num_queue[w]):
-        if n < taken and gate.places[w, n] == q:
+    for q in range(kept, departures.num_queue[w]):
+        if n < taken and departures.places[w, n] == q:
             n += 1
             continue
-        gate.queue[w, kept] = gate.queue[w, q]
+        departures.queue[w, kept] = departures.queue[w, q]
         kept += 1
-    gate.num_queue[w] = kept
+    departures.num_queue[w] = kept
 
 
 @kernel
-def admit(zones: ZoneArrays, halo: Halo, zone: int, gate: Gate, worlds: Worlds) -> None:
+def admit(
+    zones: ZoneArrays, halo: Halo, zone: int, departures: DepartureQueue, worlds: Worlds
+) -> None:
     """Write the accepted departures into `next_rows`: as owned in its zone, as ghost near it.
 
-    `halo`: how far this zone sees. `zone`: the shard's own. `gate`: `passing` is read. `worlds`:
+    `halo`: how far this zone sees. `zone`: the shard's own. `departures`: `passing` is read.
+    `worlds`:
     `next_rows` and how many they are.
     """
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]
-        for n in range(gate.num_passing[w]):
-            row = gate.passing[w, n]
+        for n in range(departures.num_passing[w]):
+            row = departures.passing[w, n]
             num = worlds.num_rows[w]
             if zone_of(zones, row["x"], row["y"]) == zone:
                 owned = worlds.num_owned[w]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.core.records.arrays import Gate, Worlds
+from cavmarl.core.records.arrays import DepartureQueue, Worlds
 from cavmarl.core.records.codes import INSERT_OPEN
 
 
@@ -30,13 +30,13 @@ def drive_on(
 
 
 @kernel
-def withdraw(gate: Gate, w: int, stop: int) -> None:
+def withdraw(departures: DepartureQueue, w: int, stop: int) -> None:
     """Take the departures that would make a barrier's stop out of the queue."""
     kept = 0
-    for q in range(gate.num_queue[w]):
-        if gate.queue[w, q]["stop"] == stop:
+    for q in range(departures.num_queue[w]):
+        if departures.queue[w, q]["stop"] == stop:
             continue
         if kept < q:
-            gate.queue[w, kept] = gate.queue[w, q]
+            departures.queue[w, kept] = departures.queue[w, q]
         kept += 1
-    gate.num_queue[w] = kept
+    departures.num_queue[w] = kept

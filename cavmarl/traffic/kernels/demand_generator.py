@@ -20,7 +20,14 @@ from cavmarl.core.math.rng import (
     below,
     uniform,
 )
-from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Travel, TripTable, Worlds
+from cavmarl.core.records.arrays import (
+    Demand,
+    DepartureQueue,
+    RoadArrays,
+    TripTable,
+    TripTables,
+    Worlds,
+)
 from cavmarl.core.records.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
@@ -42,7 +49,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
 from cavmarl.driving.kernels.motion.motion import place_on_lane
-from cavmarl.roads.kernels.map_draw import map_of
+from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.traffic.kernels.barriers import withdraw
 from cavmarl.traffic.kernels.entering import speed_at
 
@@ -60,8 +67,8 @@ GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes a
 def _order(
     demand: Demand,
     roads: RoadArrays,
-    travel: Travel,
-    gate: Gate,
+    travel: TripTables,
+    departures: DepartureQueue,
     ticks: NDArray[np.int64],
     keys: NDArray[np.uint64],
     w: int,
@@ -71,7 +78,7 @@ def _order(
     """Number and draw one departure and put it at the end of the queue."""
     key = keys[w]
     own_map = map_of(key, roads.maps.shape[0])
-    departure = gate.queue[w, _number(demand, gate, ticks[w], key, w)]
+    departure = departures.queue[w, _number(demand, departures, ticks[w], key, w)]
     vehicle = departure["id"]
     trip = _draw(trips, own_map, key, vehicle, 0)
     departure["agent"] = agent
@@ -87,13 +94,13 @@ def _order(
 
 
 @kernel
-def _number(demand: Demand, gate: Gate, tick: int, key: np.uint64, w: int) -> int:
+def _number(demand: Demand, departures: DepartureQueue, tick: int, key: np.uint64, w: int) -> int:
     """Put a numbered departure of the generator's type at the end of the queue; its place."""
-    vehicle = gate.next_id[w]
-    gate.next_id[w] = vehicle + 1
-    place: int = gate.num_queue[w]
-    departure = gate.queue[w, place]
-    gate.num_queue[w] = place + 1
+    vehicle = departures.next_id[w]
+    departures.next_id[w] = vehicle + 1
+    place: int = departures.num_queue[w]
+    departure = departures.queue[w, place]
+    departures.num_queue[w] = place + 1
     departure["id"] = vehicle
     departure["agent"] = -1
     departure["order"] = -1
@@ -113,10 +120,10 @@ def _number(demand: Demand, gate: Gate, tick: int, key: np.uint64, w: int) -> in
 def insert(
     demand: Demand,
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     num_goals: int,
     inserted: NDArray[np.float64],  # as in `Commands`
-    gate: Gate,
+    departures: DepartureQueue,
     ticks: NDArray[np.int64],
     keys: NDArray[np.uint64],
 ) -> None:
@@ -130,11 +137,14 @@ def insert(
         for n in range(inserted.shape[1]):
             lane = int(inserted[w, n, 1])
             if inserted[w, n, 0] == INSERT_OPEN:
-                withdraw(gate, w, travel.stops.shape[0] - lanes + lane)
+                withdraw(departures, w, travel.stops.shape[0] - lanes + lane)
                 continue
-            if inserted[w, n, 0] == INSERT_NONE or gate.num_queue[w] >= gate.queue.shape[1]:
+            if (
+                inserted[w, n, 0] == INSERT_NONE
+                or departures.num_queue[w] >= departures.queue.shape[1]
+            ):
                 continue
-            departure = gate.queue[w, _number(demand, gate, ticks[w], keys[w], w)]
+            departure = departures.queue[w, _number(demand, departures, ticks[w], keys[w], w)]
             first = below(keys[w], departure["id"], 0, STREAM_ROUTE, num_goals)
             _send(roads, departure, lane, first)
             for k in range(num_goals):
@@ -172,7 +182,7 @@ def _send(roads: RoadArrays, departure: np.void, lane: int, goal: int) -> None:
 @kernel
 def enter(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     worlds: Worlds,
     w: int,
     departure: np.void,
@@ -228,8 +238,8 @@ def _is_free(rows: NDArray[np.void], num: int, lane: int, s: float, half: float)
 def populate(
     demand: Demand,
     roads: RoadArrays,
-    travel: Travel,
-    gate: Gate,
+    travel: TripTables,
+    departures: DepartureQueue,
     worlds: Worlds,
     chosen: NDArray[np.bool_],
 ) -> None:
@@ -246,18 +256,18 @@ def populate(
         worlds.num_owned[w] = 0
         worlds.num_rows[w] = 0
         worlds.num_contacts[w] = 0
-        gate.num_queue[w] = 0
-        gate.next_order[w] = 0
-        gate.next_id[w] = 0
-        gate.counts[w, :] = 0
-        gate.sums[w, :] = 0.0
-        gate.num_entered[w] = demand.num_agents
+        departures.num_queue[w] = 0
+        departures.next_order[w] = 0
+        departures.next_id[w] = 0
+        departures.counts[w, :] = 0
+        departures.sums[w, :] = 0.0
+        departures.num_entered[w] = demand.num_agents
         own_map = map_of(worlds.keys[w], roads.maps.shape[0])
         for n in range(demand.num_agents + demand.num_background):
             agent = n if n < demand.num_agents else -1
             trips = demand.agent_trips if agent >= 0 else demand.start_trips
-            _order(demand, roads, travel, gate, worlds.ticks, worlds.keys, w, agent, trips)
-            departure = gate.queue[w, gate.num_queue[w] - 1]
+            _order(demand, roads, travel, departures, worlds.ticks, worlds.keys, w, agent, trips)
+            departure = departures.queue[w, departures.num_queue[w] - 1]
             vehicle = departure["id"]
             kind = travel.types[departure["vtype"]]
             half = 0.5 * kind["length"]
@@ -276,15 +286,15 @@ def populate(
                     speed = speed_at(roads, kind, lane, s, limit)
                     row = worlds.rows[w, num]
                     enter(roads, travel, worlds, w, departure, lane, s, speed, row)
-                    gate.counts[w, COUNT_DEPARTED] += 1
+                    departures.counts[w, COUNT_DEPARTED] += 1
                     worlds.num_rows[w] = num + 1
                     worlds.num_owned[w] = num + 1
-                    gate.num_queue[w] -= 1
+                    departures.num_queue[w] -= 1
                     break
 
 
 @kernel
-def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+def _needs_goal(demand: Demand, roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
     """Whether a vehicle picks another goal: near it where trips do not end, or stuck.
 
     Agents are never stuck; stuck is a vehicle that has stood for `GIVE_UP_S` at the end of a lane
@@ -302,7 +312,7 @@ def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void)
 
 
 @kernel
-def _is_stuck(roads: RoadArrays, travel: Travel, row: np.void, patience_s: float) -> bool:
+def _is_stuck(roads: RoadArrays, travel: TripTables, row: np.void, patience_s: float) -> bool:
     if row["wait_s"] <= patience_s or roads.lanes[row["lane"]]["internal"]:
         return False
     step = travel.steps[row["way"] + row["lane"]]
@@ -311,7 +321,7 @@ def _is_stuck(roads: RoadArrays, travel: Travel, row: np.void, patience_s: float
 
 
 @kernel
-def _take_detour(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+def _take_detour(roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
     """Send a vehicle of the demand file on to its goal without the lane change it waits for."""
     way = travel.first_detour + row["goal"] * roads.lanes.shape[0]
     step = travel.steps[way + row["lane"]]
@@ -327,9 +337,9 @@ def _take_detour(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
 def choose_goals(
     demand: Demand,
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     num_goals: int,
-    gate: Gate,
+    departures: DepartureQueue,
     worlds: Worlds,
     dt: float,
 ) -> None:
@@ -347,7 +357,7 @@ def choose_goals(
                 continue
             lane = row["lane"]
             if row["order"] >= 0:
-                gate.counts[w, COUNT_REROUTED] += _take_detour(roads, travel, row)
+                departures.counts[w, COUNT_REROUTED] += _take_detour(roads, travel, row)
                 continue
             if roads.lanes[lane]["internal"]:
                 continue
@@ -370,11 +380,11 @@ def choose_goals(
 
 
 @kernel
-def _next_leaving(gate: Gate, w: int, first: int) -> int:
-    """Where in `gate.passing` the smallest id stands of those from `first` on."""
+def _next_leaving(departures: DepartureQueue, w: int, first: int) -> int:
+    """Where in `departures.passing` the smallest id stands of those from `first` on."""
     found = first
-    for n in range(first + 1, gate.num_passing[w]):
-        if gate.passing[w, n]["id"] < gate.passing[w, found]["id"]:
+    for n in range(first + 1, departures.num_passing[w]):
+        if departures.passing[w, n]["id"] < departures.passing[w, found]["id"]:
             found = n
     return found
 
@@ -383,8 +393,8 @@ def _next_leaving(gate: Gate, w: int, first: int) -> int:
 def settle(
     demand: Demand,
     roads: RoadArrays,
-    travel: Travel,
-    gate: Gate,
+    travel: TripTables,
+    departures: DepartureQueue,
     ticks: NDArray[np.int64],
     keys: NDArray[np.uint64],
     dt: float,
@@ -394,49 +404,49 @@ def settle(
     They go in the order of their ids, so that those that follow get the same numbers wherever the
     rows lay.
 
-    `demand`: the generator's tables. `gate`: counts, sums and queue are written; `passing` holds
-    those that left, and is emptied.
+    `demand`: the generator's tables. `departures`: counts, sums and queue are written; `passing`
+    holds those that left, and is emptied.
     """
     for w in range(ticks.size):
-        for n in range(gate.num_passing[w]):
+        for n in range(departures.num_passing[w]):
             # Those before n are not read any more.
-            found = _next_leaving(gate, w, n)
-            row = gate.passing[w, found]
+            found = _next_leaving(departures, w, n)
+            row = departures.passing[w, found]
             agent = row["agent"]
             ordered = row["order"] >= 0
             if row["events"] & EVENT_ARRIVED:
                 time = (row["tick"] - row["departed"]) * dt
-                gate.counts[w, COUNT_ARRIVED] += 1
-                gate.sums[w, SUM_DISTANCE_M] += row["distance_m"]
-                gate.sums[w, SUM_TIME_S] += time
-                gate.sums[w, SUM_DELAY_S] += max(time - row["free_s"], 0.0)
+                departures.counts[w, COUNT_ARRIVED] += 1
+                departures.sums[w, SUM_DISTANCE_M] += row["distance_m"]
+                departures.sums[w, SUM_TIME_S] += time
+                departures.sums[w, SUM_DELAY_S] += max(time - row["free_s"], 0.0)
             else:
-                gate.counts[w, COUNT_REMOVED] += 1
-            gate.passing[w, found] = gate.passing[w, n]
+                departures.counts[w, COUNT_REMOVED] += 1
+            departures.passing[w, found] = departures.passing[w, n]
             if not demand.reenter or ordered:
                 continue
             if agent < 0:
-                _order(demand, roads, travel, gate, ticks, keys, w, -1, demand.enter_trips)
+                _order(demand, roads, travel, departures, ticks, keys, w, -1, demand.enter_trips)
             elif demand.seats:
-                _order(demand, roads, travel, gate, ticks, keys, w, agent, demand.agent_trips)
-            elif gate.num_entered[w] < demand.num_ids:
-                follower = gate.num_entered[w]
-                gate.num_entered[w] = follower + 1
+                _order(demand, roads, travel, departures, ticks, keys, w, agent, demand.agent_trips)
+            elif departures.num_entered[w] < demand.num_ids:
+                follower = departures.num_entered[w]
+                departures.num_entered[w] = follower + 1
                 trips = demand.agent_trips
-                _order(demand, roads, travel, gate, ticks, keys, w, follower, trips)
-        gate.num_passing[w] = 0
+                _order(demand, roads, travel, departures, ticks, keys, w, follower, trips)
+        departures.num_passing[w] = 0
 
 
 @kernel
-def call_orders(gate: Gate, ticks: NDArray[np.int64]) -> None:
+def call_orders(departures: DepartureQueue, ticks: NDArray[np.int64]) -> None:
     """Put the ordered departures that are due by the coming tick at the end of the queue."""
     for w in range(ticks.size):
-        n = gate.next_order[w]
-        while n < gate.num_orders[w] and gate.orders[w, n]["due"] <= ticks[w] + 1:
-            departure = gate.queue[w, gate.num_queue[w]]
-            gate.queue[w, gate.num_queue[w]] = gate.orders[w, n]
-            departure["id"] = gate.next_id[w]
-            gate.next_id[w] += 1
-            gate.num_queue[w] += 1
+        n = departures.next_order[w]
+        while n < departures.num_orders[w] and departures.orders[w, n]["due"] <= ticks[w] + 1:
+            departure = departures.queue[w, departures.num_queue[w]]
+            departures.queue[w, departures.num_queue[w]] = departures.orders[w, n]
+            departure["id"] = departures.next_id[w]
+            departures.next_id[w] += 1
+            departures.num_queue[w] += 1
             n += 1
-        gate.next_order[w] = n
+        departures.next_order[w] = n

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.rng import STREAM_DEPARTURE, STREAM_PLACE, below, uniform
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import (
     LANE_BEST,
     LANE_FIRST,
@@ -47,7 +47,7 @@ DRAW_SPEED = 1
 
 
 @kernel
-def _may_use(travel: Travel, departure: np.void, lane: int) -> bool:
+def _may_use(travel: TripTables, departure: np.void, lane: int) -> bool:
     usable: bool = travel.steps[departure["way"] + lane]["to_go"] < math.inf
     return usable
 
@@ -64,7 +64,7 @@ def crowd(scratch: Scratch, lane: int, s: float, view_m: float) -> int:
 @kernel
 def entry_lane(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     key: np.uint64,
     departure: np.void,
     ranks: NDArray[np.int64],
@@ -119,7 +119,7 @@ def entry_lane(
 @kernel
 def entry_place(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     key: np.uint64,
     departure: np.void,
     kind: np.void,
@@ -158,7 +158,7 @@ def speed_at(roads: RoadArrays, kind: np.void, lane: int, s: float, wanted: floa
 @kernel
 def _line_speed(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     departure: np.void,
     kind: np.void,
     lane: int,
@@ -184,7 +184,7 @@ def _line_speed(
 @kernel
 def _wanted_speed(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     key: np.uint64,
     departure: np.void,
     kind: np.void,
@@ -216,7 +216,7 @@ def _wanted_speed(
 @kernel
 def _behind_last_m(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     key: np.uint64,
     departure: np.void,
     kind: np.void,
@@ -252,7 +252,7 @@ def _secure_m(kind: np.void, speed: float, leader: np.void) -> float:
 @kernel
 def entry_speed(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     key: np.uint64,
     departure: np.void,
@@ -297,7 +297,7 @@ def entry_speed(
 @kernel
 def _safe_at_fork(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     departure: np.void,
     kind: np.void,
     lane: int,
@@ -349,7 +349,7 @@ def _safe_behind(kind: np.void, leader: np.void, to_centre: float) -> float:
 @kernel
 def follower_brakes(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     departure: np.void,
     kind: np.void,
@@ -372,7 +372,7 @@ def follower_brakes(
 @kernel
 def _one_that_turns_off_brakes(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     kind: np.void,
     lane: int,
@@ -410,7 +410,7 @@ def _one_that_turns_off_brakes(
 @kernel
 def _brakes(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     kind: np.void,
     lane: int,

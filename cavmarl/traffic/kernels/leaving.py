@@ -1,6 +1,6 @@
 """Vehicles that are through leave their shard.
 
-The gate settles with them in `demand_generator.settle`.
+The departure queue settles with them in `demand_generator.settle`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.core.records.arrays import Gate, Worlds
+from cavmarl.core.records.arrays import DepartureQueue, Worlds
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
@@ -49,16 +49,20 @@ def _strike(worlds: Worlds, w: int, rows: NDArray[np.void], i: int, last: int) -
 
 @kernel
 def leave(
-    gate: Gate, worlds: Worlds, rows: NDArray[np.void], driver: int, ticks_per_step: int
+    departures: DepartureQueue,
+    worlds: Worlds,
+    rows: NDArray[np.void],
+    driver: int,
+    ticks_per_step: int,
 ) -> None:
-    """Move the owned vehicles of one kind of driver that are through into `gate.passing`.
+    """Move the owned vehicles of one kind of driver that are through into `departures.passing`.
 
     Background vehicles are through when they have arrived; agents that have acted also after a
     collision or off the road.
 
-    `gate`: `passing` is written. `worlds`: how many rows there are is written. `rows`: VEHICLE (W,
-    C), the rows to take from. `ticks_per_step`: ticks a step; agents that entered within the last
-    of them have not acted.
+    `departures`: `passing` is written. `worlds`: how many rows there are is written. `rows`:
+    VEHICLE (W, C), the rows to take from. `ticks_per_step`: ticks a step; agents that entered
+    within the last of them have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
         if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:
@@ -68,8 +72,8 @@ def leave(
             if not _is_through(rows[w, i], driver, ticks_per_step):
                 i += 1
                 continue
-            gate.passing[w, gate.num_passing[w]] = rows[w, i]
-            gate.num_passing[w] += 1
+            departures.passing[w, departures.num_passing[w]] = rows[w, i]
+            departures.num_passing[w] += 1
             last_owned = worlds.num_owned[w] - 1
             last = worlds.num_rows[w] - 1
             rows[w, i] = rows[w, last_owned]
@@ -81,11 +85,11 @@ def leave(
 
 
 @kernel
-def drop_ghosts(gate: Gate, worlds: Worlds, rows: NDArray[np.void]) -> None:
-    """Forget the ghosts of vehicles that stand in `gate.passing`."""
+def drop_ghosts(departures: DepartureQueue, worlds: Worlds, rows: NDArray[np.void]) -> None:
+    """Forget the ghosts of vehicles that stand in `departures.passing`."""
     for w in range(worlds.ticks.shape[0]):
-        for n in range(gate.num_passing[w]):
-            vehicle = gate.passing[w, n]["id"]
+        for n in range(departures.num_passing[w]):
+            vehicle = departures.passing[w, n]["id"]
             for i in range(worlds.num_owned[w], worlds.num_rows[w]):
                 if rows[w, i]["id"] == vehicle:
                     last = worlds.num_rows[w] - 1

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import atan, cosine, sine
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
-from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Zoned
+from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, ZoneState
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SUMO, EVENT_ARRIVED
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step
 from cavmarl.driving.kernels.motion.motion import account, before_tick, lane_before
@@ -39,10 +39,10 @@ class Paths(NamedTuple):
 @kernel
 def mirror(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     paths: Paths,
     seen: NDArray[np.void],
-    zoned: Zoned,
+    zoned: ZoneState,
     side: int,
     w: int,
     dt: float,
@@ -81,30 +81,30 @@ def mirror(
 @kernel
 def greet(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     paths: Paths,
     seen: NDArray[np.void],
     departed: NDArray[np.int64],
     speed_factors: NDArray[np.float64],
     blank: NDArray[np.void],
-    gate: Gate,
+    departures: DepartureQueue,
     w: int,
     tick: int,
     key: np.uint64,
 ) -> None:
-    """Put a row for each vehicle that SUMO has let in into `gate.passing`, with a new id.
+    """Put a row for each vehicle that SUMO has let in into `departures.passing`, with a new id.
 
-    `seen`: as of `mirror`. `departed`: their numbers, rising. `gate`: passing, ids and counts are
-    written. `tick`: that they enter in. `key`: the root of all random numbers.
+    `seen`: as of `mirror`. `departed`: their numbers, rising. `departures`: passing, ids and counts
+    are written. `tick`: that they enter in. `key`: the root of all random numbers.
     """
     for n in range(departed.size):
         place = _find(seen, departed[n])
-        row = gate.passing[w, gate.num_passing[w]]
-        gate.passing[w, gate.num_passing[w]] = blank[0]
-        gate.num_passing[w] += 1
-        row["id"] = gate.next_id[w]
-        gate.next_id[w] += 1
-        gate.counts[w, COUNT_DEPARTED] += 1
+        row = departures.passing[w, departures.num_passing[w]]
+        departures.passing[w, departures.num_passing[w]] = blank[0]
+        departures.num_passing[w] += 1
+        row["id"] = departures.next_id[w]
+        departures.next_id[w] += 1
+        departures.counts[w, COUNT_DEPARTED] += 1
         kind = travel.types[seen[place]["vtype"]]
         row["driver"] = DRIVER_SUMO
         row["order"] = departed[n]
@@ -123,7 +123,7 @@ def greet(
 
 
 @kernel
-def list_others(zoned: Zoned, side: int, w: int, out: NDArray[np.void]) -> int:
+def list_others(zoned: ZoneState, side: int, w: int, out: NDArray[np.void]) -> int:
     """Copy all owned rows that SUMO does not move into `out`; how many they are."""
     found = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -140,7 +140,7 @@ def send_on(
     paths: Paths,
     numbers: NDArray[np.int64],
     chosen: NDArray[np.int64],
-    zoned: Zoned,
+    zoned: ZoneState,
     side: int,
     w: int,
 ) -> int:
@@ -187,7 +187,9 @@ def _find(seen: NDArray[np.void], number: int) -> int:
 
 
 @inlined_kernel
-def _stand_in(roads: RoadArrays, travel: Travel, paths: Paths, seen: np.void, row: np.void) -> None:
+def _stand_in(
+    roads: RoadArrays, travel: TripTables, paths: Paths, seen: np.void, row: np.void
+) -> None:
     half = 0.5 * row["length"]
     heading = wrap_angle(0.5 * math.pi - math.radians(seen["angle"]))
     row["heading"] = heading

@@ -1,7 +1,7 @@
 """Ways of single vehicles: which vehicles ask for one, what it takes, and where it is kept.
 
 A way that was found while the world runs is kept in a slot: room for one way's steps at the end of
-`Travel.steps`. Slots belong to a world; which of them are free is seen from its vehicles.
+`TripTables.steps`. Slots belong to a world; which of them are free is seen from its vehicles.
 
 The speed on every edge is sampled, smoothed, and put in the place of the limits, as SUMO's
 rerouting device does it (Behrisch, Krajzewicz, Wang: "Comparing performance and quality of traffic
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SCRIPTED, EVENT_ARRIVED
 from cavmarl.roads.kernels.plans import change_cost
 from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
@@ -138,7 +138,7 @@ def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -
 
 @kernel
 def has_room(
-    roads: RoadArrays, travel: Travel, row: np.void, steps: NDArray[np.void], way: int
+    roads: RoadArrays, travel: TripTables, row: np.void, steps: NDArray[np.void], way: int
 ) -> bool:
     """Whether a vehicle can still follow another way from its lane on without braking hard.
 
@@ -190,7 +190,7 @@ def slot_of(roads: RoadArrays, row: np.void, first_slot: int, slot_steps: int) -
 @kernel
 def take_slot(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     found: NDArray[np.void],
     first_slot: int,
@@ -221,7 +221,7 @@ def take_slot(
 
 
 @kernel
-def put_on_way(travel: Travel, row: np.void, way: int) -> None:
+def put_on_way(travel: TripTables, row: np.void, way: int) -> None:
     """Let a vehicle outside junctions follow another way from its lane on."""
     row["way"] = way
     row["leg"] += 1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.math.geometry import lane_pose
-from cavmarl.core.records.arrays import Gate, RoadArrays, Scripts, Travel, Worlds
+from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, Scripts, TripTables, Worlds
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SCRIPTED
 from cavmarl.driving.kernels.motion.scripted_rows import stand_at
 from cavmarl.roads.network import RoadNetwork
@@ -102,8 +102,8 @@ class Cast:
     def enter(
         self,
         roads: RoadArrays,
-        travel: Travel,
-        gate: Gate,
+        travel: TripTables,
+        departures: DepartureQueue,
         worlds: Worlds,
         w: int,
         blank: NDArray[np.void],
@@ -119,10 +119,10 @@ class Cast:
         rows = worlds.rows[w]
         others = rows[: worlds.num_owned[w]]
         others = others[(others["agent"] < 0) & self._is_clear(roads, others)].copy()
-        queue = gate.queue[w, : gate.num_queue[w]]
+        queue = departures.queue[w, : departures.num_queue[w]]
         queue = queue[queue["agent"] < 0].copy()
-        gate.queue[w, : len(queue)] = queue
-        gate.num_queue[w] = len(queue)
+        departures.queue[w, : len(queue)] = queue
+        departures.num_queue[w] = len(queue)
         for agent, seat in enumerate(self.seats):
             row = rows[agent]
             rows[agent] = blank[0]
@@ -134,7 +134,7 @@ class Cast:
         for first, vtype in zip(self.firsts, self.vtypes, strict=True):
             row = rows[num]
             rows[num] = blank[0]
-            row["id"] = gate.next_id[w]
+            row["id"] = departures.next_id[w]
             row["driver"] = DRIVER_SCRIPTED
             row["vtype"], row["goal"] = vtype, first
             for name in ("length", "width", "height"):
@@ -143,9 +143,9 @@ class Cast:
                 worlds.keys[w], worlds.ticks[w], worlds.ticks[w],
             )  # fmt: skip
             stand_at(self.scripts.frames[first], row)
-            gate.next_id[w] += 1
+            departures.next_id[w] += 1
             num += 1
-        gate.counts[w, COUNT_DEPARTED] = num
+        departures.counts[w, COUNT_DEPARTED] = num
         worlds.num_owned[w] = worlds.num_rows[w] = num
 
     def _is_clear(self, roads: RoadArrays, rows: NDArray[np.void]) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import CapacityError, SumoError
 from cavmarl.core.math.elementary_arrays import cos_all, sin_all
-from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
+from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, Worlds, ZoneState
 from cavmarl.core.records.codes import COUNT_REROUTED, LANE_GIVEN, POS_GIVEN, SPEED_MAX
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.traffic.kernels.mirroring import greet, list_others, mirror, send_on
@@ -106,9 +106,9 @@ class SumoTraffic:
         self,
         demand: SumoDemand,
         network: RoadNetwork,
-        travel: Travel,
+        travel: TripTables,
         first_step: int,
-        zoned: Zoned,
+        zoned: ZoneState,
         blank: NDArray[np.void],
     ) -> None:
         self.drives = demand.drives
@@ -189,15 +189,17 @@ class SumoTraffic:
             for w in range(len(worlds.ticks))
         )
 
-    def forgive(self, gate: Gate) -> None:
+    def forgive(self, departures: DepartureQueue) -> None:
         """Mark the leaving vehicles that have not arrived but been lifted off the road."""
-        for w, num in enumerate(gate.num_passing.tolist()):
-            leaving = gate.passing[w, :num]
+        for w, num in enumerate(departures.num_passing.tolist()):
+            leaving = departures.passing[w, :num]
             lifted = np.isin(leaving["order"], self.worlds.at(w).teleported)
             leaving["events"][lifted] = 0
 
-    def let_in(self, gate: Gate, worlds: Worlds, running: NDArray[np.int64]) -> bool:
-        """Fill `gate.passing` with the vehicles that SUMO has let in; whether there are any.
+    def let_in(
+        self, departures: DepartureQueue, worlds: Worlds, running: NDArray[np.int64]
+    ) -> bool:
+        """Fill `departures.passing` with the vehicles that SUMO has let in; whether there are any.
 
         `running`: (W,) vehicles that are in each world.
 
@@ -216,14 +218,14 @@ class SumoTraffic:
                 now.departed,
                 now.speed_factors,
                 self._blank,
-                gate,
+                departures,
                 w,
                 int(worlds.ticks[w]),
                 worlds.keys[w],
             )
-        return bool(gate.num_passing.any())
+        return bool(departures.num_passing.any())
 
-    def order(self, gate: Gate, worlds: Worlds) -> None:
+    def order(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Put the vehicles that SUMO has let in at the end of the queue, with routes of theirs.
 
         Raises CapacityError: more wait than there is room for.
@@ -232,18 +234,18 @@ class SumoTraffic:
             now = self.worlds.at(w)
             come = zip(now.departed.tolist(), now.speed_factors, now.stops, strict=True)
             for number, factor, stops in come:
-                if gate.num_queue[w] == gate.queue.shape[1]:
-                    self._check_room(gate.queue.shape[1] + 1)
-                row = gate.queue[w, gate.num_queue[w]]
+                if departures.num_queue[w] == departures.queue.shape[1]:
+                    self._check_room(departures.queue.shape[1] + 1)
+                row = departures.queue[w, departures.num_queue[w]]
                 self._fill(row, now.seen[np.searchsorted(now.seen["number"], number)], w)
-                row["id"] = gate.next_id[w]
+                row["id"] = departures.next_id[w]
                 row["due"] = worlds.ticks[w] + 1
                 row["speed_factor"] = factor
                 row["stop"], row["stops_end"] = stops
-                gate.next_id[w] += 1
-                gate.num_queue[w] += 1
+                departures.next_id[w] += 1
+                departures.num_queue[w] += 1
 
-    def send_on(self, gate: Gate, worlds: Worlds, side: int) -> None:
+    def send_on(self, departures: DepartureQueue, worlds: Worlds, side: int) -> None:
         """Give our vehicles, driving and waiting, the routes that SUMO has changed."""
         for w in range(len(worlds.ticks)):
             now, paths = self.worlds.at(w), self.worlds.paths(w)
@@ -251,10 +253,10 @@ class SumoTraffic:
                 continue
             places = np.searchsorted(now.seen["number"], now.rerouted)
             chosen = now.seen["route"][places].astype(np.int64)
-            gate.counts[w, COUNT_REROUTED] += self._send_on(
+            departures.counts[w, COUNT_REROUTED] += self._send_on(
                 self._roads, paths, now.rerouted, chosen, self._zoned, side, w
             )
-            waiting = gate.queue[w, : gate.num_queue[w]]
+            waiting = departures.queue[w, : departures.num_queue[w]]
             for n in np.flatnonzero(np.isin(waiting["order"], now.rerouted)):
                 row = waiting[n]
                 path = int(chosen[np.searchsorted(now.rerouted, row["order"])])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.neighbors import cell_columns, cell_rows, fill_grid
-from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
+from cavmarl.core.records.arrays import RoadArrays, SharedState, ZoneState
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.v2x.kernels.v2x_air import (
     band_of,
@@ -271,7 +271,7 @@ def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, scratch: V2
 
 @kernel
 def _place_receivers(
-    zoned: Zoned,
+    zoned: ZoneState,
     side: int,
     w: int,
     num: int,
@@ -316,8 +316,8 @@ def exchange_messages(
     roads: RoadArrays,
     types: NDArray[np.void],
     units: NDArray[np.void],
-    common: Common,
-    zoned: Zoned,
+    common: SharedState,
+    zoned: ZoneState,
     side: int,
     first: int,
     last: int,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.walls import Walls
-from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
+from cavmarl.core.records.arrays import RoadArrays, SharedState, ZoneState
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.signal_phases import program_at
 from cavmarl.v2x.kernels.v2x_channel import is_equipped, packet_word
@@ -43,7 +43,7 @@ STANDS_MPS = 0.1
 
 @kernel
 def gather(
-    zoned: Zoned, side: int, w: int, stations: NDArray[np.void], spare: NDArray[np.void]
+    zoned: ZoneState, side: int, w: int, stations: NDArray[np.void], spare: NDArray[np.void]
 ) -> int:
     """List the vehicles of all zones of a world by id; returns how many.
 
@@ -245,7 +245,7 @@ def send_from_vehicles(
     mail: Mail,
     w: int,
     slot: int,
-    zoned: Zoned,
+    zoned: ZoneState,
     side: int,
     num: int,
     key: np.uint64,
@@ -306,7 +306,7 @@ def send_from_units(
     w: int,
     slot: int,
     roads: RoadArrays,
-    common: Common,
+    common: SharedState,
     units: NDArray[np.void],
     types: NDArray[np.void],
     walls: Walls,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import cosine, sine
-from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.arrays import ZoneState
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance, zone_of
 
 NEAR = np.dtype(
@@ -39,7 +39,7 @@ class Borders(NamedTuple):
 def find_near(
     zones: ZoneArrays,
     borders: Borders,  # when a vehicle is near one
-    zoned: Zoned,  # the rows of all zones
+    zoned: ZoneState,  # the rows of all zones
     side: int,  # whose rows, 0 or 1
     w: int,
     # whether to look at all owned rows, and not only at those that `exchange` has found near a
@@ -126,7 +126,7 @@ def pass_on(
     row: int,  # where it probably is there
     target: int,  # the zone that will own it
     epoch: int,  # from then on
-    zoned: Zoned,  # the rows of all zones, and how many they are
+    zoned: ZoneState,  # the rows of all zones, and how many they are
     side: int,  # whose rows, 0 or 1
     w: int,
 ) -> int:
@@ -152,7 +152,7 @@ def pass_on(
 
 
 @kernel
-def give_up(vehicle: int, source: int, row: int, zoned: Zoned, side: int, w: int) -> bool:
+def give_up(vehicle: int, source: int, row: int, zoned: ZoneState, side: int, w: int) -> bool:
     """Make a vehicle that a zone owns one of its ghosts; whether it did own it."""
     row = _owned_row(vehicle, source, row, zoned, side, w)
     if row < 0:
@@ -164,7 +164,7 @@ def give_up(vehicle: int, source: int, row: int, zoned: Zoned, side: int, w: int
 
 
 @kernel
-def take_over(vehicle: int, target: int, epoch: int, zoned: Zoned, side: int, w: int) -> int:
+def take_over(vehicle: int, target: int, epoch: int, zoned: ZoneState, side: int, w: int) -> int:
     """Make a ghost of a zone a row that it owns, at an epoch: where it is; -1: it has none."""
     rows = zoned.rows[side, target, w]
     place = zoned.num_owned[target, w]
@@ -181,7 +181,7 @@ def take_over(vehicle: int, target: int, epoch: int, zoned: Zoned, side: int, w:
 
 
 @inlined_kernel
-def _owned_row(vehicle: int, zone: int, hint: int, zoned: Zoned, side: int, w: int) -> int:
+def _owned_row(vehicle: int, zone: int, hint: int, zoned: ZoneState, side: int, w: int) -> int:
     """Where a zone keeps a vehicle that it owns, probably at `hint`; -1: it does not own it."""
     rows = zoned.rows[side, zone, w]
     owned = zoned.num_owned[zone, w]

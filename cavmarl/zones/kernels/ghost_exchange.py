@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.compiled.prefetch import SOON, prefetch
-from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.arrays import ZoneState
 from cavmarl.core.records.codes import DRIVER_BACKGROUND
 from cavmarl.zones.kernels.borders import Borders
-from cavmarl.zones.kernels.handoff import BorderRecords, look_on
+from cavmarl.zones.kernels.ownership_changes import BorderRecords, look_on
 from cavmarl.zones.kernels.zone_lookup import (
     Halo,
     ZoneArrays,
@@ -39,7 +39,7 @@ def exchange(
     borders: Borders,  # when a vehicle is near one
     # the ghosts and how many there are, border and num_border are written. Of the owned rows those
     # in `outer` are looked at; they are noted here, if they are not yet
-    zoned: Zoned,
+    zoned: ZoneState,
     side: int,  # whose rows, 0 or 1
     first: int,  # the first world
     last: int,  # the one after the last
@@ -73,7 +73,7 @@ def gather(
     border_m: float,  # within that of another zone an owned row is at a border, m
     # the ghosts of this zone and how many there are, its border and num_border are written; outer
     # and num_outer stay
-    zoned: Zoned,
+    zoned: ZoneState,
     side: int,  # whose rows, 0 or 1
     zone: int,  # whose ghosts
     w: int,
@@ -125,7 +125,7 @@ def gather(
 def note_gathered(
     zones: ZoneArrays,
     borders: Borders,  # when a vehicle is near one
-    zoned: Zoned,  # num_outer is written: rows may change from here on
+    zoned: ZoneState,  # num_outer is written: rows may change from here on
     side: int,  # whose rows, 0 or 1
     book: BorderRecords,  # vehicles near a border are written
 ) -> None:
@@ -142,7 +142,7 @@ def _publish(
     halo: Halo,
     touching_m: float,
     border_m: float,
-    zoned: Zoned,
+    zoned: ZoneState,
     side: int,
     zone: int,
     w: int,
@@ -212,7 +212,9 @@ def _note_due(
 
 
 @kernel
-def _send(zoned: Zoned, side: int, zone: int, w: int, due: NDArray[np.void], num_due: int) -> None:
+def _send(
+    zoned: ZoneState, side: int, zone: int, w: int, due: NDArray[np.void], num_due: int
+) -> None:
     """Copy rows of a zone to those that they are due to, and note which are at a border."""
     for n in range(num_due):
         if n + SOON < num_due:
@@ -230,7 +232,9 @@ def _send(zoned: Zoned, side: int, zone: int, w: int, due: NDArray[np.void], num
 
 
 @kernel
-def _note_all_outer(inner: NDArray[np.float64], zoned: Zoned, side: int, zone: int, w: int) -> None:
+def _note_all_outer(
+    inner: NDArray[np.float64], zoned: ZoneState, side: int, zone: int, w: int
+) -> None:
     """Note a zone's outer rows, as `advance` does, where rows have changed since."""
     outer = 0
     for i in range(zoned.num_owned[zone, w]):
@@ -243,7 +247,7 @@ def _note_all_outer(inner: NDArray[np.float64], zoned: Zoned, side: int, zone: i
 
 @inlined_kernel
 def _take_ghost(
-    zoned: Zoned, side: int, source: int, i: int, zone: int, w: int, near: bool
+    zoned: ZoneState, side: int, source: int, i: int, zone: int, w: int, near: bool
 ) -> None:
     """Put row i of a zone behind those of another, before ghosts that can touch none if it can.
 

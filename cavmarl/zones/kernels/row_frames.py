@@ -61,7 +61,7 @@ class Ghosts(NamedTuple):
 
 
 class Passing(NamedTuple):
-    """What leaves, as the gate has it."""
+    """What leaves, as the departure queue has it."""
 
     rows: Words  # (W, C + D, V)
     num: NDArray[np.int64]  # (W,)
@@ -244,7 +244,7 @@ def take_frame(
     now: Ghosts,  # written: the ghosts, first of all
     frame: Words,
 ) -> int:
-    """Put what another process has packed behind the rows of zones of this one, and in the gate.
+    """Append rows that another process packed to the rows of these zones and the departure queue.
 
     Ghosts that can touch a vehicle come before those that cannot.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.compiled.prefetch import SOON, prefetch
 from cavmarl.core.math.buckets import add, forget, lay_out
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.core.records.rows import MERGES_M, SWEPT_BEYOND_M, is_lost
 from cavmarl.driving.kernels.junctions.gaps import STATE_MAJOR
@@ -49,7 +49,7 @@ APPROACH = np.dtype(
 @kernel
 def register_links(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,), of which `num` live
     num: int,  # live rows
     step: NDArray[np.void],  # (C,) the PLAN of each row's lane; updated
@@ -123,7 +123,7 @@ def _note(
 
 @kernel
 def _announce_claims(
-    roads: RoadArrays, travel: Travel, row: np.void, i: int, pairs: int, scratch: Scratch
+    roads: RoadArrays, travel: TripTables, row: np.void, i: int, pairs: int, scratch: Scratch
 ) -> int:
     """Register a row that follows a script, at the links of its script."""
     frame = travel.scripts.frames[row["goal"]]
@@ -153,7 +153,7 @@ def _link_into(roads: RoadArrays, row: np.void) -> int:
 @inlined_kernel
 def _announce(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     i: int,
     step: np.void,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS, can_be_ignored
 
@@ -34,7 +34,7 @@ def on_equal_road(roads: RoadArrays, link: int) -> bool:
 
 
 @inlined_kernel
-def drives_as_sumo(travel: Travel, row: np.void) -> bool:
+def drives_as_sumo(travel: TripTables, row: np.void) -> bool:
     """Return whether a vehicle is a background vehicle whose driver behaves as in SUMO."""
     if row["driver"] != DRIVER_BACKGROUND:
         return False
@@ -43,7 +43,7 @@ def drives_as_sumo(travel: Travel, row: np.void) -> bool:
 
 
 @inlined_kernel
-def resolves_deadlocks(roads: RoadArrays, travel: Travel, row: np.void, link: int) -> bool:
+def resolves_deadlocks(roads: RoadArrays, travel: TripTables, row: np.void, link: int) -> bool:
     """Return whether the driver of a vehicle resolves deadlocks at `link`, which it takes next.
 
     Drivers as in SUMO do so before a junction of equal roads.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
@@ -180,7 +180,7 @@ def _is_committed(foe: np.void, front: float) -> bool:
 @kernel
 def _is_harmless(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     row: np.void,
     link: int,
@@ -227,7 +227,7 @@ def _is_harmless(
 
 
 @inlined_kernel
-def _brisk(travel: Travel, row: np.void) -> float:
+def _brisk(travel: TripTables, row: np.void) -> float:
     """Return the assumed acceleration of a vehicle in m/s², at most that of its type."""
     brisk: float = BRISK_ACCEL
     if row["driver"] != DRIVER_AGENT:
@@ -312,7 +312,7 @@ def _comes(
 @kernel
 def _blocks_inside(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     link: int,
     distance: float,
@@ -358,7 +358,7 @@ def _blocks_inside(
 @kernel
 def foe_blocks(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     row: np.void,
     link: int,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
@@ -47,11 +47,11 @@ from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
 
-# m/s²: a driver stops at yellow if this deceleration suffices; drivers as in SUMO stop if their full
-# deceleration suffices.
+# m/s²: a driver stops at yellow if this deceleration suffices. Drivers as in SUMO stop if their
+# full deceleration suffices.
 COMFORT_STOP = 3.0
 STEERED_MPS = 5.0  # assumed top speed of a steered car in a turn
-SEE_FOES_M = 4.5  # until this distance a driver that yields is ready to stop, as in SUMO
+SEE_FOES_M = 4.5  # up to this distance, a driver that yields is ready to stop, as in SUMO
 LAST_CHANCE_M = 3.0  # distance of the front to the line at which a driver still goes at yellow
 STUB_LANES = 4  # number of lanes ahead that are searched for a stop sign
 EXIT_LANES = 4  # number of lanes behind a junction that are searched for room
@@ -68,7 +68,7 @@ STOP_SIGN_M = MOST_BACK_M + 2.0 * LINE_MARGIN_M
 @kernel
 def _blocked_by_foes(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     link: int,
@@ -133,7 +133,7 @@ def _blocked_by_foes(
 
 @kernel
 def _exit_blocked(
-    roads: RoadArrays, travel: Travel, row: np.void, link: int, way: int, scratch: Scratch
+    roads: RoadArrays, travel: TripTables, row: np.void, link: int, way: int, scratch: Scratch
 ) -> bool:
     """Return whether a row could not clear the junction behind the next standing vehicle ahead.
 
@@ -174,7 +174,7 @@ def _exit_blocked(
 @kernel
 def may_enter(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     i: int,  # row of the vehicle
     link: int,  # LINK row
@@ -305,7 +305,7 @@ def behind_merging(
 @kernel
 def waits_inside(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     link: int,
@@ -356,7 +356,7 @@ def before_waiting(
 @kernel
 def constraint_inside(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     i: int,  # row of the vehicle
     link: int,  # that the vehicle drives on

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import lane_pose
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 from cavmarl.driving.kernels.junctions.swept_areas import BUS_M
 from cavmarl.driving.kernels.lanes.lane_index import ahead_on, beside_s, last_on
@@ -30,7 +30,7 @@ def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> fl
 
 @inlined_kernel
 def swings_back_m(
-    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], leader: np.void
+    roads: RoadArrays, travel: TripTables, rows: NDArray[np.void], leader: np.void
 ) -> float:
     """Return how far a leader's rear may move back, in m: a bus's rear does so in a U-turn."""
     if leader["half"] <= 0.5 * BUS_M:
@@ -46,7 +46,7 @@ def swings_back_m(
 
 @kernel
 def behind_adjacent_leader(
-    roads: RoadArrays, travel: Travel, kind: np.void, row: np.void, lane: int, scratch: Scratch
+    roads: RoadArrays, travel: TripTables, kind: np.void, row: np.void, lane: int, scratch: Scratch
 ) -> float:
     """Return the constraint of the leader on an adjacent lane that the body covers, or will."""
     target = roads.lanes[lane]
@@ -93,7 +93,7 @@ def _sticks_out(roads: RoadArrays, other: np.void, to_left: bool) -> bool:
 @kernel
 def askew_beside(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     lane: int,
     s: float,
@@ -127,7 +127,7 @@ def askew_beside(
 @kernel
 def behind_askew(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     kind: np.void,
     row: np.void,  # VEHICLE of an agent

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.driving.kernels.lanes.lane_choice import LOOK_BACK_M, SIDE_GAP_M
 from cavmarl.driving.kernels.lanes.lane_index import behind_by, beside_s
 from cavmarl.driving.kernels.models.following import accel_behind
@@ -16,7 +16,7 @@ COOPERATIVE_DECEL = 3.0  # m/s², largest deceleration to let a vehicle merge or
 
 @kernel
 def brake_for_merging(
-    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], row: np.void, scratch: Scratch
+    roads: RoadArrays, travel: TripTables, rows: NDArray[np.void], row: np.void, scratch: Scratch
 ) -> None:
     """Slow down the follower on the lane that a vehicle needs to change to.
 
@@ -37,7 +37,7 @@ def brake_for_merging(
 @kernel
 def _brake_follower(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     row: np.void,
     target: int,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.driving.kernels.lanes.lane_change import (
     LANE_CHANGE_DELAY_S,
@@ -56,7 +56,7 @@ MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 
 
 @inlined_kernel
-def needed_change(roads: RoadArrays, travel: Travel, row: np.void, step: np.void) -> int:
+def needed_change(roads: RoadArrays, travel: TripTables, row: np.void, step: np.void) -> int:
     """The side that a vehicle's way needs it to change to by now: 1 left, -1 right, 0 none.
 
     `step` is its own one.
@@ -90,7 +90,7 @@ def _desired(roads: RoadArrays, kind: np.void, row: np.void, lane: int) -> float
 @kernel
 def wish_on_lane(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     k: int,  # its entry
     scratch: Scratch,
@@ -130,7 +130,7 @@ def _is_left_slowly(scratch: Scratch, lane: np.void, front: float, gap_m: float)
 
 @inlined_kernel
 def _next_beyond(
-    roads: RoadArrays, travel: Travel, row: np.void, lane: int, far: float, scratch: Scratch
+    roads: RoadArrays, travel: TripTables, row: np.void, lane: int, far: float, scratch: Scratch
 ) -> tuple[int, float]:
     """The entry of the next vehicle behind the end of a lane, and how far ahead its centre is.
 
@@ -153,7 +153,7 @@ def _next_beyond(
 @kernel
 def _asked_of_followers(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     row: np.void,
     target: int,
@@ -189,7 +189,7 @@ def _asked_of_followers(
 @kernel
 def _change_is_safe(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     target: int,
@@ -258,7 +258,7 @@ def _rear_is_inside(lane: np.void, row: np.void) -> bool:
 @inlined_kernel
 def _may_change(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     side: int,
@@ -324,7 +324,7 @@ def thinks_of_lanes(row: np.void, needed: int, tick: int, dt: float) -> bool:
 @inlined_kernel
 def choose_lane(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     tick: int,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
 from cavmarl.driving.kernels.junctions.swept_areas import VAN_M, before_foe_sweep, behind_fork
 from cavmarl.driving.kernels.lanes.adjacent_leaders import behind_adjacent_leader, behind_entry
@@ -23,7 +23,7 @@ from cavmarl.driving.kernels.models.following import before_line, behind, no_con
 @kernel
 def lane_end(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     kind: np.void,
     lane: int,
@@ -78,7 +78,7 @@ def _behind_turning(
 
 
 @kernel
-def misses_change(roads: RoadArrays, travel: Travel, lane: int, way: int) -> bool:
+def misses_change(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> bool:
     """Whether a lane that the way leaves sideways leads on to a turn that a car cannot take."""
     if roads.lanes[lane]["internal"]:
         return False
@@ -93,7 +93,7 @@ def misses_change(roads: RoadArrays, travel: Travel, lane: int, way: int) -> boo
 @kernel
 def behind_over_line(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,
     kind: np.void,
     lane: int,
@@ -153,7 +153,7 @@ def over_end(
 @kernel
 def behind_beside(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     rows: NDArray[np.void],
     i: int,
     kind: np.void,

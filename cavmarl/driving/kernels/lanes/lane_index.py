@@ -17,7 +17,7 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.compiled.prefetch import SOON, prefetch
 from cavmarl.core.math.buckets import add, forget, lay_out
 from cavmarl.core.math.geometry import segment_at
-from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.junctions.stop_line_registration import registration_distance_m
@@ -90,7 +90,7 @@ def _fill(
 @kernel
 def index_lanes(
     roads: RoadArrays,
-    travel: Travel,  # the vehicles' types
+    travel: TripTables,  # the vehicles' types
     rows: NDArray[np.void],  # VEHICLE (C,), of which `num` live
     num: int,  # live rows
     scratch: Scratch,  # the lists by lane and entries are written
@@ -153,7 +153,7 @@ def _make_place(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 
 @kernel
-def _count_covers(travel: Travel, row: np.void, scratch: Scratch) -> None:
+def _count_covers(travel: TripTables, row: np.void, scratch: Scratch) -> None:
     """Ask for the entries of a row that follows a script."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_cover"], frame["first_cover"] + frame["num_covers"]):
@@ -161,7 +161,7 @@ def _count_covers(travel: Travel, row: np.void, scratch: Scratch) -> None:
 
 
 @kernel
-def _insert_covers(travel: Travel, row: np.void, i: int, scratch: Scratch) -> None:
+def _insert_covers(travel: TripTables, row: np.void, i: int, scratch: Scratch) -> None:
     """Put a row that follows a script onto all lanes that it covers, or is about to cover."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_cover"], frame["first_cover"] + frame["num_covers"]):

@@ -1,9 +1,9 @@
 """Route following: which lane and link a vehicle takes at the end of a lane.
 
-All plans lie in one table, `Travel.steps`. A vehicle's `way` says where in it: the step of a lane
-outside junctions is `steps[way + lane]`. The plan of a goal covers every lane, so its way never
-changes. An explicit route has steps for its own edges only, one edge after the other; each step
-says by how much the way shifts on the next edge. Inside junctions lanes have one successor.
+All plans lie in one table, `TripTables.steps`. A vehicle's `way` says where in it: the step of a
+lane outside junctions is `steps[way + lane]`. The plan of a goal covers every lane, so its way
+never changes. An explicit route has steps for its own edges only, one edge after the other; each
+step says by how much the way shifts on the next edge. Inside junctions lanes have one successor.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.roads.kernels.signal_phases import program_at
 
 MOST_CHANGES = 8  # of lanes at the end of one lane
@@ -19,7 +19,7 @@ MOST_CHANGES = 8  # of lanes at the end of one lane
 
 @inlined_kernel
 def own_step(roads: RoadArrays, row: np.void) -> int:
-    """Where in `Travel.steps` a vehicle is: at its lane's step, in a junction at the next one's."""
+    """Return the index in `TripTables.steps`: of its lane, or in a junction of the next lane."""
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
@@ -35,7 +35,7 @@ def next_step_from(roads: RoadArrays, step: np.void, lane: int, way: int) -> tup
 
 
 @inlined_kernel
-def next_step(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[int, int, int]:
+def next_step(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> tuple[int, int, int]:
     """What follows the end of a lane: (lane, way there, link that is entered).
 
     The lane is -1 where the way ends or goes on from another lane; the link is -1 inside junctions.
@@ -72,7 +72,7 @@ def distance_left(roads: RoadArrays, row: np.void, step: np.void) -> float:
 
 @kernel
 def next_step_of_plan(
-    roads: RoadArrays, travel: Travel, lane: int, way: int
+    roads: RoadArrays, travel: TripTables, lane: int, way: int
 ) -> tuple[int, int, int]:
     """`next_step`, from the lane that the plan asks for where it does not go on from this one."""
     for _ in range(MOST_CHANGES):
@@ -89,8 +89,8 @@ def next_step_of_plan(
 
 
 @kernel
-def route_time_s(roads: RoadArrays, travel: Travel, row: np.void, begin_s: float) -> float:
-    """Return the time in s of a route at its limits, times `Travel.trip_horizon`, and signals.
+def route_time_s(roads: RoadArrays, travel: TripTables, row: np.void, begin_s: float) -> float:
+    """Return the time in s of a route at its limits, times `TripTables.trip_horizon`, and signals.
 
     Each signal counts with a whole cycle of the program that is on at `begin_s`.
     """

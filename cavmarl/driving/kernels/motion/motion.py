@@ -17,7 +17,7 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import atan, atan2
 from cavmarl.core.math.geometry import lane_pose, segment_at, wrap_angle
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, TripTables
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_RED_LIGHT, SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
@@ -57,7 +57,9 @@ def before_tick(row: np.void) -> Before:
 
 
 @kernel
-def _way_point(roads: RoadArrays, travel: Travel, row: np.void, s: float) -> tuple[float, float]:
+def _way_point(
+    roads: RoadArrays, travel: TripTables, row: np.void, s: float
+) -> tuple[float, float]:
     """X and y of a place on a vehicle's way, `s` m from the start of its lane, or behind it."""
     lane = row["lane"]
     way = row["way"]
@@ -98,7 +100,7 @@ def lane_before(roads: RoadArrays, lane: int, link: int) -> int:
 
 
 @inlined_kernel
-def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
+def place_on_lane(roads: RoadArrays, travel: TripTables, row: np.void) -> float:
     """Set x, y, z and pitch from lane, s and d; returns the direction of the body in rad.
 
     Both bumpers are on the way: in a bend the body is its chord.
@@ -151,7 +153,7 @@ def account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: fl
 
 
 @kernel
-def _cross_borders(roads: RoadArrays, travel: Travel, row: np.void) -> bool:
+def _cross_borders(roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
     """Carry s beyond lane ends over to the lanes of the way; False where the way ends."""
     for _ in range(CROSSINGS_PER_TICK):
         length = roads.lanes[row["lane"]]["length_m"]
@@ -187,7 +189,7 @@ def _stand(row: np.void, throttle: float, dt: float) -> None:
 @inlined_kernel
 def move_background(
     roads: RoadArrays,
-    travel: Travel,
+    travel: TripTables,
     row: np.void,  # VEHICLE, the committed record, which becomes the next one
     step: np.void,  # PLAN, its own step before the tick
     accel: float,  # decided acceleration in m/s²

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.core.compiled import inlined_kernel
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import UNTIL_DEPARTURE
 
 STANDING_MPS = 0.1
@@ -16,7 +16,7 @@ LANE_EARLY_M = 100.0  # this far before it the driver wants its lane
 
 
 @inlined_kernel
-def distance_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> float:
+def distance_to_stop(roads: RoadArrays, travel: TripTables, row: np.void) -> float:
     """Return the distance in m from a vehicle's front to its next stop on this edge, or inf."""
     if row["stop"] < 0 or row["stop"] == row["stops_end"]:
         return np.inf
@@ -32,7 +32,7 @@ def distance_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> float:
 
 
 @inlined_kernel
-def change_for_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
+def change_for_stop(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
     """Return the side to which a vehicle has to change for its next stop: 1 left, -1 right, 0 none.
 
     The result is `STAY` if it is on that lane already.
@@ -52,7 +52,7 @@ def change_for_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
 @inlined_kernel
 def advance_stop(
     roads: RoadArrays,
-    travel: Travel,  # with the stops
+    travel: TripTables,  # with the stops
     row: np.void,  # VEHICLE after the tick, written
     lane_before: int,  # LANE that it was on before
     dt: float,  # seconds a tick

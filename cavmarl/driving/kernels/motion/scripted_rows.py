@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step
 from cavmarl.driving.kernels.motion.motion import account, before_tick
@@ -34,7 +34,7 @@ def stand_at(frame: np.void, row: np.void) -> None:
 
 
 @inlined_kernel
-def _let_go(roads: RoadArrays, travel: Travel, row: np.void, goal: int) -> None:
+def _let_go(roads: RoadArrays, travel: TripTables, row: np.void, goal: int) -> None:
     """Make a row that of a background vehicle on its way to a goal."""
     row["driver"] = DRIVER_BACKGROUND
     row["goal"] = goal
@@ -45,7 +45,7 @@ def _let_go(roads: RoadArrays, travel: Travel, row: np.void, goal: int) -> None:
 @inlined_kernel
 def follow_script(
     roads: RoadArrays,
-    travel: Travel,  # with the scripts
+    travel: TripTables,  # with the scripts
     cues: NDArray[np.int64],  # (T,) the tick in which each came, -1: not yet
     row: np.void,  # VEHICLE, the committed record, which becomes the next one
     dt: float,  # seconds of the tick

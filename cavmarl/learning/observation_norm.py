@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts
-from cavmarl.learning.starting import begin_with
+from cavmarl.learning.warm_start import begin_with
 from cavmarl.policies.network_files import NetworkConfig
 
 LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up

@@ -23,8 +23,8 @@ from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.core.errors import ConfigError, ServiceError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate import evaluate
+from cavmarl.viewer.live_env import ShownEnv
 from cavmarl.viewer.run_loads import load_rows
-from cavmarl.viewer.shown_env import ShownEnv
 from cavmarl.viewer.web_options import WebOptions
 from tests.viewer.test_web_server import ended_with, first_of
 

@@ -17,7 +17,7 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.client.flows import AGAIN_S, RETRIED_S, Ask, Flow, Rest, ServiceFlows, check
+from cavmarl.client.service_protocol import AGAIN_S, RETRIED_S, Ask, Flow, Rest, ServiceFlows, check
 from cavmarl.core.errors import ActionError, ServiceError
 
 RECOVERY_S = 60.0

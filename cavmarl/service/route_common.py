@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path
 
-from cavmarl.service import bodies
-from cavmarl.service.guards import DurableRoute, may, open_to_all
-from cavmarl.service.infrastructure import IdentityRecord
-from cavmarl.service.refusals import PROBLEM_SCHEMA, PROBLEM_TYPE
+from cavmarl.service import requests
+from cavmarl.service.auth import DurableRoute, may, open_to_all
+from cavmarl.service.error_names import PROBLEM_SCHEMA, PROBLEM_TYPE
+from cavmarl.service.service_records import IdentityRecord
 
 OCTETS = "application/octet-stream"
 PROBLEM: dict[int | str, dict[str, Any]] = {
@@ -45,6 +45,6 @@ Admins = Annotated[IdentityRecord, Depends(may("admin"))]
 Nodes = Annotated[IdentityRecord, Depends(may("node"))]
 Anybody = Annotated[IdentityRecord, Depends(open_to_all())]
 
-NodeName = Annotated[bodies.Name, Path()]
+NodeName = Annotated[requests.Name, Path()]
 SessionId = Annotated[str, Path(pattern=r"^s-[0-9a-f]{24}$")]
-FileName = Annotated[bodies.Name, Path()]
+FileName = Annotated[requests.Name, Path()]

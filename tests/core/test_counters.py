@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.core.math.tallies import begins_second, count_tick, occasions, totals
+from cavmarl.core.math.counters import begins_second, count_tick, occasions, totals
 
 
 @pytest.mark.parametrize(("ticks", "expected"), [([3, 7], False), ([3, 20], True), ([0, 1], True)])

@@ -16,9 +16,9 @@ from fastapi.security.base import SecurityBase
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.access import Access
 from cavmarl.service.broker import Broker
-from cavmarl.service.infrastructure import ROLES, IdentityRecord
+from cavmarl.service.error_names import problem
 from cavmarl.service.rate_limit import RateLimit
-from cavmarl.service.refusals import problem
+from cavmarl.service.service_records import ROLES, IdentityRecord
 
 MOST_HELD = 64
 

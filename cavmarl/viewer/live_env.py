@@ -10,15 +10,15 @@ from functools import partial
 from typing import Any
 
 from cavmarl.engine.world_frame import WorldFrame
-from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.frame_publisher import FramePublisher
 from cavmarl.viewer.inserted_here import put_in
 from cavmarl.viewer.page_requests import PageRequest
 from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.show_world import check_extra, serve_stages
-from cavmarl.viewer.stage import first_stage
+from cavmarl.viewer.subscribers import Audience
 from cavmarl.viewer.vehicle_details import Shown, hello_of, vehicle_details
+from cavmarl.viewer.viewed_world import first_stage
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
 FRAME_HEIGHT_PX = 560  # in a notebook

@@ -13,8 +13,8 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.frame_publisher import ASKED, TIME_LINE, FramePublisher
 from cavmarl.viewer.recorded_sensors import RecordedSensors
 from cavmarl.viewer.run_clock import RunClock
-from cavmarl.viewer.stage import Stage, first_stage
 from cavmarl.viewer.vehicle_details import hello_of_map, vehicle_state
+from cavmarl.viewer.viewed_world import Stage, first_stage
 
 MOST_TOLD = 500  # events of an episode
 QUIET = frozenset({"arrived", "transferred"})  # left out first where there are more

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.arrays import ZoneState
 from cavmarl.zones.kernels.borders import Borders
-from cavmarl.zones.kernels.handoff import (
+from cavmarl.zones.kernels.ownership_changes import (
     NOT_SEEN,
     BorderRecords,
     hand_over,
@@ -27,7 +27,7 @@ BORDERS = Borders(hysteresis_m=2.0, ahead_s=0.2, max_speed_mps=60.0)
 
 def world(
     *places: tuple[float, float, float], ids: list[int], speed: float = 10.0
-) -> tuple[Zoned, BorderRecords]:
+) -> tuple[ZoneState, BorderRecords]:
     """Vehicles of zone 0 at (x, y, heading), seen by all zones at tick 7."""
     rows = vehicles(list(places), speed=speed, id=np.array(ids), epoch=4)
     book = make_book(1, 16)
@@ -36,12 +36,12 @@ def world(
     return exchanged(PARTITION, 60.0, parts, borders=BORDERS, book=book), book
 
 
-def call(zoned: Zoned, book: BorderRecords, everybody: bool = False, newborn: int = 0) -> int:
+def call(zoned: ZoneState, book: BorderRecords, everybody: bool = False, newborn: int = 0) -> int:
     arguments = (PARTITION.arrays, BORDERS, zoned, SIDE, 0)
     return int(hand_over(*arguments, everybody, newborn, book))
 
 
-def next_tick(zoned: Zoned, book: BorderRecords) -> None:
+def next_tick(zoned: ZoneState, book: BorderRecords) -> None:
     """Look on, after rows have moved."""
     book.ms[0] += 1.0
     owned = zoned.num_owned[0, 0]

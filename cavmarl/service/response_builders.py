@@ -8,16 +8,16 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from dataclasses import asdict
 
-from cavmarl.service import answers
+from cavmarl.service import responses
+from cavmarl.service.auth import Service
 from cavmarl.service.broker import Broker
-from cavmarl.service.guards import Service
-from cavmarl.service.infrastructure import (
+from cavmarl.service.node_selection import NoNodeError, score_of
+from cavmarl.service.service_records import (
     IdentityRecord,
     LogEvent,
     NodeRecord,
     SessionRecord,
 )
-from cavmarl.service.node_selection import NoNodeError, score_of
 
 TLS = "tls"  # the capability of nodes whose clients' port has it
 KEEP_ALIVE_S = 15.0
@@ -29,7 +29,7 @@ async def assigned(
     subject: str,  # of the event, if there is no node
     take: Callable[[], SessionRecord],
     wait_s: float,
-) -> answers.Assignment:
+) -> responses.Assignment:
     """What a client needs to reach its world; it waits for a node until a deadline."""
     broker = service.broker
     try:
@@ -42,14 +42,14 @@ async def assigned(
             session = await _awaited(broker, identity, subject, take, wait_s)
     node = broker.log.state.nodes[session.node or ""]
     lease_s = broker.rules.lease_s
-    return answers.Assignment(
+    return responses.Assignment(
         session=session.id,
         requested=session.preferred,
         assigned=node.name,
         redirected=session.preferred not in (None, node.name),
         reason=session.reason,
         score=session.score,
-        excluded=[answers.Excluded(**one) for one in session.excluded],
+        excluded=[responses.Excluded(**one) for one in session.excluded],
         excluded_count=session.excluded_count,
         scheme="https" if TLS in node.capabilities else "http",
         address=node.address,
@@ -93,12 +93,12 @@ async def _awaited(
         broker.waiting -= 1
 
 
-def node_answer(service: Service, node: NodeRecord) -> answers.NodeStatus:
+def node_answer(service: Service, node: NodeRecord) -> responses.NodeStatus:
     """A node, with what its last beat said."""
     live = service.broker.live[node.name]
-    return answers.NodeStatus(
+    return responses.NodeStatus(
         **asdict(node),
-        load=None if live.use is None else answers.Load(**asdict(live.use)),
+        load=None if live.use is None else responses.Load(**asdict(live.use)),
         score=score_of(node, live),
         sessions=len(live.hosted),
         zones_of=list(live.zones_of),
@@ -106,20 +106,20 @@ def node_answer(service: Service, node: NodeRecord) -> answers.NodeStatus:
     )
 
 
-def session_answer(service: Service, session: SessionRecord) -> answers.Session:
+def session_answer(service: Service, session: SessionRecord) -> responses.Session:
     """A session or a job, without what only its node needs."""
     found = asdict(session)
     del found["saved_blob"], found["owners"]
     live = service.broker.live.get(session.node or "")
     progress = None if live is None else live.jobs.get(session.id)
-    return answers.Session(**found, progress=progress)
+    return responses.Session(**found, progress=progress)
 
 
-def event_answer(line: LogEvent) -> answers.EventLine:
+def event_answer(line: LogEvent) -> responses.EventLine:
     """A line of the log, without what is never shown."""
     found = line._asdict()
     del found["private"]
-    return answers.EventLine(**found)
+    return responses.EventLine(**found)
 
 
 async def event_stream(

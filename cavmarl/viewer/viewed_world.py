@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.frame_messages import FrameEncoder
 from cavmarl.viewer.map_geometry import map_message, unpack
+from cavmarl.viewer.subscribers import Audience
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from cavmarl.core.tracebacks import print_traceback
 Found = TypeVar("Found")
 Tell = Callable[..., None]
 
-PROGRAM = "from cavmarl.evaluate.fresh import main; main()"
+PROGRAM = "from cavmarl.evaluate.subprocess_calls import main; main()"
 
 
 def call_in_fresh_process(

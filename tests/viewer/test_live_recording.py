@@ -15,8 +15,8 @@ from cavmarl.env.vector import make_vec
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.frame_messages import FRAME_HEAD, Publication
+from cavmarl.viewer.live_recording import ShownRecording, recording_stages
 from cavmarl.viewer.page_requests import PageRequest
-from cavmarl.viewer.shown_recording import ShownRecording, recording_stages
 
 STEPS = 30
 

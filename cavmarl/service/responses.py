@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from cavmarl.service.bodies import ConfigurationBody, Sha256
-from cavmarl.service.infrastructure import Role
+from cavmarl.service.requests import ConfigurationBody, Sha256
+from cavmarl.service.service_records import Role
 
 
 class _Answer(BaseModel):

@@ -6,8 +6,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.errors import MapError
-from cavmarl.core.whole_file import draft_folder
 from cavmarl.maps.defects import Defect, cut_off_edges, find_defects
 from cavmarl.maps.net_document import NetDocument
 from cavmarl.maps.netconvert_process import run_netconvert

@@ -14,8 +14,8 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from cavmarl.core.errors import CavmarlError, ServiceError
+from cavmarl.service.error_names import PROBLEM_TYPE, PROBLEMS
 from cavmarl.service.node_selection import NoNodeError
-from cavmarl.service.refusals import PROBLEM_TYPE, PROBLEMS
 
 MOST_EXCLUSIONS = 100  # that an answer names
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.evaluate.encounters import mirrored_conflicts
-from cavmarl.evaluate.kernels.watching import locate_agents, watch_encroachments
+from cavmarl.evaluate.kernels.near_misses import locate_agents, watch_encroachments
 from tests.naive.encroachment import Passage, least_encroachments
 from tests.support.traffic import network
 

@@ -38,7 +38,7 @@ def measure(
     common = {"zones.count": zones, **parse_settings(settings)}
     pair = {
         name: make_vec(env, overrides={**common, "zones.repartition_steps": often})
-        for name, often in (("static", 0), ("re-cut", every))
+        for name, often in (("static", 0), ("repartitioned", every))
     }
     uneven: dict[str, list[float]] = {name: [] for name in pair}
     taken: dict[str, list[float]] = {name: [] for name in pair}
@@ -52,7 +52,7 @@ def measure(
             raise EvaluationError(f"seed {seed}: the world that was cut anew is another one")
         vehicles.append(int(pair["static"].simulation.running()[0]))
     rows = [_row(name, vec, uneven[name], taken[name]) for name, vec in pair.items()]
-    ratios = np.array(uneven["re-cut"]) / np.array(uneven["static"])
+    ratios = np.array(uneven["repartitioned"]) / np.array(uneven["static"])
     interval = mean_interval(ratios)
     between = "" if interval is None else f" ({interval.low:.2f} to {interval.high:.2f})"
     mean = statistics.fmean(vehicles)
@@ -63,9 +63,9 @@ def measure(
             "max / mean": "mean_imbalance:.2f",
             "95 % between seeds": "between",
             "step, ms": "median_ms:.2f",
-            "re-cuts": "recuts",
+            "re-cuts": "repartitions",
             "moved": "moved",
-            "ms each": "recut_ms:.1f",
+            "ms each": "repartition_ms:.1f",
         },
         rows,
         notes=[
@@ -100,7 +100,7 @@ def _run_beside(
 
 
 def _row(name: str, vec: CavVectorEnv, uneven: list[float], taken: list[float]) -> dict[str, Any]:
-    recuts = vec.simulation.zones.recuts
+    repartitions = vec.simulation.zones.repartitions
     interval = mean_interval(np.array(uneven))
     return {
         "name": name,
@@ -109,9 +109,11 @@ def _row(name: str, vec: CavVectorEnv, uneven: list[float], taken: list[float]) 
         "between": None if interval is None else f"{interval.low:.2f} to {interval.high:.2f}",
         "step_ms": taken,
         "median_ms": statistics.median(taken),
-        "recuts": len(recuts),
-        "moved": sum(recut.moved for recut in recuts),
-        "recut_ms": statistics.median(recut.ms for recut in recuts) if recuts else None,
+        "repartitions": len(repartitions),
+        "moved": sum(repartitioned.moved for repartitioned in repartitions),
+        "repartition_ms": statistics.median(repartitioned.ms for repartitioned in repartitions)
+        if repartitions
+        else None,
     }
 
 

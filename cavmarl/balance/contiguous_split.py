@@ -8,7 +8,7 @@ from itertools import accumulate
 import numpy as np
 
 from cavmarl.balance.load_score import find_rejections
-from cavmarl.balance.refining import LEAST_GAIN
+from cavmarl.balance.local_search import LEAST_GAIN
 from cavmarl.balance.shard_placement import Placement
 from cavmarl.core.errors import NoAdmissibleWorkerError
 

@@ -12,7 +12,7 @@ from cavmarl.config.action import ActionConfig
 from cavmarl.config.sensors import ConflictsConfig, HistoryConfig, SensorsConfig
 from cavmarl.core.errors import PolicyError
 from cavmarl.learning.actor_critic import ActorCritic, save_network
-from cavmarl.learning.starting import begin_with
+from cavmarl.learning.warm_start import begin_with
 from cavmarl.policies.network_files import NetworkConfig
 from cavmarl.sensors.observed import feature_names
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.arrays import ZoneState
 from cavmarl.zones.kernels.borders import NEAR, Borders, find_near, pass_on
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance
 
@@ -122,7 +122,7 @@ def make_book(num_worlds: int, capacity: int) -> BorderRecords:
 def look(
     zones: ZoneArrays,
     borders: Borders,  # when a vehicle is near one
-    zoned: Zoned,  # the rows of all zones
+    zoned: ZoneState,  # the rows of all zones
     side: int,  # whose rows, 0 or 1
     w: int,
     everybody: bool,  # whether to look at all owned rows, see `find_near`
@@ -150,7 +150,7 @@ def look(
 
 @kernel
 def look_on(
-    zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, w: int, book: BorderRecords
+    zones: ZoneArrays, borders: Borders, zoned: ZoneState, side: int, w: int, book: BorderRecords
 ) -> None:
     """`look` at the rows of the next tick."""
     now = book.turn[w]
@@ -165,7 +165,7 @@ def look_on(
 def hand_over(
     zones: ZoneArrays,
     borders: Borders,  # when a vehicle is near one
-    zoned: Zoned,  # the rows of all zones
+    zoned: ZoneState,  # the rows of all zones
     side: int,  # whose rows, 0 or 1
     w: int,
     everybody: bool,  # whether rows have changed since `look_on`
@@ -197,7 +197,9 @@ def hand_over(
 
 
 @inlined_kernel
-def _follow_swap(zoned: Zoned, w: int, near: np.void, changed: int, book: BorderRecords) -> None:
+def _follow_swap(
+    zoned: ZoneState, w: int, near: np.void, changed: int, book: BorderRecords
+) -> None:
     """The last to enter a zone fills the row of one that leaves it in the same tick.
 
     Without this `release` would look for it among all rows.
@@ -219,7 +221,7 @@ def _is_newborn(book: BorderRecords, w: int, num_newborn: int, vehicle: int) -> 
 
 
 @inlined_kernel
-def _renew(zoned: Zoned, side: int, w: int, book: BorderRecords) -> None:
+def _renew(zoned: ZoneState, side: int, w: int, book: BorderRecords) -> None:
     """Let the present `coming` be the vehicles near now; known ones keep what is known of them."""
     turn = book.turn[w]
     before = book.coming[w, 1 - turn]
@@ -273,7 +275,7 @@ def _next_crossed(near: NDArray[np.void], num: int, last: int) -> int:
 
 
 @kernel
-def _change(zoned: Zoned, side: int, w: int, near: np.void, book: BorderRecords) -> int:
+def _change(zoned: ZoneState, side: int, w: int, near: np.void, book: BorderRecords) -> int:
     """Let a vehicle that has crossed change its owner; its new row, or why it has none."""
     vehicle = near["vehicle"]
     target = near["target"]
@@ -306,7 +308,7 @@ def _change(zoned: Zoned, side: int, w: int, near: np.void, book: BorderRecords)
 @kernel
 def release(
     zones: ZoneArrays,
-    zoned: Zoned,  # the rows of all zones
+    zoned: ZoneState,  # the rows of all zones
     side: int,  # whose rows, 0 or 1
     w: int,
     changed: int,  # how many there are of them

@@ -22,8 +22,8 @@ from cavmarl.viewer.frame_publisher import FramePublisher
 from cavmarl.viewer.inserted_here import put_in
 from cavmarl.viewer.page_requests import PageRequest
 from cavmarl.viewer.run_clock import RunClock
-from cavmarl.viewer.stage import Stage
 from cavmarl.viewer.vehicle_details import vehicle_details
+from cavmarl.viewer.viewed_world import Stage
 
 HELD_S = 1.0  # after which the policy drives again if a page says nothing
 PRESSED = 0.3  # of throttle or steering, from where it is a choice among meta-actions

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.core import whole_file
-from cavmarl.core.whole_file import draft_folder, write_whole
+from cavmarl.core import atomic_file
+from cavmarl.core.atomic_file import draft_folder, write_whole
 
 _MAKE_AND_WAIT = (
-    "import sys, pathlib; from cavmarl.core.whole_file import draft_folder\n"
+    "import sys, pathlib; from cavmarl.core.atomic_file import draft_folder\n"
     "with draft_folder(pathlib.Path(sys.argv[1])) as folder:\n"
     "    (folder / 'half').write_bytes(b'1')\n"
     "    print(folder, flush=True); sys.stdin.read()\n"
@@ -88,7 +88,7 @@ def test_drafts_begun_at_once_do_not_remove_each_other(tmp_path: Path) -> None:
 def test_a_folder_that_is_taken_for_a_dead_ones_before_its_lock_is_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make, made = whole_file.tempfile.mkdtemp, []
+    make, made = atomic_file.tempfile.mkdtemp, []
 
     def robbed(*args: object, **options: object) -> str:
         name: str = make(*args, **options)  # type: ignore[call-overload]
@@ -97,7 +97,7 @@ def test_a_folder_that_is_taken_for_a_dead_ones_before_its_lock_is_made_anew(
             os.rmdir(name)
         return name
 
-    monkeypatch.setattr(whole_file.tempfile, "mkdtemp", robbed)
+    monkeypatch.setattr(atomic_file.tempfile, "mkdtemp", robbed)
     with draft_folder(tmp_path) as folder:
         assert [str(folder)] == made[1:]
         assert folder.is_dir()
@@ -133,7 +133,7 @@ def test_a_write_that_fails_leaves_the_older_file_and_no_draft(
 
 
 def test_all_of_the_package_makes_its_drafts_here() -> None:
-    package = Path(whole_file.__file__).parents[1]
+    package = Path(atomic_file.__file__).parents[1]
     beside = re.compile(r"(TemporaryDirectory|NamedTemporaryFile|mkdtemp|mkstemp)\([^)]*dir=")
     found = [path for path in package.rglob("*.py") if beside.search(path.read_text("utf-8"))]
-    assert found == [Path(whole_file.__file__)]
+    assert found == [Path(atomic_file.__file__)]
