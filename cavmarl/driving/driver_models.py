@@ -52,8 +52,8 @@ def model_code(name: str, key: str = "traffic.model") -> int:
         return REGISTERED_MODELS[name]
     known = ", ".join(model_names())
     raise ConfigError(
-        f"{key} = {name!r}: no such driver model; there are {known}, or register one with "
-        "cavmarl.register_driver_model"
+        f"{key} = {name!r} is not a driver model; choose one of {known}, or register the model "
+        "with cavmarl.register_driver_model"
     )
 
 
@@ -83,7 +83,10 @@ def register_driver_model(name: str, model: Callable[..., float]) -> None:
     if code is None:
         code = FIRST_REGISTERED + len(REGISTERED_MODELS.names)
     if code >= FIRST_REGISTERED + MAX_REGISTERED:
-        raise ConfigError(f"driver model '{name}': there are {MAX_REGISTERED} already")
+        raise ConfigError(
+            f"driver model '{name}': {MAX_REGISTERED} models are registered, which is the maximum; "
+            "register fewer models"
+        )
     REGISTERED_MODELS.add(name, code, model, (*_CODES, *NEAREST_MODEL))
     try:
         put_model(code, model)
