@@ -172,7 +172,7 @@ class RegisteredFunction:
         if wrong.any():
             before, after = numbers[wrong][0].tolist(), again[wrong][0].tolist()
             raise RegisteredFunctionError(
-                f"registered function '{self._name}' depends on {changed}: it returned {before} and, "
-                f"after a change, {after}; compute values that are independent of it, such as the "
+                f"registered function '{self._name}' depends on {changed}: it returned {before}, "
+                f"and after a change {after}; use values that are independent of it, such as the "
                 "nearest, the minimum or the sum over each agent's others"
             )
