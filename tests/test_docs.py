@@ -39,11 +39,11 @@ def test_the_page_of_environments_lists_every_key() -> None:
     assert [row[0].strip("`") for row in rows] == dotted_keys(EnvConfig)
     assert all(row[-1] for row in rows), "a key without a word under Attributes:"
     header = ("key", "type", "unit", "default", "meaning")
-    check_block(ROOT / "docs/environments.md", "keys", table(header, rows))
+    check_block(ROOT / "docs/reference/environments.md", "keys", table(header, rows))
 
 
 def test_the_page_of_sensors_lists_every_type_and_key() -> None:
-    page = ROOT / "docs/sensors.md"
+    page = ROOT / "docs/reference/sensors.md"
     types = [
         (
             f"`{kind.type}`",
@@ -69,7 +69,7 @@ def test_the_page_of_sensors_lists_every_type_and_key() -> None:
 
 
 def test_the_page_of_environments_explains_every_term() -> None:
-    text = (ROOT / "docs/environments.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/reference/environments.md").read_text(encoding="utf-8")
     assert tuple(re.findall(r"^\| `(\w+)` \|", text.split("## Terms")[1], re.MULTILINE)) == TERMS
 
 

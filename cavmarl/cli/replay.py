@@ -39,7 +39,7 @@ def replay(
     watch_only: Annotated[bool, about("Pages may not pause it or go to another moment.")] = False,
     json_path: JsonPath = None,
 ) -> None:
-    """Show a recording from above, or export it; see docs/recordings.md."""
+    """Show a recording from above, or export it; see docs/guides/recordings.md."""
     from cavmarl.core.errors import ConfigError, RecordingError
     from cavmarl.recordings.recording import Recording
     from cavmarl.recordings.recording_exports import EXPORTS

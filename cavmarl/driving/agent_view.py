@@ -27,7 +27,7 @@ class AgentView:
     """An agent's vehicle and the vehicles near it, at the end of a step; read-only.
 
     Attributes:
-        own: the fields of `VEHICLE` (docs/extending.md) of the agent's vehicle.
+        own: the fields of `VEHICLE` (docs/guides/extending.md) of the agent's vehicle.
         others: (n,) the same for vehicles whose centres are within the reach, by increasing id.
         network: the roads; `own["lane"]` is a row of `network.lanes`.
         step_s: length of a step in s.
@@ -47,7 +47,7 @@ class BatchView:
     depend on the other agents.
 
     Attributes:
-        own: (n,) the fields of `VEHICLE` (docs/extending.md) of the agents' vehicles.
+        own: (n,) the fields of `VEHICLE` (docs/guides/extending.md) of the agents' vehicles.
         others: (m,) the same for the vehicles near each agent, agent by agent, by increasing id. A
             vehicle near two agents occurs twice.
         agent: (m,) for each of `others`, the row of `own` that the vehicle is near.

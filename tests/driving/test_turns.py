@@ -49,9 +49,7 @@ def test_a_car_can_take_each_corner_of_a_grid() -> None:
     roads = network("grid4x4")
     links = with_tight_turns(roads, STEERING_RAD).links
     assert links["direction"].tolist() == roads.links["direction"].tolist()
-    blunt = with_tight_turns(
-        roads, 0.3
-    ).links  # with this small steering angle, the car cannot turn there
+    blunt = with_tight_turns(roads, 0.3).links  # impossible with this steering angle
     assert (blunt["direction"] != roads.links["direction"]).any()
 
 

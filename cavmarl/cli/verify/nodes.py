@@ -48,7 +48,8 @@ Faults = Annotated[
 Mix = Annotated[
     str | None,
     about(
-        "On the simulated machine: the kinds of faults, as in docs/faults.md [default: all].",
+        "On the simulated machine: the kinds of faults, as in docs/explanation/faults.md "
+        "[default: all].",
         metavar="NAME,…",
     ),
 ]
