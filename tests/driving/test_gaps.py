@@ -23,7 +23,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_OFF_BLINKING,
 )
 from cavmarl.driving.kernels.junctions.approach import APPROACH
-from cavmarl.driving.kernels.junctions.gaps import STUCK_S, foe_blocks, ignores
+from cavmarl.driving.kernels.junctions.gaps import STUCK_S, hold_for_foe, may_ignore
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
@@ -86,7 +86,7 @@ def blocks(network: RoadNetwork) -> Blocks:
             for name, value in fields.items():
                 rows[k][name] = value
         foe["speed"] = rows[1]["speed"]
-        return foe_blocks(
+        return hold_for_foe(
             network.arrays, travel, rows, rows[0], FROM_SOUTH,
             own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, asked[0], foe[0], True,
             np.zeros(1, np.int32),
@@ -258,7 +258,7 @@ def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float
 
     def waits(front_m: float) -> int:
         foe["dist"] = front_m + HALF_M
-        return foe_blocks(network.arrays, CARS, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
+        return hold_for_foe(network.arrays, CARS, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
                           True, np.zeros(1, np.int32))  # fmt: skip
 
     return next(m for m in np.arange(1.0, 400.0, 0.1) if not waits(m)), over_m
@@ -312,7 +312,7 @@ def test_at_an_all_way_stop_the_longest_waiting_vehicle_goes_first(
 ) -> None:
     waits = [own_wait_s, foe_wait_s]
     row, foe = waiting_pair(id=[own_id, 3], wait_s=waits, speed=[speed, 0.0])
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
+    assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, False), (-1, True)])
@@ -322,17 +322,17 @@ def test_at_an_all_way_stop_a_foe_that_has_not_stopped_is_ignored(
     row, foe = vehicles(
         [(0.0, 0.0, 0.0)] * 2, speed=[0.0, 8.0], wait_s=[0.6, 0.0], stopped_at=[0, stopped_at]
     )
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
-    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, STOP, STOP, STUCK_S), (
+    assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
+    assert not may_ignore(row, foe, 0, 1, SIGNAL_NONE, STOP, STOP, STUCK_S), (
         "a stop sign of a side road"
     )
 
 
 def test_waiting_vehicles_on_equal_roads_do_not_block_each_other() -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[3.1, 9.0], speed=0.0)
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S)
+    assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S)
     row["wait_s"] = 2.9
-    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S), (
+    assert not may_ignore(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S), (
         "the foe has waited longer"
     )
 
@@ -366,7 +366,7 @@ def test_at_blinking_signals_the_longest_waiting_vehicle_goes_first(
 ) -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[own_wait_s, 2.0], speed=0.0)
     foe["hold"] = foe_hold  # HOLD_NONE: the foe is about to go
-    assert ignores(row, foe, 0, 1, SIGNAL_OFF_BLINKING, MINOR, MINOR, STUCK_S) == goes
+    assert may_ignore(row, foe, 0, 1, SIGNAL_OFF_BLINKING, MINOR, MINOR, STUCK_S) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, True), (2, False)])
@@ -379,4 +379,4 @@ def test_an_agent_that_stands_at_its_stop_line_yields(stopped_at: int, goes: boo
         driver=[DRIVER_BACKGROUND, DRIVER_AGENT],
         stopped_at=[-1, stopped_at],
     )
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, STOP, STUCK_S) == goes
+    assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, STOP, STUCK_S) == goes

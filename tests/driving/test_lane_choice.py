@@ -10,10 +10,10 @@ from cavmarl.driving.kernels.lanes.lane_choice import (
     MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
     SWAP_ROOM_M,
-    _asked_of_followers,
     _change_is_safe,
+    _imposed_on_followers,
     _rear_is_inside,
-    room_for_more,
+    room_for_further_changes,
     wish_on_lane,
 )
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
@@ -39,7 +39,7 @@ def test_each_further_lane_change_has_its_own_room(
 ) -> None:
     lane, step = np.zeros(1, LANE)[0], np.zeros(1, PLAN)[0]
     lane["length_m"], step["changes"] = length_m, changes
-    assert room_for_more(lane, blank_vehicle()[0], step) == pytest.approx(room_m)
+    assert room_for_further_changes(lane, blank_vehicle()[0], step) == pytest.approx(room_m)
 
 
 @pytest.mark.parametrize(("view_m", "minds"), [(100.0, True), (60.0, False)])
@@ -124,7 +124,7 @@ def test_a_lane_change_considers_followers_on_every_incoming_lane(
     )
     room = scratch(roads, 3)
     index_lanes(roads.arrays, tables, rows, 3, room)
-    least = _asked_of_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
+    least = _imposed_on_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
     assert (least < -MAX_BRAKING_NEEDED) == asks
 
 

@@ -20,7 +20,7 @@ from cavmarl.driving.kernels.lanes.lane_ends import (
     LONGEST_HALF_M,
     _behind_turning,
     behind_over_line,
-    misses_change,
+    misses_last_change,
 )
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.models.following import no_constraint
@@ -39,9 +39,9 @@ def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_t
     way = goal * len(roads.lanes)
     assert plans["change"][goal, right] == 1
     assert plans["link"][goal, right] >= 0, "its lane continues as well"
-    assert [misses_change(roads.arrays, tables, lane, way) for lane in (right, left)] == [1, 0]
+    assert [misses_last_change(roads.arrays, tables, lane, way) for lane in (right, left)] == [1, 0]
     inside = int(roads.links["first_internal"][plans["link"][goal, right]])
-    assert not misses_change(roads.arrays, tables, inside, way)
+    assert not misses_last_change(roads.arrays, tables, inside, way)
 
     rows = world.vehicles(0)  # side by side before the end
     end = float(roads.lanes["length_m"][right])

@@ -9,7 +9,7 @@ import pytest
 
 from cavmarl.core.records.codes import EVENT_ARRIVED, HOLD_NONE, HOLD_SIGNAL, MODEL_KRAUSS
 from cavmarl.driving.kernels.junctions.gaps import is_minor
-from cavmarl.driving.kernels.junctions.junctions import may_enter
+from cavmarl.driving.kernels.junctions.junctions import hold_at_line
 from cavmarl.driving.kernels.motion.motion import move_background
 from cavmarl.driving.vehicle_types import set_model
 from cavmarl.engine.simulation import Simulation
@@ -51,7 +51,7 @@ def test_krauss_stops_for_yellow_if_its_deceleration_suffices() -> None:
         front_m = 10.0**2 / (2.0 * needs)
         row = on_lane(roads, lane, length_m - front_m - back_m - 2.5, speed=10.0, length=5.0)
         distance = length_m - float(row["s"][0])
-        held = may_enter(arrays, tables, row, 0, link, distance, 0, phase, room)
+        held = hold_at_line(arrays, tables, row, 0, link, distance, 0, phase, room)
         assert held == holds
 
 

@@ -12,7 +12,7 @@ from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.lanes.side_clearance import (
     STAYS_ASIDE,
     has_side_clearance,
-    stays_aside,
+    has_to_stay_aside,
 )
 from cavmarl.driving.kernels.motion.motion import move_background
 from cavmarl.roads.routing import PLAN
@@ -72,7 +72,7 @@ def test_a_vehicle_between_lanes_moves_until_it_would_touch(
     rows["side_lane"] = -1
     index, step = scratch(roads, 2), np.zeros(2, PLAN)
     index_lanes(roads.arrays, tables, rows, 2, index)
-    assert stays_aside(roads.arrays, rows, rows[0], index) == stays
+    assert has_to_stay_aside(roads.arrays, rows, rows[0], index) == stays
     register_links(roads.arrays, tables, rows, 2, step, np.zeros(2, np.int64), index)
     phase = np.zeros(len(roads.signals), np.int32)
     decide(roads.arrays, tables, rows, 2, DRIVER_BACKGROUND, 0, 0.1, phase, step, index)

@@ -12,7 +12,7 @@ from cavmarl.driving.kernels.drivers import decide
 from cavmarl.driving.kernels.junctions.approach import register_links
 from cavmarl.driving.kernels.junctions.swept_areas import stop_before_foe_sweep
 from cavmarl.driving.kernels.lanes.lane_choice import _change_is_safe
-from cavmarl.driving.kernels.lanes.lane_ends import behind_beside
+from cavmarl.driving.kernels.lanes.lane_ends import constraint_of_side_lane
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.models.following import no_constraint
 from cavmarl.driving.vehicle_types import generated_types
@@ -113,7 +113,7 @@ def test_a_vehicle_waits_for_a_lane_end_while_its_body_covers_the_lane(
     bus["row"], bus["id"], bus["half"] = 1, 1, 0.5 * BUS_M
     bus["dist"], bus["speed"] = 0.5 * BUS_M - bus_m, 2.0
     kind = generated_types()[0]
-    found = behind_beside(network.arrays, travel, rows, 0, kind, 100.0, 0.1, room)
+    found = constraint_of_side_lane(network.arrays, travel, rows, 0, kind, 100.0, 0.1, room)
     assert (found > no_constraint(kind)) == brakes
 
 

@@ -35,9 +35,9 @@ from cavmarl.driving.kernels.junctions.junctions import (
     before_waiting,
     behind_merging,
     constraint_inside,
-    has_crept,
-    may_enter,
-    waits_inside,
+    has_crept_over_red,
+    hold_at_line,
+    hold_inside,
 )
 from cavmarl.driving.kernels.junctions.swept_areas import (
     before_foe_sweep,
@@ -51,7 +51,7 @@ from cavmarl.driving.kernels.lanes.adjacent_leaders import (
     behind_adjacent_leader,
     behind_askew,
     behind_entry,
-    swings_back_m,
+    rear_swing_m,
 )
 from cavmarl.driving.kernels.lanes.cooperative_braking import COOPERATIVE_DECEL, brake_for_merging
 from cavmarl.driving.kernels.lanes.lane_choice import (
@@ -59,21 +59,21 @@ from cavmarl.driving.kernels.lanes.lane_choice import (
     MERGE_ROOM_M,
     SIDEWAYS_S,
     choose_lane,
+    considers_lane_change,
     needed_change,
-    room_for_more,
-    thinks_of_lanes,
+    room_for_further_changes,
     wish_on_lane,
 )
 from cavmarl.driving.kernels.lanes.lane_ends import (
-    behind_beside,
     behind_over_line,
+    constraint_of_side_lane,
+    constraint_over_lane_end,
     lane_end,
-    misses_change,
-    over_end,
+    misses_last_change,
 )
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M, last_on
 from cavmarl.driving.kernels.lanes.route_following import next_step, next_step_from
-from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE, stays_aside
+from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE, has_to_stay_aside
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import before_line, no_constraint, response, wish
 from cavmarl.driving.kernels.motion.ordered_stops import distance_to_stop
@@ -155,7 +155,7 @@ def _at_line(
     speed = row["speed"]
     front = distance - 0.5 * row["length"]
     to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
-    if to_line <= 0.0 and has_crept(roads, row, link, -to_line, phase):
+    if to_line <= 0.0 and has_crept_over_red(roads, row, link, -to_line, phase):
         return before_line(kind, speed, 0.0, dt), HOLD_SIGNAL, 0.0
     if to_line <= 0.0:
         # The front has passed the line, so the vehicle does not wait there.
@@ -167,10 +167,10 @@ def _at_line(
     merging = no_constraint(kind)
     if row["driver"] == DRIVER_AGENT or speed > FAST_MPS:
         merging = behind_merging(roads, kind, row, link, distance, scratch)
-    hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    hold = hold_at_line(roads, travel, rows, i, link, distance, way, phase, scratch)
     waits = HOLD_NONE
     if hold == HOLD_NONE:
-        waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
+        waits = hold_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
     stop = math.inf
     if roads.links[link]["num_sweeps"] > 0:
         room = room_m(hold, waits)
@@ -258,7 +258,7 @@ def _road_ahead(
     if k + 1 < scratch.lane_end[lane] and (scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m):
         leader = scratch.entries[k + 1]
         gap = leader["s"] - row["s"] - half - leader["half"]
-        gap -= swings_back_m(roads, travel, rows, leader)
+        gap -= rear_swing_m(roads, travel, rows, leader)
         kept = behind_entry(kind, speed, gap, leader)
         constraint = max(constraint, kept)
         look = min(look, half + NEXT_LINE_M + speed + 0.5 * speed * speed / kind["decel"])
@@ -270,9 +270,11 @@ def _road_ahead(
             lane, way, link = next_step_from(roads, step, before, way)
         else:
             lane, way, link = next_step(roads, travel, before, way)
-        if lane < 0 or (steered and misses_change(roads, travel, before, before_way)):
+        if lane < 0 or (steered and misses_last_change(roads, travel, before, before_way)):
             end = lane_end(roads, travel, row, kind, before, before_way, distance, merge_room_m, dt)
-            over = over_end(roads, rows, i, kind, before, distance, distance < see, dt, scratch)
+            over = constraint_over_lane_end(
+                roads, rows, i, kind, before, distance, distance < see, dt, scratch
+            )
             constraint = max(constraint, end, over)
             break
         stops = False
@@ -300,7 +302,7 @@ def _road_ahead(
             gap = distance + leader["s"] - half - leader["half"]
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
                 gap -= 0.5 * rows[leader["row"]]["width"]
-            gap -= swings_back_m(roads, travel, rows, leader)
+            gap -= rear_swing_m(roads, travel, rows, leader)
             kept = max(kept, behind_entry(kind, speed, gap, leader))
             constraint = max(constraint, kept)
         elif stops:
@@ -379,9 +381,9 @@ def decide(
         speed = row["speed"]
         further_m = 0.0
         if driver == DRIVER_AGENT and step[i]["changes"] > 1:
-            further_m = room_for_more(roads.lanes[row["lane"]], row, step[i])
+            further_m = room_for_further_changes(roads.lanes[row["lane"]], row, step[i])
         room_m = MERGE_ROOM_M + further_m
-        if driver == DRIVER_AGENT and misses_change(roads, travel, row["lane"], row["way"]):
+        if driver == DRIVER_AGENT and misses_last_change(roads, travel, row["lane"], row["way"]):
             room_m += MISSED_ROOM_M
         constraint, allowed, hold, link_ahead = _road_ahead(
             roads, travel, rows, k, step[i], phase, room_m, dt, scratch
@@ -395,11 +397,11 @@ def decide(
             constraint = max(constraint, askew)
         if row["side_lane"] >= 0:
             see = min(see_line_m(kind, speed), travel.see_m)
-            aside = behind_beside(roads, travel, rows, i, kind, see, dt, scratch)
+            aside = constraint_of_side_lane(roads, travel, rows, i, kind, see, dt, scratch)
             constraint = max(constraint, aside)
         needed = needed_change(roads, travel, row, step[i])
         change = 0
-        if thinks_of_lanes(row, needed, tick, dt):
+        if considers_lane_change(row, needed, tick, dt):
             own_wish = wish(kind, speed, allowed, constraint)
             if driver == DRIVER_AGENT:
                 own_wish = wish_on_lane(roads, travel, row, k, scratch)
@@ -437,7 +439,7 @@ def decide(
                     behind_adjacent_leader(roads, travel, kind, row, target, scratch),
                 )
                 accel = min(accel, max(fall_in, -COOPERATIVE_DECEL))
-        if driver == DRIVER_BACKGROUND and stays_aside(roads, rows, row, scratch):
+        if driver == DRIVER_BACKGROUND and has_to_stay_aside(roads, rows, row, scratch):
             change = STAYS_ASIDE
         scratch.accel[i] = accel
         scratch.lane_change[i] = change

@@ -81,11 +81,11 @@ def register_links(
             prefetch(roads.links, step[i]["link"], 1)
         for i in range(first, last):
             if rows[i]["driver"] == DRIVER_SCRIPTED:
-                pairs = _announce_claims(roads, travel, rows[i], i, pairs, scratch)
+                pairs = _register_claims(roads, travel, rows[i], i, pairs, scratch)
                 continue
             if is_lost(rows[i]):
                 continue
-            pairs = _announce(roads, travel, rows[i], i, step[i], pairs, scratch)
+            pairs = _register_row(roads, travel, rows[i], i, step[i], pairs, scratch)
     end = scratch.link_end
     forget(scratch.links)
     for k in range(pairs):
@@ -98,7 +98,7 @@ def register_links(
 
 
 @inlined_kernel
-def _note(
+def _append(
     roads: RoadArrays,
     scratch: Scratch,
     pairs: int,
@@ -122,14 +122,14 @@ def _note(
 
 
 @kernel
-def _announce_claims(
+def _register_claims(
     roads: RoadArrays, travel: TripTables, row: np.void, i: int, pairs: int, scratch: Scratch
 ) -> int:
     """Register a row that follows a script, at the links of its script."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_claim"], frame["first_claim"] + frame["num_claims"]):
         claim = travel.scripts.claims[c]
-        pairs = _note(roads, scratch, pairs, claim["link"], row, i, claim["dist"])
+        pairs = _append(roads, scratch, pairs, claim["link"], row, i, claim["dist"])
     return pairs
 
 
@@ -151,7 +151,7 @@ def _link_into(roads: RoadArrays, row: np.void) -> int:
 
 
 @inlined_kernel
-def _announce(
+def _register_row(
     roads: RoadArrays,
     travel: TripTables,
     row: np.void,
@@ -166,7 +166,7 @@ def _announce(
     s = row["s"]
     if here["internal"]:
         driven_m = max(here["link_offset_m"] + s, LEAST_M)
-        pairs = _note(roads, scratch, pairs, here["link"], row, i, -driven_m)
+        pairs = _append(roads, scratch, pairs, here["link"], row, i, -driven_m)
     elif s - 0.5 * row["length"] < SWEPT_BEYOND_M:
         # The centre has left the junction, but the rear has not left the junction, the fork, or a
         # swept area.
@@ -175,14 +175,14 @@ def _announce(
             left = roads.links[link]
             minded = max(left["length_m"], left["fork_m"], left["swept_m"])
             if left["length_m"] + s - 0.5 * row["length"] < minded:
-                pairs = _note(roads, scratch, pairs, link, row, i, -(left["length_m"] + s))
+                pairs = _append(roads, scratch, pairs, link, row, i, -(left["length_m"] + s))
     side = row["side_lane"]
     if side >= 0 and not here["internal"] and roads.lanes[side]["num_links"] > 0:
         # The body also covers the adjacent lane, so it blocks that lane as well.
         to_end = roads.lanes[side]["length_m"] - beside_s(roads, lane, side, s)
         if to_end < STANDS_BEFORE_M:
             link = roads.lanes[side]["first_link"]
-            pairs = _note(roads, scratch, pairs, link, row, i, max(to_end, 0.0))
+            pairs = _append(roads, scratch, pairs, link, row, i, max(to_end, 0.0))
     reach = registration_distance_m(row["speed"])
     distance = here["length_m"] - s
     way = row["way"]
@@ -200,11 +200,13 @@ def _announce(
             last = roads.lanes[before]
             ends = travel.steps[before_way + before]["change"] == 0
             if (ends or distance < STANDS_BEFORE_M) and found == 0 and last["num_links"] > 0:
-                pairs = _note(roads, scratch, pairs, last["first_link"], row, i, max(distance, 0.0))
+                pairs = _append(
+                    roads, scratch, pairs, last["first_link"], row, i, max(distance, 0.0)
+                )
             break
         if link >= 0:
             if roads.links[link]["num_conflicts"] + roads.links[link]["num_sweeps"] > 0:
-                pairs = _note(roads, scratch, pairs, link, row, i, max(distance, 0.0))
+                pairs = _append(roads, scratch, pairs, link, row, i, max(distance, 0.0))
             found += 1
             far &= roads.links[link]["state"] == STATE_MAJOR and not here["internal"]
             if found == MAX_LINKS_AHEAD:

@@ -108,7 +108,7 @@ def is_minor(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
 
 
 @inlined_kernel
-def _goes_on(row: np.void, link: int) -> bool:
+def _has_turn(row: np.void, link: int) -> bool:
     """Return whether a vehicle that stopped at `link` has been given its turn.
 
     For an agent, moving counts as taking the turn.
@@ -118,7 +118,7 @@ def _goes_on(row: np.void, link: int) -> bool:
 
 
 @inlined_kernel
-def _gives_way(row: np.void, link: int) -> bool:
+def _is_yielding(row: np.void, link: int) -> bool:
     """Return whether a standing vehicle yields at `link`; an agent's does so at its stop line."""
     stands: bool = row["driver"] == DRIVER_AGENT and row["wait_s"] > 0.0
     return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
@@ -131,7 +131,7 @@ def _in_turn(state: int) -> bool:
 
 
 @kernel
-def ignores(
+def may_ignore(
     row: np.void,
     foe: np.void,
     link: int,
@@ -144,7 +144,7 @@ def ignores(
     """Return whether a driver at `link` may ignore a foe at `foe_link` with the right of way.
 
     `signal` is the state of the foe's signal; `state` and `foe_state` are those of the links. After
-    a wait of `stuck_s` s, the driver also ignores a foe that stands and yields.
+    a wait of `stuck_s` s, the driver also may_ignore a foe that stands and yields.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
@@ -154,14 +154,14 @@ def ignores(
         return True
     if signal == SIGNAL_NONE and foe_state == STATE_ALLWAY_STOP and foe["stopped_at"] != foe_link:
         return True  # the foe has to stop once, too, and has not yet stopped
-    if foe["speed"] > STANDING_MPS or not _gives_way(foe, foe_link):
+    if foe["speed"] > STANDING_MPS or not _is_yielding(foe, foe_link):
         return False
     # If the foe's signal is off and blinks, the foe has to yield as well.
     in_turn = _in_turn(state) or signal == SIGNAL_OFF_BLINKING
     if not (in_turn or row["wait_s"] > stuck_s):
         return False  # the other road has the right of way even while its vehicle waits
     # On equal roads all vehicles could wait for one another, so waiting vehicles are ignored.
-    if (state == STATE_EQUAL and row["wait_s"] > IMPATIENT_S) or _goes_on(row, link):
+    if (state == STATE_EQUAL and row["wait_s"] > IMPATIENT_S) or _has_turn(row, link):
         return True
     # Both wait: the vehicle that has waited longer takes its turn first.
     if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
@@ -219,20 +219,20 @@ def _is_harmless(
     state, foe_state = roads.links[link]["state"], roads.links[foe_link]["state"]
     alike = drives_as_sumo(travel, row) and drives_as_sumo(travel, other)
     stuck_s = RESCUED_S if alike else STUCK_S
-    if ignores(row, other, link, foe_link, signal, state, foe_state, stuck_s):
+    if may_ignore(row, other, link, foe_link, signal, state, foe_state, stuck_s):
         return True
     # A vehicle that has been given its turn goes on if the foe can still brake for it.
     brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * front
-    return brakes and _goes_on(row, link)
+    return brakes and _has_turn(row, link)
 
 
 @inlined_kernel
-def _brisk(travel: TripTables, row: np.void) -> float:
+def _assumed_accel(travel: TripTables, row: np.void) -> float:
     """Return the assumed acceleration of a vehicle in m/s², at most that of its type."""
-    brisk: float = BRISK_ACCEL
+    assumed_accel: float = BRISK_ACCEL
     if row["driver"] != DRIVER_AGENT:
-        brisk = min(BRISK_ACCEL, travel.types[row["vtype"]]["accel"])
-    return brisk
+        assumed_accel = min(BRISK_ACCEL, travel.types[row["vtype"]]["accel"])
+    return assumed_accel
 
 
 @inlined_kernel
@@ -323,40 +323,42 @@ def _blocks_inside(
     to_clear: float,
     equal: bool,
 ) -> int:
-    """Return `foe_blocks` for a foe on the junction that clears the shared area in `to_clear` m."""
+    """Return `hold_for_foe` for a foe on the junction that clears the area in `to_clear` m."""
     target, half = roads.links[link], 0.5 * row["length"]
     to_area = distance + conflict["enter_m"] - half
     cleared = to_clear / max(foe["speed"], 0.1)
-    brisk = _brisk(travel, row)
-    time_in = _earliest(to_area, row["speed"], limit, brisk)
+    assumed_accel = _assumed_accel(travel, row)
+    time_in = _earliest(to_area, row["speed"], limit, assumed_accel)
     if stays_inside(other):
         return HOLD_EXIT_BLOCKED
     if equal and conflict["merging"]:
         apart = distance + conflict["leave_m"] - half - to_clear
         return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # wait until there is room behind it
-    if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
+    if _in_turn(target["state"]) and _has_turn(row, link) and to_area > ROOM_M:
         return HOLD_NONE  # it would lose its turn by stopping again, and can wait before the area
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # A foe that has just started will accelerate; a foe that brakes may have to stop.
-        cleared = _earliest(to_clear, foe["speed"], top, GENTLE_SHARE * _brisk(travel, other))
+        cleared = _earliest(
+            to_clear, foe["speed"], top, GENTLE_SHARE * _assumed_accel(travel, other)
+        )
     elif foe["speed"] * foe["speed"] < -2.0 * other["accel"] * to_clear:
         cleared = math.inf  # the foe brakes so hard that it stops before it clears the area
     if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
         time_in -= 0.5 * GAP_S
-    elif row["speed"] <= STANDING_MPS and not equal and not _goes_on(row, link):
+    elif row["speed"] <= STANDING_MPS and not equal and not _has_turn(row, link):
         if target["state"] != STATE_ALLWAY_STOP:
             time_in = min(SET_OFF_S, time_in)
         else:  # in turn: the row starts so that it need not brake before the area
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
-            time_in = _earliest(free, row["speed"], limit, brisk)
+            time_in = _earliest(free, row["speed"], limit, assumed_accel)
             if other["accel"] > SPEEDING_UP_MPS2:
                 cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
     return HOLD_YIELD if cleared > time_in else HOLD_NONE
 
 
 @kernel
-def foe_blocks(
+def hold_for_foe(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -402,12 +404,12 @@ def foe_blocks(
             roads, travel, row, link, distance, limit, conflict, foe, other, to_clear, equal
         )
     # The foe is before its line: both vehicles are assumed to need the whole junction.
-    over, brisk = target["length_m"], _brisk(travel, row)
+    over, assumed_accel = target["length_m"], _assumed_accel(travel, row)
     if conflict["enter_m"] < target["wait_m"] - LINE_MARGIN_M:
         over = min(over, target["wait_m"])
     passed = (foe["dist"] + foe_link["length_m"] + foe["half"]) / max(foe["speed"], 0.1)
     after_s = GAP_S if conflict["merging"] else 0.0
-    if passed + after_s < _earliest(distance - half, row["speed"], limit, brisk):
+    if passed + after_s < _earliest(distance - half, row["speed"], limit, assumed_accel):
         return HOLD_NONE
     speed, to_line = row["speed"], distance - half
     if not (steered or conflict["merging"]) and speed <= STANDING_MPS:
@@ -416,13 +418,15 @@ def foe_blocks(
         ahead = to_line + target["wait_m"] if inside else to_line
         to_line -= min(max(ahead, 0.0), LINE_MARGIN_M)
     over += min(to_line, 0.0)  # from a waiting position, only the rest counts
-    reached = math.sqrt(speed * speed + 2.0 * brisk * max(over, 0.0))
+    reached = math.sqrt(speed * speed + 2.0 * assumed_accel * max(over, 0.0))
     leaves_mps = min(reached, max(limit, speed))
-    time_line = _earliest(to_line, speed, limit, GENTLE_SHARE * brisk)
+    time_line = _earliest(to_line, speed, limit, GENTLE_SHARE * assumed_accel)
     time_out = time_line + 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
     if steered:
         comes = _comes_to_steered(row, conflict, foe, front, leaves_mps, time_out)
     else:
-        time_in = _earliest(distance - half - LINE_MARGIN_M, speed, limit, GENTLE_SHARE * brisk)
+        time_in = _earliest(
+            distance - half - LINE_MARGIN_M, speed, limit, GENTLE_SHARE * assumed_accel
+        )
         comes = _comes(roads, row, conflict, foe, other, time_in, time_out, leaves_mps)
     return HOLD_YIELD if comes else HOLD_NONE

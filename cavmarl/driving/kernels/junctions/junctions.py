@@ -35,7 +35,7 @@ from cavmarl.driving.kernels.junctions.gaps import (
     ROOM_M,
     STOOD_S,
     STOP_SIGN_S,
-    foe_blocks,
+    hold_for_foe,
     is_minor,
     link_signal,
     must_stop,
@@ -66,7 +66,7 @@ STOP_SIGN_M = MOST_BACK_M + 2.0 * LINE_MARGIN_M
 
 
 @kernel
-def _blocked_by_foes(
+def _hold_for_foes(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -107,7 +107,7 @@ def _blocked_by_foes(
             waits = both and conflict["must_yield"] and foe["dist"] > foe["half"]
             if waits and yields_in_deadlock(roads, rows, other, conflict["foe"], row, scratch):
                 continue
-            found = foe_blocks(
+            found = hold_for_foe(
                 roads,
                 travel,
                 rows,
@@ -172,7 +172,7 @@ def _exit_blocked(
 
 
 @kernel
-def may_enter(
+def hold_at_line(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
@@ -207,7 +207,7 @@ def may_enter(
     if resolves and yields_in_deadlock(roads, rows, row, link, row, scratch):
         return HOLD_YIELD
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    hold = _blocked_by_foes(
+    hold = _hold_for_foes(
         roads, travel, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
     )
     if hold != HOLD_NONE:
@@ -218,7 +218,7 @@ def may_enter(
 
 
 @inlined_kernel
-def has_crept(
+def has_crept_over_red(
     roads: RoadArrays,
     row: np.void,  # VEHICLE
     link: int,  # LINK row
@@ -303,7 +303,7 @@ def behind_merging(
 
 
 @kernel
-def waits_inside(
+def hold_inside(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -316,14 +316,14 @@ def waits_inside(
 ) -> int:
     """Return the reason (HOLD_*) for row i to stop at the waiting position of `link`, if any.
 
-    The arguments are those of `may_enter`. The distance is negative inside the junction.
+    The arguments are those of `hold_at_line`. The distance is negative inside the junction.
     """
     wait_m = roads.links[link]["wait_m"]
     if wait_m == math.inf:
         return HOLD_NONE
     signal = link_signal(roads, link, phase)
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    hold = _blocked_by_foes(
+    hold = _hold_for_foes(
         roads, travel, rows, i, link, distance, wait_m, True, gives_way, phase, scratch
     )
     if hold != HOLD_NONE:
@@ -383,7 +383,7 @@ def constraint_inside(
     constraint, waits = no_constraint(kind), HOLD_NONE
     target = roads.links[link]
     if target["wait_m"] < math.inf and front <= target["wait_m"] + WAIT_SLACK_M:
-        waits = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
+        waits = hold_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
         minor = kind["as_sumo"] and is_minor(roads, link, phase)
         constraint = before_waiting(roads, kind, row, link, front, waits, minor, dt)
     hold = waits

@@ -29,7 +29,7 @@ def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> fl
 
 
 @inlined_kernel
-def swings_back_m(
+def rear_swing_m(
     roads: RoadArrays, travel: TripTables, rows: NDArray[np.void], leader: np.void
 ) -> float:
     """Return how far a leader's rear may move back, in m: a bus's rear does so in a U-turn."""
@@ -91,7 +91,7 @@ def _sticks_out(roads: RoadArrays, other: np.void, to_left: bool) -> bool:
 
 
 @kernel
-def askew_beside(
+def next_askew(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
@@ -139,7 +139,7 @@ def behind_askew(
     constraint = no_constraint(kind)
     begin = max(s, 0.0)
     for to_left in (True, False):
-        k, apart = askew_beside(roads, travel, rows, lane, begin, row["id"], to_left, scratch)
+        k, apart = next_askew(roads, travel, rows, lane, begin, row["id"], to_left, scratch)
         apart += begin - s
         if k >= 0 and apart <= travel.view_m:
             leader = scratch.entries[k]

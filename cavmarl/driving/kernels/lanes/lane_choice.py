@@ -76,7 +76,7 @@ def needed_change(roads: RoadArrays, travel: TripTables, row: np.void, step: np.
 
 
 @inlined_kernel
-def room_for_more(lane: np.void, row: np.void, step: np.void) -> float:
+def room_for_further_changes(lane: np.void, row: np.void, step: np.void) -> float:
     """Return the room in m for all lane changes of a steered vehicle but the first one."""
     further = (step["changes"] - 1) * (row["length"] + SWAP_ROOM_M)
     return float(min(further, max(MERGE_ROOM_SHARE * lane["length_m"] - MERGE_ROOM_M, 0.0)))
@@ -117,7 +117,7 @@ def wish_on_lane(
 
 
 @inlined_kernel
-def _is_left_slowly(scratch: Scratch, lane: np.void, front: float, gap_m: float) -> bool:
+def _has_rear_close_beyond(scratch: Scratch, lane: np.void, front: float, gap_m: float) -> bool:
     """Return whether the rear of a vehicle that leaves a lane is less than `gap_m` m ahead.
 
     `front` is the distance in m from the own front to the end of the lane.
@@ -156,7 +156,7 @@ def _next_beyond(
 
 
 @kernel
-def _asked_of_followers(
+def _imposed_on_followers(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -218,7 +218,7 @@ def _change_is_safe(
         ahead = scratch.entries[j]["s"] - s
     else:
         j, ahead = _next_beyond(roads, travel, row, target, lane["length_m"] - s, scratch)
-        if _is_left_slowly(scratch, lane, lane["length_m"] - s - half, kind["min_gap"]):
+        if _has_rear_close_beyond(scratch, lane, lane["length_m"] - s - half, kind["min_gap"]):
             return False
     after = wish(kind, speed, desired, no_constraint(kind))
     if j >= 0:
@@ -236,7 +236,7 @@ def _change_is_safe(
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
         return False
-    followers = _asked_of_followers(roads, travel, rows, row, target, s, scratch)
+    followers = _imposed_on_followers(roads, travel, rows, row, target, s, scratch)
     most = MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED
     # With POLITENESS = 0 the present accelerations of the followers do not count.
     return mobil_accepts(own_wish, after, 0.0, followers, 0.0, 0.0, mandatory, most)
@@ -312,7 +312,7 @@ def _may_change(
 
 
 @inlined_kernel
-def thinks_of_lanes(row: np.void, needed: int, tick: int, dt: float) -> bool:
+def considers_lane_change(row: np.void, needed: int, tick: int, dt: float) -> bool:
     """Return whether a driver considers a lane change in this tick.
 
     Each driver does so once per LANE_CHANGE_DELAY_S and side, in ticks that depend on its id. A

@@ -79,7 +79,7 @@ def _behind_turning(
 
 
 @kernel
-def misses_change(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> bool:
+def misses_last_change(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> bool:
     """Return whether a missed lane change would lead to a turn that a steered car cannot take."""
     if roads.lanes[lane]["internal"]:
         return False
@@ -123,7 +123,7 @@ def behind_over_line(
 
 
 @inlined_kernel
-def over_end(
+def constraint_over_lane_end(
     roads: RoadArrays,
     rows: NDArray[np.void],
     i: int,
@@ -152,7 +152,7 @@ def over_end(
 
 
 @kernel
-def behind_beside(
+def constraint_of_side_lane(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -171,6 +171,8 @@ def behind_beside(
     constraint = behind_adjacent_leader(roads, travel, kind, row, lane, scratch)
     distance = roads.lanes[lane]["length_m"] - beside_s(roads, row["lane"], lane, row["s"])
     if distance > 0.5 * row["length"]:
-        over = over_end(roads, rows, i, kind, lane, distance, distance < see_m, dt, scratch)
+        over = constraint_over_lane_end(
+            roads, rows, i, kind, lane, distance, distance < see_m, dt, scratch
+        )
         constraint = max(constraint, over)
     return constraint

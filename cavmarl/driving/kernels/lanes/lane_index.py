@@ -244,7 +244,7 @@ def behind_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 
 @kernel
-def comes_over(
+def _search_incoming(
     roads: RoadArrays,
     scratch: Scratch,
     before: int,
@@ -307,4 +307,6 @@ def behind_by(
     row = roads.lanes[lane]
     if n >= row["num_into"]:
         return -1, math.inf
-    return comes_over(roads, scratch, roads.into[row["first_into"] + n], s, own_id, reach_m, view_m)
+    return _search_incoming(
+        roads, scratch, roads.into[row["first_into"] + n], s, own_id, reach_m, view_m
+    )

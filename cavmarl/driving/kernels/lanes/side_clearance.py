@@ -89,7 +89,9 @@ def _is_touched(
 
 
 @inlined_kernel
-def stays_aside(roads: RoadArrays, rows: NDArray[np.void], row: np.void, scratch: Scratch) -> bool:
+def has_to_stay_aside(
+    roads: RoadArrays, rows: NDArray[np.void], row: np.void, scratch: Scratch
+) -> bool:
     """Return whether a vehicle between two lanes has to stay there to touch no stopped vehicle."""
     if row["d"] == 0.0 or row["speed"] > ASIDE_MPS:
         return False

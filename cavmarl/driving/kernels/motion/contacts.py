@@ -101,15 +101,15 @@ def _touches_earlier(
                 dy = spot["y"] - other["y"]
                 near = spot["radius"] + other["radius"]
                 if dx * dx + dy * dy < near * near and _bodies_touch(rows[i], rows[k]):
-                    _note(hit, i, rows[k]["id"])
-                    _note(hit, k, rows[i]["id"])
+                    _keep_smallest(hit, i, rows[k]["id"])
+                    _keep_smallest(hit, k, rows[i]["id"])
                     found = True
                 k = other["next"]
     return found
 
 
 @kernel
-def _note(hit: NDArray[np.int64], row: int, vehicle_id: int) -> None:
+def _keep_smallest(hit: NDArray[np.int64], row: int, vehicle_id: int) -> None:
     """Keep the smallest id."""
     if hit[row] < 0 or vehicle_id < hit[row]:
         hit[row] = vehicle_id

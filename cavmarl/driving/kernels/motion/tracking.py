@@ -149,7 +149,7 @@ def _search(roads: RoadArrays, grid: LaneGrid, row: np.void) -> int:
 
 
 @inlined_kernel
-def _tell_how_far(roads: RoadArrays, row: np.void) -> None:
+def _set_distance_beyond(roads: RoadArrays, row: np.void) -> None:
     """Set d to the distance beyond the start or the end of the lane if that is larger."""
     beyond = max(row["s"] - roads.lanes[row["lane"]]["length_m"], -row["s"])
     if beyond > abs(row["d"]):
@@ -200,7 +200,7 @@ def locate(
     if outside > 0.0:
         events |= _search(roads, grid, row)
         if events:
-            _tell_how_far(roads, row)
+            _set_distance_beyond(roads, row)
     here = roads.lanes[row["lane"]]
     row["s"] = min(max(row["s"], 0.0), here["length_m"])
     if not _drives_along(roads, row):
