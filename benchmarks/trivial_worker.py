@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import validate
-from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
+from cavmarl.parallel.memory.shared_memory import Segment, arrays_in
 from cavmarl.parallel.processes.worker_loop import Job, serve
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
 
 __all__ = ["TrivialJob", "make_jobs"]
 

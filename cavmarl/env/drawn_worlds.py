@@ -17,12 +17,12 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import ENDED, NONE_ENDED
-from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.backends import shows_state
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_arrays import StepArrays, SteppedWorlds
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.worlds.journaled_worlds import unwatched
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.step_arrays import StepArrays, SteppedWorlds
 
 RENDER_MODES = ("human", "rgb_array")
 

@@ -7,7 +7,10 @@ from typing import Protocol
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.backend_name import (
+from cavmarl.parallel.nodes.node_groups import NodeGroups
+from cavmarl.parallel.nodes.node_starters import system_of
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.placement.backend_name import (
     LOCAL,
     NODES,
     OWN,
@@ -16,12 +19,9 @@ from cavmarl.parallel.backend_name import (
     BackendName,
     read_backend,
 )
-from cavmarl.parallel.nodes.node_groups import NodeGroups
-from cavmarl.parallel.nodes.node_starters import system_of
-from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.pooled_worlds import PooledWorlds
-from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
+from cavmarl.parallel.worlds.sensor_worker_setup import local_worlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 
 
 class MakeWorlds(Protocol):

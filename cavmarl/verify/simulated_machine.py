@@ -19,8 +19,6 @@ from typing import Any
 
 from cavmarl.core.errors import MessageError
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.transport import (
     Bytes,
     Connection,
@@ -30,6 +28,8 @@ from cavmarl.parallel.network.transport import (
 )
 from cavmarl.parallel.nodes.leases import late_ticks
 from cavmarl.parallel.nodes.node_system import NodeSystem
+from cavmarl.parallel.worlds.journaled_worlds import unwatched
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 ADDRESS = "node"
 ALIVE_S = 25.0  # until a system ends a connection over which no answer comes

@@ -9,7 +9,7 @@ import pytest
 
 import cavmarl
 from cavmarl.core.errors import ConfigError
-from cavmarl.parallel.backend_name import BackendName, read_backend
+from cavmarl.parallel.placement.backend_name import BackendName, read_backend
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cavmarl.engine.world_setup import load_world
-from cavmarl.parallel.checkpoint.checkpoint_log import STEPS, CheckpointLog, make_segments
+from cavmarl.parallel.state.checkpoint_log import STEPS, CheckpointLog, make_segments
 from cavmarl.shards.shard import Commands
 from tests.support.vec_runs import Make, drive, pool_of, same
 

@@ -11,11 +11,11 @@ from cavmarl.core.errors import JournalError, MessageError, ProtocolError
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, reading
 from cavmarl.parallel.nodes.row_checks import RowChecks
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 
 SMALL: dict[str, Any] = {"agents": 3, "background": 12, "zones": 3, "steps": 6}

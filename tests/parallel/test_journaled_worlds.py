@@ -15,7 +15,7 @@ from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError, JournalError
 from cavmarl.handoff.coordinator.journal import Journal, JournalReader
 from cavmarl.ownership.log_records import replay
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from tests.support.replayed import BUSY
 from tests.support.vec_runs import Make
 

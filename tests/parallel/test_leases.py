@@ -15,13 +15,13 @@ from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Offer, Prepare
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.leases import MOST, late_ticks, lease_ticks, leases_of
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.row_checks import RowChecks
-from cavmarl.parallel.nodes.zone_hosts import Report, ZoneHosts, packed, read_report, unpacked
+from cavmarl.parallel.nodes.zone_endpoints import Report, ZoneHosts, packed, read_report, unpacked
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 WAIT_S = 0.1
 

@@ -19,10 +19,10 @@ from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.plan_file import plan_from_dict
 from cavmarl.config.registry import entries
 from cavmarl.core.errors import NoAdmissibleWorkerError
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.parallel.processes.worker_pool import Pool
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
+from cavmarl.parallel.worlds.tasks import Task
 from tests.support.pools import strike_soon
 from tests.support.replayed import BUSY
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand

@@ -16,8 +16,8 @@ from cavmarl.core.errors import WorkerDeathError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.worlds.tasks import Task
 from tests.support.vec_runs import Make, drive, same
 
 WANTED: dict[str, Any] = {"env": "grid4x4", "num_envs": 3, "agents": 6, "background": 20}

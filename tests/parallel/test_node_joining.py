@@ -29,8 +29,8 @@ from cavmarl.core.errors import (
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.network.listener import MAX_CALLERS, Listener
 from cavmarl.parallel.nodes import node_starters
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, Newcomer, Newcomers
 from cavmarl.parallel.nodes.link import Link
-from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import read_key

@@ -19,11 +19,11 @@ from cavmarl.parallel.network.tcp_transport import TcpConnection
 from cavmarl.parallel.network.transport import READS
 from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, said_by
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.node_handshake import call_node, calls_of
 from cavmarl.parallel.nodes.node_system import MACHINE
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
-from cavmarl.parallel.nodes.zone_hosts import packed
+from cavmarl.parallel.nodes.zone_endpoints import packed
 from tests.parallel.test_node_joining import WAIT_S
 
 

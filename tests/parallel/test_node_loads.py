@@ -14,7 +14,7 @@ from cavmarl.balance.load_score import Utilisation
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.parallel.nodes.node_loads import TO_SHOW
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_placement import StepPlacement
+from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.subscribers import Audience, Wishes
 from tests.parallel.test_nodes import WANTED, over_nodes

@@ -16,10 +16,10 @@ from cavmarl.parallel.network.code_stamp import code_stamp
 from cavmarl.parallel.network.framed_socket import VERSION
 from cavmarl.parallel.network.listener import Listener, call
 from cavmarl.parallel.network.tcp_transport import TcpConnection, TcpListener
-from cavmarl.parallel.nodes import newcomers as newcomers_module
+from cavmarl.parallel.nodes import joining_nodes
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, Newcomers
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomers
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from tests.parallel.test_node_joining import WAIT_S, elsewhere
@@ -111,7 +111,7 @@ def test_nodes_that_are_not_wanted(
     monkeypatch: pytest.MonkeyPatch, code: str, room: int, words: str
 ) -> None:
     if code:
-        monkeypatch.setattr(newcomers_module, "code_stamp", code_stamp)
+        monkeypatch.setattr(joining_nodes, "code_stamp", code_stamp)
         monkeypatch.setattr("cavmarl.parallel.nodes.node_process.code_stamp", lambda: code)
     with closing(Door(b"a" * 32, room=room)) as door:
         with pytest.raises(NodeRefusedError, match=words):

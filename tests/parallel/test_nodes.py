@@ -21,7 +21,7 @@ from cavmarl.parallel.nodes.node_actions import Actions, ActionsTaken, read_refu
 from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import LocalNodes
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from tests.support.actuated import actuated_grid
 from tests.support.forks import said_in_fork
 from tests.support.vec_runs import Make, drive, same

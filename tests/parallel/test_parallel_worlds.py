@@ -12,7 +12,7 @@ import pytest
 
 from cavmarl import CavEnv, ConfigError, parallel_env
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from tests.support.pools import alive
 
 SMALL = {"zones": 4, "agents": 4, "background": 12, "max_cycles": 20}

@@ -20,7 +20,7 @@ from cavmarl.core.errors import (
     WorkerError,
     WorkerFailureError,
 )
-from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.processes.worker_pool import Pool
 from tests.support.forks import said_in_fork
 from tests.support.pools import (

@@ -22,12 +22,12 @@ import pytest
 import cavmarl
 from cavmarl import CavVectorEnv, make_vec
 from cavmarl.core.errors import ConfigError, WorkerError
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.sensor_workers import sensor_pool as sensor_farm
 from cavmarl.parallel.sensor_workers import sensor_shares
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.sensor_workers.sensor_shares import LineWorth, Shares
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.sensors.mounted.sensor_rig import Turn
 
 RIG: dict[str, dict[str, Any]] = {

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.parallel.processes import shared_huge_pages
-from cavmarl.parallel.processes.shared_huge_pages import (
+from cavmarl.parallel.memory import shared_huge_pages
+from cavmarl.parallel.memory.shared_huge_pages import (
     HUGE_BYTES,
     MOST_BYTES,
     collapse_heap,

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from cavmarl import ConfigError, make_vec
 from cavmarl.core.errors import WorkerFailureError
 from cavmarl.engine.world_setup import load_world
-from cavmarl.parallel import pooled_worlds as pooled
-from cavmarl.parallel.work_shares import make_plans, parts_of
+from cavmarl.parallel.placement.work_shares import make_plans, parts_of
+from cavmarl.parallel.workers import pooled_worlds as pooled
 from tests.support.actuated import actuated_grid
 from tests.support.pools import alive
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand

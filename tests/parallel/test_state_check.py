@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.traffic.departure_queue import DEPARTURE
 from tests.support.actuated import actuated_grid
 from tests.support.replayed import BUSY

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.processes.shared_memory import Segment
-from cavmarl.parallel.processes.state_image import Image
+from cavmarl.parallel.memory.shared_memory import Segment
+from cavmarl.parallel.state.state_image import Image
 
 RECORD = np.dtype([("a", np.float64), ("b", np.int32)])  # 12 bytes: no whole number of words
 

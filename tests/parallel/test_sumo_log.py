@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import SumoError, WorkerError
-from cavmarl.parallel.checkpoint.sumo_log import FIRST_LOG_BYTES, KeptLog
-from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.memory.shared_memory import Segment
+from cavmarl.parallel.state.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.traffic.sumo.sumo_history import MOVED, ToldLog
 
 

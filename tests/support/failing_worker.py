@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from cavmarl.parallel.job_factory import make_jobs
 from cavmarl.parallel.processes.worker_loop import serve
-from cavmarl.parallel.team.team import TeamFollower
+from cavmarl.parallel.workers.job_factory import make_jobs
+from cavmarl.parallel.workers.team import TeamFollower
 from cavmarl.shards.shard_group import ShardGroup
 
 PHASE = "resolve"

@@ -216,7 +216,7 @@ def test_a_state_that_is_not_gone_back_to(monkeypatch: pytest.MonkeyPatch) -> No
     def present(data: Bytes, like: list[Any]) -> list[Any]:
         return [array.copy() for array in like]
 
-    monkeypatch.setattr("cavmarl.parallel.nodes.kept_states.from_bytes", present)
+    monkeypatch.setattr("cavmarl.parallel.nodes.state_replicas.from_bytes", present)
     assert one_line("kill", seeds=3).wrong
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError
 from cavmarl.parallel.network.transport import Bytes
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import (
     Outcome,
     note_own,

@@ -19,7 +19,7 @@ from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, SilenceError
 from cavmarl.parallel.nodes.peer_faults import check_indices, reading
-from cavmarl.parallel.nodes.zone_hosts import NOTHING, Report, packed, unpacked
+from cavmarl.parallel.nodes.zone_endpoints import NOTHING, Report, packed, unpacked
 
 MOST_IDS = 1 << 62  # of vehicles in a run
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.step_arrays import StepArrays
-from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.worlds.step_arrays import StepArrays
+from cavmarl.parallel.worlds.tasks import Task
 
 _HEAD = struct.Struct("<II")
 _INPUTS: Mapping[Task, tuple[str, ...]] = {

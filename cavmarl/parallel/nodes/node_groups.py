@@ -20,16 +20,16 @@ from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
-from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.commanded_worlds import CommandedWorlds
-from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds, WorldShare, check_nodes, empty_arrays
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task, commands_of
-from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.placement.commanded_worlds import CommandedWorlds
+from cavmarl.parallel.placement.mover import Mover
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.placement.work_shares import Part, parts_of
+from cavmarl.parallel.worlds.tasks import Task, commands_of
 from cavmarl.v2x.v2x_messages import Exchange, NetworkSimulator, check_external
 
 Found = TypeVar("Found")

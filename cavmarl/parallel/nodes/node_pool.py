@@ -22,11 +22,10 @@ from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.network.transport import Bytes
-from cavmarl.parallel.nodes.kept_states import KEPT
+from cavmarl.parallel.nodes.joining_nodes import Newcomer
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.newcomers import Newcomer
 from cavmarl.parallel.nodes.node_actions import NodeCommand, ZoneRects, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, told_zones
@@ -35,7 +34,8 @@ from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
-from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
+from cavmarl.parallel.nodes.state_replicas import KEPT
+from cavmarl.parallel.nodes.zone_endpoints import read_report, told_hostings
 from cavmarl.parallel.nodes.zone_moves import (
     ZoneMoves,
     Zones,
@@ -44,7 +44,7 @@ from cavmarl.parallel.nodes.zone_moves import (
     name_of,
     nodes_of,
 )
-from cavmarl.parallel.world_errors import own_error
+from cavmarl.parallel.worlds.world_errors import own_error
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 
 log = logging.getLogger("cavmarl.nodes")

@@ -18,14 +18,11 @@ from cavmarl.core.tracebacks import traceback_text
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.code_stamp import code_stamp
 from cavmarl.parallel.network.transport import Bytes, Place
 from cavmarl.parallel.nodes.agent_stream import ResultStream
-from cavmarl.parallel.nodes.kept_states import KeptStates
 from cavmarl.parallel.nodes.link import FrameKind, NeededNoMoreError, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
-from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_actions import ActionsTaken, refusal
 from cavmarl.parallel.nodes.node_cuts import cut_worlds, proposal_of, read_zones, told_neighbours
 from cavmarl.parallel.nodes.node_executor import NodeExecutor, TimedNodeExecutor
@@ -36,14 +33,17 @@ from cavmarl.parallel.nodes.node_frames import (
     saved_of,
     worlds_payload,
 )
+from cavmarl.parallel.nodes.node_handshake import call_node, calls_of
 from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_network import AskedNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
-from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of, unpacked
+from cavmarl.parallel.nodes.state_replicas import KeptStates
+from cavmarl.parallel.nodes.zone_endpoints import ZoneHosts, hosting_of, unpacked
 from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of, read_order
-from cavmarl.parallel.tasks import WORLD_TASKS, Task, WorldTask, commands_of
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.tasks import WORLD_TASKS, Task, WorldTask, commands_of
 
 MEASURED_TICKS = 10  # one of so many shows what zones cost
 MEETING_S = 60.0  # for the other nodes to call

@@ -12,13 +12,13 @@ from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
-from cavmarl.parallel.backend_name import RAY, BackendName
 from cavmarl.parallel.network.mpi_transport import MPI, mpi_transport
 from cavmarl.parallel.network.ray_actors import RayActors
 from cavmarl.parallel.network.tcp_transport import TcpListener
 from cavmarl.parallel.network.transport import Place, TransportListener
 from cavmarl.parallel.nodes.node_process import run_on_ray
 from cavmarl.parallel.nodes.node_system import MACHINE, Machine, NodeSystem
+from cavmarl.parallel.placement.backend_name import RAY, BackendName
 from cavmarl.parallel.processes.watchdog import is_stopped
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node

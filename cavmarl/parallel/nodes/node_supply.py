@@ -10,16 +10,16 @@ from threading import RLock
 from cavmarl.core.processes import is_fork
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, Newcomer, Newcomers
 from cavmarl.parallel.nodes.leases import lease_ticks
 from cavmarl.parallel.nodes.link import Link
-from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.recipe import recipe_of
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.worlds.journaled_worlds import unwatched
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.world_message import recipe_of
 
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
 

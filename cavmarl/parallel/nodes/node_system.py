@@ -7,12 +7,12 @@ import time
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.tcp_transport import TcpTransport
 from cavmarl.parallel.network.transport import Transport
 from cavmarl.parallel.nodes.leases import late_ticks
-from cavmarl.parallel.recipe import world_of
+from cavmarl.parallel.worlds.journaled_worlds import unwatched
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.world_message import world_of
 
 LOOKS = 25  # of about a microsecond each
 

@@ -23,9 +23,6 @@ from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
 from cavmarl.handoff.repartitioning import Repartition, is_due
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
-from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.commanded_worlds import CommandedWorlds
-from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand, ZoneRects
 from cavmarl.parallel.nodes.node_cuts import read_zones
@@ -48,10 +45,13 @@ from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, stra
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.peer_faults import check_indices, read_json
-from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task
-from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.placement.commanded_worlds import CommandedWorlds
+from cavmarl.parallel.placement.mover import Mover
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.placement.work_shares import Part, parts_of
+from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays, layout_of
+from cavmarl.parallel.worlds.tasks import Task
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator, check_external
 from cavmarl.zones.partition.zone_partition import ZonePartition

@@ -28,11 +28,11 @@ import numpy as np
 
 from cavmarl.core.processes import die_with_parent
 from cavmarl.core.tracebacks import traceback_text
+from cavmarl.parallel.memory.shared_huge_pages import collapse_heap
+from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.processes import process_barrier as barrier
 from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, Meeting, present_core
-from cavmarl.parallel.processes.shared_huge_pages import collapse_heap
-from cavmarl.parallel.processes.shared_memory import Segment
-from cavmarl.parallel.processes.state_image import Arrays, Image
+from cavmarl.parallel.state.state_image import Arrays, Image
 
 # Words of the pool's line, behind those of `barrier`.
 TASK, PAYLOAD, SLOT, COMMITTED, LOADS = 2, 3, 4, 5, 6
@@ -45,6 +45,10 @@ OUT_OF_MEMORY = 77  # exit status
 MAX_MESSAGE = 1 << 17
 MAIL = b"="  # begins a message with something in it
 MAX_TRACEBACK = 16_000  # characters, six bytes each at most; the end of a longer one is sent
+
+
+class TeamFailedError(Exception):
+    """A worker cannot go on because another one of its team failed; that one reports why."""
 
 
 class Job:

@@ -21,9 +21,15 @@ from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureErro
 from cavmarl.core.processes import refuse_fork
 from cavmarl.parallel.processes.process_barrier import LONG_WORK_S
 from cavmarl.parallel.processes.watchdog import CHECK_S, Watchdog, processor_s
-from cavmarl.parallel.processes.worker_loop import FAILED, MAIL, MAX_MESSAGE, NOTHING, TASK
+from cavmarl.parallel.processes.worker_loop import (
+    FAILED,
+    MAIL,
+    MAX_MESSAGE,
+    NOTHING,
+    TASK,
+    TeamFailedError,
+)
 from cavmarl.parallel.processes.worker_processes import Program, WorkerProcesses
-from cavmarl.parallel.team.team import LeftAloneError
 
 __all__ = ["Death", "Pool", "Program"]
 
@@ -221,7 +227,7 @@ class Pool:
         failure: WorkerFailureError | None = None
         for k in workers:
             kind, answer = self._processes.answer(k)
-            if kind == FAILED and (failure is None or failure.kind == LeftAloneError.__name__):
+            if kind == FAILED and (failure is None or failure.kind == TeamFailedError.__name__):
                 failure = WorkerFailureError(k, self._program.parts[k], **answer)
             answers.append(answer)
         if failure is not None:

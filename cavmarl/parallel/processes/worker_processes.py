@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cavmarl.core.errors import WorkerError
+from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.processes.core_placement import keep_apart
 from cavmarl.parallel.processes.fork_server import (
     ForkServer,
@@ -27,7 +28,6 @@ from cavmarl.parallel.processes.process_barrier import (
     present_core,
     usable_cores,
 )
-from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.worker_loop import ANSWER, CORE, LOADS, OUT_OF_MEMORY, SILENT, TASK
 
 _LINE_BYTES = WORDS * 8

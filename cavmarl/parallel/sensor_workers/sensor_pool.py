@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.processes.shared_memory import Segment, size_of
+from cavmarl.parallel.memory.shared_memory import Segment, size_of
 from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_job import SensorTask

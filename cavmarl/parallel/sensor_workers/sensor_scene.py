@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.parallel.processes.shared_memory import Layout, Segment, arrays_in
+from cavmarl.parallel.memory.shared_memory import Layout, Segment, arrays_in
 from cavmarl.sensors.kernels.rig_frames import POSE, Due
 
 NEVER = -1  # a tick that there is not

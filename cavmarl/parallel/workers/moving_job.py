@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.processes.state_image import Image
-from cavmarl.parallel.tasks import Task
-from cavmarl.parallel.worlds_job import WorldsJob
+from cavmarl.parallel.state.state_image import Image
+from cavmarl.parallel.workers.worlds_job import WorldsJob
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.tasks import Task
 
 Array = NDArray[Any]
 Share = list[Array]

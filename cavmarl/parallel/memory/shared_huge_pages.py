@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cavmarl.parallel.processes.shared_memory import shared_zeros
+from cavmarl.parallel.memory.shared_memory import shared_zeros
 
 HUGE_BYTES = 1 << 21  # of a huge page, on most processors
 MOST_BYTES = 1 << 28  # of an array that is had as a whole, whatever of it will be written

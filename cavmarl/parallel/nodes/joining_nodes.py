@@ -19,7 +19,7 @@ from cavmarl.parallel.nodes.node_cuts import read_neighbours
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, read_json, reading
-from cavmarl.parallel.world_errors import own_error
+from cavmarl.parallel.worlds.world_errors import own_error
 
 log = logging.getLogger("cavmarl.nodes")
 

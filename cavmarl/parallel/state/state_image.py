@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from xxhash import xxh3_64_intdigest
 
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.memory.shared_memory import Segment
 
 Array = NDArray[Any]
 Arrays = Sequence[Array]

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task
-from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.memory.shared_memory import Segment, arrays_in, size_of
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.placement.work_shares import Part, parts_of
+from cavmarl.parallel.worlds.tasks import Task
 
 _OUTBOX_BYTES = 1 << 12  # of what a worker leaves for others; it grows
 

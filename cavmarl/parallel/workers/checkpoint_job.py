@@ -9,10 +9,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import SumoError
-from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
-from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.tasks import Task
-from cavmarl.parallel.worlds_job import WorldsJob
+from cavmarl.parallel.state.checkpoint_log import CheckpointLog
+from cavmarl.parallel.workers.worlds_job import WorldsJob
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.tasks import Task
 
 AGAIN_S = 0.04  # a successor goes through no more steps again than take that long
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.worker_loop import Job
-from cavmarl.parallel.tasks import WORLD_TASKS, Task, commands_of
+from cavmarl.parallel.state.world_bytes import SavedWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.tasks import WORLD_TASKS, Task, commands_of
 
 
 class WorldsJob(Job):

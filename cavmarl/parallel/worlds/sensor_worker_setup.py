@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.config.zones import ZonesConfig
-from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.memory.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.processes.process_barrier import usable_cores
-from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
-from cavmarl.parallel.recipe import recipe_of, world_of
-from cavmarl.parallel.sensor_workers.sensor_job import SensorJob
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkerPlan, SensorWorkers
-from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays, SceneShape
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.sensor_workers.sensor_scene import SceneShape
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.worlds.world_message import recipe_of
 from cavmarl.sensors.registry import type_of
 
-PROGRAM = "cavmarl.parallel.sensor_workers.sensor_worker"
+PROGRAM = "cavmarl.parallel.worlds.sensor_worker"
 
 
 def local_worlds(
@@ -78,18 +74,3 @@ def sensor_workers_of(
     recipe = recipe_of(world._replace(config=undivided), base_dir, part=part, num_worlds=num_worlds)
     lines = tuple(type_of(name, sensor).num_lines(sensor) for name, sensor in config.rig.items())
     return SensorWorkers(SensorWorkerPlan(PROGRAM, recipe, arrays, shape, lines, config.workers))
-
-
-def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
-    """The jobs of all sensor workers, every kernel loaded."""
-    world = world_of(recipe)
-    config = world.config
-    shape = SceneShape(*recipe["shape"])
-    layout = layout_of(config, shape.capacity, recipe["num_worlds"])
-    arrays = StepArrays.of(arrays_in(Segment(recipe["frames"], 0).map(), layout))
-    frames = arrays.part(*recipe["part"]).frames
-    shared = SceneArrays.of(Segment(recipe["scene"], 0), shape)
-    simulation = Simulation(config, world.network, shape.worlds, world.demand, world.partition)
-    jobs = [SensorJob(simulation, shared, frames, number) for number in range(shape.workers)]
-    jobs[0].warm()
-    return jobs

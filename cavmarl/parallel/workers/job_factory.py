@@ -7,21 +7,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
-from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
-from cavmarl.parallel.checkpoint.moving_job import MovingJob
-from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
-from cavmarl.parallel.journaled_worlds import open_runs, unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.processes.shared_huge_pages import huge_shared_zeros
-from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
-from cavmarl.parallel.processes.state_image import Image
+from cavmarl.parallel.memory.shared_huge_pages import huge_shared_zeros
+from cavmarl.parallel.memory.shared_memory import Segment, arrays_in
+from cavmarl.parallel.placement.work_shares import Part
 from cavmarl.parallel.processes.worker_loop import Job, serve
-from cavmarl.parallel.recipe import CHANGED, world_of
-from cavmarl.parallel.sensor_workers.sensor_worker_setup import sensor_workers_of
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
-from cavmarl.parallel.team.team_job import LeaderJob
-from cavmarl.parallel.work_shares import Part
+from cavmarl.parallel.state.checkpoint_log import CheckpointLog
+from cavmarl.parallel.state.state_image import Image
+from cavmarl.parallel.state.world_bytes import SavedWorlds
+from cavmarl.parallel.workers.checkpoint_job import CheckpointJob
+from cavmarl.parallel.workers.moving_job import MovingJob
+from cavmarl.parallel.workers.team_job import LeaderJob
+from cavmarl.parallel.worlds.journaled_worlds import open_runs, unwatched
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.sensor_worker_setup import sensor_workers_of
+from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.worlds.world_message import CHANGED, world_of
 
 
 def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:

@@ -15,12 +15,12 @@ from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.core.errors import WorkerDeathError, WorkerFailureError
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.mover import Mover
-from cavmarl.parallel.step_arrays import Driven, StepArrays
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task
-from cavmarl.parallel.work_shares import Part
-from cavmarl.parallel.world_errors import own_error, unconnected, uncopied
+from cavmarl.parallel.placement.mover import Mover
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.placement.work_shares import Part
+from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays
+from cavmarl.parallel.worlds.tasks import Task
+from cavmarl.parallel.worlds.world_errors import own_error, unconnected, uncopied
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 

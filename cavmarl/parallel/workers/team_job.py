@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
-from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.worker_loop import Job
-from cavmarl.parallel.tasks import Task
-from cavmarl.parallel.team.team import Leader, Team, TeamFollower
-from cavmarl.parallel.worlds_job import WorldsJob
+from cavmarl.parallel.state.checkpoint_log import CheckpointLog
+from cavmarl.parallel.workers.checkpoint_job import CheckpointJob
+from cavmarl.parallel.workers.team import Leader, Team, TeamFollower
+from cavmarl.parallel.workers.worlds_job import WorldsJob
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.tasks import Task
 from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Shard
 

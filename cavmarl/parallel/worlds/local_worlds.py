@@ -24,10 +24,10 @@ from cavmarl.handoff.coordinator.coordinator_setup import OpenRun
 from cavmarl.handoff.coordinator.saved_ownership import without_journal
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
-from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
-from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
-from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
+from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
+from cavmarl.parallel.worlds.journaled_worlds import unwatched
+from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog

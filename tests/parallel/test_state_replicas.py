@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
-from cavmarl.parallel.nodes.kept_states import KeptStates
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
+from cavmarl.parallel.nodes.state_replicas import KeptStates
+from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 
 
 class Worlds:

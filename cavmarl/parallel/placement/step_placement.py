@@ -14,7 +14,7 @@ from cavmarl.balance.balancer import Balancer
 from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, ShardCost
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.work_shares import make_plans
+from cavmarl.parallel.placement.work_shares import make_plans
 
 if TYPE_CHECKING:
     from cavmarl.balance.probe import Watch

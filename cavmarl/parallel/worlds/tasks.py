@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.shards.shard import Commands
 
 

@@ -13,7 +13,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import flat_observation_space, state_space
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.processes.shared_memory import Layout
+from cavmarl.parallel.memory.shared_memory import Layout
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.registry import frame_layout, frames_in
 from cavmarl.shards.shard import Commands

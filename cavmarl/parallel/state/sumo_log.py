@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
 FIRST_LOG_BYTES = 1 << 12

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.parallel.checkpoint.sumo_log import FIRST_LOG_BYTES, KeptLog
-from cavmarl.parallel.processes.shared_memory import Layout, Segment, arrays_in, size_of
-from cavmarl.parallel.processes.state_image import Arrays, Image
+from cavmarl.parallel.memory.shared_memory import Layout, Segment, arrays_in, size_of
+from cavmarl.parallel.state.state_image import Arrays, Image
+from cavmarl.parallel.state.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.shards.shard import COMMANDS, Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 

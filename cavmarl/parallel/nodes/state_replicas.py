@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.peer_faults import FAULTS, reading
+from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
 Array = NDArray[Any]

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.parallel.memory.shared_memory import shared_zeros
 from cavmarl.parallel.processes.process_barrier import (
     NUMBER,
     WORDS,
@@ -29,8 +30,8 @@ from cavmarl.parallel.processes.process_barrier import (
     usable_cores,
     wait_for,
 )
-from cavmarl.parallel.processes.shared_memory import shared_zeros
-from cavmarl.parallel.team.hosted_zones import HostedZones
+from cavmarl.parallel.processes.worker_loop import TeamFailedError
+from cavmarl.parallel.workers.hosted_zones import HostedZones
 from cavmarl.shards.executor import PhaseExecutor
 from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands, Shard
@@ -46,10 +47,6 @@ CORE = 5  # a word of both: where the process was when it began with a phase
 # Phases that all workers run side by side, by their code.
 SHARED = tuple(phase for phase in Phase if phase.value.is_shared)
 END = len(SHARED)
-
-
-class LeftAloneError(Exception):
-    """Another worker of the same world could not run a phase; that one says why."""
 
 
 class Team:
@@ -95,7 +92,7 @@ class Leader(PhaseExecutor):
         """The time of a command, in which the followers wait for phases.
 
         Raises:
-            LeftAloneError: one of them has failed.
+            TeamFailedError: one of them has failed.
         """
         self._wait()
         self._leads, self._last, self._is_ahead = True, None, False
@@ -127,7 +124,7 @@ class Leader(PhaseExecutor):
         """Run a phase on every shard.
 
         Raises:
-            LeftAloneError: a follower has failed.
+            TeamFailedError: a follower has failed.
         """
         rule = phase.value
         which = self._which(phase, arguments)
@@ -153,7 +150,7 @@ class Leader(PhaseExecutor):
         self._is_ahead = False
         for line in self._others:
             if line.item(FAILED):
-                raise LeftAloneError
+                raise TeamFailedError
 
     def _which(self, phase: Phase, arguments: tuple[Any, ...]) -> int:
         """Which of what the followers know a phase is called with; -1: none, or no followers."""

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
-from cavmarl.parallel.processes.shared_memory import Segment
-from cavmarl.parallel.processes.state_image import Image
+from cavmarl.parallel.memory.shared_memory import Segment
+from cavmarl.parallel.state.state_image import Image
 
 Array = NDArray[Any]
 

@@ -14,24 +14,24 @@ from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
-from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
-from cavmarl.parallel.commanded_worlds import CommandedWorlds
-from cavmarl.parallel.journaled_worlds import refuse_watched, runs_as_text, unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.mover import Mover, MovingMemory
+from cavmarl.parallel.memory.shared_memory import Segment, arrays_in, size_of
+from cavmarl.parallel.placement.commanded_worlds import CommandedWorlds
+from cavmarl.parallel.placement.mover import Mover, MovingMemory
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.placement.work_shares import Part, parts_of
 from cavmarl.parallel.processes.process_barrier import usable_cores
-from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.processes.worker_pool import Pool, Program
-from cavmarl.parallel.recipe import recipe_of
-from cavmarl.parallel.sensor_workers.sensor_worker_setup import warn_if_crowded
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import TASK_NAMES, Task
-from cavmarl.parallel.work_shares import Part, parts_of
-from cavmarl.parallel.world_errors import own_error, refuse_external
+from cavmarl.parallel.state.checkpoint_log import make_segments
+from cavmarl.parallel.state.world_bytes import SavedWorlds
+from cavmarl.parallel.worlds.journaled_worlds import refuse_watched, runs_as_text, unwatched
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.sensor_worker_setup import warn_if_crowded
+from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.worlds.tasks import TASK_NAMES, Task
+from cavmarl.parallel.worlds.world_errors import own_error, refuse_external
+from cavmarl.parallel.worlds.world_message import recipe_of
 
-PROGRAM = "cavmarl.parallel.job_factory"
+PROGRAM = "cavmarl.parallel.workers.job_factory"
 
 
 class PooledWorlds(CommandedWorlds):
