@@ -13,8 +13,7 @@ import pytest
 from cavmarl.core.errors import MessageError, MissingExtraError, NodeRefusedError
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.code_stamp import code_stamp
-from cavmarl.parallel.network.framed_socket import VERSION
-from cavmarl.parallel.network.listener import Listener, call
+from cavmarl.parallel.network.listener import VERSION, Listener, call
 from cavmarl.parallel.network.tcp_transport import TcpConnection, TcpListener
 from cavmarl.parallel.nodes import joining_nodes
 from cavmarl.parallel.nodes.joining_nodes import ANYONE, Newcomers

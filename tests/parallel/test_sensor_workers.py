@@ -26,7 +26,7 @@ from cavmarl.parallel.sensor_workers import sensor_pool as sensor_farm
 from cavmarl.parallel.sensor_workers import sensor_shares
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
-from cavmarl.parallel.sensor_workers.sensor_shares import LineWorth, Shares
+from cavmarl.parallel.sensor_workers.sensor_shares import Shares
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.sensors.mounted.sensor_rig import Turn
 
@@ -130,7 +130,7 @@ def test_nothing_depends_on_how_frames_are_divided(
     """
     divided, turn = set[int](), count()
 
-    def divide(shares: Shares, _: LineWorth) -> Shares:
+    def divide(shares: Shares, _: LineCosts) -> Shares:
         lines = {unit.sensor: unit.end for unit in shares.units}
         fine = [number for number, unit in enumerate(shares.units) if unit.end >= 8]
         if not fine:

@@ -31,8 +31,9 @@ from cavmarl.parallel.network.encryption import (
     leaves_this_machine,
     prepare,
 )
-from cavmarl.parallel.network.framed_socket import MAGIC, VERSION, FramedSocket
 
+MAGIC = b"cavW"
+VERSION = 1  # of this handshake
 NONCE = 16  # bytes of a random number
 PROOF = 32  # of an HMAC
 SECRET = 32
@@ -236,15 +237,6 @@ class Listener:
         for caller in self._callers:
             caller.close()
         self._listener.close()
-
-
-def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
-    """Call as a host; the caller may be busy for long before it answers.
-
-    Raises:
-        OSError: no process listens there.
-    """
-    return FramedSocket(call(place, secret, number))
 
 
 def call(

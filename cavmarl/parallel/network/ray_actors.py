@@ -12,16 +12,14 @@ from cavmarl.parallel.network.ray_cluster import choose_nodes, join, leave, node
 ENDS_S = 3.0  # for actors to return by themselves: Ray prints a complaint for each that is killed
 SPARES = 1  # hosts that wait for another one's death: a new actor takes seconds
 
-Main = Callable[[str, tuple[str, int], bytes, int], None]
+Main = Callable[[tuple[str, int], bytes, int], None]
 
 
 class RayHost:
     """The actor: its one call lasts as long as it lives."""
 
-    def run(
-        self, main: Main, recipe: str, place: tuple[str, int], secret: bytes, number: int
-    ) -> None:
-        main(recipe, place, secret, number)
+    def run(self, main: Main, place: tuple[str, int], secret: bytes, number: int) -> None:
+        main(place, secret, number)
 
 
 class RayActors:
@@ -45,7 +43,6 @@ class RayActors:
     def __init__(
         self,
         main: Main,  # what each runs; a function of a module, which every node has to have
-        recipe: Callable[[int], str],  # what that is told, by the number of workers
         workers: int | None,  # actors with a CPU of their own; None: as many as there are free CPUs
         at_most: int,  # so many are of use
     ) -> None:
@@ -67,7 +64,6 @@ class RayActors:
         except BaseException:
             self.close()
             raise
-        self._recipe = recipe(self.workers)
 
     def start(self, place: tuple[str, int], secret: bytes) -> None:
         for number, node in enumerate(self._nodes):
@@ -85,7 +81,7 @@ class RayActors:
             scheduling_strategy=strategies.NodeAffinitySchedulingStrategy(node, soft=True),
         )
         self._actors.append(actor.remote())
-        call = self._actors[-1].run.remote(self._main, self._recipe, place, secret, number)
+        call = self._actors[-1].run.remote(self._main, place, secret, number)
         self._calls.append(call)
 
     def restart(self, number: int) -> None:

@@ -195,7 +195,7 @@ class NodeProgram:
         is_caller = number == COORDINATOR
         match frame.kind:
             case FrameKind.MESSAGES:
-                self._hosts.hear(number, frame)
+                self._hosts.hear(frame)
             case FrameKind.KEEP if not is_caller:
                 self._kept.take(number, frame)
             case FrameKind.AGENT if not is_caller:
@@ -508,7 +508,7 @@ def run_node(
         links.close()
 
 
-def run_on_ray(recipe: str, place: Place, secret: bytes, number: int) -> None:
+def run_on_ray(place: Place, secret: bytes, number: int) -> None:
     """The same as an actor, which Ray starts again if it ends before it is needed no more."""
     if not run_node(place, secret, number):
         os._exit(1)

@@ -260,7 +260,7 @@ def start_nodes(
     nodes = backend.count or 1
     if backend.kind == RAY:
         at_most = backend.count or num_worlds
-        actors = RayActors(run_on_ray, lambda workers: "", backend.count, at_most)
+        actors = RayActors(run_on_ray, backend.count, at_most)
         listener = TcpListener(actors.address)
         return RayNodes(actors, listener, settings.max_retries), listener
     if backend.address is None:

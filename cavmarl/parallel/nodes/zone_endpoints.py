@@ -292,7 +292,7 @@ class ZoneHosts:
                     self._send(w, message)
         return movers, is_late
 
-    def hear(self, number: int, frame: NodeFrame) -> None:
+    def hear(self, frame: NodeFrame) -> None:
         """Take messages of other nodes as soon as they come."""
         messages = unpacked(frame.data)
         check_indices("world", (w for w, _ in messages), len(self._endpoints))
@@ -335,7 +335,7 @@ class ZoneHosts:
         left = set()
         for zone, advance in leases.items():
             for vehicle in advance.leave:
-                self._send_agent(w, zone, vehicle)
+                self._send_agent(w, vehicle)
                 division.changes.give_up(w, zone, vehicle)
                 left.add(vehicle)
         for zone, advance in leases.items():
@@ -350,7 +350,7 @@ class ZoneHosts:
         zone, row = self._division.changes.find(w, vehicle)
         return int(self._division.owned(w, zone)["agent"][row])
 
-    def _send_agent(self, w: int, zone: int, vehicle: int) -> None:
+    def _send_agent(self, w: int, vehicle: int) -> None:
         """Send what is kept of an agent to the node that its vehicle goes to, if it is another."""
         target = self._targets[w].pop(vehicle, -1)
         if target in self._zones:

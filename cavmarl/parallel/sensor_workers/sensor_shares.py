@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from cavmarl.balance.load_snapshot import idle_snapshot
 from cavmarl.balance.local_search import refine
 from cavmarl.balance.problem import Problem, ShardCost
 from cavmarl.balance.shard_placement import Placement
+from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 
 PIECES_A_WORKER = 4  # of the agents of one sensor, where there are so many
 LEAST_S = 2e-4  # that has to be saved to divide frames: what stands around is looked up twice then
@@ -35,16 +36,6 @@ class Unit(NamedTuple):
     last: int  # the one after the last
     begin: int = 0  # line of their frames
     end: int = 1  # the one after the last
-
-
-class LineWorth(Protocol):
-    """Where in the frames of each sensor the time goes."""
-
-    def part(self, sensor: int, begin: int, end: int) -> float:
-        """What the lines [begin, end) cost, as a part of the frame."""
-
-    def line_at(self, sensor: int, part: float) -> int:
-        """The line before which about that part of the frame's cost lies."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +110,7 @@ def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int)
     return Shares(tuple(units), tuple(placed.homes), tuple(costs_s), workers)
 
 
-def divide(shares: Shares, worth: LineWorth) -> Shares:
+def divide(shares: Shares, costs: LineCosts) -> Shares:
     """Move lines from workers with too many to workers with too few, until all have about the same.
 
     Each step leaves one worker with the mean, so no more frames are divided than there are workers.
@@ -143,12 +134,12 @@ def divide(shares: Shares, worth: LineWorth) -> Shares:
             for other, home in zip(units, homes, strict=True)
         ):
             break  # what one worker writes of a frame is in one piece
-        before = worth.part(unit.sensor, 0, unit.end)
-        within = worth.part(unit.sensor, unit.begin, unit.end)
-        line = worth.line_at(unit.sensor, before - within * wanted_s / cost_s)
+        before = costs.part(unit.sensor, 0, unit.end)
+        within = costs.part(unit.sensor, unit.begin, unit.end)
+        line = costs.line_at(unit.sensor, before - within * wanted_s / cost_s)
         if not unit.begin < line < unit.end:
             break  # it cannot be divided, or not so finely
-        given_s = cost_s * worth.part(unit.sensor, line, unit.end) / within
+        given_s = cost_s * costs.part(unit.sensor, line, unit.end) / within
         units[number], costs_s[number] = unit._replace(end=line), cost_s - given_s
         units.append(unit._replace(begin=line))
         homes.append(taker)

@@ -112,21 +112,6 @@ class Image:
             yield words[at:end].view(np.uint8)[:num_bytes].view(dtype).reshape(shape)
             at = end
 
-    def content(self) -> NDArray[np.uint8]:
-        """(n,) What has been written, as bytes; a view."""
-        return self._words[: self._words[0]].view(np.uint8)
-
-    def put(self, content: NDArray[np.uint8]) -> None:
-        """Take over the content of another image, perhaps from another machine.
-
-        Raises:
-            OSError: there is no memory for it.
-        """
-        self._make_room(content.size)
-        self._places.clear()  # its arrays may lie elsewhere
-        self._written = ()
-        self._words.view(np.uint8)[: content.size] = content
-
     def _make_room(self, size: int) -> bool:
         """Whether it lies elsewhere from here on, because it was too small."""
         if size <= _WORD * len(self._words):

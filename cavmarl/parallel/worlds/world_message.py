@@ -13,7 +13,6 @@ from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.engine.world_setup import World, make_world
 
 CHANGED = "have changed while workers were started: try again"
-ELSEWHERE = "in {} are not the caller's: copy them to all machines"
 
 
 def recipe_of(world: World, base_dir: Path, **more: Any) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """`FramedSocket`: frames over a connection.
 
-A frame is a head of fixed size, a payload (mostly a few numbers, as the dialect writes them;
-between hosts as JSON) and data (bytes of arrays, whose shapes both ends know). A frame carries
-numbers and text, never code.
+A frame is a head of fixed size, a payload (mostly a few numbers, encoded as the dialect defines)
+and data (bytes of arrays, whose shapes both ends know). A frame carries numbers and text, never
+code.
 
     head    magic, version, kind, order, bytes of the payload, bytes of the data,
             checksum of the data, checksum of the head and the payload
@@ -12,7 +12,6 @@ numbers and text, never code.
 
 from __future__ import annotations
 
-import json
 import socket
 import struct
 import zlib
@@ -27,26 +26,11 @@ from cavmarl.core.errors import MessageError
 
 Array = NDArray[Any]
 
-MAGIC = b"cavW"
-VERSION = 1
-MAX_LETTER = 1 << 17
-MAX_DATA = 1 << 34
 MAX_PIECES = 512  # buffers in one call of the system
 
 _HEAD = struct.Struct("<4sHHQIQI")
 _SUM = struct.Struct("<I")
 HEAD_BYTES = _HEAD.size + _SUM.size
-
-
-class Kind(IntEnum):
-    """What a frame says."""
-
-    ORDER = 0  # do this
-    READY = 1  # a host can be given commands
-    BEAT = 2  # it is working
-    DONE = 3  # what has come out
-    FAILED = 4  # an exception: its class, its words, its traceback
-    END = 5  # a host is needed no more
 
 
 class Dialect(NamedTuple):
@@ -62,22 +46,6 @@ class Dialect(NamedTuple):
     cure: str  # what to do about another version
 
 
-def _as_json(payload: Any) -> bytes:
-    return json.dumps(payload).encode()
-
-
-HOSTS = Dialect(
-    MAGIC,
-    VERSION,
-    Kind,
-    MAX_LETTER,
-    MAX_DATA,
-    _as_json,
-    json.loads,
-    "install the same cavmarl on all machines",
-)
-
-
 class Frame(NamedTuple):
     """What stands before a frame's data."""
 
@@ -89,23 +57,18 @@ class Frame(NamedTuple):
 
 
 class FramedSocket:
-    """One end of a connection; everything blocks, at most as long as the socket's timeout.
-
-    Attributes:
-        is_torn: a frame was begun and not ended, so what follows cannot be understood.
-    """
+    """One end of a connection; each call blocks, at most for the timeout of the socket."""
 
     def __init__(
         self,
-        connection: socket.socket,  # a socket of a stream, which the wire owns from here on
-        dialect: Dialect = HOSTS,  # that both ends speak
+        connection: socket.socket,  # a stream socket, which this object owns and closes
+        dialect: Dialect,  # that both ends use
     ) -> None:
         if connection.family != socket.AF_UNIX:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = connection
         self._dialect = dialect
         self._frame: Frame | None = None
-        self.is_torn = False
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -121,9 +84,7 @@ class FramedSocket:
         size = sum(len(piece) for piece in data)
         head = _HEAD.pack(dialect.magic, dialect.version, kind, order, len(text), size, checksum)
         start = b"".join((head, _SUM.pack(zlib.crc32(text, zlib.crc32(head))), text))
-        self.is_torn = True
         self._send_all([memoryview(start), *data])
-        self.is_torn = False
 
     def receive(self) -> Frame:
         """What stands before the next frame's data, which then has to be taken or skipped.
@@ -133,7 +94,6 @@ class FramedSocket:
             OSError: it is gone, or sends nothing.
         """
         dialect = self._dialect
-        self.is_torn = True
         raw = self._read(HEAD_BYTES)
         head = bytes(raw[: _HEAD.size])
         kind, order, payload_size, size, checksum = _understood(head, dialect)
@@ -163,7 +123,7 @@ class FramedSocket:
             self._fill(piece)
         if frame.checksum != _checksum(pieces):
             raise MessageError("the data of a frame are not what was sent")
-        self._frame, self.is_torn = None, False
+        self._frame = None
 
     def skip(self) -> None:
         """Read the data of the frame that was received, and forget them."""
