@@ -134,9 +134,11 @@ def test_the_process_that_forks_may_die(make: Make) -> None:
     assert same(drive(vec, before=strike), whole)
 
 
-def test_a_follower_that_fails(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("phase", ["move", "resolve"])
+def test_a_member_that_fails(make: Make, phase: str, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = {"agents": 5, "background": 20}
     whole = drive(make("grid4x4", **wanted))
+    monkeypatch.setenv("FAILING_PHASE", phase)
     monkeypatch.setattr(pooled, "PROGRAM", "tests.support.failing_worker")
     vec = make("grid4x4", zones=4, workers=2, **wanted)
     failures: list[WorkerFailureError] = []
@@ -154,7 +156,7 @@ def test_a_follower_that_fails(make: Make, monkeypatch: pytest.MonkeyPatch) -> N
     (failure,) = failures
     assert (failure.kind, failure.worker) == ("ZeroDivisionError", 1)
     assert "world 0, zone" in str(failure)
-    assert failure.text == "a follower's own"
+    assert failure.text == "of a member"
     trace = failure.traceback
     assert trace.startswith("Traceback (most recent call last)")
     assert "in perform" in trace

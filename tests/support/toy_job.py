@@ -49,10 +49,10 @@ class Adder:
         self.more = np.zeros(0)  # another one each time
         self.falls_at = ""
 
-    def afterwards(self) -> None:
+    def on_idle(self) -> None:
         """Nothing to do."""
 
-    def prepare(self) -> None:
+    def before_fork(self) -> None:
         """Nothing is shared."""
 
     def perform(self, task: int, payload: Any) -> Any:

@@ -69,14 +69,14 @@ class Job:
     def load(self, saved: Sequence[Any]) -> None:
         """Go on from what `save` gave."""
 
-    def afterwards(self) -> None:
+    def on_idle(self) -> None:
         """Called after a command's answer is sent: for work that is not waited for.
 
         What it makes must not be needed before another command is carried out: that one may be
         carried out by a successor, which finds what was committed.
         """
 
-    def prepare(self) -> None:
+    def before_fork(self) -> None:
         """Called where workers are forked, before each fork that is to do this job.
 
         The worker that did it is dead; so are those it shares memory with, if it is their first.
@@ -156,7 +156,7 @@ def _fork_on_demand(
             _say(pool, {"status": os.waitstatus_to_exitcode(status)})
             continue
         number, (wire,) = order["fork"], descriptors
-        jobs[number].prepare()
+        jobs[number].before_fork()
         mother = os.getpid()
         pid = os.fork()
         if pid == 0:
@@ -231,7 +231,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
         meeting.post(number)
         if mine[ANSWER] != FAILED:
             try:
-                job.afterwards()
+                job.on_idle()
             except MemoryError:
                 os._exit(OUT_OF_MEMORY)
 

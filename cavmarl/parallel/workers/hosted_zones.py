@@ -1,4 +1,4 @@
-"""`HostedZones`: the zones of one world that one worker of a team runs; they may change."""
+"""`HostedZones`: the zones of a world that one worker of a team runs."""
 
 from __future__ import annotations
 
@@ -13,37 +13,34 @@ from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-TIMED = 16  # one tick of so many is run zone by zone, with a clock
+TIMED = 16  # one tick in 16 is run zone by zone and timed
 
 
 class HostedZones:
-    """Runs phases on some shards of a world."""
+    """Runs phases on the shards of its zones, which may change."""
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # all of the world, one a zone; every process knows them
-        zones: Sequence[int],  # that are run here; none is fine, too
+        shards: Sequence[Shard],  # of all zones of the world
+        zones: Sequence[int],  # hosted here, maybe none
         # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self._all = shards
         self._spent_s = spent_s
         self._ticks = 0
-        self._collect(zones)
+        self.host(zones)
 
-    def _collect(self, zones: Sequence[int]) -> None:
+    def host(self, zones: Sequence[int]) -> None:
+        """Run these zones from now on, and no others."""
         self._shards = [self._all[zone] for zone in sorted(zones)]
         self._together = [ShardGroup(self._shards)] if self._shards else []
         self._alone: list[ShardGroup] = []
-        self._rehearsal = -1
-        self._sides: tuple[int, int] | None = None  # as far as they have been told here
-
-    def take(self, zones: Sequence[int]) -> None:
-        """Run these zones from now on, and no others."""
-        self._collect(zones)
+        self._untimed = -1  # tick whose run prepares the timed groups
+        self._sides: tuple[int, int] | None = None  # that the shards face, if known
 
     def face(self, side: int, next_side: int) -> None:
-        """Say on which side the rows are, and the next ones; where others call the phases."""
+        """Set the sides of the present and the next rows, as another process announced them."""
         if self._sides != (side, next_side):
             self._sides = side, next_side
             for shard in self._shards:
@@ -61,12 +58,12 @@ class HostedZones:
     def _run_timed(
         self, spent_s: NDArray[np.float64], phase: Phase, arguments: tuple[Any, ...]
     ) -> None:
-        """The same zone by zone; the clock's time stands for all ticks until the next timed one."""
+        """Run a phase zone by zone; the time counts for all ticks until the next timed one."""
         if not self._alone:
             self._alone = [ShardGroup([shard]) for shard in self._shards]
-            self._rehearsal = self._ticks  # it makes ready what later ones use
+            self._untimed = self._ticks  # this tick also loads what the later ones use
         for shard, group in zip(self._shards, self._alone, strict=True):
             began_ns = time.thread_time_ns()
             phase.run(group, arguments)
-            if self._ticks != self._rehearsal:
+            if self._ticks != self._untimed:
                 spent_s[shard.zone] += TIMED * 1e-9 * (time.thread_time_ns() - began_ns)

@@ -14,9 +14,10 @@ from cavmarl.parallel.processes.worker_loop import Job, serve
 from cavmarl.parallel.state.checkpoint_log import CheckpointLog
 from cavmarl.parallel.state.state_image import Image
 from cavmarl.parallel.state.world_bytes import SavedWorlds
-from cavmarl.parallel.workers.checkpoint_job import CheckpointJob
-from cavmarl.parallel.workers.moving_job import MovingJob
-from cavmarl.parallel.workers.team_job import LeaderJob
+from cavmarl.parallel.workers.logged_worlds import LoggedWorlds
+from cavmarl.parallel.workers.movable_worlds import MovableWorlds
+from cavmarl.parallel.workers.team_job import LedTeam
+from cavmarl.parallel.workers.worlds_job import WorldsJob
 from cavmarl.parallel.worlds.journaled_worlds import open_runs, unwatched
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.sensor_worker_setup import sensor_workers_of
@@ -50,50 +51,50 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             runs=runs[first:last] or None,
         )
 
-    def with_sensors(worlds: LocalWorlds, part: Part) -> LocalWorlds:
+    def make_shared(number: int) -> LocalWorlds:
+        """Make a world whose zones several workers share."""
+        return LocalWorlds(
+            world,
+            1,
+            arrays.part(number, number + 1),
+            in_next_step=recipe["in_next_step"],
+            zeros=huge_shared_zeros,
+            runs=runs[number : number + 1] or None,
+        )
+
+    def attach_sensors(worlds: LocalWorlds, part: Part) -> None:
         if config.workers.sensors:
             memory = Segment(os.dup(recipe["arrays"]), 0)
             bounds = (part.first, part.last)
             base_dir, num_worlds = Path(recipe["base_dir"]), recipe["num_worlds"]
             sensors = sensor_workers_of(world, base_dir, memory, bounds, num_worlds)
             worlds.attach_sensor_workers(sensors)
-        return worlds
 
-    mover = recipe["mover"]
-    spent_s = None
+    saved = [SavedWorlds(Segment(fd, 0)) for fd in recipe["saved_worlds"]]
+    mover, spent_s = recipe["mover"], None
     if mover is not None:
         spent_s = arrays_in(Segment(mover["spent"], 0).map(), mover["layout"])["spent_s"]
         outboxes = [Image(Segment(fd, 0)) for fd in mover["outboxes"]]
         if outboxes:
             bounds = [part.first for part in parts] + [parts[-1].last]
             whole_s = spent_s[:, 0]
-            moving = [MovingJob(make, bounds, k, outboxes, whole_s) for k in range(len(parts))]
-            for mover_job, fd in zip(moving, recipe["saved_worlds"], strict=True):
-                mover_job.saved_worlds = SavedWorlds(Segment(fd, 0))
-            return list(moving)
+            return [
+                WorldsJob(MovableWorlds(make, bounds, k, outboxes, whole_s), saved[k])
+                for k in range(len(parts))
+            ]
     jobs: list[Job] = []
-    job: CheckpointJob
-    logs = recipe["checkpoint_logs"]
-    for part, descriptors, fd in zip(parts, logs, recipe["saved_worlds"], strict=True):
+    for part, descriptors, memory in zip(parts, recipe["checkpoint_logs"], saved, strict=True):
         checkpoint_log = CheckpointLog(config, part.last - part.first, descriptors)
-        if len(part.zones) > 1:
-            worlds = LocalWorlds(
-                world,
-                1,
-                arrays.part(part.first, part.last),
-                in_next_step=recipe["in_next_step"],
-                zeros=huge_shared_zeros,
-                runs=runs[part.first : part.last] or None,
-            )
-            theirs = None if spent_s is None else spent_s[part.first]
-            sensed = with_sensors(worlds, part)
-            job = leader = LeaderJob(sensed, part.first, part.zones, checkpoint_log, theirs)
-            jobs += [leader, *leader.followers()]
-        else:
-            sensed = with_sensors(make(part.first, part.last), part)
-            job = CheckpointJob(sensed, part.first, checkpoint_log)
-            jobs.append(job)
-        job.saved_worlds = SavedWorlds(Segment(fd, 0))
+        is_team = len(part.zones) > 1
+        worlds = make_shared(part.first) if is_team else make(part.first, part.last)
+        attach_sensors(worlds, part)
+        kept = LoggedWorlds(worlds, part.first, checkpoint_log, limits_repeat=not is_team)
+        if not is_team:
+            jobs.append(WorldsJob(kept, memory))
+            continue
+        own_s = None if spent_s is None else spent_s[part.first]
+        team = LedTeam(kept, part.zones, checkpoint_log.entries, own_s)
+        jobs += [WorldsJob(kept, memory, team), *team.members()]
     return jobs
 
 

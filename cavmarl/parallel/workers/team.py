@@ -1,12 +1,13 @@
 """`Team`: the worker processes of one world, which run the phases of its ticks together.
 
-The first of them leads: it runs the tick as one process would. Each phase that is mostly done zone
-by zone it announces to the others, the followers, runs it on its own zones, and goes on when they
-have run it on theirs. What is in between, departures, signals and owners, it does alone.
+The first worker leads: it runs the tick as a single process would. Phases that are mostly
+independent for each zone are shared. The leader announces such a phase to the other members, runs
+it on its own zones, and continues when the members have run it on theirs. Between the phases it
+handles departures, signals and ownership alone.
 
-All arrays that shards write are shared (`shared_huge_pages`), and each row has one writer at a
-time. A follower keeps nothing from one phase to the next but scratch memory: what a phase needs to
-know beside the arrays stands in the leader's line.
+All arrays that shards write are shared memory (`shared_huge_pages`), and each row has one writer at
+a time. Between phases a member keeps scratch memory only. Beside the arrays, a phase depends on the
+line of the leader alone.
 """
 
 from __future__ import annotations
@@ -37,62 +38,61 @@ from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-# Words of the leader's line, behind those of `barrier`: what is called with even numbers, and what
-# with odd ones.
+# Words of the leader's line, after those of `process_barrier`: the calls with even numbers, and
+# those with odd numbers.
 CALLS = (2, 3)
-# A word of a follower's line.
+# A word of a member's line.
 FAILED = 2
-CORE = 5  # a word of both: where the process was when it began with a phase
+CORE = 5  # a word of both lines: the core on which the process was when it began a phase
 
-# Phases that all workers run side by side, by their code.
+# Phases that all members run in parallel, by their code.
 SHARED = tuple(phase for phase in Phase if phase.value.is_shared)
 END = len(SHARED)
 
 
 class Team:
-    """The workers of one world and their zones; made before the processes start."""
+    """The workers of one world and their zones; made before the processes are forked."""
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # one a zone, in the order of zones; their arrays are shared
-        zones: Sequence[Sequence[int]],  # of each worker, to begin with; the first leads
-        # the arguments of shared phases: for each phase all that there are to choose from; the
-        # arrays among them are shared
+        shards: Sequence[Shard],  # one per zone, in the order of zones; their arrays are shared
+        zones: Sequence[Sequence[int]],  # initial zones of each worker; the first worker leads
+        # arguments of shared phases: all that a phase may be called with, with shared arrays
         known: Mapping[Phase, Sequence[tuple[Any, ...]]],
         # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self.known = {phase: tuple(known.get(phase, ((),))) for phase in SHARED}
-        self.everybody = ShardGroup(shards)
+        self.all_zones = ShardGroup(shards)
         self.hosts = [HostedZones(shards, hosted, spent_s) for hosted in zones]
         lines = shared_zeros((len(zones), WORDS), np.int64)
         self.lines: list[Words] = list(lines)
 
     def forget(self) -> None:
-        """Begin to count anew: the processes that counted are dead."""
+        """Reset the lines after the processes that wrote them have died."""
         for line in self.lines:
             line[:] = 0
 
 
-class Leader(PhaseExecutor):
-    """Runs each phase on all shards of a world, with the help of the followers; an `Executor`."""
+class TeamLeader(PhaseExecutor):
+    """Runs each phase on all shards of a world, with the help of the other members."""
 
     def __init__(self, team: Team) -> None:
         self._known = team.known
-        self._everybody = team.everybody
+        self._all_zones = team.all_zones
         self._own = team.hosts[0]
         self._line, *self._others = team.lines
         self._codes = {phase: code for code, phase in enumerate(SHARED)}
         self._leads = False
         self._last: Phase | None = None
-        self._is_ahead = False  # a phase is announced and not waited for
+        self._is_ahead = False  # a phase is announced and not awaited yet
 
     @contextmanager
-    def order(self) -> Iterator[None]:
-        """The time of a command, in which the followers wait for phases.
+    def command(self) -> Iterator[None]:
+        """Enclose a command, in which the members wait for phases.
 
         Raises:
-            TeamFailedError: one of them has failed.
+            TeamFailedError: a member has failed.
         """
         self._wait()
         self._leads, self._last, self._is_ahead = True, None, False
@@ -102,7 +102,7 @@ class Leader(PhaseExecutor):
             self._dismiss()
 
     def end_after(self, phase: Phase | None) -> None:
-        """Let the followers end the command when they have run this phase."""
+        """Let the members end the command as soon as they have run this phase."""
         self._last = phase
 
     def _dismiss(self) -> None:
@@ -111,27 +111,27 @@ class Leader(PhaseExecutor):
             self._wait()
             self._announce(END)
 
-    def take(self, zones: Sequence[int]) -> None:
-        """From now on these zones are its own; the others are the followers'."""
-        self._own.take(zones)
+    def host(self, zones: Sequence[int]) -> None:
+        """Host these zones from now on; the other members host the rest."""
+        self._own.host(zones)
 
     def advance(self, commands: Commands) -> None:
-        """Turn the rows, if they are to be put in order, and move them."""
-        self._everybody.turn()
+        """Sort the rows if that is due, and move the vehicles."""
+        self._all_zones.turn()
         self.run(Phase.MOVE, (commands,))
 
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
         """Run a phase on every shard.
 
         Raises:
-            TeamFailedError: a follower has failed.
+            TeamFailedError: a member has failed.
         """
         rule = phase.value
         which = self._which(phase, arguments)
         if (which < 0 and not rule.is_early) or rule.is_late:
             self.meet()
         if which < 0:
-            phase.run(self._everybody, arguments)
+            phase.run(self._all_zones, arguments)
             return
         self._announce(self._codes[phase], which)
         self._is_ahead = True
@@ -143,7 +143,7 @@ class Leader(PhaseExecutor):
             self._dismiss()
 
     def meet(self) -> None:
-        """Wait until the followers are through with the last phase, whatever it was."""
+        """Wait until the members have run the phase that was announced last, if any."""
         if not self._is_ahead:
             return
         self._wait()
@@ -153,7 +153,10 @@ class Leader(PhaseExecutor):
                 raise TeamFailedError
 
     def _which(self, phase: Phase, arguments: tuple[Any, ...]) -> int:
-        """Which of what the followers know a phase is called with; -1: none, or no followers."""
+        """Return the index of the arguments among those that members know.
+
+        -1: the members do not know the arguments, or wait for no phase.
+        """
         if self._leads and phase in self._codes:
             for number, known in enumerate(self._known[phase]):
                 if all(map(is_, arguments, known)):
@@ -163,7 +166,7 @@ class Leader(PhaseExecutor):
     def _announce(self, code: int, which: int = 0) -> None:
         line = self._line
         number = line.item(NUMBER) + 1
-        side, next_side = self._everybody.sides
+        side, next_side = self._all_zones.sides
         line[CALLS[number % 2]] = which << 16 | code << 2 | side << 1 | next_side
         line[CORE] = present_core()
         post(line, number)
@@ -174,8 +177,8 @@ class Leader(PhaseExecutor):
             wait_for(line, number, line.item(CORE) != core)
 
 
-class TeamFollower:
-    """Runs the phases that the leader announces on its own shards."""
+class TeamMember:
+    """A worker that runs the phases announced by the leader on its own shards."""
 
     def __init__(self, team: Team, number: int) -> None:
         self._known = team.known
@@ -185,7 +188,8 @@ class TeamFollower:
         self._before = team.lines[:number]
         self._cores = usable_cores()
 
-    def follow(self) -> None:
+    def run_phases(self) -> None:
+        """Run what the leader announces until it ends the command."""
         line, leader = self._line, self._leader
         line[FAILED] = 0
         failure: Exception | None = None
@@ -206,13 +210,14 @@ class TeamFollower:
         if failure is not None:
             raise failure
 
-    def take(self, zones: Sequence[int]) -> None:
-        self._own.take(zones)
+    def host(self, zones: Sequence[int]) -> None:
+        self._own.host(zones)
 
-    def _get_out_of_the_way(self) -> None:
-        """Leave the core of those before in the team: they wait for this one, and it for them.
+    def _leave_shared_core(self) -> None:
+        """Leave the core of a member with a lower number: both would wait for each other.
 
-        Systems put processes that are woken together on one core, and take milliseconds to notice.
+        Operating systems put processes that wake together on one core, and take milliseconds to
+        separate them.
         """
         core = present_core()
         taken = {line.item(CORE) for line in self._before}
@@ -222,6 +227,6 @@ class TeamFollower:
         self._line[CORE] = core
 
     def _run(self, phase: Phase, call: int) -> None:
-        self._get_out_of_the_way()
+        self._leave_shared_core()
         self._own.face(call >> 1 & 1, call & 1)
         self._own.run(phase, self._known[phase][call >> 16])

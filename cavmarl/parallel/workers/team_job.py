@@ -1,134 +1,123 @@
-"""What the workers of one world do: `LeaderJob` runs it, `FollowerJob` helps."""
+"""The team of one world as its leader commands it, and the job of the other members."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.parallel.processes.worker_loop import Job
-from cavmarl.parallel.state.checkpoint_log import CheckpointLog
-from cavmarl.parallel.workers.checkpoint_job import CheckpointJob
-from cavmarl.parallel.workers.team import Leader, Team, TeamFollower
-from cavmarl.parallel.workers.worlds_job import WorldsJob
-from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.workers.team import Team, TeamLeader, TeamMember
+from cavmarl.parallel.workers.worker_worlds import WorkerWorlds
 from cavmarl.parallel.worlds.tasks import Task
 from cavmarl.shards.phases import Phase
-from cavmarl.shards.shard import Shard
+from cavmarl.shards.shard import Commands, Shard
 
-# Phases that end a task for the followers; what comes after them the leader does alone, and one of
-# the followers wakes the caller in the meantime.
+# The phase after which members have finished a task. The leader does the rest of the task alone;
+# meanwhile one of the members wakes the caller.
 LAST = {Task.STEP: Phase.SENSE, Task.SUGGEST: Phase.SUGGEST}
-# Tasks of the leader, of which no follower hears.
+# Tasks that the leader does alone; the pool does not send them to the members.
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
 
-class LeaderJob(CheckpointJob):
-    """One world that several workers run, of which this one leads."""
+class LedTeam:
+    """The workers of one world, as the worker that leads them sees them.
+
+    Attributes:
+        hosts: (k,) number within the team of the worker that hosts each zone.
+    """
 
     def __init__(
         self,
-        worlds: LocalWorlds,  # the one; what its shards write is shared
-        first: int,  # its number among all
-        zones: Sequence[Sequence[int]],  # that each worker hosts, to begin with; the leader's first
-        checkpoint_log: CheckpointLog,  # the checkpoint log in which it leaves the state behind
+        kept: WorkerWorlds,  # of one world, whose shards write shared memory
+        zones: Sequence[Sequence[int]],  # initial zones of each worker, those of the leader first
+        repeated: Sequence[Commands],  # commands that the steps of a checkpoint log may have
         # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
-        super().__init__(worlds, first, checkpoint_log)
-        self._zones = zones
-        self._hosts = _hosts(zones)
-        self._spent_s = spent_s
-        worlds.simulation.zones.use_team(self._lead)
+        self._kept = kept
+        self._zones, self._repeated, self._spent_s = zones, repeated, spent_s
+        self.hosts = _hosts(zones)
+        kept.worlds.simulation.zones.use_team(self._make_leader)
 
-    def _lead(self, shards: Sequence[Shard], gathering: tuple[float, float]) -> Leader:
-        commands = [(self._commands,), *((entry,) for entry in self._log.entries)]
-        chosen = [(self._worlds.simulation.everywhere,)]
+    def _make_leader(self, shards: Sequence[Shard], gathering: tuple[float, float]) -> TeamLeader:
+        worlds = self._kept.worlds
+        # The leader compares arguments by identity, so each step has to pass one of these objects.
+        commands = [(self._kept.commands,), *((commands,) for commands in self._repeated)]
+        chosen = [(worlds.simulation.everywhere,)]
         known: dict[Phase, Sequence[tuple[Any, ...]]] = {
             Phase.BEGIN_STEP: commands,
             Phase.MOVE: commands,
             Phase.GATHER: [gathering],
             Phase.SENSE: chosen,
             Phase.CREDIT: chosen,
-            Phase.SUGGEST: [(self._worlds.arrays.suggested,)],
+            Phase.SUGGEST: [(worlds.arrays.suggested,)],
         }
         self._team = Team(shards, self._zones, known, self._spent_s)
-        self._leader = Leader(self._team)
+        self._leader = TeamLeader(self._team)
         return self._leader
 
-    def followers(self) -> Iterator[FollowerJob]:
+    def members(self) -> Iterator[TeamMemberJob]:
+        """Make the jobs of the other workers."""
         for number in range(1, len(self._zones)):
-            follower = TeamFollower(self._team, number)
-            yield FollowerJob(follower, self._first, number, self._hosts.copy())
+            member = TeamMember(self._team, number)
+            yield TeamMemberJob(member, self._kept.first, number, self.hosts.copy())
 
-    def prepare(self) -> None:
-        """The former leader is dead, and so are its followers."""
+    def forget(self) -> None:
+        """Start anew after the processes of the whole team have died."""
         self._team.forget()
 
-    def perform(self, task: int, payload: Any) -> Any:
-        if task in ALONE:
-            return super().perform(task, payload)
-        if task == Task.HOST:
-            self._host(_hosts(payload[self._first]))
-            return None
-        with self._leader.order():
-            self._catch_up(task)
-            if task == Task.STEP:
-                self._note_step()
-            self._leader.end_after(LAST.get(Task(task)))
-            WorldsJob.perform(self, task, payload)
-        if task in (Task.RESET, Task.LOAD):
-            self._begin_anew()
-        return None
+    def command(self, task: Task) -> AbstractContextManager[None]:
+        """Enclose a task, in which the members wait for phases unless the leader is alone."""
+        return nullcontext() if task in ALONE else self._leader.command()
 
-    def _host(self, hosts: NDArray[np.int64]) -> None:
-        self._hosts[:] = hosts
-        self._leader.take(np.flatnonzero(hosts == 0).tolist())
+    def end_with(self, task: Task) -> None:
+        """Let the members finish as soon as they are not needed for the rest of the task."""
+        self._leader.end_after(LAST.get(task))
 
-    def save(self) -> list[NDArray[Any]]:
-        """Where to begin in the checkpoint log, and which worker hosts which zone."""
-        return [*super().save(), self._hosts]
+    def host(self, payload: Any) -> None:
+        """Do the task HOST, whose payload has the zones of each worker of each world."""
+        self.set_hosts(_hosts(payload[self._kept.first]))
 
-    def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave; the steps since the last image wait for a task."""
-        place, hosts = saved
-        self._host(hosts)
-        super().load([place])
+    def set_hosts(self, hosts: NDArray[np.int64]) -> None:
+        self.hosts[:] = hosts
+        self._leader.host(np.flatnonzero(hosts == 0).tolist())
 
 
-class FollowerJob(Job):
-    """Some zones of one world, of which other workers have the rest."""
+class TeamMemberJob(Job):
+    """Runs some zones of a world that another worker leads."""
 
     def __init__(
-        self, follower: TeamFollower, world: int, number: int, hosts: NDArray[np.int64]
+        self, member: TeamMember, world: int, number: int, hosts: NDArray[np.int64]
     ) -> None:
-        self._follower = follower
+        self._member = member
         self._world = world
         self._number = number
         self._hosts = hosts
 
     def perform(self, task: int, payload: Any) -> None:
         if task == Task.HOST:
-            self._host(_hosts(payload[self._world]))
+            self._set_hosts(_hosts(payload[self._world]))
         else:
-            self._follower.follow()
+            self._member.run_phases()
 
-    def _host(self, hosts: NDArray[np.int64]) -> None:
+    def _set_hosts(self, hosts: NDArray[np.int64]) -> None:
         self._hosts[:] = hosts
-        self._follower.take(np.flatnonzero(hosts == self._number).tolist())
+        self._member.host(np.flatnonzero(hosts == self._number).tolist())
 
     def save(self) -> list[NDArray[Any]]:
-        """Which worker hosts which zone; the leader keeps the rest of the state."""
+        """Return which worker hosts which zone; the leader keeps the rest of the state."""
         return [self._hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        self._host(saved[0])
+        self._set_hosts(saved[0])
 
 
 def _hosts(zones: Sequence[Sequence[int]]) -> NDArray[np.int64]:
-    """(k,) number in the team of each zone's worker."""
+    """Return (k,) the number within the team of the worker that hosts each zone."""
     hosts = np.zeros(sum(map(len, zones)), dtype=np.int64)
     for number, hosted in enumerate(zones):
         hosts[list(hosted)] = number

@@ -2,51 +2,73 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.state.world_bytes import SavedWorlds
-from cavmarl.parallel.worlds.local_worlds import LocalWorlds
-from cavmarl.parallel.worlds.tasks import WORLD_TASKS, Task, commands_of
+from cavmarl.parallel.workers.team_job import LedTeam
+from cavmarl.parallel.workers.worker_worlds import WorkerWorlds
+from cavmarl.parallel.worlds.tasks import WORLD_TASKS, Task
 
 
 class WorldsJob(Job):
-    """Some of the worlds, next to each other."""
+    """Runs worlds; with a team, a single world whose zones its members share."""
 
-    saved_worlds: SavedWorlds  # where they are left, and found, as bytes
-
-    def __init__(self, worlds: LocalWorlds, first: int) -> None:
-        self._take(worlds, first)
-
-    def _take(self, worlds: LocalWorlds, first: int) -> None:
-        self._worlds = worlds
-        self._first = first
-        self._commands = commands_of(worlds.arrays)
+    def __init__(
+        self,
+        kept: WorkerWorlds,
+        saved_worlds: SavedWorlds,  # memory through which SAVE and LOAD pass worlds
+        team: LedTeam | None = None,
+    ) -> None:
+        self._kept = kept
+        self._saved_worlds = saved_worlds
+        self._team = team
+        self._own_tasks = kept.tasks if team is None else {**kept.tasks, Task.HOST: team.host}
 
     def perform(self, task: int, payload: Any) -> Any:
-        if task == Task.LOAD:
-            payload = self.saved_worlds.take()
-        found = WORLD_TASKS[Task(task)].perform(self._worlds, payload, self._first)
-        if task == Task.SAVE:
-            self.saved_worlds.put(found)
+        task = Task(task)
+        if task in self._own_tasks:
+            self._own_tasks[task](payload)
             return None
-        return found
+        kept, team = self._kept, self._team
+        with nullcontext() if team is None else team.command(task):
+            kept.before(task)
+            if team is not None:
+                team.end_with(task)
+            answer = self._perform(task, payload)
+        kept.after(task)
+        return answer
 
-    def timed_step(self) -> NDArray[np.float64]:
-        """Step; (W,) the processor time of each world, which share it by their vehicles."""
-        began_ns = time.thread_time_ns()
-        self._worlds.step(self._commands)
-        spent_s = 1e-9 * (time.thread_time_ns() - began_ns)
-        vehicles = self._worlds.simulation.running() + 1
-        return np.asarray(vehicles * (spent_s / float(vehicles.sum())), dtype=np.float64)
+    def _perform(self, task: Task, payload: Any) -> Any:
+        if task == Task.STEP:
+            self._kept.step()
+            return None
+        if task == Task.LOAD:
+            payload = self._saved_worlds.take()
+        answer = WORLD_TASKS[task].perform(self._kept.worlds, payload, self._kept.first)
+        if task != Task.SAVE:
+            return answer
+        self._saved_worlds.put(answer)
+        return None
 
     def save(self) -> list[NDArray[Any]]:
-        return self._worlds.save()
+        """Return what the worlds need, and for a team which worker hosts which zone."""
+        kept = self._kept.save()
+        return kept if self._team is None else [*kept, self._team.hosts]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        self._worlds.load(saved)
+        if self._team is not None:
+            *saved, hosts = saved
+            self._team.set_hosts(hosts)
+        self._kept.load(saved)
+
+    def on_idle(self) -> None:
+        self._kept.on_idle()
+
+    def before_fork(self) -> None:
+        if self._team is not None:
+            self._team.forget()
