@@ -11,10 +11,10 @@ from cavmarl.core.errors import JournalError, MessageError, ProtocolError
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
+from cavmarl.parallel.nodes.index_check import IndexCheck
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, reading
-from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 
@@ -96,14 +96,14 @@ def simulation() -> Simulation:
     ],
 )  # fmt: skip
 def test_rows_that_point_at_nothing(simulation: Simulation, change: dict[str, int]) -> None:
-    checks, rows = RowChecks(simulation), simulation.division.vehicles(0).copy()
+    checks, rows = IndexCheck(simulation), simulation.division.vehicles(0).copy()
     assert rows.dtype == VEHICLE
     assert len(rows) > 5
     checks.check(rows)
     checks.check(rows[:0])
     for name, value in change.items():
         rows[name][-1] = value
-    with pytest.raises(MessageError, match="where nothing is"):
+    with pytest.raises(MessageError, match="an index that no table has"):
         checks.check(rows)
 
 

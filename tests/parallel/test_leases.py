@@ -16,10 +16,10 @@ from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Offer, Prepare
 from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.index_check import IndexCheck
 from cavmarl.parallel.nodes.leases import MOST, late_ticks, lease_ticks, leases_of
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
-from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.parallel.nodes.zone_endpoints import Report, ZoneHosts, packed, read_report, unpacked
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
@@ -90,7 +90,7 @@ def begun() -> tuple[ZoneHosts, NodeCoordinator, ZonedShards, Any]:
     coordinator = NodeCoordinator([bytes(16)], [0, 0], limits, wires, [None])
     wires.coordinator = coordinator
     hostings = coordinator.host(neighbours_of(division))
-    checks = RowChecks(worlds.simulation)
+    checks = IndexCheck(worlds.simulation)
     hosts = ZoneHosts(division, (0, 1), (0, 0), hostings, limits, wires, [], checks, ticks=2)
     hosts.reset(np.ones(1, dtype=np.bool_))
     return hosts, coordinator, division, wires
@@ -124,7 +124,7 @@ def test_an_offer_that_comes_before_the_lease_of_its_episode_is_answered_after_i
     prepare = Prepare(
         bytes(16), table.episode, table.tick + 1, 0, 1, 1, division.codec.schema, (offer,)
     )
-    hosts.hear(1, NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
+    hosts.hear(NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
     assert wires.answers == []
     hosts.note(unpacked(memoryview(coordinator.begin(WAIT_S)[0])))
     (ack,) = wires.answers

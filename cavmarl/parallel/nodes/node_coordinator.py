@@ -20,8 +20,7 @@ from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, SilenceError
 from cavmarl.parallel.nodes.peer_faults import check_indices, reading
 from cavmarl.parallel.nodes.zone_endpoints import NOTHING, Report, packed, unpacked
-
-MOST_IDS = 1 << 62  # of vehicles in a run
+from cavmarl.shards.row_check import MOST_IDS
 
 
 class CrossingDigests:

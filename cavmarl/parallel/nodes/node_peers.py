@@ -23,10 +23,10 @@ from cavmarl.core.records.codes import (
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.agent_stream import AgentStream
+from cavmarl.parallel.nodes.index_check import IndexCheck
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, reading
-from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.parallel.nodes.row_stream import RowStream, forecast_of, passing_of
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 from cavmarl.zones.kernels.row_frames import Passing, count_own
@@ -75,7 +75,7 @@ class NodePeers:
         self._rerouted = np.zeros(self._num_worlds, dtype=np.int64)
         mine = (self._zoned, self._mine)
         clock = simulation.config.clock
-        self.checks = checks = RowChecks(simulation)
+        self.checks = checks = IndexCheck(simulation)
         bounds = checks.of_rows, checks.of_ghosts
         law = forecast_of(shard.roads, clock.sim_dt_s, clock.ticks_per_step, *bounds)
         self._rows = {

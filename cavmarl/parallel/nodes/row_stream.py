@@ -62,7 +62,7 @@ def forecast_of(
     roads: RoadArrays,
     dt: float,  # s of a tick
     ticks_per_step: int,
-    of_rows: Bounds,  # see `RowChecks`
+    of_rows: Bounds,  # see `IndexCheck`
     of_ghosts: Bounds,  # likewise
 ) -> Forecast:
     """What is foreseen on some roads, and what is not taken."""

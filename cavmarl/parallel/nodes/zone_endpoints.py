@@ -31,6 +31,7 @@ from cavmarl.ownership.messages import COORDINATOR, Done, Message, Prepare, Remo
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
 from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.index_check import IndexCheck
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.peer_faults import (
@@ -39,7 +40,6 @@ from cavmarl.parallel.nodes.peer_faults import (
     read_json,
     reading,
 )
-from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
@@ -77,7 +77,7 @@ class ZoneHosts:
         limits: Limits,
         links: Links,  # to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) of agents: what they do, what is kept of them
-        checks: RowChecks,  # of vehicles that are offered
+        checks: IndexCheck,  # of vehicles that are offered
         *,
         generation: int = 0,  # how often nodes have been lost
         is_checked: bool = False,  # whether the caller checks what zones own
