@@ -20,7 +20,13 @@ from cavmarl.parallel.nodes.index_check import IndexCheck
 from cavmarl.parallel.nodes.leases import MOST, late_ticks, lease_ticks, leases_of
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
-from cavmarl.parallel.nodes.zone_endpoints import Report, ZoneHosts, packed, read_report, unpacked
+from cavmarl.parallel.nodes.zone_endpoints import (
+    Report,
+    ZoneEndpoints,
+    packed,
+    read_report,
+    unpacked,
+)
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 WAIT_S = 0.1
@@ -72,13 +78,13 @@ class Wires:
             self.coordinator.commit({0: (messages, said)})
         else:
             self.answers += [message for _, message in unpacked(data)]
-            self.coordinator.hear(0, NodeFrame(kind, number, data))
+            self.coordinator.receive(0, NodeFrame(kind, number, data))
 
     def now_s(self) -> float:
         return 0.0
 
 
-def begun() -> tuple[ZoneHosts, NodeCoordinator, ZonedShards, Any]:
+def begun() -> tuple[ZoneEndpoints, NodeCoordinator, ZonedShards, Any]:
     """Hosts of two zones at one node, that have begun an episode and not reported it."""
     config, base_dir = load_config("grid4x4", zones=2, agents=1, background=20)
     worlds = LocalWorlds(make_world(config, base_dir), 1)
@@ -91,7 +97,7 @@ def begun() -> tuple[ZoneHosts, NodeCoordinator, ZonedShards, Any]:
     wires.coordinator = coordinator
     hostings = coordinator.host(neighbours_of(division))
     checks = IndexCheck(worlds.simulation)
-    hosts = ZoneHosts(division, (0, 1), (0, 0), hostings, limits, wires, [], checks, ticks=2)
+    hosts = ZoneEndpoints(division, (0, 1), (0, 0), hostings, limits, wires, [], checks, ticks=2)
     hosts.reset(np.ones(1, dtype=np.bool_))
     return hosts, coordinator, division, wires
 
@@ -124,7 +130,7 @@ def test_an_offer_that_comes_before_the_lease_of_its_episode_is_answered_after_i
     prepare = Prepare(
         bytes(16), table.episode, table.tick + 1, 0, 1, 1, division.codec.schema, (offer,)
     )
-    hosts.hear(NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
+    hosts.receive(NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
     assert wires.answers == []
     hosts.note(unpacked(memoryview(coordinator.begin(WAIT_S)[0])))
     (ack,) = wires.answers

@@ -13,7 +13,7 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.ownership.messages import Reset
 from cavmarl.parallel.nodes import node_process
-from cavmarl.parallel.nodes.node_cuts import read_neighbours, read_zones, told_zones
+from cavmarl.parallel.nodes.node_cuts import read_neighbours, read_zones, zones_as_json
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 from cavmarl.zones.partition.zone_layouts import cut_map
@@ -144,7 +144,7 @@ def test_pictures_have_the_zones_of_now(make: Make) -> None:
 def test_zones_are_told_to_the_last_bit(make: Make) -> None:
     vec = make("grid4x4", agents=1, background=0)
     partition = cut_map(vec.simulation.network, "bisection", 7)
-    assert read_zones(told_zones(partition)).content_hash == partition.content_hash
+    assert read_zones(zones_as_json(partition)).content_hash == partition.content_hash
     assert read_neighbours([[[0, 1], [1]], True], 2).near == (frozenset({0, 1}), frozenset({1}))
 
 

@@ -29,7 +29,7 @@ from cavmarl.core.errors import (
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.network.listener import MAX_CALLERS, Listener
 from cavmarl.parallel.nodes import node_starters
-from cavmarl.parallel.nodes.joining_nodes import ANYONE, Newcomer, Newcomers
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, JoiningNode, JoiningNodes
 from cavmarl.parallel.nodes.link import Link
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_process import run_node
@@ -38,9 +38,9 @@ from cavmarl.parallel.nodes.zone_moves import moves_of
 from tests.parallel.test_moving import RESTLESS, uneven
 from tests.parallel.test_nodes import over_nodes
 from tests.support.actuated import actuated_grid
+from tests.support.local_actors import FORKS, LocalActors
 from tests.support.vec_runs import Make, drive, same
 from tests.support.wires import Proxy, free_port, own_address
-from tests.support.world_hosts import FORKS, WorldHosts
 
 __all__ = ["uneven"]
 
@@ -142,13 +142,13 @@ def test_what_goes_over_the_wire(
     said = bytes(wire.said) + b"".join(wire.heard)
     assert (b"cavN" in said) == (not is_elsewhere)
     assert KEY.encode() not in said
-    newcomers = over_nodes(vec).pool.newcomers
+    joining_nodes = over_nodes(vec).pool.joining_nodes
     for heard in wire.heard:  # said again, it is nothing
         with socket.create_connection(place) as stranger, suppress(OSError):
             stranger.sendall(heard)
             for _ in range(3):
-                newcomers.look(10.0)
-            assert newcomers.ready == []
+                joining_nodes.look(10.0)
+            assert joining_nodes.ready == []
             assert stranger.recv(1 << 16)[:4] != b"cavN"
     assert over_nodes(vec).pool.losses == 1
     wire.close()
@@ -219,8 +219,8 @@ def test_zones_that_change_their_node(make: Make, uneven: list[int], is_lost: bo
     assert over_nodes(vec).pool.generation > 1 + is_lost
 
 
-def test_hosts_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(node_starters, "RayActors", WorldHosts)
+def test_actors_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_starters, "RayActors", LocalActors)
     one = make("grid4x4", **WANTED)
     vec = make("grid4x4", zones=4, backend="ray:2", **WANTED)
     worlds = over_nodes(vec)
@@ -236,16 +236,16 @@ def test_a_node_that_the_others_cannot_reach(
 ) -> None:
     """The one that two others miss is lost, though it lives."""
     wires: list[Proxy] = []
-    take = Newcomers.take
+    take = JoiningNodes.take
 
-    def through_a_wire(newcomers: Newcomers, number: int) -> tuple[Newcomer, Link]:
-        newcomer, link = take(newcomers, number)
-        assert newcomer.place is not None
-        wires.append(Proxy(newcomer.place))
-        newcomer.place = wires[-1].place
-        return newcomer, link
+    def through_a_wire(joining_nodes: JoiningNodes, number: int) -> tuple[JoiningNode, Link]:
+        joining_node, link = take(joining_nodes, number)
+        assert joining_node.place is not None
+        wires.append(Proxy(joining_node.place))
+        joining_node.place = wires[-1].place
+        return joining_node, link
 
-    monkeypatch.setattr(Newcomers, "take", through_a_wire)
+    monkeypatch.setattr(JoiningNodes, "take", through_a_wire)
     vec = make("grid4x4", zones=4, nodes=3, **WANTED)
 
     def cut(step: int) -> None:
@@ -261,7 +261,7 @@ def test_a_node_that_the_others_cannot_reach(
 def test_a_crowd_of_strangers_disturbs_nobody(make: Make, whole: Any) -> None:
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     worlds = over_nodes(vec)
-    address, port = worlds.pool.newcomers.place.split(":")
+    address, port = worlds.pool.joining_nodes.place.split(":")
     before = psutil.Process().num_fds()
     strangers: list[socket.socket] = []
 

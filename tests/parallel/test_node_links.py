@@ -17,10 +17,10 @@ from cavmarl.ownership.messages import Done
 from cavmarl.parallel.network.encryption import encrypted
 from cavmarl.parallel.network.tcp_transport import TcpConnection
 from cavmarl.parallel.network.transport import READS
-from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
-from cavmarl.parallel.nodes.node_handshake import call_node, calls_of
+from cavmarl.parallel.nodes.node_handshake import accept_nodes, call_node
 from cavmarl.parallel.nodes.node_system import MACHINE
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from cavmarl.parallel.nodes.zone_endpoints import packed
@@ -74,7 +74,7 @@ def test_what_is_no_frame_ends_a_connection(said: bytes, words: str) -> None:
     far.sendall(said)
     far.close()
     with pytest.raises(LinkLostError, match=words):
-        _ = [links.take([0], WAIT_S) for _ in range(3)]
+        _ = [links.receive([0], WAIT_S) for _ in range(3)]
 
 
 def test_a_node_speaks_for_its_own_zones() -> None:
@@ -82,7 +82,7 @@ def test_a_node_speaks_for_its_own_zones() -> None:
     links, far = pair()
     coordinator = NodeCoordinator([bytes(16)], [0, 0, 1], Limits(), links, [None])
     coordinator.host(Neighbours((frozenset((1,)), frozenset((0, 2)), frozenset((1,)))))
-    links.urgent = coordinator.hear
+    links.urgent = coordinator.receive
     table = coordinator._worlds[0].directory.table
     done = {
         zone: Done(bytes(16), table.episode, table.tick, zone=zone, incarnation=1)
@@ -114,7 +114,7 @@ def test_each_bit_of_a_frame_is_guarded(size: int, bits: int | None) -> None:
         links, far = pair()
         far.sendall(changed)
         with pytest.raises(LinkLostError, match="frame"):
-            links.take([0], WAIT_S)
+            links.receive([0], WAIT_S)
         far.close()
 
 
@@ -146,9 +146,9 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
     with ThreadPoolExecutor() as pool:
         flushed = pool.submit(near.flush)
         for part in parts:
-            assert far.next(0).data == part.data
-            assert far.next(0).data == b"small"
-        assert far.next(0).data == parts[0, :-1].data
+            assert far.receive_next(0).data == part.data
+            assert far.receive_next(0).data == b"small"
+        assert far.receive_next(0).data == parts[0, :-1].data
         flushed.result()
     near.close()
     far.close()
@@ -157,7 +157,7 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
 @pytest.mark.parametrize("said", [b"no JSON", b"{}", b"\xff"])
 def test_a_list_is_a_list(said: bytes) -> None:
     with pytest.raises(MessageError, match="a frame of kind PONG: it"):
-        said_by(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
+        read_list(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
 
 
 def test_machines_that_vanish_are_missed() -> None:
@@ -189,7 +189,7 @@ def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
 
     with closing(listener), ThreadPoolExecutor() as callers:
         earlier = callers.submit(call, 6)
-        (found,) = calls_of(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
+        (found,) = accept_nodes(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
         found.close()  # the attempt has come to nothing
         assert earlier.result() == 0
         earlier = callers.submit(call, 6)
@@ -199,9 +199,9 @@ def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
             if earlier.done() and not present:
                 present.append(callers.submit(call, 7))
 
-        found_now = calls_of(MACHINE, listener, [2], 7, WAIT_S, check)
+        found_now = accept_nodes(MACHINE, listener, [2], 7, WAIT_S, check)
         assert earlier.result() == 0
         assert list(found_now) == [2]
         found_now[2].close()
         with pytest.raises(LinkLostError, match="node 3"):
-            calls_of(MACHINE, listener, [3], 7, 0.0, lambda: None)
+            accept_nodes(MACHINE, listener, [3], 7, 0.0, lambda: None)

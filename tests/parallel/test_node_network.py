@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cavmarl import ConfigError, make_vec
 from cavmarl.core.errors import MessageError
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.nodes.node_network import asked_of, read_asked
+from cavmarl.parallel.nodes.node_network import read_request, request_of
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.v2x.kernels.v2x_records import PACKET, RECEIVER
 from cavmarl.v2x.v2x_messages import RECEPTION, Exchange
@@ -147,12 +147,12 @@ def test_what_cannot_be_connected_is_refused(make: Make) -> None:
 def test_what_is_asked_goes_over_whole() -> None:
     packets, receivers = np.zeros(3, PACKET), np.zeros(2, RECEIVER)
     packets["sender"], receivers["id"] = [4, 5, 6], [7, -1]
-    pieces = asked_of(Exchange(1, 12, packets, receivers), np.array([3, 0, 2]))
+    pieces = request_of(Exchange(1, 12, packets, receivers), np.array([3, 0, 2]))
     data = memoryview(b"".join(map(bytes, pieces)))
-    sent, num_packets = read_asked(data, 2, 2)
+    sent, num_packets = read_request(data, 2, 2)
     assert (sent.world, sent.tick, num_packets.tolist()) == (1, 12, [3, 0, 2])
     assert sent.packets.tobytes() == packets.tobytes()
     assert sent.receivers.tobytes() == receivers.tobytes()
     for worlds, cut in ((1, len(data)), (2, len(data) - 1), (2, 20)):
         with pytest.raises(MessageError, match="an exchange"):
-            read_asked(data[:cut], worlds, 2)
+            read_request(data[:cut], worlds, 2)

@@ -16,7 +16,7 @@ from cavmarl.parallel.network.code_stamp import code_stamp
 from cavmarl.parallel.network.listener import VERSION, Listener, call
 from cavmarl.parallel.network.tcp_transport import TcpConnection, TcpListener
 from cavmarl.parallel.nodes import joining_nodes
-from cavmarl.parallel.nodes.joining_nodes import ANYONE, Newcomers
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, JoiningNodes
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_process import run_node
@@ -29,19 +29,19 @@ class Door:
 
     def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
         self.listener = TcpListener(address, key)
-        self.newcomers = Newcomers(self.listener, {}, [], lambda: room, 1)
+        self.joining_nodes = JoiningNodes(self.listener, {}, [], lambda: room, 1)
         self._is_open = True
         self._thread = threading.Thread(target=self._look)
         self._thread.start()
 
     def _look(self) -> None:
         while self._is_open:
-            self.newcomers.look(5.0)
+            self.joining_nodes.look(5.0)
 
     def close(self) -> None:
         self._is_open = False
         self._thread.join()
-        self.newcomers.close()
+        self.joining_nodes.close()
 
 
 def test_who_has_another_key_stays_outside() -> None:
@@ -124,5 +124,5 @@ def test_who_has_come_in_and_talks_nonsense_is_sent_away() -> None:
             links.add(COORDINATOR, TcpConnection(call(door.listener.place, b"a" * 32, ANYONE)))
             links.send(COORDINATOR, FrameKind.JOIN, 0, [said])
             with pytest.raises(LinkLostError):
-                links.take([COORDINATOR], WAIT_S)
+                links.receive([COORDINATOR], WAIT_S)
             links.close()

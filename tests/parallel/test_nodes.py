@@ -17,7 +17,7 @@ from cavmarl import ConfigError, make_vec, parallel_env
 from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
-from cavmarl.parallel.nodes.node_actions import Actions, ActionsTaken, read_refusal
+from cavmarl.parallel.nodes.node_actions import Actions, ReceivedActions, read_refusal
 from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import LocalNodes
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
@@ -84,10 +84,10 @@ def test_a_node_is_told_what_its_own_agents_do() -> None:
     there = StepArrays(*(array.copy() for array in arrays[:-2]), {}, {})
     there = there._replace(meta_actions=np.zeros((1, 4), np.int64))
     there.controls[...] = -1.0
-    taken = ActionsTaken(there, number=1)
+    taken = ReceivedActions(there, number=1)
     taken.begin(owner)
     data = memoryview(bytes(8) + bytes(actions.of_node(1, owner)))
-    wrong, end = taken.take(data, 8, owner)
+    wrong, end = taken.read(data, 8, owner)
     assert (wrong.tolist(), end, taken.are_due) == ([], len(data), False)
     assert there.controls[0, :, 0].tolist() == [0.0, -1.0, 2.0, 3.0]
     assert there.meta_actions.tolist() == [[0, 0, 2, 3]]
@@ -99,20 +99,20 @@ def test_actions_of_others_and_what_are_none() -> None:
         | {"mask": np.ones((1, 4), bool), "meta_actions": np.ones((1, 4), np.int64)}
     )
     owner = np.array([1, 0, 1, -1], np.int32)
-    taken = ActionsTaken(arrays, number=1)
+    taken = ReceivedActions(arrays, number=1)
     taken.begin(owner)
     told = bytes(Actions.of(arrays).some(np.array([0, 1])))
-    wrong, _ = taken.take(memoryview(told), 0, owner)
+    wrong, _ = taken.read(memoryview(told), 0, owner)
     assert wrong.tolist() == [1]
     assert taken.are_due, "agent 2 is missing"
-    taken.take(memoryview(bytes(Actions.of(arrays).some(np.array([2])))), 0, owner)
+    taken.read(memoryview(bytes(Actions.of(arrays).some(np.array([2])))), 0, owner)
     assert not taken.are_due
     words = np.frombuffer(told, np.int64)
     for word, value in ((0, -1), (0, 5), (1, 4), (2, 4), (6, -1)):
         other = words.copy()
         other[word] = value
         with pytest.raises(MessageError, match="do not tell what agents do"):
-            taken.take(memoryview(other.tobytes()), 0, owner)
+            taken.read(memoryview(other.tobytes()), 0, owner)
 
 
 @pytest.mark.parametrize(
@@ -399,7 +399,7 @@ def test_a_node_that_is_lost_while_zones_are_given_out_is_replaced(
     make: Make, monkeypatch: pytest.MonkeyPatch, nodes: int, how: signal.Signals, is_told: bool
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
-    tell, struck = NodePool._tell_zones, list[int]()  # processes
+    tell, struck = NodePool._send_zones, list[int]()  # processes
 
     def tell_and_strike(self: NodePool, *told: Any, **more: Any) -> None:
         process = psutil.Process(self.pids[-1 if struck else 0])
@@ -416,7 +416,7 @@ def test_a_node_that_is_lost_while_zones_are_given_out_is_replaced(
         if not is_told:
             tell(self, *told, **more)
 
-    monkeypatch.setattr(NodePool, "_tell_zones", tell_and_strike)
+    monkeypatch.setattr(NodePool, "_send_zones", tell_and_strike)
     vec = make("grid4x4", zones=4, nodes=nodes, **WANTED)
     assert len(set(struck)) == 2
     assert same(drive(vec), whole)

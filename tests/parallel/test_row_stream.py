@@ -43,8 +43,8 @@ class Node:
     def packed(self) -> bytearray:
         return bytearray(self._frames.packed(1, passing_of(self.departures)))
 
-    def take(self, data: bytes | bytearray) -> None:
-        self._frames.take(memoryview(data), 1, passing_of(self.departures))
+    def read(self, data: bytes | bytearray) -> None:
+        self._frames.read(memoryview(data), 1, passing_of(self.departures))
 
 
 def nodes() -> tuple[Node, Node]:
@@ -114,7 +114,7 @@ def test_what_is_taken_is_what_was_sent() -> None:
         far.running[:] = 100
         first = far.departures.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
         counted = far.departures.counts[:, COUNT_REROUTED].copy()
-        far.take(near.packed())
+        far.read(near.packed())
         assert found(far.zoned, 2) == found(near.zoned, 0)
         assert far.running.tolist() == [100 + tick, 107]
         more = near.departures.counts[:, COUNT_REROUTED] - near.rerouted
@@ -142,7 +142,7 @@ def test_what_is_foreseen_is_not_sent() -> None:
         near.zoned.num_rows[zone, 0] = near.zoned.num_near[zone, 0] = ghosts
         clear(far.zoned)
         data = near.packed()
-        far.take(data)
+        far.read(data)
         assert found(far.zoned, 2) == found(near.zoned, 0)
         sizes.append((len(data) // 8 - LIKE) / ghosts - 2)
     vec.close()
@@ -199,7 +199,7 @@ def test_what_cannot_be_is_refused(harm: str) -> None:
     data = harmed(np.frombuffer(near.packed(), np.int64).copy(), harm).tobytes()
     clear(far.zoned)
     with pytest.raises(MessageError, match=f"^{len(data)} bytes are not"):
-        far.take(data)
+        far.read(data)
     assert (far.zoned.num_rows[THEIRS] == 2).all(), "nothing of it was put anywhere"
     assert not far.departures.num_passing.any()
 
@@ -223,7 +223,7 @@ def test_agents_are_taken_as_they_were_sent() -> None:
     here[0][...], here[1][...] = drawn.random((WORLDS, 4, 3)), True
     mine = np.array([True, False, False, True, False, False, True, False])
     owner = np.full(8, -1, dtype=np.int32)
-    AgentStream(there).take(packed(here, mine), 5, owner)
+    AgentStream(there).read(packed(here, mine), 5, owner)
     assert owner.tolist() == [5, -1, -1, 5, -1, -1, 5, -1]
     for sent, taken in zip(here, there, strict=True):
         flat, other = (array.reshape(8, -1) for array in (sent, taken))
@@ -239,5 +239,5 @@ def test_agents_that_cannot_be_are_refused(change: bytes | None) -> None:
         data[8:16] = (8).to_bytes(8, "little")  # there are agents 0 to 7
     owner = np.full(8, -1, dtype=np.int32)
     with pytest.raises(MessageError, match="not what a node tells of its agents"):
-        AgentStream(there).take(memoryview(data if change is None else change), 5, owner)
+        AgentStream(there).read(memoryview(data if change is None else change), 5, owner)
     assert (owner == -1).all()

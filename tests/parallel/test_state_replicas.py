@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
-from cavmarl.parallel.nodes.state_replicas import KeptStates
+from cavmarl.parallel.nodes.state_replicas import StateReplicas
 from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 
 
@@ -28,14 +28,14 @@ class Wires:
 
 def test_older_states_go_when_the_newest_has_come_everywhere() -> None:
     worlds, wires = Worlds(), Wires()
-    kept = KeptStates(worlds, (), wires, 1)  # type: ignore[arg-type]
+    kept = StateReplicas(worlds, (), wires, 1)  # type: ignore[arg-type]
     for state in (1, 2, 3):
-        kept.take(0, NodeFrame(FrameKind.KEEP, state, memoryview(b"theirs")))
+        kept.receive(0, NodeFrame(FrameKind.KEEP, state, memoryview(b"theirs")))
         kept.keep(state, [0, 1, 4])
     assert wires.sent == [(4, 1), (4, 2), (4, 3)]
     assert (list(kept._own), list(kept._others[0])) == ([2, 3], [2, 3])
     kept.settle()
-    kept.take(0, NodeFrame(FrameKind.KEEP, 4, memoryview(b"theirs")))  # ahead of this node
+    kept.receive(0, NodeFrame(FrameKind.KEEP, 4, memoryview(b"theirs")))  # ahead of this node
     kept.settle()
     assert (list(kept._own), list(kept._others[0])) == ([3], [3, 4]), "all may go back to 3"
 

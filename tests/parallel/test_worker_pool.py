@@ -107,7 +107,7 @@ def test_one_that_dies_at_a_point_of_an_order(make: Make, point: int, tmp_path: 
 def test_an_image_that_is_not_what_was_written_is_refused(make: Make) -> None:
     pool = make(workers=1)
     pool.run(ADD)
-    image = pool._processes._held.segments[2 + pool._committed].map()
+    image = pool._processes._resources.segments[2 + pool._committed].map()
     image[200] ^= 1
     os.kill(pool.pids[0], signal.SIGKILL)
     with pytest.raises(WorkerFailureError, match="not what it wrote"):
@@ -235,7 +235,7 @@ def test_a_server_whose_pool_has_gone_says_nothing() -> None:
     """Ctrl-C ends the pool while the server starts: no traceback of it is shown."""
     pool, server = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     pool.close()
-    worker_loop._say(server, {"ready": 1})
+    worker_loop._send(server, {"ready": 1})
     assert server.recv(10) == b""  # by which the server ends
     server.close()
 

@@ -52,19 +52,19 @@ class PendingConnection:
     def __init__(self, connection: socket.socket, secret: bytes) -> None:
         connection.setblocking(False)
         self.until_s = time.monotonic() + GREETING_S  # for so long it may take, by `time.monotonic`
-        self.number = -1  # that it says it has; -1: it has said nothing
+        self.number = -1  # that it says it has; -1: it has data nothing
         self._socket = connection
         if leaves_this_machine(connection):
             self._socket = encrypted(connection, secret, calls=False)
         self._secret = secret
-        self._heard = b""
+        self._received = b""
         self._expected = b""
 
     def fileno(self) -> int:
         return self._socket.fileno()
 
     def listen(self) -> socket.socket | None:
-        """Take what it has said; its connection, once it has proved that it knows the secret.
+        """Take what it has data; its connection, once it has proved that it knows the secret.
 
         Raises:
             OSError: it is gone.
@@ -77,20 +77,20 @@ class PendingConnection:
             self._go_on()
         wanted = PROOF if self._expected else _HELLO.size
         try:
-            heard = self._socket.recv(wanted - len(self._heard))
+            received = self._socket.recv(wanted - len(self._received))
         except BlockingIOError:
             return None
-        if not heard:
+        if not received:
             raise EOFError("the connection has ended")
-        self._heard += heard
-        if len(self._heard) < wanted:
+        self._received += received
+        if len(self._received) < wanted:
             return None
-        said, self._heard = self._heard, b""
+        data, self._received = self._received, b""
         if not self._expected:
-            self._answer(said)
+            self._answer(data)
             self._go_on()
             return None
-        if not hmac.compare_digest(said, self._expected):
+        if not hmac.compare_digest(data, self._expected):
             raise MessageError("a caller does not know the secret")
         return self._socket
 
@@ -281,20 +281,20 @@ def _encrypted(connection: socket.socket, place: tuple[str, int], secret: bytes)
 def _prove(connection: socket.socket, place: tuple[str, int], secret: bytes, number: int) -> None:
     hello = _HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
     connection.sendall(hello)
-    heard = b""
-    while len(heard) < NONCE + PROOF:
+    received = b""
+    while len(received) < NONCE + PROOF:
         more = b""
         with suppress(ConnectionError, ssl.SSLError):
-            more = connection.recv(NONCE + PROOF - len(heard))
-        if not more and len(heard) == _SPOKEN.size and heard[:4] == MAGIC:
+            more = connection.recv(NONCE + PROOF - len(received))
+        if not more and len(received) == _SPOKEN.size and received[:4] == MAGIC:
             raise MessageError(
-                f"what listens at {place[0]}:{place[1]} speaks version {_SPOKEN.unpack(heard)[1]}, "
+                f"what listens at {place[0]}:{place[1]} speaks version {_SPOKEN.unpack(received)[1]}, "
                 f"this is {VERSION}: install the same cavmarl on all machines"
             )
         if not more:
             raise EOFError(f"the process that listens at {place} has ended the connection")
-        heard += more
-    nonce, proof = heard[:NONCE], heard[NONCE:]
+        received += more
+    nonce, proof = received[:NONCE], received[NONCE:]
     if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):
         raise _foreign(place)
     connection.sendall(_proof(secret, b"host", hello + nonce))
@@ -306,5 +306,5 @@ def _foreign(place: tuple[str, int]) -> MessageError:
     )
 
 
-def _proof(secret: bytes, side: bytes, said: bytes) -> bytes:
-    return hmac.digest(secret, side + said, "sha256")
+def _proof(secret: bytes, side: bytes, content: bytes) -> bytes:
+    return hmac.digest(secret, side + content, "sha256")

@@ -34,18 +34,18 @@ from cavmarl.parallel.network.transport import (
 
 MPI: Literal["mpi"] = "mpi"
 CALLER = 0  # the rank of the program whose worlds the other ranks host
-ABOUT = 0  # the tag of messages about connections
+NOTICE = 0  # the tag of messages about connections
 LISTENER = 0  # the number by which a poll tells of the listener
 LOOKS = 500  # without a nap between them
 NAP_S = 50e-6
 END_S = 60.0  # for the others to end after the caller
 PRINTED_S = 0.3  # for what this process has printed to come through, before the run is ended
 HOW = f"mpirun -n 1 python PROGRAM : -n NODES cavmarl node --{MPI}"
-_ABOUT = struct.Struct("<IIII")
+_NOTICE = struct.Struct("<IIII")
 _SHARED = re.compile(r"/dev/shm/mpich_shm_\w+(?= *$)", re.MULTILINE)
 
 
-class _About(IntEnum):
+class _Notice(IntEnum):
     """What a message says of a connection."""
 
     OPEN = 0  # a number that is said to the listener; the opener's end
@@ -125,8 +125,8 @@ class MpiListener:
 class MpiPoll:
     """A `TransportPoll`. MPI has nothing that a process can sleep on: it looks again and again."""
 
-    def __init__(self, take: Callable[[], None]) -> None:
-        self._take = take  # takes what has come
+    def __init__(self, receive_all: Callable[[], None]) -> None:
+        self._receive_all = receive_all  # takes what has come
         self._ones: dict[int, MpiConnection | MpiListener] = {}
 
     def register(self, one: Any, events: int) -> None:
@@ -141,7 +141,7 @@ class MpiPoll:
     def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
         until_s = None if timeout_ms is None else time.monotonic() + 1e-3 * timeout_ms
         for look in count():
-            self._take()
+            self._receive_all()
             ready = [(number, READS) for number, one in self._ones.items() if one.is_ready()]
             if ready or (until_s is not None and time.monotonic() >= until_s):
                 return ready
@@ -180,11 +180,11 @@ class MpiTransport:
 
     def open(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Connection:
         end = self._new(place[1], far=0)
-        self._say(end.rank, _About.OPEN, number, end.number)
+        self._send_notice(end.rank, _Notice.OPEN, number, end.number)
         answer_s = self.wait_s if answer_s is None else answer_s
         until_s = None if answer_s is None else time.monotonic() + answer_s
         for look in count():
-            self.take()
+            self.receive_all()
             if end.far:
                 break
             if end.has_ended:
@@ -201,7 +201,7 @@ class MpiTransport:
         return self._listener
 
     def poll(self) -> TransportPoll:
-        return MpiPoll(self.take)
+        return MpiPoll(self.receive_all)
 
     def _new(self, rank: int, far: int) -> MpiConnection:
         end = MpiConnection(self, rank, next(self._numbers), far)
@@ -212,11 +212,11 @@ class MpiTransport:
     def forget(self, end: MpiConnection) -> None:
         """End a connection; what still comes for it is dropped."""
         if self._ends.pop(end.number, None) is not None and end.far and not end.has_ended:
-            self._say(end.rank, _About.CLOSE, 0, end.far)
+            self._send_notice(end.rank, _Notice.CLOSE, 0, end.far)
 
-    def _say(self, rank: int, what: _About, first: int, second: int) -> None:
+    def _send_notice(self, rank: int, what: _Notice, first: int, second: int) -> None:
         if not self._has_left:
-            self.send(rank, ABOUT, _ABOUT.pack(what, first, second, 0))
+            self.send(rank, NOTICE, _NOTICE.pack(what, first, second, 0))
 
     def send(self, rank: int, tag: int, data: bytes) -> None:
         """Send a message.
@@ -231,7 +231,7 @@ class MpiTransport:
         except self._mpi.Exception as error:
             raise OSError(f"rank {rank} cannot be reached: {error}") from error
 
-    def take(self) -> None:
+    def receive_all(self) -> None:
         """Take all messages that have come.
 
         Raises:
@@ -245,34 +245,34 @@ class MpiTransport:
                 data = bytearray(status.Get_count(mpi.BYTE))
                 rank, tag = status.Get_source(), status.Get_tag()
                 message.Recv([data, mpi.BYTE])
-                if tag != ABOUT:
+                if tag != NOTICE:
                     if tag in self._ends:
                         self._ends[tag].come.append(memoryview(data))
                 else:
-                    self._hear(rank, *_ABOUT.unpack(data)[:3])
+                    self._receive_notice(rank, *_NOTICE.unpack(data)[:3])
             while self._sent and self._sent[0][0].Test():
                 self._sent.popleft()
         except mpi.Exception as error:
             self.is_broken = True
             raise WorkerError(f"MPI has lost a rank, and has no failover: {error}") from error
 
-    def _hear(self, rank: int, what: int, first: int, second: int) -> None:
+    def _receive_notice(self, rank: int, what: int, first: int, second: int) -> None:
         """Take what is said of a connection."""
         end = self._ends.get(second)
-        if what == _About.OPEN:
+        if what == _Notice.OPEN:
             end = self._new(rank, far=second)
-            self._say(rank, _About.ACCEPT, end.number, second)
+            self._send_notice(rank, _Notice.ACCEPT, end.number, second)
             if self._listener.is_open:
                 self._listener.callers.append((first, end))
             else:
                 end.close()
-        elif what == _About.ACCEPT and end is not None:
+        elif what == _Notice.ACCEPT and end is not None:
             end.far = first
-        elif what == _About.ACCEPT:  # it has been waited for too long
-            self._say(rank, _About.CLOSE, 0, first)
-        elif what == _About.CLOSE and end is not None:
+        elif what == _Notice.ACCEPT:  # it has been waited for too long
+            self._send_notice(rank, _Notice.CLOSE, 0, first)
+        elif what == _Notice.CLOSE and end is not None:
             end.has_ended = True
-        elif what == _About.GONE:
+        elif what == _Notice.GONE:
             self._gone.add(rank)
             for one in self._ends.values():
                 one.has_ended |= one.rank == rank
@@ -308,10 +308,10 @@ class MpiTransport:
         until_s = None
         try:
             for rank in others:
-                self._say(rank, _About.GONE, 0, 0)
+                self._send_notice(rank, _Notice.GONE, 0, 0)
             self._has_left = True
             for look in count():
-                self.take()
+                self.receive_all()
                 if self.is_broken or (others <= self._gone and not self._sent):
                     break
                 if until_s is None and CALLER in (self.rank, *self._gone):

@@ -70,7 +70,7 @@ class AgentStream:
         self._mine = np.zeros(len(self._tables[0]), dtype=np.bool_)
         self._note = specialized(note_own, checks=False)
         self._pack = specialized(pack_agents, checks=False)
-        self._take = specialized(take_agents, checks=False)
+        self._unpack = specialized(take_agents, checks=False)
 
     def packed(
         self,
@@ -85,13 +85,13 @@ class AgentStream:
         self._note(present, chosen, number, own, self._mine, owner)
         return room.data[: self._pack(self._mine, self._tables, room.words, room.data)].data
 
-    def take(self, data: memoryview, number: int, owner: NDArray[np.int32]) -> None:
+    def read(self, data: memoryview, number: int, owner: NDArray[np.int32]) -> None:
         """Write what node `number` tells to the tables, and that it owns these agents.
 
         Raises:
             MessageError: it is none, or is about agents that there are not.
         """
-        if self._take(self._tables, *_read(data), number, owner) != len(data):
+        if self._unpack(self._tables, *_read(data), number, owner) != len(data):
             raise MessageError(f"{len(data)} bytes are not what a node tells of its agents")
 
 
@@ -107,13 +107,13 @@ class ResultStream:
             )
         )
         common = tuple(_flat(getattr(arrays, name)) for name in COMMON)
-        self._told = Outcome(common, sensed, final, arrays.episode_over, arrays.terminations)
+        self._outcome = Outcome(common, sensed, final, arrays.episode_over, arrays.terminations)
         size = sum(part.size for part in common) + _size(sensed) + _size(final)
         self._room = _Room(size + 16)
         self._mine = np.zeros(arrays.mask.size, dtype=np.bool_)
         self._unread = np.zeros(arrays.mask.size, dtype=np.int32)
         self._pack = specialized(pack_results, checks=False)
-        self._take = specialized(take_results, checks=False)
+        self._unpack = specialized(take_results, checks=False)
 
     def packed(
         self,
@@ -125,10 +125,10 @@ class ResultStream:
     ) -> Bytes:
         """The results of one node, until the next are packed."""
         room = self._room
-        told = self._told, own, chosen, before, of_step, with_common, self._mine
+        told = self._outcome, own, chosen, before, of_step, with_common, self._mine
         return room.data[: self._pack(*told, room.words, room.data)].data
 
-    def take(
+    def read(
         self,
         data: memoryview,
         chosen: Flags,  # (W,) the worlds that have been reset, or stepped
@@ -142,6 +142,6 @@ class ResultStream:
         Raises:
             MessageError: it is none, or is about agents that there are not.
         """
-        told = self._told, chosen, of_step, with_common, number, owner, self._unread
-        if not self._take(*told, *_read(data)):
+        told = self._outcome, chosen, of_step, with_common, number, owner, self._unread
+        if not self._unpack(*told, *_read(data)):
             raise MessageError(f"{len(data)} bytes are not the results of a node")

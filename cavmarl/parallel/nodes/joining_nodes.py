@@ -1,4 +1,4 @@
-"""`Newcomers`: nodes that have called, and host no zones yet."""
+"""`JoiningNodes`: nodes that have called, and host no zones yet."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from cavmarl.core.errors import MessageError, WorkerError, WorkerFailureError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.parallel.network.code_stamp import code_stamp
 from cavmarl.parallel.network.transport import Place, TransportListener
-from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_cuts import read_neighbours
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, read_json, reading
-from cavmarl.parallel.worlds.world_errors import own_error
+from cavmarl.parallel.worlds.world_errors import original_error
 
 log = logging.getLogger("cavmarl.nodes")
 
@@ -29,7 +29,7 @@ ANYONE = (1 << 32) - 1  # the number of a node that takes any
 
 
 @dataclass
-class Newcomer:
+class JoiningNode:
     """One of them."""
 
     asked: int  # the number that it was started with, or ANYONE
@@ -40,7 +40,7 @@ class Newcomer:
     neighbours: Neighbours | None = None  # between which zones vehicles change, by that world
 
 
-class Newcomers:
+class JoiningNodes:
     """Tells processes that may join which node to be, and waits until they are ready.
 
     Attributes:
@@ -63,9 +63,9 @@ class Newcomers:
         self._job = json.dumps({**job, "files": files}).encode()
         self._files = files
         self._room, self._zones = room, zones
-        self._links = Links(self._hear, system)
+        self._links = Links(self._receive, system)
         self.place = "{}:{}".format(*listener.place)
-        self._all: dict[int, Newcomer] = {}
+        self._all: dict[int, JoiningNode] = {}
         self._next = 0
         self.ready: list[int] = []
         self.refused: list[str] = []
@@ -74,15 +74,15 @@ class Newcomers:
     def look(self, wait_ms: float) -> None:
         """Accept calls, and hear what earlier callers say."""
         for asked, connection in self._listener.admit():
-            self._all[self._next] = Newcomer(asked)
+            self._all[self._next] = JoiningNode(asked)
             self._links.add(self._next, connection)
             self._next += 1
         try:
             self._links.pump(wait_ms)
             for number in list(self._all):
-                frame = self._links.arrived(number)
+                frame = self._links.receive_if_there(number)
                 if frame is not None:
-                    self._hear(number, frame)
+                    self._receive(number, frame)
         except LinkLostError as lost:
             self._forget(lost.peer)
 
@@ -103,7 +103,7 @@ class Newcomers:
         while len(self.ready) < num:
             self.look(LOOK_MS)
             for failure in self.failures:
-                raise own_error(failure) from failure
+                raise original_error(failure) from failure
             why = trouble()
             if why is None and self._links.now_s() > until_s:
                 why = "; refused ".join(
@@ -120,45 +120,45 @@ class Newcomers:
         """Return the number with which one of them was started."""
         return self._all[number].asked
 
-    def take(self, number: int) -> tuple[Newcomer, Link]:
+    def take(self, number: int) -> tuple[JoiningNode, Link]:
         """One that is ready, and its connection."""
         self.ready.remove(number)
         return self._all.pop(number), self._links.release(number)
 
-    def _hear(self, number: int, frame: NodeFrame) -> None:
-        newcomer = self._all.get(number)
-        if newcomer is None:  # it has been sent away
+    def _receive(self, number: int, frame: NodeFrame) -> None:
+        joining_node = self._all.get(number)
+        if joining_node is None:  # it has been sent away
             return
         try:
             with reading(number):
-                self._take(number, newcomer, frame)
+                self._apply(number, joining_node, frame)
         except LinkLostError as lost:  # it is no node
             log.warning("a caller is sent away: %s", lost)
             self._forget(number)
 
-    def _take(self, number: int, newcomer: Newcomer, frame: NodeFrame) -> None:
+    def _apply(self, number: int, joining_node: JoiningNode, frame: NodeFrame) -> None:
         match frame.kind:
-            case FrameKind.JOIN if not newcomer.is_let_in:
-                self._examine(number, newcomer, read_json(frame.data, dict))
-            case FrameKind.WANTED if newcomer.is_let_in:
-                self._send_files(number, said_by(frame))
-            case FrameKind.READY if newcomer.is_let_in and newcomer.place is None:
-                host, port, near, may_teleport = said_by(frame)
-                newcomer.neighbours = read_neighbours([near, may_teleport], self._zones)
-                newcomer.place = str(host), int(port)
+            case FrameKind.JOIN if not joining_node.is_let_in:
+                self._examine(number, joining_node, read_json(frame.data, dict))
+            case FrameKind.WANTED if joining_node.is_let_in:
+                self._send_files(number, read_list(frame))
+            case FrameKind.READY if joining_node.is_let_in and joining_node.place is None:
+                host, port, near, may_teleport = read_list(frame)
+                joining_node.neighbours = read_neighbours([near, may_teleport], self._zones)
+                joining_node.place = str(host), int(port)
                 self.ready.append(number)
             case FrameKind.FAILED:
-                name, text, trace = map(str, said_by(frame))
-                where = f"node on {newcomer.machine}"
-                failure = WorkerFailureError(newcomer.asked, where, name, text, trace)
+                name, text, trace = map(str, read_list(frame))
+                where = f"node on {joining_node.machine}"
+                failure = WorkerFailureError(joining_node.asked, where, name, text, trace)
                 self.failures.append(failure)
                 log.warning("%s", failure)
                 self._forget(number)
             case _:
                 raise MessageError(f"a frame of kind {frame.kind.name} is not its turn")
 
-    def _examine(self, number: int, newcomer: Newcomer, told: dict[str, Any]) -> None:
-        newcomer.machine, newcomer.pid = str(told["machine"]), int(told["pid"])
+    def _examine(self, number: int, joining_node: JoiningNode, told: dict[str, Any]) -> None:
+        joining_node.machine, joining_node.pid = str(told["machine"]), int(told["pid"])
         if told["code"] != code_stamp():
             why = (
                 f"it runs {told['code']}, the caller {code_stamp()}: install the same versions on "
@@ -167,10 +167,10 @@ class Newcomers:
         elif self._room() <= sum(each.is_let_in for each in self._all.values()):
             why = "no more nodes are wanted: all zones have theirs, and one more waits"
         else:
-            newcomer.is_let_in = True
+            joining_node.is_let_in = True
             self._links.send(number, FrameKind.JOB, 0, [self._job])
             return
-        self.refused.append(f"a node on {newcomer.machine}: {why}")
+        self.refused.append(f"a node on {joining_node.machine}: {why}")
         log.warning("refused %s", self.refused[-1])
         self._links.send(number, FrameKind.REFUSED, 0, [why.encode()])
         self._forget(number)

@@ -114,7 +114,7 @@ class Link:
         self._filled = 0  # bytes of it
         self._into = self._room  # where the next bytes go: there, or into a frame that has begun
         self._opened: tuple[NodeFrame, int] | None = None  # that frame, and its checksum
-        self._num_sent = self._num_heard = 0  # frames
+        self._num_sent = self._num_received = 0  # frames
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> int:
         """Send what the connection takes at once; the rest is kept, as a copy.
@@ -174,8 +174,8 @@ class Link:
         room, at = self._room, 0
         while filled - at >= HEAD_BYTES:
             begin, code, which, size, summed, own = _WHOLE_HEAD.unpack_from(room, at)
-            self._num_heard = heard = self._num_heard + 1 & _ALL
-            is_next = xxh3_64_intdigest(room[at : at + SUMMED], heard) == own
+            self._num_received = received = self._num_received + 1 & _ALL
+            is_next = xxh3_64_intdigest(room[at : at + SUMMED], received) == own
             if begin != BEGIN or not is_next or code not in _KINDS or size > MAX_FRAME:
                 raise _stranger(begin, is_next, code, size)
             at += HEAD_BYTES
@@ -241,7 +241,7 @@ def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError
     return MessageError(f"a frame of kind {code} with {size} bytes is none")
 
 
-def said_by(frame: NodeFrame) -> list[Any]:
+def read_list(frame: NodeFrame) -> list[Any]:
     """A list as JSON. Raises MessageError: it is none."""
     try:
         found: list[Any] = read_json(frame.data, list)

@@ -52,7 +52,9 @@ class Links:
         self._links: dict[int, Link] = {}
         self._poll = system.poll()
         self._by_place: dict[int, tuple[int, Link]] = {}  # as the poll tells of them
-        self._heard: deque[tuple[int, NodeFrame]] = deque()  # urgent frames, and their senders
+        self._urgent_frames: deque[tuple[int, NodeFrame]] = (
+            deque()
+        )  # urgent frames, and their senders
         self.wanted: Collection[int] = ()  # whose frames this process waits for
         self.waited_s = 0.0
         self.sent_bytes = 0
@@ -91,7 +93,7 @@ class Links:
         if link.waiting:
             self._poll.modify(link.connection, READS_AND_WRITES)
 
-    def take(
+    def receive(
         self,
         wanted: Collection[int],  # numbers of the nodes whose frames are awaited
         timeout_s: float | None = None,  # None: as long as it takes
@@ -104,14 +106,14 @@ class Links:
             SilenceError: nothing has come in time.
             RecoveryOrderedError: the coordinator has one that is not awaited.
         """
-        links, heeds = self._links, COORDINATOR not in wanted
+        links, is_member = self._links, COORDINATOR not in wanted
         self.wanted = wanted
         until_s = None if timeout_s is None else self.now_s() + timeout_s
         left_ms = None
         for number in wanted:
             while number not in links or not links[number].frames:
-                if heeds:
-                    self.heed()
+                if is_member:
+                    self.check_recovery()
                 if number not in links:
                     raise LinkLostError(number)
                 if until_s is not None:
@@ -120,15 +122,15 @@ class Links:
                         silent = self.awaited
                         raise SilenceError(f"nodes {silent} do not answer within {timeout_s:g} s")
                 self.pump(left_ms)
-        if heeds:
-            self.heed()
+        if is_member:
+            self.check_recovery()
         found = {}
         for number in wanted:
             found[number] = links[number].frames.popleft()
         self.wanted = ()
         return found
 
-    def next(self, number: int) -> NodeFrame:
+    def receive_next(self, number: int) -> NodeFrame:
         """The next frame of one, however long that takes; errors as of `take`."""
         try:
             frames = self._links[number].frames
@@ -140,12 +142,12 @@ class Links:
             looks = 0 if number == COORDINATOR else self._looks
             while not frames:
                 if number != COORDINATOR:
-                    self.heed()
+                    self.check_recovery()
                 self.pump(None, looks)
             self.wanted = ()
         return frames.popleft()
 
-    def heed(self) -> None:
+    def check_recovery(self) -> None:
         """Raises RecoveryOrderedError: the coordinator's order to go back has come.
 
         What is awaited then may never come: its sender may be lost without anyone noticing here.
@@ -156,7 +158,7 @@ class Links:
         if any(frame.kind is FrameKind.RECOVER for frame in link.frames):
             raise RecoveryOrderedError(None)
 
-    def arrived(self, number: int) -> NodeFrame | None:
+    def receive_if_there(self, number: int) -> NodeFrame | None:
         """The next frame of one, if it has come."""
         frames = self._links[number].frames
         return frames.popleft() if frames else None
@@ -169,7 +171,7 @@ class Links:
         """Give a connection away."""
         return self._forget(number)
 
-    def put_back(self, number: int, frame: NodeFrame) -> None:
+    def unread(self, number: int, frame: NodeFrame) -> None:
         """Let a frame be the next one of its sender once more."""
         self._links[number].frames.appendleft(frame)
 
@@ -178,8 +180,8 @@ class Links:
 
         Before it sleeps it looks so many times.
         """
-        if self._heard:  # an error was raised of the one before them
-            self._tell()
+        if self._urgent_frames:  # an error was raised of the one before them
+            self._deliver()
             return
         began_s = self.now_s()
         poll = self._poll.poll
@@ -196,26 +198,26 @@ class Links:
                     link.go_on_sending()
                     if not link.waiting:
                         self._poll.modify(link.connection, READS)
-                link.receive(self._heard, number)
+                link.receive(self._urgent_frames, number)
             except LOST as error:
-                self._tell()
+                self._deliver()
                 raise self._lost(number, error) from error
-            if self._heard:
-                self._tell()
+            if self._urgent_frames:
+                self._deliver()
 
-    def _tell(self) -> None:
+    def _deliver(self) -> None:
         """Let urgent frames be heard."""
-        while self._heard:
-            number, frame = self._heard.popleft()
+        while self._urgent_frames:
+            number, frame = self._urgent_frames.popleft()
             try:
                 with reading(number):
-                    passed_on = self.urgent(number, frame)
+                    error = self.urgent(number, frame)
             except LinkLostError as lost:
                 if lost.peer == number:
                     self.drop(number)
                 raise
-            if passed_on is not None:
-                raise passed_on
+            if error is not None:
+                raise error
 
     def _lost(self, number: int, error: Exception) -> LinkLostError:
         self.drop(number)
@@ -242,7 +244,7 @@ class Links:
         for number in self.numbers:
             with suppress(LinkLostError):
                 self.send(number, FrameKind.END, 0)
-        self.urgent = _unheard
+        self.urgent = _ignore
         until_s = self.now_s() + timeout_s
         while self._links and self.now_s() < until_s:
             with suppress(LinkLostError):
@@ -254,6 +256,6 @@ class Links:
             self.drop(number)
 
 
-def _unheard(number: int, frame: NodeFrame) -> Exception | None:
+def _ignore(number: int, frame: NodeFrame) -> Exception | None:
     """What is of no use any more."""
     return None

@@ -22,7 +22,7 @@ Agents = NDArray[np.int64]
 """Some, counted over all worlds."""
 
 ZoneRects = list[list[float]]
-"""Zones as `node_cuts.told_zones` gives them."""
+"""Zones as `node_cuts.zones_as_json` gives them."""
 
 _pack = unchecked(pack_actions)
 
@@ -76,7 +76,7 @@ class NodeCommand(NamedTuple):
         return [first, *told, *rest, lease]
 
 
-class ActionsTaken:
+class ReceivedActions:
     """What agents do, as one node is told it step by step."""
 
     def __init__(self, arrays: StepArrays, number: int) -> None:  # `number`: of the node
@@ -85,21 +85,21 @@ class ActionsTaken:
         self._arrays = arrays.controls.reshape(num, 2), arrays.meta_actions.reshape(num)
         self._missing = np.zeros(num, dtype=np.bool_)
         self._wrong = np.empty(num, dtype=np.int64)
-        self._take = specialized(take_actions, checks=False)
+        self._unpack = specialized(take_actions, checks=False)
         self.are_due = False  # some of the node's own agents have not been told of yet
 
     def begin(self, owner: NDArray[np.int32]) -> None:
         """A step begins; `owner`: (W · A,) the node of each agent."""
         np.equal(owner, self._number, out=self._missing)
 
-    def take(self, data: memoryview, at: int, owner: NDArray[np.int32]) -> tuple[Agents, int]:
+    def read(self, data: memoryview, at: int, owner: NDArray[np.int32]) -> tuple[Agents, int]:
         """Write what agents do to the arrays; those that other nodes own, and where it ends.
 
         Raises:
             MessageError: the bytes tell of no actions.
         """
         words = np.frombuffer(data, np.int64, (len(data) - at) // 8, at)
-        size, wrong, missing = self._take(
+        size, wrong, missing = self._unpack(
             words, words.view(np.float64), *self._arrays,
             self._missing, owner, self._number, self._wrong,
         )  # fmt: skip

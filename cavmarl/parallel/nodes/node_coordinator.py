@@ -27,10 +27,10 @@ class CrossingDigests:
     """Digests of the states of vehicles that have crossed a border, as their owners said."""
 
     def __init__(self) -> None:
-        self.told: dict[int, bytes] = {}
+        self.digests: dict[int, bytes] = {}
 
     def digest_of(self, vehicle: int) -> bytes:
-        return self.told[vehicle]
+        return self.digests[vehicle]
 
     def state(self, vehicle: int) -> bytes:
         """No state is known here: a node that needs one has lost what it was sent."""
@@ -57,7 +57,7 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
-        self.has_told = False  # of the present episode, by a STEP to each zone
+        self.has_stepped = False  # of the present episode, by a STEP to each zone
         self.has_begun = False  # before the first reset nodes have rows of no episode
         self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
 
@@ -85,7 +85,7 @@ class _World:
     def says_nothing(self, births: Sequence[Birth]) -> bool:
         """Whether there is nothing to say of the next tick, nor to write down."""
         is_watched = self.journal is not None or self.on_record is not None
-        return self.has_told and not (births or self.movers or is_watched)
+        return self.has_stepped and not (births or self.movers or is_watched)
 
     def write(self, output: Output) -> int:
         """Write records down; how many vehicles change their owner by them."""
@@ -154,7 +154,7 @@ class NodeCoordinator:
                 world.write(world.directory.host(zone, worker=node_of[zone]))
             world.births, world.movers = [], []
             world.answered.clear()
-            world.has_told = False
+            world.has_stepped = False
         self._node_of, self.switched = node_of, switched
         return self._hostings()
 
@@ -162,7 +162,7 @@ class NodeCoordinator:
         zones = range(len(self._node_of))
         return [[world.directory.hosting(zone) for zone in zones] for world in self._worlds]
 
-    def hear(self, number: int, frame: NodeFrame) -> None:
+    def receive(self, number: int, frame: NodeFrame) -> None:
         """Acknowledgements, as soon as they come.
 
         Raises:
@@ -171,7 +171,7 @@ class NodeCoordinator:
         messages = unpacked(frame.data)
         self.check(number, messages)
         for w, message in messages:
-            self._take(w, message)
+            self._apply(w, message)
 
     def check(
         self,
@@ -211,7 +211,7 @@ class NodeCoordinator:
             if vehicle not in owners or self._node_of[owners[vehicle][0]] != number:
                 raise MessageError(f"node {number} offers vehicle {vehicle}, which it does not own")
 
-    def _take(self, w: int, message: Message) -> None:
+    def _apply(self, w: int, message: Message) -> None:
         world = self._worlds[w]
         table = world.directory.table
         is_present = message.episode == table.episode and message.tick >= table.tick
@@ -225,7 +225,7 @@ class NodeCoordinator:
     def commit(self, reports: Mapping[int, tuple[list[tuple[int, Message]], list[Report]]]) -> None:
         """All nodes are through with the tick, as they report."""
         if any(messages for messages, _ in reports.values()):
-            self._take_all({number: messages for number, (messages, _) in reports.items()})
+            self._apply_all({number: messages for number, (messages, _) in reports.items()})
         every = [report for _, report in reports.values() if report]
         self.is_late = any(one.is_late for report in every for one in report)
         for w, world in enumerate(self._worlds):
@@ -238,17 +238,17 @@ class NodeCoordinator:
                 world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
             if any(report.began for report in said):
                 world.write(world.directory.reset())
-                world.births, world.has_told = [], False
+                world.births, world.has_stepped = [], False
             for number, (_, report) in reports.items():
                 with reading(number):
                     self._check_movers(number, w, report[w] if report else NOTHING)
             movers = [mover for report in said for mover in report.movers]
             world.movers = [(vehicle, target) for vehicle, target, _ in movers]
-            world.states.told = {v: bytes.fromhex(digest) for v, _, digest in movers}
+            world.states.digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
             world.check_owned(w, said)
 
-    def _take_all(self, told: Mapping[int, Sequence[tuple[int, Message]]]) -> None:
+    def _apply_all(self, told: Mapping[int, Sequence[tuple[int, Message]]]) -> None:
         """Take what nodes say of a tick; those of which nothing is said have changed nothing."""
         worlds = {w for messages in told.values() for w, _ in messages}
         disturbed = [w for w in worlds if self._worlds[w].directory.is_quiet]
@@ -257,7 +257,7 @@ class NodeCoordinator:
         for number, messages in told.items():
             with reading(number):
                 for w, message in messages:
-                    self._take(w, message)
+                    self._apply(w, message)
         for w in disturbed:
             self._worlds[w].directory.answer_for_silent()
 
@@ -289,7 +289,7 @@ class NodeCoordinator:
             if world.says_nothing(births) and world.directory.begin_quiet():
                 continue
             output = world.directory.begin(world.movers, births)
-            world.has_told = True
+            world.has_stepped = True
             self.switched += world.write(output)
             messages += [(w, message) for message in output.messages]
         return messages

@@ -41,7 +41,7 @@ class PoolState(NamedTuple):
     cut: ZoneCut
 
 
-def told_zones(partition: ZonePartition) -> ZoneRects:
+def zones_as_json(partition: ZonePartition) -> ZoneRects:
     """Zones as JSON has them: the bounds, and the rectangle of each."""
     return [list(map(float, partition.bounds)), *partition.rects.tolist()]
 
@@ -52,7 +52,7 @@ def read_zones(told: Sequence[Sequence[float]]) -> ZonePartition:
     return ZonePartition((min_x, min_y, max_x, max_y), np.array(rects))
 
 
-def told_neighbours(simulation: Simulation) -> list[Any]:
+def neighbours_as_json(simulation: Simulation) -> list[Any]:
     """Between which zones vehicles change, likewise."""
     near, may_teleport = neighbours_of(simulation.division)
     return [list(map(sorted, near)), may_teleport]
@@ -76,7 +76,7 @@ def proposal_of(simulation: Simulation) -> list[Any] | None:
     if found is None:
         return None
     said = (found.before, found.after, found.moved, 1e3 * (time.perf_counter() - began))
-    return [told_zones(found.partition), *said]
+    return [zones_as_json(found.partition), *said]
 
 
 def cut_worlds(simulation: Simulation, peers: NodePeers, told: Sequence[Sequence[float]]) -> None:

@@ -80,9 +80,9 @@ def files_of(config: EnvConfig, base_dir: Path) -> list[WorldFile]:
     ]
 
 
-def recipe_with(recipe: Mapping[str, Any], files: Sequence[WorldFile]) -> dict[str, Any]:
-    """A recipe whose configuration names the files as they are on this machine."""
-    config = dict(recipe["config"])
+def with_local_files(message: Mapping[str, Any], files: Sequence[WorldFile]) -> dict[str, Any]:
+    """A message whose configuration names the files as they are on this machine."""
+    config = dict(message["config"])
     maps = [str(file.found()) for file in files if file.key == "map.source"]
     config["map"] = {**config["map"], "source": maps[0] if len(maps) == 1 else maps}
     for file in files:
@@ -97,7 +97,7 @@ def recipe_with(recipe: Mapping[str, Any], files: Sequence[WorldFile]) -> dict[s
             values[field] = [*values[field]]
             values[field][file.nth] = path
         config[section] = values
-    return {**recipe, "config": config}
+    return {**message, "config": config}
 
 
 def _digest(path: Path) -> str:

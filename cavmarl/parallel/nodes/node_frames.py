@@ -42,7 +42,7 @@ class Inputs:
         every = {task: [_flat(getattr(arrays, name)) for name in _INPUTS[task]] for task in _INPUTS}
         self._parts = {task: [part for part in parts if part.size] for task, parts in every.items()}
 
-    def take(self, task: Task, data: memoryview, at: int) -> int:
+    def read(self, task: Task, data: memoryview, at: int) -> int:
         """Read them; where they end."""
         for part in self._parts[task]:
             part[:] = np.frombuffer(data, np.uint8, part.size, at)

@@ -14,12 +14,12 @@ ANSWER_S = 5.0  # for a node to answer a call
 _MOST = 1 << 16  # nodes, and generations that are told apart
 
 
-def call_number(number: int, generation: int) -> int:
+def caller_number(number: int, generation: int) -> int:
     """What a node says when it calls another one: which it is, and for which attempt to begin."""
     return number + generation % _MOST * _MOST
 
 
-def calls_of(
+def accept_nodes(
     system: NodeSystem,
     listener: TransportListener,
     wanted: Iterable[int],  # numbers of those that are to call
@@ -32,7 +32,7 @@ def calls_of(
     Raises:
         LinkLostError: one has not called in time.
     """
-    missing = {call_number(number, generation): number for number in wanted}
+    missing = {caller_number(number, generation): number for number in wanted}
     found: dict[int, Connection] = {}
     until_s = system.now_s() + timeout_s
     poll = system.poll()
@@ -64,6 +64,6 @@ def call_node(
         LinkLostError: it cannot be reached.
     """
     try:
-        return system.open(place, secret, call_number(number, generation), ANSWER_S)
+        return system.open(place, secret, caller_number(number, generation), ANSWER_S)
     except (OSError, EOFError, MessageError) as error:
         raise LinkLostError(of) from error

@@ -39,22 +39,22 @@ class NetworkFailedError(Exception):
         self.error = error
 
 
-class AskedNetwork:
+class RemoteNetwork:
     """The simulator as the bus of a node sees it; a `NetworkSimulator`."""
 
     def __init__(self, links: Links, bus: Bus) -> None:
         self._links, self._bus = links, bus
         self._generation = 0
-        self._tells = False
-        self._heard: deque[NodeFrame] = deque()
+        self._is_reporter = False
+        self._answers: deque[NodeFrame] = deque()
         bus.connect(self)
 
-    def begin(self, generation: int, tells: bool) -> None:
+    def begin(self, generation: int, is_reporter: bool) -> None:
         """Go on after nodes have come or gone; one of them asks for all."""
-        self._generation, self._tells = generation, tells
+        self._generation, self._is_reporter = generation, is_reporter
 
-    def hear(self, frame: NodeFrame) -> None:
-        self._heard.append(frame)
+    def receive(self, frame: NodeFrame) -> None:
+        self._answers.append(frame)
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         """See `NetworkSimulator.exchange`.
@@ -63,12 +63,12 @@ class AskedNetwork:
             RecoveryOrderedError: the coordinator wants something else by now.
         """
         links = self._links
-        if self._tells:
-            asked = asked_of(sent, self._bus.mail.num_packets[sent.world])
+        if self._is_reporter:
+            asked = request_of(sent, self._bus.mail.num_packets[sent.world])
             links.send(COORDINATOR, FrameKind.EXCHANGE, self._generation, asked)
         while True:
-            while self._heard:
-                frame = self._heard.popleft()
+            while self._answers:
+                frame = self._answers.popleft()
                 if frame.number == self._generation:
                     with reading(COORDINATOR):
                         found = np.frombuffer(frame.data, RECEPTION)
@@ -76,25 +76,25 @@ class AskedNetwork:
                         return check_receptions(
                             found, sent, latency, self._bus.mail.num_packets[sent.world]
                         )
-            links.heed()
+            links.check_recovery()
             links.pump(None)
 
 
-class Asked(NamedTuple):
+class ExchangeRequest(NamedTuple):
     """What a simulator is asked, and what its answer is checked by."""
 
     exchange: Exchange
     num_packets: NDArray[np.int64]  # in flight, as `check_receptions` has it
 
 
-def asked_of(sent: Exchange, num_packets: NDArray[np.int64]) -> list[Bytes]:
+def request_of(sent: Exchange, num_packets: NDArray[np.int64]) -> list[Bytes]:
     """The same as the pieces of a frame."""
     arrays = (num_packets, sent.packets, sent.receivers)
     head = _HEAD.pack(sent.world, sent.tick, len(sent.packets), len(sent.receivers))
     return [head, *(np.ascontiguousarray(array).tobytes() for array in arrays)]
 
 
-def read_asked(data: memoryview, num_worlds: int, latency_ticks: int) -> Asked:
+def read_request(data: memoryview, num_worlds: int, latency_ticks: int) -> ExchangeRequest:
     """The same, read. Raises MessageError: it is none."""
     slots, at = latency_ticks + 1, _HEAD.size + 8 * (latency_ticks + 1)
     if len(data) < at:
@@ -109,10 +109,10 @@ def read_asked(data: memoryview, num_worlds: int, latency_ticks: int) -> Asked:
         np.frombuffer(data, PACKET, packets, at),
         np.frombuffer(data, RECEIVER, receivers, at + packets * PACKET.itemsize),
     )
-    return Asked(sent, np.frombuffer(data, np.int64, slots, _HEAD.size))
+    return ExchangeRequest(sent, np.frombuffer(data, np.int64, slots, _HEAD.size))
 
 
-def answer_of(network: NetworkSimulator | None, asked: Asked) -> bytes:
+def answer_of(network: NetworkSimulator | None, asked: ExchangeRequest) -> bytes:
     """What the simulator says.
 
     Raises:

@@ -137,7 +137,7 @@ class NodePeers:
         for number, rows in self._rows.items():
             data = self._share_of(number)
             with reading(number):
-                rows.take(data, side, passing)
+                rows.read(data, side, passing)
 
     def running(self) -> NDArray[np.int64]:
         if not self._others:
@@ -230,7 +230,7 @@ class NodePeers:
             self.stepped[...] = self.own
         for number, data in self._swap([told]):
             with reading(number):
-                self._agents.take(data, number, self.owner)
+                self._agents.read(data, number, self.owner)
 
     @contextmanager
     def everybody(self, departures: DepartureQueue, side: int) -> Iterator[None]:
@@ -310,11 +310,11 @@ class NodePeers:
         Raises:
             RecoveryOrderedError: it has been told to go back already.
         """
-        kind, which, data = self._links.next(number)
+        kind, which, data = self._links.receive_next(number)
         if kind is _SHARE and which == self._sent:
             return data
         if kind is FrameKind.SYNC:
-            self._links.put_back(number, NodeFrame(kind, which, data))
+            self._links.unread(number, NodeFrame(kind, which, data))
             raise RecoveryOrderedError(None)
         error = MessageError(f"it is at {kind.name} {which}, not at share {self._sent}")
         raise LinkLostError(number, error)

@@ -22,20 +22,20 @@ from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.network.transport import Bytes
-from cavmarl.parallel.nodes.joining_nodes import Newcomer
+from cavmarl.parallel.nodes.joining_nodes import JoiningNode
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
-from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_actions import NodeCommand, ZoneRects, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
-from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, told_zones
+from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, zones_as_json
 from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
 from cavmarl.parallel.nodes.state_replicas import KEPT
-from cavmarl.parallel.nodes.zone_endpoints import read_report, told_hostings
+from cavmarl.parallel.nodes.zone_endpoints import hostings_as_json, read_report
 from cavmarl.parallel.nodes.zone_moves import (
     ZoneMoves,
     Zones,
@@ -44,7 +44,7 @@ from cavmarl.parallel.nodes.zone_moves import (
     name_of,
     nodes_of,
 )
-from cavmarl.parallel.worlds.world_errors import own_error
+from cavmarl.parallel.worlds.world_errors import original_error
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 
 log = logging.getLogger("cavmarl.nodes")
@@ -64,11 +64,11 @@ class NodePool:
     Attributes:
         zones: that each node hosts.
         pids: of the nodes' processes, each on its machine.
-        teller: number of the node that tells what all know alike.
+        reporter: number of the node that tells what all know alike.
         owner: (W · A,) the node that owns each agent, as far as is known.
-        partition: the zones' rectangles, as `node_cuts.told_zones` gives them.
+        partition: the zones' rectangles, as `node_cuts.zones_as_json` gives them.
         coordinator: of the ownership of vehicles.
-        newcomers: nodes that have joined and host nothing yet.
+        joining_nodes: nodes that have joined and host nothing yet.
         generation: how often nodes have come and gone.
         losses: how many nodes were lost.
         recoveries: how often the worlds have gone back because of that.
@@ -97,7 +97,7 @@ class NodePool:
     ) -> None:
         self._is_native = world.config.traffic.source == "native"
         self._supply, self._route, self._answer = supply, route, answer
-        self.newcomers = supply.newcomers
+        self.joining_nodes = supply.joining_nodes
         config = world.config
         self.zones = self._homes = zones
         self.generation = 0
@@ -109,14 +109,14 @@ class NodePool:
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
         self._num_ids, self._num_zones = config.population.num_ids, world.partition.count
-        self._partition = told_zones(world.partition)
+        self._partition = zones_as_json(world.partition)
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
         self._watch = NodeWatch(self._links, self._stopped)
-        self._nodes: dict[int, Newcomer] = {}  # what is known of each that lives
+        self._nodes: dict[int, JoiningNode] = {}  # what is known of each that lives
         self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
         self._lease_ticks, self._settings = lease_ticks(config), config.zones
-        self._links.urgent = self._hear
+        self._links.urgent = self._receive
         self._prepare(runs)
         try:
             self._begin()
@@ -128,7 +128,7 @@ class NodePool:
         """Have worlds that have not begun."""
         self.zones = self._homes
         self._living = living_of(self.zones)
-        self.teller = 0
+        self.reporter = 0
         self._cut = ZoneCut(self._partition, Neighbours(()))
         # What all nodes can go back to, and what they keep before the next command.
         self._state = PoolState(self._next_state, self.zones, 0, self._cut)
@@ -171,7 +171,7 @@ class NodePool:
                 self._cut = self._cut._replace(neighbours=neighbours)
                 self._state = self._state._replace(cut=self._cut)
                 hostings = hostings or self.coordinator.host(neighbours)
-                self._tell_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
+                self._send_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
                 self._commit()
             except LinkLostError as lost:
                 self._lose(lost, has_begun=False)
@@ -215,16 +215,16 @@ class NodePool:
     def _seat(self, num: int, waits: bool = True) -> None:
         """Let nodes that are ready host the zones that lost nodes had at the beginning."""
         empty = [n for n in range(len(self._homes)) if n not in self._nodes]
-        for newcomer, connection in self._supply.take(num, self._pump, waits):
-            number = newcomer.asked if newcomer.asked in empty else empty[0]
+        for joining_node, connection in self._supply.take(num, self._pump, waits):
+            number = joining_node.asked if joining_node.asked in empty else empty[0]
             empty.remove(number)
-            assert newcomer.place is not None
+            assert joining_node.place is not None
             self._links.add(number, connection)
-            self._nodes[number], self._new[number] = newcomer, self._route(newcomer.place)
+            self._nodes[number], self._new[number] = joining_node, self._route(joining_node.place)
             if number in self._lost:
                 self._lost.remove(number)
 
-    def _take(self, kind: FrameKind) -> dict[int, NodeFrame]:
+    def _receive_all(self, kind: FrameKind) -> dict[int, NodeFrame]:
         """The next frame of all living nodes, by rising numbers.
 
         Raises:
@@ -232,7 +232,7 @@ class NodePool:
         """
         found: dict[int, NodeFrame] = {}
         while missing := [n for n in self._living if n not in found] if found else self._living:
-            wait = partial(self._links.take, missing)
+            wait = partial(self._links.receive, missing)
             for number, frame in self._watch.wait(self._living, self._timeout_s, wait).items():
                 if frame.number == self.generation:
                     found[number] = frame
@@ -346,14 +346,14 @@ class NodePool:
             pieces = command.of_node(number, self.owner, lease.get(number, b""))
             self._links.send(number, FrameKind.COMMAND, kept, pieces)
         if not command.changes:
-            return {n: frame.data for n, frame in self._take(FrameKind.RESULT).items()}
+            return {n: frame.data for n, frame in self._receive_all(FrameKind.RESULT).items()}
         results = self._commit()
         for _ in range(1, leases):
             self.coordinator.lease(self._begin_lease(), self._ticks_per_step)
             results = self._commit()
         if command.cut is not None:
-            with reading(self.teller):
-                near = read_neighbours(read_json(results[self.teller], list), self._num_zones)
+            with reading(self.reporter):
+                near = read_neighbours(read_json(results[self.reporter], list), self._num_zones)
             self._cut = ZoneCut(command.cut, near)
             self.coordinator.know(near)
         return results
@@ -368,7 +368,7 @@ class NodePool:
             lease = decide()
         return lease
 
-    def _hear(self, number: int, frame: NodeFrame) -> Exception | None:
+    def _receive(self, number: int, frame: NodeFrame) -> Exception | None:
         """Take an urgent frame.
 
         Returns:
@@ -379,16 +379,16 @@ class NodePool:
             case FrameKind.MISSED:
                 peer = int.from_bytes(frame.data, "little")
                 if is_present and peer in self._nodes:
-                    self._watch.hear_missed(number, peer)
+                    self._watch.report_missed(number, peer)
             case FrameKind.FAILED:
-                name, text, trace = map(str, said_by(frame))
+                name, text, trace = map(str, read_list(frame))
                 part = name_of(self._homes[number])
                 failure = WorkerFailureError(number, part, name, text, trace)
-                found = own_error(failure)
+                found = original_error(failure)
                 found.__cause__ = None if found is failure else failure
                 return found
             case FrameKind.PONG:
-                self._watch.hear_pong(number, frame)
+                self._watch.receive_pong(number, frame)
             case FrameKind.KEEP:
                 self._kept[frame.number] = frame.data
                 for old in sorted(self._kept)[:-KEPT]:
@@ -398,9 +398,9 @@ class NodePool:
                     self._exchange(frame)
             case FrameKind.NOT_MINE:
                 if is_present:
-                    self._send_on(frame)
+                    self._forward(frame)
             case FrameKind.MESSAGES:
-                self.coordinator.hear(number, frame)
+                self.coordinator.receive(number, frame)
             case _:
                 raise MessageError(f"a node sends no frame of kind {frame.kind.name}")
         return None
@@ -421,7 +421,7 @@ class NodePool:
             self._links.send(node, FrameKind.RECEPTIONS, self.generation, [answer])
         self._exchanged += 1
 
-    def _send_on(self, frame: NodeFrame) -> None:
+    def _forward(self, frame: NodeFrame) -> None:
         """Send actions that a node refuses to the owners that it names.
 
         Raises:
@@ -479,7 +479,7 @@ class NodePool:
         self._cut = state.cut
         self.coordinator.know(state.cut.neighbours)
         hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)
-        self._tell_zones(hostings, moves, begins=False, kept=kept)
+        self._send_zones(hostings, moves, begins=False, kept=kept)
         self._commit()
         self._new.clear()
         self._is_torn = False
@@ -511,7 +511,7 @@ class NodePool:
         zones[successor] = state.zones[hosts[0]]
         return ZoneMoves(zones, {}, []), kept
 
-    def _tell_zones(
+    def _send_zones(
         self,
         hostings: Sequence[Sequence[Hosting]],
         moves: ZoneMoves,
@@ -528,21 +528,21 @@ class NodePool:
             "places": list(self._new.items()),
             "zones": moves.zones,
             "partition": self._cut.partition,
-            "first": self._first_teller(),
+            "first": self._choose_reporter(),
             "state": self._state.number,
             "runs": self._runs,
-            "hostings": told_hostings(hostings),
+            "hostings": hostings_as_json(hostings),
         }
         for number in self._living:
             data = json.dumps({**told, "number": number}).encode()
             size = len(data).to_bytes(8, "little")
             self._links.send(number, FrameKind.RECOVER, self.generation, [size, data, kept])
 
-    def _first_teller(self) -> int:
+    def _choose_reporter(self) -> int:
         """The node that tells what all know alike: one that has been there in the last step."""
         old = [number for number in self._living if number not in self._new]
-        self.teller = self.teller if self.teller in old else (old or self._living)[0]
-        return self.teller
+        self.reporter = self.reporter if self.reporter in old else (old or self._living)[0]
+        return self.reporter
 
     def _commit(self) -> dict[int, memoryview]:
         """Wait for the nodes to be through with a tick.
@@ -554,8 +554,8 @@ class NodePool:
             LinkLostError: one is lost, or has sent what cannot be.
         """
         told, results = {}, {}
-        frames = self._take(FrameKind.REPORT)
-        for number in sorted(frames, key=self.teller.__ne__):  # else by rising numbers
+        frames = self._receive_all(FrameKind.REPORT)
+        for number in sorted(frames, key=self.reporter.__ne__):  # else by rising numbers
             with reading(number):
                 messages, said, more = read_report(frames[number].data, len(self._runs))
                 self.coordinator.check(number, messages, said)

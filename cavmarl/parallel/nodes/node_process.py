@@ -23,30 +23,30 @@ from cavmarl.parallel.network.transport import Bytes, Place
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.link import FrameKind, NeededNoMoreError, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
-from cavmarl.parallel.nodes.node_actions import ActionsTaken, refusal
-from cavmarl.parallel.nodes.node_cuts import cut_worlds, proposal_of, read_zones, told_neighbours
+from cavmarl.parallel.nodes.node_actions import ReceivedActions, refusal
+from cavmarl.parallel.nodes.node_cuts import cut_worlds, neighbours_as_json, proposal_of, read_zones
 from cavmarl.parallel.nodes.node_executor import NodeExecutor, TimedNodeExecutor
-from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
+from cavmarl.parallel.nodes.node_files import WorldFile, with_local_files
 from cavmarl.parallel.nodes.node_frames import (
     Inputs,
     command_of,
     saved_of,
     worlds_payload,
 )
-from cavmarl.parallel.nodes.node_handshake import call_node, calls_of
+from cavmarl.parallel.nodes.node_handshake import accept_nodes, call_node
 from cavmarl.parallel.nodes.node_loads import told_of
-from cavmarl.parallel.nodes.node_network import AskedNetwork
+from cavmarl.parallel.nodes.node_network import RemoteNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
-from cavmarl.parallel.nodes.state_replicas import KeptStates
-from cavmarl.parallel.nodes.zone_endpoints import ZoneHosts, hosting_of, unpacked
+from cavmarl.parallel.nodes.state_replicas import StateReplicas
+from cavmarl.parallel.nodes.zone_endpoints import ZoneEndpoints, hosting_of, unpacked
 from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of, read_order
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.tasks import WORLD_TASKS, Task, WorldTask, commands_of
 
 MEASURED_TICKS = 10  # one of so many shows what zones cost
-MEETING_S = 60.0  # for the other nodes to call
+HANDSHAKE_S = 60.0  # for the other nodes to call
 DIFFERENT = "are read as something else on this machine: {} is the caller's folder"
 
 
@@ -84,14 +84,14 @@ class NodeProgram:
         zones: that it hosts.
     """
 
-    _kept: KeptStates  # once it has begun
+    _replicas: StateReplicas  # once it has begun
 
     def __init__(self, system: NodeSystem, links: Links, address: str, secret: bytes) -> None:
         self.zones: tuple[int, ...] = ()
         self._system, self._links = system, links
         self._address = address  # of this machine, as the caller reaches it
         self._secret = secret
-        self._network: AskedNetwork | None = None
+        self._network: RemoteNetwork | None = None
         self._number = -1  # until the caller has said it
         self._generation = 0
         self._actions: deque[NodeFrame] = deque()  # that have been sent here after all
@@ -101,8 +101,8 @@ class NodeProgram:
             Task.RESET: self._reset,
             Task.LOAD: self._load,
             Task.CUT: self._cut,
-            Task.COSTS: self._tell_costs,
-            Task.LOADS: self._tell_loads,
+            Task.COSTS: self._report_costs,
+            Task.LOADS: self._report_loads,
             Task.SUGGEST: self._suggest,
         }
 
@@ -116,15 +116,15 @@ class NodeProgram:
         told = {"code": code_stamp(), "machine": socket.gethostname(), "pid": os.getpid()}
         links.send(COORDINATOR, FrameKind.JOIN, 0, [json.dumps(told).encode()])
         with reading(COORDINATOR):
-            job = read_json(self._take(FrameKind.JOB), dict)
+            job = read_json(self._receive_next(FrameKind.JOB), dict)
             files = [WorldFile(*told) for told in job["files"]]
         self._fetch(files)
-        recipe = recipe_with(job["recipe"], files)
-        worlds = self._system.worlds_of(recipe, DIFFERENT, job["num_worlds"], job["in_next_step"])
+        message = with_local_files(job["message"], files)
+        worlds = self._system.worlds_of(message, DIFFERENT, job["num_worlds"], job["in_next_step"])
         self._run_worlds(worlds)
         self._lease_ticks = job["lease_ticks"]
         self._listener = self._system.listen(self._address, self._secret)
-        said = [*self._listener.place, *told_neighbours(worlds.simulation)]
+        said = [*self._listener.place, *neighbours_as_json(worlds.simulation)]
         links.send(COORDINATOR, FrameKind.READY, 0, [json.dumps(said).encode()])
 
     def _run_worlds(self, worlds: LocalWorlds) -> None:
@@ -135,7 +135,7 @@ class NodeProgram:
         self._logs = worlds.keep_logs()
         v2x = worlds.world.config.v2x
         if v2x.enabled and v2x.channel.external:
-            self._network = AskedNetwork(self._links, worlds.simulation.messages)
+            self._network = RemoteNetwork(self._links, worlds.simulation.messages)
 
     def _fetch(self, files: Sequence[WorldFile]) -> None:
         """Get those that this machine does not have."""
@@ -144,15 +144,15 @@ class NodeProgram:
             return
         self._links.send(COORDINATOR, FrameKind.WANTED, 0, [json.dumps(wanted).encode()])
         with reading(COORDINATOR):
-            data = self._take(FrameKind.FILES)
+            data = self._receive_next(FrameKind.FILES)
             at = 8 + int.from_bytes(data[:8], "little")
             for n, size in zip(wanted, read_json(data[8:at], list), strict=True):
                 files[n].keep(bytes(data[at : at + size]))
                 at += size
 
-    def _take(self, kind: FrameKind) -> memoryview:
+    def _receive_next(self, kind: FrameKind) -> memoryview:
         """What the caller sends next, while it may send this node away."""
-        frame = self._links.next(COORDINATOR)
+        frame = self._links.receive_next(COORDINATOR)
         if frame.kind is not kind:
             raise MessageError(f"the caller sent {frame.kind.name}, not {kind.name}")
         return frame.data
@@ -172,7 +172,7 @@ class NodeProgram:
         carried = [arrays.controls, arrays.meta_actions]
         carried += [] if mounted is None else mounted.arrays()
         settings, division = simulation.config.zones, simulation.division
-        self._hosts = ZoneHosts(
+        self._endpoints = ZoneEndpoints(
             division, mine, nodes_of(zones), told, limits_of(settings, division.codec.schema),
             self._links, carried, self._peers.checks, generation=generation,
             is_checked=settings.check_invariants, ticks=self._lease_ticks,
@@ -188,24 +188,24 @@ class NodeProgram:
         self._clock = ShardClock(own, MEASURED_TICKS) if every else None
         plain = NodeExecutor(own, foreign)
         executor = plain if self._clock is None else TimedNodeExecutor(plain, self._clock)
-        simulation.zones.host_zones(self._peers, self._hosts, executor)
+        simulation.zones.host_zones(self._peers, self._endpoints, executor)
 
-    def _hear(self, number: int, frame: NodeFrame) -> None:
+    def _receive(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
         is_caller = number == COORDINATOR
         match frame.kind:
             case FrameKind.MESSAGES:
-                self._hosts.hear(frame)
+                self._endpoints.receive(frame)
             case FrameKind.KEEP if not is_caller:
-                self._kept.take(number, frame)
+                self._replicas.receive(number, frame)
             case FrameKind.AGENT if not is_caller:
-                self._hosts.keep_agent(frame)
+                self._endpoints.receive_agent(frame)
             case FrameKind.GIVE if not is_caller:
-                self._kept.take_given(number, frame)
+                self._replicas.receive_given(number, frame)
             case FrameKind.ACTIONS if is_caller:
                 self._actions.append(frame)
             case FrameKind.RECEPTIONS if is_caller and self._network is not None:
-                self._network.hear(frame)
+                self._network.receive(frame)
             case FrameKind.PING if is_caller:
                 said = json.dumps(self._links.awaited).encode()
                 self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
@@ -221,13 +221,13 @@ class NodeProgram:
         """
         while True:
             try:
-                frame = self._links.next(COORDINATOR)
+                frame = self._links.receive_next(COORDINATOR)
                 if frame.kind is FrameKind.RECOVER:
                     self._recover(frame)
                 elif frame.kind is FrameKind.LEASE:
                     with reading(COORDINATOR):
                         leased = unpacked(frame.data)
-                    self._hosts.note(leased)
+                    self._endpoints.note(leased)
                 else:
                     self._perform(frame)
             except RecoveryOrderedError as ordered:
@@ -241,7 +241,7 @@ class NodeProgram:
         while True:
             try:
                 while frame is None or frame.kind is not FrameKind.RECOVER:
-                    frame = self._links.next(COORDINATOR)
+                    frame = self._links.receive_next(COORDINATOR)
                 self._recover(frame)
                 return
             except RecoveryOrderedError as ordered:
@@ -271,16 +271,16 @@ class NodeProgram:
             self._run_worlds(before.of_number(num_worlds))
             before.close()
             if not is_new:
-                self._kept.begin_anew(self._worlds, self._logs)
+                self._replicas.begin_anew(self._worlds, self._logs)
         if is_new or self._worlds is not before:
             self._number = told["number"]
-            self._taken = ActionsTaken(self._worlds.arrays, self._number)
+            self._received_actions = ReceivedActions(self._worlds.arrays, self._number)
         if is_new:
-            self._kept = KeptStates(self._worlds, self._logs, links, self._number)
-            links.urgent = self._hear
-        self._tells = told["first"] == self._number
+            self._replicas = StateReplicas(self._worlds, self._logs, links, self._number)
+            links.urgent = self._receive
+        self._is_reporter = told["first"] == self._number
         if self._network is not None:
-            self._network.begin(frame.number, self._tells)
+            self._network.begin(frame.number, self._is_reporter)
         for number in told["lost"]:
             links.drop(number)
         zones = told["zones"]
@@ -291,23 +291,23 @@ class NodeProgram:
         state, mine = told["state"], zones[self._number]
         if told["begins"]:  # what is kept elsewhere has come when the SYNC after it comes
             self._peers.keep_own(self._worlds.simulation.everywhere)
-            self._kept.keep(state, self._living)
+            self._replicas.keep(state, self._living)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
         for node in others:
             while True:
-                found = links.next(node)
+                found = links.receive_next(node)
                 if found.kind is FrameKind.SYNC and found.number == frame.number:
                     break
         if not told["begins"]:
             if len(data) > at:
                 with reading(COORDINATOR):
-                    self._kept.take_over(state, data[at:])
+                    self._replicas.resume_from(state, data[at:])
             adopted = [number for number, heir in told["heirs"] if heir == self._number]
             donors = [donor for donor, taker in told["donors"] if taker == self._number]
             takers = [taker for donor, taker in told["donors"] if donor == self._number]
-            self._kept.load(state, adopted, donors, takers, mine, self._generation, self._check)
-        self._hosts.report()
+            self._replicas.load(state, adopted, donors, takers, mine, self._generation, self._check)
+        self._endpoints.report()
 
     def _meet(self, places: Mapping[int, Place], others: Sequence[int]) -> None:
         """Connect with new nodes, by their places; of two of them the higher one calls.
@@ -328,7 +328,9 @@ class NodeProgram:
             links.wanted = callers = [
                 node for node in others if node not in places or node > number
             ]
-            called = calls_of(self._system, self._listener, callers, times, MEETING_S, self._check)
+            called = accept_nodes(
+                self._system, self._listener, callers, times, HANDSHAKE_S, self._check
+            )
             links.wanted = ()
             for other, connection in called.items():
                 links.add(other, connection)
@@ -344,9 +346,9 @@ class NodeProgram:
             if frame.kind is not FrameKind.COMMAND:
                 raise MessageError(f"it sends no frame of kind {frame.kind.name} here")
             task, payload, at = command_of(frame.data)
-        self._kept.settle()
+        self._replicas.settle()
         if frame.number:
-            self._kept.keep(frame.number, self._living)
+            self._replicas.keep(frame.number, self._living)
         if perform := self._of_all.get(task):
             perform(payload, frame.data, at)
         else:
@@ -356,40 +358,40 @@ class NodeProgram:
         worlds = self._worlds
         at = self._await_actions(data, at)
         with reading(COORDINATOR):
-            at = self._inputs.take(Task.STEP, data, at)
+            at = self._inputs.read(Task.STEP, data, at)
             leased = unpacked(data[at:])
-        self._hosts.lease(leased)
+        self._endpoints.lease(leased)
         self._peers.begin_step()
         worlds.step(self._commands)
-        self._hosts.report([self._results_of(worlds.simulation.everywhere, of_step=True)])
+        self._endpoints.report([self._results_of(worlds.simulation.everywhere, of_step=True)])
 
     def _reset(self, payload: Any, data: memoryview, at: int) -> None:
         task = WORLD_TASKS[Task.RESET]
         with reading(COORDINATOR):
-            self._inputs.take(Task.RESET, data, at)
+            self._inputs.read(Task.RESET, data, at)
             told = task.read(payload, 0)
         task.method(self._worlds, **told)
-        self._hosts.report([self._results_of(self._worlds.arrays.chosen, of_step=False)])
+        self._endpoints.report([self._results_of(self._worlds.arrays.chosen, of_step=False)])
 
     def _load(self, payload: Any, data: memoryview, at: int) -> None:
         with reading(COORDINATOR):
             saved = saved_of(payload)
         WORLD_TASKS[Task.LOAD].perform(self._worlds, saved)
-        self._hosts.report()
+        self._endpoints.report()
 
     def _cut(self, payload: Any, data: memoryview, at: int) -> None:
         simulation = self._worlds.simulation
         cut_worlds(simulation, self._peers, payload)
         self._run_own()
-        self._hosts.report([json.dumps(told_neighbours(simulation)).encode()])
+        self._endpoints.report([json.dumps(neighbours_as_json(simulation)).encode()])
 
-    def _tell_costs(self, payload: None, data: memoryview, at: int) -> None:
+    def _report_costs(self, payload: None, data: memoryview, at: int) -> None:
         spent_s = [] if self._clock is None else self._clock.take_s().tolist()
         of_zones = list(zip(self.zones, spent_s, strict=False))
         running = self._worlds.simulation.running().tolist()
         self._answer([json.dumps([of_zones, running]).encode()])
 
-    def _tell_loads(self, payload: Any, data: memoryview, at: int) -> None:
+    def _report_loads(self, payload: Any, data: memoryview, at: int) -> None:
         told = told_of(payload, self._links, self._worlds.simulation, self.zones)
         self._answer([json.dumps([self._number, *told]).encode()])
 
@@ -407,27 +409,27 @@ class NodeProgram:
         Raises:
             RecoveryOrderedError: the coordinator wants something else by now.
         """
-        taken, owner = self._taken, self._peers.owner
-        taken.begin(owner)
+        received, owner = self._received_actions, self._peers.owner
+        received.begin(owner)
         with reading(COORDINATOR):
-            wrong, end = taken.take(data, at, owner)
+            wrong, end = received.read(data, at, owner)
         if len(wrong):
             said = refusal(wrong, owner)
             self._links.send(COORDINATOR, FrameKind.NOT_MINE, self._generation, said)
-        while taken.are_due:
+        while received.are_due:
             while self._actions:
                 late = self._actions.popleft()
                 if late.number == self._generation:
                     with reading(COORDINATOR):
-                        taken.take(late.data, 0, owner)
-            if taken.are_due:
-                self._links.heed()
+                        received.read(late.data, 0, owner)
+            if received.are_due:
+                self._links.check_recovery()
                 self._links.pump(None)
         return end
 
     def _results_of(self, chosen: NDArray[np.bool_], of_step: bool) -> Bytes:
         peers = self._peers
-        return self._results.packed(peers.own, chosen, peers.stepped, of_step, self._tells)
+        return self._results.packed(peers.own, chosen, peers.stepped, of_step, self._is_reporter)
 
     def _look(self, task: Task, payload: Any) -> None:
         """Answer what only the first node can, which has the whole world meanwhile."""

@@ -10,16 +10,16 @@ from threading import RLock
 from cavmarl.core.processes import is_fork
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.nodes.joining_nodes import ANYONE, Newcomer, Newcomers
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, JoiningNode, JoiningNodes
 from cavmarl.parallel.nodes.leases import lease_ticks
 from cavmarl.parallel.nodes.link import Link
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.placement.backend_name import BackendName
-from cavmarl.parallel.worlds.journaled_worlds import unwatched
+from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
-from cavmarl.parallel.worlds.world_message import recipe_of
+from cavmarl.parallel.worlds.world_message import make_world_message
 
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
@@ -29,7 +29,7 @@ class NodeSupply:
 
     Attributes:
         count: how many nodes the pools have together if none is lost.
-        newcomers: nodes that have joined and belong to no pool.
+        joining_nodes: nodes that have joined and belong to no pool.
 
     Raises:
         ConfigError: a setting that nodes cannot have.
@@ -52,7 +52,7 @@ class NodeSupply:
     ) -> None:
         config = world.config
         if not compiled_before():
-            LocalWorlds(unwatched(world), 1, warm=True)
+            LocalWorlds(without_journals(world), 1, warm=True)
         self._join_timeout_s = config.workers.join_timeout_s
         self._lock, self._pid = RLock(), os.getpid()
         self._are_there = False  # all nodes that the pools want have been there
@@ -61,12 +61,14 @@ class NodeSupply:
         self._starter, listener = start(backend, num_worlds, config.workers, base_dir, route)
         self.count = self._starter.count
         job = {
-            "recipe": recipe_of(world, base_dir),
+            "message": make_world_message(world, base_dir),
             "num_worlds": -(-num_worlds // self.count) if by_worlds else num_worlds,
             "in_next_step": in_next_step,
             "lease_ticks": lease_ticks(config),
         }
-        self.newcomers = Newcomers(listener, job, files, self._room, world.partition.count, system)
+        self.joining_nodes = JoiningNodes(
+            listener, job, files, self._room, world.partition.count, system
+        )
 
     @property
     def is_here(self) -> bool:
@@ -79,12 +81,12 @@ class NodeSupply:
     def look(self) -> bool:
         """Hear nodes that want to join; return whether one is ready."""
         with self._lock:
-            self.newcomers.look(0.0)
-            return bool(self.newcomers.ready)
+            self.joining_nodes.look(0.0)
+            return bool(self.joining_nodes.ready)
 
     def take(
         self, num: int, trouble: Callable[[], None], waits: bool = True
-    ) -> list[tuple[Newcomer, Link]]:
+    ) -> list[tuple[JoiningNode, Link]]:
         """Return nodes that are ready, and their connections.
 
         Args:
@@ -102,28 +104,28 @@ class NodeSupply:
             return self._starter.trouble(self._begun)
 
         with self._lock:
-            newcomers, wanted = self.newcomers, num
+            joining_nodes, wanted = self.joining_nodes, num
             while waits and len(self._usable()) < num:
-                newcomers.await_ready(wanted, self._join_timeout_s, why)
-                wanted = len(newcomers.ready) + 1
-            found = [newcomers.take(number) for number in self._usable()[:num]]
-            self._begun += [newcomer.pid for newcomer, _ in found]
+                joining_nodes.await_ready(wanted, self._join_timeout_s, why)
+                wanted = len(joining_nodes.ready) + 1
+            found = [joining_nodes.take(number) for number in self._usable()[:num]]
+            self._begun += [joining_node.pid for joining_node, _ in found]
             self._are_there |= len(self._begun) == self.count
             return found
 
     def _usable(self) -> list[int]:
         """Return which are ready; none that was started to spare before all others were there."""
-        newcomers, spares = self.newcomers, range(self.count, ANYONE)
-        ready = newcomers.ready
-        return [n for n in ready if self._are_there or newcomers.asked(n) not in spares]
+        joining_nodes, spares = self.joining_nodes, range(self.count, ANYONE)
+        ready = joining_nodes.ready
+        return [n for n in ready if self._are_there or joining_nodes.asked(n) not in spares]
 
-    def replace(self, node: Newcomer, is_silent: bool) -> None:
+    def replace(self, node: JoiningNode, is_silent: bool) -> None:
         """A node of a pool is lost: start another one in its place."""
         with self._lock:
             self._begun.remove(node.pid)
             self._starter.replace(node.asked, is_silent)
 
-    def retry(self, node: Newcomer, is_silent: bool) -> str | None:
+    def retry(self, node: JoiningNode, is_silent: bool) -> str | None:
         """Start a node again that was lost before it had begun; else why not, in words."""
         with self._lock:
             self._begun.remove(node.pid)
@@ -137,5 +139,5 @@ class NodeSupply:
         """Send away the nodes that wait, and end the processes; a fork has no right to."""
         if is_fork(self._pid):
             return
-        self.newcomers.close()
+        self.joining_nodes.close()
         self._starter.close()

@@ -1,4 +1,4 @@
-"""What a caller or a node needs of the system: a clock, connections, and the worlds of a recipe."""
+"""What the caller and the nodes need of their system: a clock, connections and worlds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from cavmarl.parallel.network.tcp_transport import TcpTransport
 from cavmarl.parallel.network.transport import Transport
 from cavmarl.parallel.nodes.leases import late_ticks
-from cavmarl.parallel.worlds.journaled_worlds import unwatched
+from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.world_message import world_of
 
@@ -28,7 +28,7 @@ class NodeSystem(Transport, Protocol):
 
     def worlds_of(
         self,
-        recipe: Mapping[str, Any],
+        message: Mapping[str, Any],
         trouble: str,  # what it means if its files differ
         num_worlds: int,
         in_next_step: bool,  # when worlds begin anew
@@ -45,11 +45,11 @@ class Machine:
         self.open, self.listen, self.poll = transport.open, transport.listen, transport.poll
 
     def worlds_of(
-        self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
+        self, message: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
     ) -> LocalWorlds:
-        world = world_of(recipe, trouble)
+        world = world_of(message, trouble)
         late = late_ticks(world.config)
-        world = unwatched(world)
+        world = without_journals(world)
         return LocalWorlds(world, num_worlds, warm=True, in_next_step=in_next_step, late_ticks=late)
 
 

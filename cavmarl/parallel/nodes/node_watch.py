@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from cavmarl.core.errors import MessageError, WorkerError
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import Links, SilenceError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices
 
@@ -40,14 +40,14 @@ class NodeWatch:
         self._answered: dict[int, list[int]] = {}
         self._pings = 0
 
-    def hear_missed(self, number: int, peer: int) -> None:
+    def report_missed(self, number: int, peer: int) -> None:
         """A node says that its connection to another one has ended. Raises LinkLostError."""
         self._missed += (number, peer)
         raise LinkLostError(peer)
 
-    def hear_pong(self, number: int, frame: NodeFrame) -> None:
+    def receive_pong(self, number: int, frame: NodeFrame) -> None:
         if frame.number == self._pings:
-            awaited = said_by(frame)
+            awaited = read_list(frame)
             check_indices("node", (peer for peer in awaited if peer != COORDINATOR), MOST_NODES)
             self._answered[number] = awaited
 

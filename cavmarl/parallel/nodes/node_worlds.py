@@ -39,7 +39,7 @@ from cavmarl.parallel.nodes.node_loads import (
     NodeLoad,
     since,
 )
-from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_asked
+from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_request
 from cavmarl.parallel.nodes.node_pool import Found, NodePool, Read, unread
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
@@ -121,10 +121,10 @@ class NodeWorlds(CommandedWorlds):
             raise
         self._spent_s = np.zeros((1, count))
         self._ticks_per_step = config.clock.ticks_per_step
-        self._ticks_done = self._ticks_told = 0
+        self._ticks_done = self._ticks_reported = 0
         self._steps_begun = 0  # since the worlds were made
         self.repartitions: list[Repartition] = []
-        self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
+        self._last_loads: dict[int, list[Any]] = {}  # what nodes have said of themselves last
         every = config.workers.balance_steps
         if every and share is None:
             self.mover = Mover(self.placement, count, every, self._spent_s)
@@ -174,7 +174,7 @@ class NodeWorlds(CommandedWorlds):
     def _answer(self, data: memoryview) -> bytes:
         """Return what the network simulator says; errors as of `answer_of`."""
         latency = self.world.config.v2x.channel.latency_ticks
-        return answer_of(self._network, read_asked(data, len(self.arrays.mask), latency))
+        return answer_of(self._network, read_request(data, len(self.arrays.mask), latency))
 
     def _seen(self) -> LoadSnapshot:
         """Ask what zones have cost, before they are balanced by it; how busy all nodes are.
@@ -288,7 +288,7 @@ class NodeWorlds(CommandedWorlds):
         self, chosen: NDArray[np.bool_], of_step: bool, number: int, data: memoryview
     ) -> None:
         pool = self.pool
-        self._results.take(data, chosen, of_step, number == pool.teller, number, pool.owner)
+        self._results.read(data, chosen, of_step, number == pool.reporter, number, pool.owner)
 
     def _read_suggested(self, number: int, data: memoryview) -> tuple[NDArray[Any], NDArray[Any]]:
         suggested = self.arrays.suggested
@@ -309,12 +309,12 @@ class NodeWorlds(CommandedWorlds):
         After a node was lost its successor's time is that since it began.
         """
         found = []
-        ticks, self._ticks_told = self._ticks_done - self._ticks_told, self._ticks_done
+        ticks, self._ticks_reported = self._ticks_done - self._ticks_reported, self._ticks_done
         for node, now in self._run(Task.LOADS, None, _read_totals):
-            before = self._told.get(node)
+            before = self._last_loads.get(node)
             is_same = before is not None and before[0] <= now[0]
             found.append(since(node, ticks, now, before if is_same else None))
-            self._told[node] = now
+            self._last_loads[node] = now
         return sorted(found)
 
     def node_snapshot(self, purpose: str = TO_SHOW) -> LoadSnapshot:

@@ -111,7 +111,7 @@ class RowStream:
         self._slots = np.empty(1, dtype=np.int32)
         self._make_frame(1 + (3 + 2 * len(others)) * running.size)
         self._pack = specialized(pack_frame, checks=False)
-        self._take = specialized(take_frame, checks=False)
+        self._unpack = specialized(take_frame, checks=False)
 
     def packed(self, side: int, passing: Passing) -> Bytes:
         """The frame that the other one gets, until the next is packed.
@@ -141,7 +141,7 @@ class RowStream:
         self._frame = huge_zeros(words, dtype=np.int64)
         self._bytes = self._frame.view(np.uint8).data
 
-    def take(self, data: memoryview, side: int, passing: Passing) -> None:
+    def read(self, data: memoryview, side: int, passing: Passing) -> None:
         """Take a frame of the other one.
 
         Raises:
@@ -151,10 +151,10 @@ class RowStream:
         if data and not len(data) % 8:
             frame = np.frombuffer(data, np.int64)
             args = self._both, side, passing, self._law, taken.before
-            num = self._take(*args, taken.now, frame)
+            num = self._unpack(*args, taken.now, frame)
             if NO_FRAME < num < 0:
                 taken.make(-1 - num)
-                num = self._take(*args, taken.now, frame)
+                num = self._unpack(*args, taken.now, frame)
         if num < 0:
             raise MessageError(f"{len(data)} bytes are not what a node tells of the rows of a tick")
         if num or len(taken.before.words):

@@ -1,4 +1,4 @@
-"""`KeptStates`: what a node keeps of its zones and of those of the node before it.
+"""`StateReplicas`: what a node keeps of its zones and of those of the node before it.
 
 Now and then, between two steps, each node keeps what it needs to go on from there, and sends it to
 the next node that lives. When a node is lost, the next one hosts its zones, and all go back to the
@@ -27,7 +27,7 @@ Array = NDArray[Any]
 KEPT = 2  # so many states: the newest may not have come everywhere
 
 
-class KeptStates:
+class StateReplicas:
     """Those of one node."""
 
     def __init__(
@@ -70,7 +70,7 @@ class KeptStates:
             told = to_bytes([log.words for log in self._logs])
             self._links.send(COORDINATOR, FrameKind.KEEP, state, [told, data])
 
-    def take_over(self, state: int, data: Bytes) -> None:
+    def resume_from(self, state: int, data: Bytes) -> None:
         """Have a state that the coordinator has kept for the node before this one.
 
         Raises:
@@ -85,12 +85,12 @@ class KeptStates:
             log.take_up(words)
         self._own[state] = to_bytes(saved)
 
-    def take(self, number: int, frame: NodeFrame) -> None:
+    def receive(self, number: int, frame: NodeFrame) -> None:
         """What another node wants to have kept here."""
         _add(self._others.setdefault(number, {}), frame.number, frame.data)
         self._is_settled = False
 
-    def take_given(self, number: int, frame: NodeFrame) -> None:
+    def receive_given(self, number: int, frame: NodeFrame) -> None:
         """What another node has had of zones that are hosted here from now on."""
         self._given[number] = frame
 

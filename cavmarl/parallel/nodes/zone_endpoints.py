@@ -1,4 +1,4 @@
-"""`ZoneHosts`: the zones of a node as hosts of the ownership protocol.
+"""`ZoneEndpoints`: the zones of a node as hosts of the ownership protocol.
 
 A vehicle that has crossed a border is offered to the node of the zone that it is in, by PREPARE;
 that node acknowledges it to the coordinator and to the source; the coordinator decides, and the
@@ -62,7 +62,7 @@ class Report(NamedTuple):
 NOTHING = Report([], [], False, [])
 
 
-class ZoneHosts:
+class ZoneEndpoints:
     """Those of one node, of W worlds."""
 
     coordinators: tuple[LocalCoordinator, ...] = ()  # they are in another process
@@ -117,7 +117,7 @@ class ZoneHosts:
         if self._is_open:
             self.report()
         while not all(map(self._is_leased, range(len(self._leases)))):
-            frame = self._links.next(COORDINATOR)
+            frame = self._links.receive_next(COORDINATOR)
             if frame.kind is FrameKind.RECOVER:
                 raise RecoveryOrderedError(frame)
             if frame.kind is not FrameKind.LEASE:
@@ -138,7 +138,7 @@ class ZoneHosts:
         with reading(COORDINATOR):
             check_indices("world", told, len(self._endpoints))
         for w, message in messages:
-            self._take(w, message)
+            self._apply(w, message)
         for w, endpoints in enumerate(self._endpoints):
             if not (w in told or self._leases[w] or self._is_quiet[w]):
                 self._is_quiet[w] = True
@@ -146,7 +146,7 @@ class ZoneHosts:
                     endpoint.go_on()
         early, self._early = self._early, []
         for w, message in early:
-            self._take(w, message)
+            self._apply(w, message)
 
     def _is_leased(self, w: int) -> bool:
         return self._is_quiet[w] or len(self._leases[w]) == len(self._zones)
@@ -292,7 +292,7 @@ class ZoneHosts:
                     self._send(w, message)
         return movers, is_late
 
-    def hear(self, frame: NodeFrame) -> None:
+    def receive(self, frame: NodeFrame) -> None:
         """Take messages of other nodes as soon as they come."""
         messages = unpacked(frame.data)
         check_indices("world", (w for w, _ in messages), len(self._endpoints))
@@ -300,9 +300,9 @@ class ZoneHosts:
             for offer in message.entries if isinstance(message, Prepare) else ():
                 record = self._division.codec.record(offer.state, offer.vehicle)
                 self._checks.check_state(record)
-            self._take(w, message)
+            self._apply(w, message)
 
-    def _take(self, w: int, message: Message) -> None:
+    def _apply(self, w: int, message: Message) -> None:
         for zone in message.destinations():
             endpoint = self._endpoints[w].get(zone)
             if endpoint is None:
@@ -320,12 +320,12 @@ class ZoneHosts:
         """To the nodes of its zones, which may be this one, and to the coordinator."""
         for destination in message.destinations():
             if destination in self._zones:
-                self._take_own(w, destination, message)
+                self._apply_own(w, destination, message)
             else:
                 to = COORDINATOR if destination == COORDINATOR else self._node_of[destination]
                 self._links.send(to, FrameKind.MESSAGES, 0, [packed([(w, message)])])
 
-    def _take_own(self, w: int, zone: int, message: Message) -> None:
+    def _apply_own(self, w: int, zone: int, message: Message) -> None:
         reaction = self._endpoints[w][zone].on_message(message)
         for answer in reaction.messages:
             self._send(w, answer)
@@ -343,7 +343,7 @@ class ZoneHosts:
             for vehicle, state in advance.enter:
                 division.changes.take_over(w, zone, vehicle, owned[vehicle], state)
                 if vehicle not in left:
-                    self._take_agent(w, vehicle)
+                    self._await_agent(w, vehicle)
 
     def _agent(self, w: int, vehicle: int) -> int:
         """The agent whose vehicle it is; -1: none."""
@@ -361,7 +361,7 @@ class ZoneHosts:
             pieces = [_LENGTH.pack(w, 0), np.int64(vehicle).tobytes(), *kept]
             self._links.send(self._node_of[target], FrameKind.AGENT, self._generation, pieces)
 
-    def _take_agent(self, w: int, vehicle: int) -> None:
+    def _await_agent(self, w: int, vehicle: int) -> None:
         """Wait for the same from the node that its vehicle comes from."""
         agent = self._agent(w, vehicle)
         if agent < 0:
@@ -370,7 +370,7 @@ class ZoneHosts:
             others = {node for zone, node in enumerate(self._node_of) if zone not in self._zones}
             self._links.wanted = others  # all but the silent one have sent their next share
             while (w, vehicle) not in self._come:
-                self._links.heed()
+                self._links.check_recovery()
                 self._links.pump(None)
             self._links.wanted = ()
         data, at = self._come.pop((w, vehicle)), 0
@@ -379,7 +379,7 @@ class ZoneHosts:
             kept[...] = np.frombuffer(data, array.dtype, kept.size, at).reshape(kept.shape)
             at += kept.nbytes
 
-    def keep_agent(self, frame: NodeFrame) -> None:
+    def receive_agent(self, frame: NodeFrame) -> None:
         """Take what another node had of an agent, until its vehicle comes."""
         if frame.number == self._generation:
             w, _ = _LENGTH.unpack_from(frame.data)
@@ -391,7 +391,7 @@ class ZoneHosts:
             self._come[w, vehicle] = frame.data[_LENGTH.size + 8 :]
 
 
-def told_hostings(hostings: Sequence[Sequence[Hosting]]) -> list[list[list[int]]]:
+def hostings_as_json(hostings: Sequence[Sequence[Hosting]]) -> list[list[list[int]]]:
     """What hosts have to know, as JSON does; by worlds and zones."""
     return [[[h.episode, h.tick, h.zone, h.incarnation] for h in some] for some in hostings]
 

@@ -20,7 +20,7 @@ from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.parallel.placement.work_shares import Part
 from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays
 from cavmarl.parallel.worlds.tasks import Task
-from cavmarl.parallel.worlds.world_errors import own_error, unconnected, uncopied
+from cavmarl.parallel.worlds.world_errors import copy_error, network_error, original_error
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
@@ -89,7 +89,7 @@ class CommandedWorlds(ABC):
         """Let the worker or node of a world do a task about it, and return its answer."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        raise uncopied()
+        raise copy_error()
 
     def reset(self, seed: int | None, first_world: int) -> None:
         self._order(Task.RESET, {"seed": seed, "first_world": first_world})
@@ -130,7 +130,7 @@ class CommandedWorlds(ABC):
         """Go on from what `save_worlds` gave; `arrays` stay as they are."""
 
     def connect_network(self, network: NetworkSimulator) -> None:
-        raise unconnected()
+        raise network_error()
 
     def ticks(self) -> NDArray[np.int64]:
         return self.arrays.ticks.copy()
@@ -162,7 +162,7 @@ class CommandedWorlds(ABC):
         try:
             self._send(task, payload, commits)
         except WorkerFailureError as failure:
-            raise own_error(failure) from failure
+            raise original_error(failure) from failure
         except WorkerDeathError as death:
             death.add_note(f"in step {self._steps + 1} since the reset")
             raise

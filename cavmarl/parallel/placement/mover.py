@@ -85,7 +85,7 @@ class MovingMemory:
     """What shards have cost, and an outbox for each worker that may give whole worlds away.
 
     Attributes:
-        recipe: what workers are told about it.
+        message: what workers are told about it.
         spent_s: (W, zones) processor time of each shard from the start on.
 
     Raises:
@@ -108,4 +108,4 @@ class MovingMemory:
                 segment.close()
             raise
         spent, *others = (segment.fd for segment in self.segments)
-        self.recipe = {"spent": spent, "layout": layout, "outboxes": others}
+        self.message = {"spent": spent, "layout": layout, "outboxes": others}

@@ -56,10 +56,10 @@ class Process:
     def collect(self) -> None:
         """Take what has come through the wire; calls to wake up are forgotten."""
         with suppress(BlockingIOError, ConnectionResetError):
-            while self.take():
+            while self.receive():
                 pass
 
-    def take(self) -> bool:
+    def receive(self) -> bool:
         """Take one message; False: the other end is closed.
 
         Raises:
@@ -93,11 +93,11 @@ class ForkServer:
     def __init__(
         self,
         program: str,  # module that is run, and calls `worker_loop.serve`
-        start: Mapping[str, Any],  # what it is told, as JSON knows it; descriptors by number
+        start: Mapping[str, Any],  # JSON message that it gets; it names descriptors by number
         descriptors: tuple[int, ...],  # that it and its workers get
     ) -> None:
         ours, theirs = _wires()
-        told = {
+        start_message = {
             **start,
             "pool": theirs.fileno(),
             "parent": os.getpid(),
@@ -105,7 +105,7 @@ class ForkServer:
         self._wire = ours
         try:
             self._process = start_python(
-                ["-m", program, json.dumps(told)],
+                ["-m", program, json.dumps(start_message)],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(), *descriptors),
                 env=_ONE_THREAD,
@@ -116,7 +116,7 @@ class ForkServer:
         finally:
             theirs.close()
         try:
-            self._greet()
+            self._await_ready()
         except BaseException:
             self.close()
             raise
@@ -159,7 +159,7 @@ class ForkServer:
             self._process.kill()  # the system kills the workers
             self._process.wait()
 
-    def _greet(self) -> None:
+    def _await_ready(self) -> None:
         """Wait until it is ready; that takes as long as its work, unless it is stopped."""
         poll = select.poll()
         poll.register(self._wire, select.POLLIN)

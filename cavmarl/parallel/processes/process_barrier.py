@@ -236,7 +236,7 @@ def wait_for(
             time.sleep(NAP_S)
 
 
-class Meeting:
+class WakeSignal:
     """One side of a place where two processes wait for each other."""
 
     def __init__(
@@ -254,7 +254,7 @@ class Meeting:
 
     def post(self, number: int) -> None:
         if self.announce(number):
-            self.wake()
+            self.wake_peer()
         if self._crowded:
             _pass()  # the other side may look from this core, or wake up on it
 
@@ -262,7 +262,7 @@ class Meeting:
         """Come to a number; not 0: the other side sleeps, and has to be woken."""
         return _set(self.mine, NUMBER, number, self.theirs)
 
-    def wake(self) -> None:
+    def wake_peer(self) -> None:
         with suppress(BrokenPipeError, ConnectionResetError):  # its process has ended
             self.wire.send(WAKE)
 
@@ -293,17 +293,17 @@ class Meeting:
                 return True
         return False
 
-    def lie_down_first(self) -> None:
+    def announce_sleep(self) -> None:
         """Say that this side sleeps when it comes to its next number: it will have to wait long."""
         self.mine[ASLEEP] = 1  # seen with that number, or before
 
-    def lie_down(self, number: int) -> bool:
+    def sleep(self, number: int) -> bool:
         """Say that this side sleeps from here on; False: there is no need any more."""
         _set(self.mine, ASLEEP, 1, self.theirs)
         if self.has(number):
-            self.get_up()
+            self.wake()
             return False
         return True
 
-    def get_up(self) -> None:
+    def wake(self) -> None:
         _set(self.mine, ASLEEP, 0, self.theirs)

@@ -20,7 +20,7 @@ class Watchdog:
     def __init__(
         self,
         pid: int,  # of the process
-        timeout_s: float,  # for so long it may work; unwatched times do not count
+        timeout_s: float,  # for so long it may work; without_journals times do not count
     ) -> None:
         self._pid = pid
         self._timeout_s = timeout_s

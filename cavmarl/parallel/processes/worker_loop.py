@@ -31,7 +31,7 @@ from cavmarl.core.tracebacks import traceback_text
 from cavmarl.parallel.memory.shared_huge_pages import collapse_heap
 from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.processes import process_barrier as barrier
-from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, Meeting, present_core
+from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, WakeSignal, present_core
 from cavmarl.parallel.state.state_image import Arrays, Image
 
 # Words of the pool's line, behind those of `barrier`.
@@ -96,17 +96,17 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
     if os.getppid() != start["parent"]:
         os._exit(0)
     try:
-        recipe = _read(start["recipe"], start["recipe_bytes"])
-        jobs = make_jobs(recipe)
+        message = _read(start["message"], start["message_bytes"])
+        jobs = make_jobs(message)
         barrier.load_kernels()
         _refuse_threads()
     except Exception as error:
-        _say(pool, describe(error))
+        _send(pool, describe(error))
         os._exit(1)
     gc.collect()
     gc.freeze()  # what is ready is not moved around by workers
     collapse_heap()
-    _say(pool, {"ready": len(jobs)})
+    _send(pool, {"ready": len(jobs)})
     _fork_on_demand(pool, parent, jobs, start)
 
 
@@ -129,7 +129,7 @@ def describe(error: BaseException) -> dict[str, str]:
     return {"kind": type(error).__name__, "text": message, "traceback": text}
 
 
-def _say(pool: socket.socket, what: Mapping[str, Any]) -> None:
+def _send(pool: socket.socket, what: Mapping[str, Any]) -> None:
     """Tell the pool; that it is gone (Ctrl-C) is seen when its socket is read."""
     with suppress(BrokenPipeError, ConnectionResetError):
         pool.send(json.dumps(what).encode())
@@ -153,22 +153,22 @@ def _fork_on_demand(
             pid = order["reap"]
             _, status = os.waitpid(pid, 0)
             alive.discard(pid)
-            _say(pool, {"status": os.waitstatus_to_exitcode(status)})
+            _send(pool, {"status": os.waitstatus_to_exitcode(status)})
             continue
         number, (wire,) = order["fork"], descriptors
         jobs[number].before_fork()
-        mother = os.getpid()
+        server_pid = os.getpid()
         pid = os.fork()
         if pid == 0:
             die_with_parent()
-            if os.getppid() != mother:
+            if os.getppid() != server_pid:
                 os._exit(0)
             pool.close()
             os.close(parent)
             _work(number, jobs[number], socket.socket(fileno=wire), start)
         os.close(wire)
         alive.add(pid)
-        _say(pool, {"pid": pid})
+        _send(pool, {"pid": pid})
 
 
 def _end(alive: set[int]) -> NoReturn:
@@ -188,25 +188,25 @@ def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) 
     theirs = orders[number * WORDS : (number + 1) * WORDS]
     mine = np.frombuffer(Segment(start["statuses"][number], 0).map(), dtype=np.int64)[:WORDS]
     slots = [Image(Segment(fd, 0)) for fd in start["images"][number]]
-    meeting = Meeting(mine, theirs, wire, start["crowded"])
-    meeting.get_up()  # a predecessor may have died asleep
+    wake_signal = WakeSignal(mine, theirs, wire, start["crowded"])
+    wake_signal.wake()  # a predecessor may have died asleep
     with suppress(BrokenPipeError, ConnectionResetError):  # the pool is gone
-        _obey(job, meeting, slots)
+        _run_commands(job, wake_signal, slots)
     os._exit(0)
 
 
-def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
-    mine, theirs = meeting.mine, meeting.theirs
+def _run_commands(job: Job, wake_signal: WakeSignal, slots: Sequence[Image]) -> NoReturn:
+    mine, theirs = wake_signal.mine, wake_signal.theirs
     is_new = True
     wait_s = 0.0
     began = time.perf_counter()
     while True:
         order = int(mine[NUMBER]) + 1
-        wait_s = _await(meeting, order, wait_s, time.perf_counter() - began)
+        wait_s = _await(wake_signal, order, wait_s, time.perf_counter() - began)
         began = time.perf_counter()
         core = present_core()
         number, _, task, has_payload, slot, committed, loads, _ = theirs.tolist()
-        payload = _receive(meeting.wire) if has_payload else None
+        payload = _receive(wake_signal.wire) if has_payload else None
         try:
             if (is_new or loads) and committed >= 0:
                 dtypes = [array.dtype for array in job.save()]
@@ -222,13 +222,13 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
             os._exit(OUT_OF_MEMORY)
         except Exception as error:
             mine[ANSWER] = FAILED
-            meeting.wire.send(MAIL + json.dumps(describe(error)).encode())
+            wake_signal.wire.send(MAIL + json.dumps(describe(error)).encode())
         else:
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
-                meeting.wire.send(MAIL + json.dumps(answer).encode())
+                wake_signal.wire.send(MAIL + json.dumps(answer).encode())
         mine[CORE] = core  # now, and not before: the pool polls this line all the time
-        meeting.post(number)
+        wake_signal.post(number)
         if mine[ANSWER] != FAILED:
             try:
                 job.on_idle()
@@ -237,24 +237,24 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
 
 
 def _await(
-    meeting: Meeting,  # with the pool
+    wake_signal: WakeSignal,  # with the pool
     order: int,
     last_s: float,  # how long the last wait was that was one
     work_s: float,  # how long was worked since
 ) -> float:  # how long the last wait was, which may be this one
     """Return when there is a command; end with the pool."""
-    if meeting.has(order):
+    if wake_signal.has(order):
         return last_s
     began = time.perf_counter()
-    if not meeting.watch(order, last_s, work_s):
-        while meeting.lie_down(order):
+    if not wake_signal.watch(order, last_s, work_s):
+        while wake_signal.sleep(order):
             # A payload may come before its command: it is left where it is.
-            message = meeting.wire.recv(len(WAKE), socket.MSG_PEEK)
-            meeting.get_up()
+            message = wake_signal.wire.recv(len(WAKE), socket.MSG_PEEK)
+            wake_signal.wake()
             if not message:
                 os._exit(0)
             if message == WAKE:
-                meeting.wire.recv(len(WAKE))
+                wake_signal.wire.recv(len(WAKE))
     return time.perf_counter() - began
 
 

@@ -166,8 +166,8 @@ class Pool:
         if pending:
             self._await_asleep(pending, mail, sleeps)
 
-    def _await_asleep(self, pending: list[int], mail: bytes | None, is_lying: bool) -> None:
-        dead = self._processes.sleep(pending, CHECK_S, is_lying)
+    def _await_asleep(self, pending: list[int], mail: bytes | None, is_asleep: bool) -> None:
+        dead = self._processes.sleep(pending, CHECK_S, is_asleep)
         first = len(self.deaths)
         guard = _Guard(self._processes, self._timeout_s, self._ordered_s)
         while pending or dead:
@@ -175,7 +175,7 @@ class Pool:
             pending = self._pending()
             if pending and len(pending) < len(asked):
                 # Orders are shared out so that all end together.
-                self._processes.forget_calls()
+                self._processes.drain_wakeups()
                 pending = [k for k in pending if not self._processes.watch(k, is_soon=True)]
             self._note_done(first, pending)
             if not (pending or dead):

@@ -24,7 +24,7 @@ from cavmarl.parallel.processes.fork_server import (
 from cavmarl.parallel.processes.process_barrier import (
     NUMBER,
     WORDS,
-    Meeting,
+    WakeSignal,
     present_core,
     usable_cores,
 )
@@ -38,9 +38,9 @@ class Program(NamedTuple):
     """What the workers of a pool run."""
 
     module: str  # that is run as a program and calls `worker_loop.serve`
-    recipe: Mapping[str, Any]  # from which it makes the jobs, as JSON knows it
+    message: Mapping[str, Any]  # from which it makes the jobs, as JSON knows it
     parts: tuple[str, ...]  # what each worker hosts, in words
-    # that the jobs share with the pool, and the pool gives back; the recipe names their descriptors
+    # memory shared by the jobs and the pool, which closes it; the message names the descriptors
     segments: tuple[Segment, ...]
     tasks: tuple[str, ...]  # what each task is called, by its number
     pins: bool = False  # each worker stays on a core of its own, as far as there are so many
@@ -74,32 +74,32 @@ class WorkerProcesses:
         self._count = len(program.parts)
         self._crowded = self._count + 1 > len(usable_cores())
         self._poll = select.poll()
-        self._held = _Held(list(program.segments))
-        self._meetings: dict[int, Meeting] = {}
+        self._resources = _OwnedResources(list(program.segments))
+        self._signals: dict[int, WakeSignal] = {}
         self._owners: dict[int, tuple[int, bool]] = {}  # descriptor → worker, whether of its death
-        self._heard: set[int] = set()  # workers whose messages have woken this side, and lie there
+        self._woken_by: set[int] = set()  # workers whose unread messages have woken this side
         try:
             if not hasattr(os, "pidfd_open"):
                 raise WorkerError("workers need Linux 5.3 or later: use backend='local'")
             self._make_memory()
             self._start()
         except BaseException:
-            self._held.release()
+            self._resources.release()
             raise
 
     @property
     def release(self) -> Callable[[], None]:
         """Ends the processes and gives all back, also when this object is collected."""
-        return self._held.release
+        return self._resources.release
 
     @property
     def processes(self) -> dict[int, Process]:
         """By number of the worker; none when all have been given back."""
-        return self._held.processes
+        return self._resources.processes
 
     @property
     def server_pid(self) -> int:
-        server = self._held.server
+        server = self._resources.server
         return 0 if server is None else server.pid
 
     def order(
@@ -119,63 +119,63 @@ class WorkerProcesses:
         """
         if sleeps:
             for k in workers:
-                self._meetings[k].lie_down_first()
+                self._signals[k].announce_sleep()
         asleep = []
         for k in workers:
             words = self.orders[k]
             words[TASK : LOADS + 1] = (*head, stale[k])
             if mail is not None:
                 self._send(k, mail)
-            if self._meetings[k].announce(words.item(NUMBER) + 1):
+            if self._signals[k].announce(words.item(NUMBER) + 1):
                 asleep.append(k)
         if len(asleep) > 1:
             here = present_core()
             asleep.sort(key=lambda k: self._statuses[k].item(CORE) == here)
         for k in asleep:
-            self._meetings[k].wake()
+            self._signals[k].wake_peer()
 
     def number(self, k: int) -> int:
         return self.orders.item(k, NUMBER)
 
     def has(self, k: int) -> bool:
-        return self._meetings[k].has(self.number(k))
+        return self._signals[k].has(self.number(k))
 
     def watch(self, k: int, last_s: float = 0.0, is_soon: bool = False) -> bool:
         """The same, but look for a moment; a longer one if it cannot take long."""
-        return self._meetings[k].watch(self.number(k), last_s, is_soon=is_soon)
+        return self._signals[k].watch(self.number(k), last_s, is_soon=is_soon)
 
     def sleep(
-        self, pending: Sequence[int], limit_s: float, is_lying: bool = False
+        self, pending: Sequence[int], limit_s: float, is_asleep: bool = False
     ) -> dict[int, Process]:  # the dead, by worker
         """Sleep until one of those is done, or one is dead, but not for ever."""
         ready: list[tuple[int, int]] = []
-        if self._hears_no_worker(pending) if is_lying else self._lie_down(pending):
+        if self._none_has_finished(pending) if is_asleep else self._fall_asleep(pending):
             ready = self._poll.poll(1000.0 * limit_s)
         for k in pending:
-            self._meetings[k].get_up()
+            self._signals[k].wake()
         if not ready:
             return {}
         found = [self._owners[fd] for fd, _ in ready]
-        self._heard.update(k for k, is_dead in found if not is_dead)
+        self._woken_by.update(k for k, is_dead in found if not is_dead)
         return {k: self.processes[k] for k, is_dead in found if is_dead}
 
-    def _lie_down(self, pending: Sequence[int]) -> bool:
+    def _fall_asleep(self, pending: Sequence[int]) -> bool:
         """Say that this side sleeps; False: a worker is through by now, or has called already."""
-        self.forget_calls()
+        self.drain_wakeups()
         # Of several it is enough that one of them is through: an awake process is not woken.
-        return all(self._meetings[k].lie_down(self.number(k)) for k in pending)
+        return all(self._signals[k].sleep(self.number(k)) for k in pending)
 
-    def forget_calls(self) -> None:
+    def drain_wakeups(self) -> None:
         """Drain the sockets, so that old messages do not wake this side again.
 
         Mostly it is one message; another one is read the next time.
         """
-        for k in self._heard:
+        for k in self._woken_by:
             with suppress(BlockingIOError, ConnectionResetError):
-                self.processes[k].take()
-        self._heard.clear()
+                self.processes[k].receive()
+        self._woken_by.clear()
 
-    def _hears_no_worker(self, pending: Sequence[int]) -> bool:
+    def _none_has_finished(self, pending: Sequence[int]) -> bool:
         """Forget also calls that came while this side was about to get up; False: one is through.
 
         Only once they have their command, so that none waits for it: of a call that is forgotten
@@ -184,8 +184,8 @@ class WorkerProcesses:
         for fd, _ in self._poll.poll(0):
             k, is_dead = self._owners[fd]
             if not is_dead:
-                self._heard.add(k)
-        self.forget_calls()
+                self._woken_by.add(k)
+        self.drain_wakeups()
         return not any(map(self.has, pending))
 
     def settle(self, k: int, limit_s: float) -> bool:
@@ -227,12 +227,12 @@ class WorkerProcesses:
         old = {j: self.processes[j] for j in team}
         for process in old.values():
             self._dismiss(process)
-        self._take_back(team, ordered)
-        server = self._held.server
+        self._reopen_command(team, ordered)
+        server = self._resources.server
         assert server is not None
         try:
             statuses = {j: server.reap(process) for j, process in old.items()}
-            cause = _say(statuses[k])
+            cause = _describe_status(statuses[k])
             for j in team:
                 self._fork(j)
         except ServerGoneError:
@@ -249,7 +249,7 @@ class WorkerProcesses:
             del self._owners[fd]
         process.collect()
 
-    def _take_back(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
+    def _reopen_command(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
         """Let a team, all of it dead, do a command again together that not all have carried out."""
         asked = [j for j in team if j in ordered]
         if not all(self.has(j) for j in asked):
@@ -270,8 +270,8 @@ class WorkerProcesses:
         Returns:
             the old processes of all workers.
         """
-        assert self._held.server is not None
-        self._held.server.close()
+        assert self._resources.server is not None
+        self._resources.server.close()
         for k, process in self.processes.items():
             if process is dead.get(k):
                 continue
@@ -280,7 +280,7 @@ class WorkerProcesses:
                 process.release()
         old = {**self.processes, **dead}
         for team in {self._program.team_of(k) for k in old}:
-            self._take_back(team, ordered)
+            self._reopen_command(team, ordered)
         try:
             self._start()
         except BaseException:
@@ -296,21 +296,21 @@ class WorkerProcesses:
                 self.processes[k].wire.send(mail)
 
     def _make_memory(self) -> None:
-        held = self._held
-        orders = held.hold(Segment.make(self._count * _LINE_BYTES))
-        statuses = [held.hold(Segment.make(_LINE_BYTES)) for _ in range(self._count)]
+        resources = self._resources
+        orders = resources.own(Segment.make(self._count * _LINE_BYTES))
+        statuses = [resources.own(Segment.make(_LINE_BYTES)) for _ in range(self._count)]
         images = [
-            [held.hold(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2)]
+            [resources.own(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2)]
             for _ in range(self._count)
         ]
-        text = json.dumps(self._program.recipe).encode()
-        recipe = held.hold(Segment.make(len(text)))
-        os.pwrite(recipe.fd, text, 0)
+        text = json.dumps(self._program.message).encode()
+        message = resources.own(Segment.make(len(text)))
+        os.pwrite(message.fd, text, 0)
         self.orders = np.frombuffer(orders.map(), dtype=np.int64).reshape(-1, WORDS)
         self._statuses = [np.frombuffer(s.map(), dtype=np.int64)[:WORDS] for s in statuses]
-        self._told = {
-            "recipe": recipe.fd,
-            "recipe_bytes": len(text),
+        self._start_message = {
+            "message": message.fd,
+            "message_bytes": len(text),
             "orders": orders.fd,
             "statuses": [segment.fd for segment in statuses],
             "images": [[image.fd for image in pair] for pair in images],
@@ -320,11 +320,11 @@ class WorkerProcesses:
 
     def _start(self) -> None:
         """Start the process that forks, and a process for every worker."""
-        fds = tuple(segment.fd for segment in self._held.segments)
+        fds = tuple(segment.fd for segment in self._resources.segments)
         causes: list[str] = []
         while len(causes) <= self._repeats:
             try:
-                self._held.server = ForkServer(self._program.module, self._told, fds)
+                self._resources.server = ForkServer(self._program.module, self._start_message, fds)
                 for k in range(self._count):
                     self._fork(k)
                 return
@@ -343,21 +343,23 @@ class WorkerProcesses:
                 self._dismiss(process)
                 process.release()
         self.processes.clear()
-        if self._held.server is not None:
-            self._held.server.close()
-            self._held.server = None
+        if self._resources.server is not None:
+            self._resources.server.close()
+            self._resources.server = None
 
     def _fork(self, k: int) -> None:
-        assert self._held.server is not None
-        process = self._held.server.fork(k)
+        assert self._resources.server is not None
+        process = self._resources.server.fork(k)
         self.processes[k] = process
         for fd, is_dead in ((process.pidfd, True), (process.wire.fileno(), False)):
             self._poll.register(fd, select.POLLIN)
             self._owners[fd] = k, is_dead
-        self._meetings[k] = Meeting(self.orders[k], self._statuses[k], process.wire, self._crowded)
+        self._signals[k] = WakeSignal(
+            self.orders[k], self._statuses[k], process.wire, self._crowded
+        )
 
 
-def _say(status: int) -> str:
+def _describe_status(status: int) -> str:
     if status == OUT_OF_MEMORY:
         return "out of memory"
     if status >= 0:
@@ -365,7 +367,7 @@ def _say(status: int) -> str:
     return signal.Signals(-status).name
 
 
-class _Held:
+class _OwnedResources:
     """What has to be given back, in any case."""
 
     def __init__(self, segments: list[Segment]) -> None:
@@ -374,7 +376,7 @@ class _Held:
         self.processes: dict[int, Process] = {}
         self._pid = os.getpid()
 
-    def hold(self, segment: Segment) -> Segment:
+    def own(self, segment: Segment) -> Segment:
         self.segments.append(segment)
         return segment
 

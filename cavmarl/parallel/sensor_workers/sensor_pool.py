@@ -38,7 +38,7 @@ class SensorWorkerPlan(NamedTuple):
     """What processes are made of."""
 
     module: str  # that they run
-    recipe: Mapping[str, Any]  # from which it makes its jobs; `shape` and `scene` are added
+    message: Mapping[str, Any]  # from which it makes its jobs; `shape` and `scene` are added
     frames: Segment  # memory that samples are written to; it is released with the sensor workers
     shape: SceneShape  # of what is shared
     num_lines: tuple[int, ...]  # (S,) into how many lines a frame of each sensor can be divided
@@ -172,10 +172,12 @@ class SensorWorkers:
         scene = Segment.make(size_of(plan.shape.layout))
         self.shared = SceneArrays.of(scene, plan.shape)
         told = {"shape": plan.shape, "scene": scene.fd, "frames": plan.frames.fd}
-        recipe = {**plan.recipe, **told}
+        message = {**plan.message, **told}
         names = tuple(f"sensor worker {k}" for k in range(plan.shape.workers))
         tasks = tuple(task.name.lower() for task in SensorTask)
-        program = Program(plan.module, recipe, names, (scene, plan.frames), tasks, plan.workers.pin)
+        program = Program(
+            plan.module, message, names, (scene, plan.frames), tasks, plan.workers.pin
+        )
         return Pool(program, plan.workers.timeout_s, plan.workers.max_retries)
 
     def _publish(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:

@@ -64,11 +64,11 @@ class SavedWorlds:
     def __init__(self, segment: Segment) -> None:
         self._image = Image(segment)
 
-    def put(self, saved: Sequence[bytes]) -> None:
+    def write(self, saved: Sequence[bytes]) -> None:
         sizes = np.array([len(one) for one in saved], dtype=np.int64)
         self._image.write([sizes, np.frombuffer(b"".join(saved), dtype=np.uint8)])
 
-    def take(self) -> list[bytes]:
+    def read(self) -> list[bytes]:
         """Raises WorkerError: it is not what was put there."""
         dtypes: list[np.dtype[Any]] = [np.dtype(np.int64), np.dtype(np.uint8)]
         sizes, content = self._image.read(dtypes)

@@ -18,35 +18,35 @@ from cavmarl.parallel.workers.logged_worlds import LoggedWorlds
 from cavmarl.parallel.workers.movable_worlds import MovableWorlds
 from cavmarl.parallel.workers.team_job import LedTeam
 from cavmarl.parallel.workers.worlds_job import WorldsJob
-from cavmarl.parallel.worlds.journaled_worlds import open_runs, unwatched
+from cavmarl.parallel.worlds.journaled_worlds import open_runs, without_journals
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.sensor_worker_setup import sensor_workers_of
 from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.worlds.world_message import CHANGED, world_of
 
 
-def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
+def make_jobs(message: Mapping[str, Any]) -> list[Job]:
     """The jobs of all workers, every kernel loaded.
 
     Raises:
         WorkerError: a file is not what it was.
         JournalError: a journal cannot be opened.
     """
-    world = world_of(recipe, CHANGED)
+    world = world_of(message, CHANGED)
     config = world.config
-    layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
-    arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
-    one = LocalWorlds(unwatched(world), 1, warm=True)
-    parts = [Part(*given) for given in recipe["parts"]]
+    layout = layout_of(config, message["capacity"], message["num_worlds"])
+    arrays = StepArrays.of(arrays_in(Segment(message["arrays"], 0).map(), layout))
+    one = LocalWorlds(without_journals(world), 1, warm=True)
+    parts = [Part(*given) for given in message["parts"]]
 
-    runs = open_runs(recipe["runs"])  # which workers inherit
+    runs = open_runs(message["runs"])  # which workers inherit
 
     def make(first: int, last: int) -> LocalWorlds:
         return LocalWorlds(
             world,
             last - first,
             arrays.part(first, last),
-            in_next_step=recipe["in_next_step"],
+            in_next_step=message["in_next_step"],
             like=one,
             runs=runs[first:last] or None,
         )
@@ -57,21 +57,21 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             world,
             1,
             arrays.part(number, number + 1),
-            in_next_step=recipe["in_next_step"],
+            in_next_step=message["in_next_step"],
             zeros=huge_shared_zeros,
             runs=runs[number : number + 1] or None,
         )
 
     def attach_sensors(worlds: LocalWorlds, part: Part) -> None:
         if config.workers.sensors:
-            memory = Segment(os.dup(recipe["arrays"]), 0)
+            memory = Segment(os.dup(message["arrays"]), 0)
             bounds = (part.first, part.last)
-            base_dir, num_worlds = Path(recipe["base_dir"]), recipe["num_worlds"]
+            base_dir, num_worlds = Path(message["base_dir"]), message["num_worlds"]
             sensors = sensor_workers_of(world, base_dir, memory, bounds, num_worlds)
             worlds.attach_sensor_workers(sensors)
 
-    saved = [SavedWorlds(Segment(fd, 0)) for fd in recipe["saved_worlds"]]
-    mover, spent_s = recipe["mover"], None
+    saved = [SavedWorlds(Segment(fd, 0)) for fd in message["saved_worlds"]]
+    mover, spent_s = message["mover"], None
     if mover is not None:
         spent_s = arrays_in(Segment(mover["spent"], 0).map(), mover["layout"])["spent_s"]
         outboxes = [Image(Segment(fd, 0)) for fd in mover["outboxes"]]
@@ -83,7 +83,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
                 for k in range(len(parts))
             ]
     jobs: list[Job] = []
-    for part, descriptors, memory in zip(parts, recipe["checkpoint_logs"], saved, strict=True):
+    for part, descriptors, memory in zip(parts, message["checkpoint_logs"], saved, strict=True):
         checkpoint_log = CheckpointLog(config, part.last - part.first, descriptors)
         is_team = len(part.zones) > 1
         worlds = make_shared(part.first) if is_team else make(part.first, part.last)

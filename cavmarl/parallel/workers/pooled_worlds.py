@@ -23,13 +23,13 @@ from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.processes.worker_pool import Pool, Program
 from cavmarl.parallel.state.checkpoint_log import make_segments
 from cavmarl.parallel.state.world_bytes import SavedWorlds
-from cavmarl.parallel.worlds.journaled_worlds import refuse_watched, runs_as_text, unwatched
+from cavmarl.parallel.worlds.journaled_worlds import refuse_journal, runs_as_text, without_journals
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.sensor_worker_setup import warn_if_crowded
 from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.worlds.tasks import TASK_NAMES, Task
-from cavmarl.parallel.worlds.world_errors import own_error, refuse_external
-from cavmarl.parallel.worlds.world_message import recipe_of
+from cavmarl.parallel.worlds.world_errors import original_error, refuse_external
+from cavmarl.parallel.worlds.world_message import make_world_message
 
 PROGRAM = "cavmarl.parallel.workers.job_factory"
 
@@ -60,14 +60,14 @@ class PooledWorlds(CommandedWorlds):
         parts = parts_of(self.placement.plans, world.partition.count)
         may_change = bool(config.workers.balance_steps) and workers > 1 and self.placement.in_row
         if may_change and config.zones.repartition_steps:
-            refuse_watched(
+            refuse_journal(
                 config.zones,
                 "of worlds that move from worker to worker, each of which cuts its zones anew",
                 "leave workers.balance_steps or zones.repartition_steps 0",
             )
         _warn_of_few_cores(workers)
         if not compiled_before():
-            LocalWorlds(unwatched(world), 1, warm=True)
+            LocalWorlds(without_journals(world), 1, warm=True)
         capacity = world.capacity
         layout = layout_of(config, capacity, num_worlds)
         segment = Segment.make(size_of(layout))
@@ -84,7 +84,7 @@ class PooledWorlds(CommandedWorlds):
         warn_if_crowded(config.workers.sensors, len(parts))
         logs = [_log_segments(config, part, may_change) for part in parts]
         saved = [Segment.make(0) for _ in parts]
-        recipe = recipe_of(
+        message = make_world_message(
             world,
             base_dir,
             num_worlds=num_worlds,
@@ -95,18 +95,20 @@ class PooledWorlds(CommandedWorlds):
             checkpoint_logs=[[one.fd for one in log] for log in logs],
             saved_worlds=[one.fd for one in saved],
             runs=runs_as_text(config.zones, num_worlds),
-            mover=None if memory is None else memory.recipe,
+            mover=None if memory is None else memory.message,
         )
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
         moving = () if memory is None else memory.segments
         segments = (segment, *chain.from_iterable(logs), *moving, *saved)
         pins = config.workers.pin
-        what = Program(program or PROGRAM, recipe, _names(parts), segments, TASK_NAMES, pins, teams)
+        what = Program(
+            program or PROGRAM, message, _names(parts), segments, TASK_NAMES, pins, teams
+        )
         try:
             self.pool = Pool(what, config.workers.timeout_s, config.workers.max_retries)
         except WorkerFailureError as failure:
-            raise own_error(failure) from failure
+            raise original_error(failure) from failure
         self._saved = [SavedWorlds(one) for one in saved]
         self._parts = parts
         self._leader_of = _leaders(parts)
@@ -131,11 +133,11 @@ class PooledWorlds(CommandedWorlds):
 
     def save_worlds(self) -> list[bytes]:
         self._order(Task.SAVE, commits=False)
-        return [world for part in self._saved for world in part.take()]
+        return [world for part in self._saved for world in part.read()]
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         for memory, part in zip(self._saved, self._parts, strict=True):
-            memory.put(saved[part.first : part.last])
+            memory.write(saved[part.first : part.last])
         self._order(Task.LOAD)
 
     def _settle(self, parts: list[Part]) -> None:

@@ -48,11 +48,11 @@ class WorldsJob(Job):
             self._kept.step()
             return None
         if task == Task.LOAD:
-            payload = self._saved_worlds.take()
+            payload = self._saved_worlds.read()
         answer = WORLD_TASKS[task].perform(self._kept.worlds, payload, self._kept.first)
         if task != Task.SAVE:
             return answer
-        self._saved_worlds.put(answer)
+        self._saved_worlds.write(answer)
         return None
 
     def save(self) -> list[NDArray[Any]]:

@@ -14,13 +14,13 @@ from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, WorldRun, pre
 RunText = tuple[str, str]  # the run in hex, and its journal; empty: it has none
 
 
-def unwatched(world: World) -> World:
+def without_journals(world: World) -> World:
     """The same world without a journal, to make tables, copies or load kernels with."""
     zones = replace(world.config.zones, journal="")
     return world._replace(config=replace(world.config, zones=zones))
 
 
-def refuse_watched(zones: ZonesConfig, where: str, cure: str) -> None:
+def refuse_journal(zones: ZonesConfig, where: str, cure: str) -> None:
     """Refuse a journal where none can be written.
 
     Raises:

@@ -26,7 +26,7 @@ from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
-from cavmarl.parallel.worlds.journaled_worlds import unwatched
+from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
 from cavmarl.shards.shard import Commands
@@ -278,7 +278,7 @@ class LocalWorlds:
         saved = [array.copy() for array in self.save()]
         shown = [array.copy() for array in every_array(self.arrays)]
         modules = extension_modules(config.registered)
-        return _made_again, (modules, unwatched(self.world), self.in_next_step, saved, shown)
+        return _made_again, (modules, without_journals(self.world), self.in_next_step, saved, shown)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> LocalWorlds:
         """With the same map and settings, which never change."""

@@ -14,15 +14,15 @@ from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.worlds.world_message import world_of
 
 
-def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
+def make_sensor_jobs(message: Mapping[str, Any]) -> list[SensorJob]:
     """The jobs of all sensor workers, every kernel loaded."""
-    world = world_of(recipe)
+    world = world_of(message)
     config = world.config
-    shape = SceneShape(*recipe["shape"])
-    layout = layout_of(config, shape.capacity, recipe["num_worlds"])
-    arrays = StepArrays.of(arrays_in(Segment(recipe["frames"], 0).map(), layout))
-    frames = arrays.part(*recipe["part"]).frames
-    shared = SceneArrays.of(Segment(recipe["scene"], 0), shape)
+    shape = SceneShape(*message["shape"])
+    layout = layout_of(config, shape.capacity, message["num_worlds"])
+    arrays = StepArrays.of(arrays_in(Segment(message["frames"], 0).map(), layout))
+    frames = arrays.part(*message["part"]).frames
+    shared = SceneArrays.of(Segment(message["scene"], 0), shape)
     simulation = Simulation(config, world.network, shape.worlds, world.demand, world.partition)
     jobs = [SensorJob(simulation, shared, frames, number) for number in range(shape.workers)]
     jobs[0].warm()

@@ -15,7 +15,7 @@ from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkerPlan, Sensor
 from cavmarl.parallel.sensor_workers.sensor_scene import SceneShape
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
-from cavmarl.parallel.worlds.world_message import recipe_of
+from cavmarl.parallel.worlds.world_message import make_world_message
 from cavmarl.sensors.registry import type_of
 
 PROGRAM = "cavmarl.parallel.worlds.sensor_worker"
@@ -71,6 +71,8 @@ def sensor_workers_of(
     )
     # The same environment with all zones in one, and no sensor workers.
     undivided = replace(config, zones=ZonesConfig(), workers=WorkersConfig())
-    recipe = recipe_of(world._replace(config=undivided), base_dir, part=part, num_worlds=num_worlds)
+    message = make_world_message(
+        world._replace(config=undivided), base_dir, part=part, num_worlds=num_worlds
+    )
     lines = tuple(type_of(name, sensor).num_lines(sensor) for name, sensor in config.rig.items())
-    return SensorWorkers(SensorWorkerPlan(PROGRAM, recipe, arrays, shape, lines, config.workers))
+    return SensorWorkers(SensorWorkerPlan(PROGRAM, message, arrays, shape, lines, config.workers))

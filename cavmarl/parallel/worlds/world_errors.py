@@ -7,7 +7,7 @@ from cavmarl.config.v2x import V2xConfig
 from cavmarl.core.errors import CavmarlError, ConfigError, WorkerFailureError
 
 
-def uncopied() -> ConfigError:
+def copy_error() -> ConfigError:
     """Return the refusal of a copy or a pickle of worlds in other processes."""
     return ConfigError(
         "workers: worlds that worker processes run cannot be copied; use backend='local', "
@@ -15,7 +15,7 @@ def uncopied() -> ConfigError:
     )
 
 
-def unconnected() -> ConfigError:
+def network_error() -> ConfigError:
     """Return the refusal to connect a network simulator with worlds in workers."""
     return ConfigError(
         "v2x.channel.external: a network simulator is in the caller's process, and worlds over "
@@ -26,10 +26,10 @@ def unconnected() -> ConfigError:
 def refuse_external(v2x: V2xConfig) -> None:
     """Refuse what asks a part of the caller's process in each tick."""
     if v2x.enabled and v2x.channel.external:
-        raise unconnected()
+        raise network_error()
 
 
-def own_error(failure: WorkerFailureError) -> CavmarlError:
+def original_error(failure: WorkerFailureError) -> CavmarlError:
     """Return an error that the worlds raise on purpose, as they would raise it in this process."""
     kind = getattr(cavmarl.core.errors, failure.kind, None)
     if not isinstance(kind, type) or not issubclass(kind, CavmarlError):

@@ -15,8 +15,8 @@ from cavmarl.engine.world_setup import World, make_world
 CHANGED = "have changed while workers were started: try again"
 
 
-def recipe_of(world: World, base_dir: Path, **more: Any) -> dict[str, Any]:
-    """The recipe of a world, and more, as JSON knows it."""
+def make_world_message(world: World, base_dir: Path, **more: Any) -> dict[str, Any]:
+    """The message of a world, and more, as JSON knows it."""
     return {
         "config": asdict(world.config),
         "extensions": extension_modules(world.config.registered),
@@ -26,19 +26,19 @@ def recipe_of(world: World, base_dir: Path, **more: Any) -> dict[str, Any]:
     }
 
 
-def world_of(recipe: Mapping[str, Any], trouble: str = "") -> World:
-    """The world of a recipe, made anew; `trouble` says what it means if its files differ.
+def world_of(message: Mapping[str, Any], trouble: str = "") -> World:
+    """The world of a message, made anew; `trouble` says what it means if its files differ.
 
     Raises:
         CavmarlError: they cannot be read.
     """
     from cavmarl.config.io import validate  # pydantic is slow to import
 
-    load_extensions(recipe["extensions"])
-    config = validate(EnvConfig, recipe["config"], "the environment")
-    world = make_world(config, Path(recipe["base_dir"]))
-    if trouble and fingerprint(world) != recipe["fingerprint"]:
-        raise WorkerError(f"the files of '{config.name}' {trouble.format(recipe['base_dir'])}")
+    load_extensions(message["extensions"])
+    config = validate(EnvConfig, message["config"], "the environment")
+    world = make_world(config, Path(message["base_dir"]))
+    if trouble and fingerprint(world) != message["fingerprint"]:
+        raise WorkerError(f"the files of '{config.name}' {trouble.format(message['base_dir'])}")
     return world
 
 

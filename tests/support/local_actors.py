@@ -1,39 +1,35 @@
-"""Hosts of worlds as processes of this machine: what Ray's actors do, without Ray."""
+"""Nodes as processes of this machine: does what `RayActors` does, without Ray."""
 
 from __future__ import annotations
 
 import importlib
 import multiprocessing
-from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-__all__ = ["WorldHosts"]
+__all__ = ["FORKS", "LocalActors"]
 
-# Each host is a fork of one process that has loaded the kernels: to start one anew takes seconds.
+# Each process is a fork of one process that has loaded the kernels: a fresh start takes seconds.
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["tests.support.loaded_kernels"])
 
 
-class WorldHosts:
-    """In the place of `RayActors`: two at most, and one to spare; who dies is started again."""
+class LocalActors:
+    """At most two processes and a spare one; a process that dies is started again."""
 
     address = "127.0.0.1"
 
-    def __init__(
-        self, main: Any, recipe: Callable[[int], str], workers: int | None, at_most: int
-    ) -> None:
+    def __init__(self, main: Any, workers: int | None, at_most: int) -> None:
         self.workers = min(2, at_most) if workers is None else workers
-        self._main = f"{main.__module__} {main.__name__}"
-        self._recipe = recipe(self.workers)
+        self._main = main
         self.processes: list[BaseProcess] = []
 
     def start(self, place: tuple[str, int], secret: bytes) -> None:
-        self._told = (*self._main.split(), self._recipe, place, secret)
+        self._arguments = (self._main.__module__, self._main.__name__, place, secret)
         self.processes = [self._start(number) for number in range(self.workers + 1)]
 
     def _start(self, number: int) -> BaseProcess:
-        process = FORKS.Process(target=_serve, args=(*self._told, number), daemon=True)
+        process = FORKS.Process(target=_serve, args=(*self._arguments, number), daemon=True)
         process.start()
         return process
 
@@ -53,7 +49,5 @@ class WorldHosts:
             process.join()
 
 
-def _serve(
-    module: str, function: str, recipe: str, place: tuple[str, int], secret: bytes, number: int
-) -> None:
-    getattr(importlib.import_module(module), function)(recipe, place, secret, number)
+def _serve(module: str, function: str, place: tuple[str, int], secret: bytes, number: int) -> None:
+    getattr(importlib.import_module(module), function)(place, secret, number)
