@@ -409,7 +409,7 @@ class _System:
         if listener is None or listener.owner.is_ended:
             raise ConnectionRefusedError(f"nothing listens at {place}")
         if secret != listener.secret:
-            raise MessageError(f"what listens at {place} does not know the secret")
+            raise MessageError(f"the process at {place} does not know the secret")
         here, there = (SimulatedSocket(machine, each) for each in (self._process, listener.owner))
         here.other, there.other = there, here
         machine.connections.append((here, there))

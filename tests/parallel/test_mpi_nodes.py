@@ -104,5 +104,5 @@ def test_more_nodes_than_ranks(program: str) -> None:
     """Rank 0 ends before it listens, and the others with it."""
     done = mpirun("-n", "2", *NODE, program)
     assert done.returncode != 0
-    assert "1 ranks are beside this one" in done.stdout
+    assert "there are 1 other ranks" in done.stdout
     assert "rank 0 of MPI has ended" in done.stdout

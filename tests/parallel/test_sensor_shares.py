@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_shares import (
-    LEAST_S,
+    MIN_GAIN_S,
     Unit,
     cut,
     divide,
@@ -99,7 +99,7 @@ def test_one_large_frame_is_divided_and_all_end_together() -> None:
 
 def test_what_would_save_next_to_nothing_is_not_divided() -> None:
     units = [Unit(0, 0, 1, 0, 100), Unit(1, 0, 1, 0, 100)]
-    costs_s = [1e-3 + 1.9 * LEAST_S, 1e-3]
+    costs_s = [1e-3 + 1.9 * MIN_GAIN_S, 1e-3]
     whole = share_by_cost(units, costs_s, 2)
     assert divide(whole, LineCosts([100, 100])) == whole
 

@@ -1,7 +1,7 @@
-"""Memory that processes share: without a name, so that nothing can be left behind.
+"""Memory that processes share. It has no name, so nothing is left behind.
 
-A segment is known by its descriptor alone, which a process is given when it is started. It goes
-when the last process that has it open or mapped ends, however it ends.
+A process knows a segment by its descriptor alone, which it gets when it starts. The system frees a
+segment when the last process that has it open or mapped ends, in whatever way.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from numpy.typing import DTypeLike, NDArray
 from cavmarl.core.errors import WorkerError
 
 Layout = Mapping[str, tuple[str, tuple[int, ...]]]
-"""Arrays of a segment: name → dtype as text, shape."""
+"""Arrays of a segment: name → dtype as text, and shape."""
 
 _LINE = 64  # bytes of a cache line: no two arrays share one
 
 
 class Segment:
-    """Memory of a number of bytes, all of them had."""
+    """Shared memory whose bytes are all allocated."""
 
     def __init__(
         self,
@@ -38,7 +38,11 @@ class Segment:
 
     @classmethod
     def make(cls, size: int) -> Segment:
-        """A new one, of zeros."""
+        """Make a segment of zeros.
+
+        Raises:
+            WorkerError: there is not enough memory.
+        """
         try:
             free = _free_bytes()
             if free is not None and size > free:
@@ -54,17 +58,17 @@ class Segment:
         return segment
 
     def grow(self, size: int) -> None:
-        """Make it larger, if it is smaller; memory that cannot be had is noticed here.
+        """Grow to at least this number of bytes.
 
         Raises:
-            OSError: there is not so much.
+            OSError: there is not enough memory.
         """
         if size > self.size:
             os.posix_fallocate(self.fd, 0, size)
             self.size = size
 
     def map(self) -> mmap.mmap:
-        """Its bytes, as many as there are by now, as this process reads and writes them."""
+        """Map the segment at its present size, which another process may have changed."""
         self.size = os.fstat(self.fd).st_size
         try:
             return mmap.mmap(self.fd, self.size)
@@ -72,7 +76,7 @@ class Segment:
             raise WorkerError(f"shared memory cannot be mapped: {error}") from error
 
     def close(self) -> None:
-        """Give the descriptor back; what is mapped stays until it is not referenced any more."""
+        """Close the descriptor; mapped memory stays while it is referenced."""
         os.close(self.fd)
 
 
@@ -81,7 +85,7 @@ def size_of(layout: Layout) -> int:
 
 
 def arrays_in(memory: mmap.mmap, layout: Layout) -> dict[str, NDArray[Any]]:
-    """The arrays in a segment's bytes, each at the start of a cache line."""
+    """Return the arrays in the bytes of a segment, each at the start of a cache line."""
     found: dict[str, NDArray[Any]] = {}
     at = 0
     for name, (dtype, shape) in layout.items():
@@ -92,9 +96,9 @@ def arrays_in(memory: mmap.mmap, layout: Layout) -> dict[str, NDArray[Any]]:
 
 
 def shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
-    """As `numpy.zeros`, but this process shares the array with those that it forks.
+    """Return zeros that this process shares with the processes that it forks.
 
-    Memory that is never written is never taken.
+    The system allocates a page when it is first written.
     """
     kind = np.dtype(dtype)
     sides = (shape,) if isinstance(shape, int) else shape

@@ -128,7 +128,7 @@ class NodeGroups(CommandedWorlds):
         parts = [saved[first:last] for first, last in pairwise(self._bounds)]
         for group, part in zip(self.groups, parts, strict=True):
             group.check_worlds(part)
-        self._order(Task.LOAD, parts)
+        self._command(Task.LOAD, parts)
 
     @property
     def simulation(self) -> Simulation:

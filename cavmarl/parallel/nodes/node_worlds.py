@@ -151,7 +151,7 @@ class NodeWorlds(CommandedWorlds):
             return
         if proposal := self.ask(Task.PROPOSE):
             zones, figures = proposal
-            self._order(Task.CUT, zones)
+            self._command(Task.CUT, zones)
             self.repartitions.append(Repartition(self._steps_begun - 1, *figures))
 
     def _read_proposal(self, said: Any) -> tuple[ZoneRects, list[Any]] | None:
@@ -253,11 +253,11 @@ class NodeWorlds(CommandedWorlds):
     def _run(self, task: Task, payload: Any, read: Read[Found]) -> list[Found]:
         """Let all nodes do a task; return what is read of what each has found."""
         try:
-            return self.pool.run(self._command(task, payload), read)
+            return self.pool.run(self._make_command(task, payload), read)
         except NetworkFailedError as failed:
             raise failed.error from None
 
-    def _command(self, task: Task, payload: Any) -> NodeCommand:
+    def _make_command(self, task: Task, payload: Any) -> NodeCommand:
         changes = task in (Task.STEP, Task.RESET, Task.LOAD, Task.CUT)
         pieces = pieces_of(task, payload, self.arrays)
         if task != Task.STEP:
@@ -341,7 +341,7 @@ class NodeWorlds(CommandedWorlds):
             ConfigError: it is of other worlds.
         """
         self.check_worlds(saved)
-        self._order(Task.LOAD, saved)
+        self._command(Task.LOAD, saved)
 
     def check_worlds(self, saved: Sequence[bytes]) -> None:
         """Raises ConfigError: worlds were saved that these cannot go on from."""

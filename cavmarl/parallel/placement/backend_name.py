@@ -1,4 +1,4 @@
-"""`BackendName`: where worlds run, as the argument `backend` and its short forms say it."""
+"""`BackendName`: where worlds run, read from the argument `backend` and its short forms."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class BackendName:
 
     Attributes:
         kind: one of `OWN`, or the name of a registered backend.
-        count: number of processes or nodes; None: none, or as many as are of use there.
-        address: host and port to listen on for nodes that are started by hand; or MPI, whose other
-            ranks are the nodes.
+        count: number of processes or nodes; None: no number, or as many as are of use.
+        address: host and port to listen on for nodes started by hand, or MPI, whose other ranks are
+            the nodes.
     """
 
     kind: str = LOCAL
@@ -43,7 +43,7 @@ class BackendName:
 
     @property
     def is_local(self) -> bool:
-        """Whether the worlds run in the caller's process."""
+        """Whether the worlds run in the process of the caller."""
         return self.kind == LOCAL
 
     @property
@@ -52,7 +52,7 @@ class BackendName:
         return self.address == MPI
 
     def is_split(self, num_worlds: int) -> bool:
-        """Return whether there are more processes or nodes than worlds, which share out zones."""
+        """Return whether there are more processes or nodes than worlds, so that they share zones."""
         return self.count is not None and self.count > num_worlds
 
 
@@ -62,16 +62,16 @@ def read_backend(
     nodes: int | None = None,
     registered: Collection[str] = (),
 ) -> BackendName:
-    """Read where worlds run; all that are given have to say the same.
+    """Read where worlds run; the given arguments have to agree.
 
     Args:
-        backend: as text, see `FORMS`; None: as the short forms say, or local.
+        backend: one of `FORMS`; None: by the short forms, else local.
         workers: short form: N for `processes:N`, 0 for `local`.
         nodes: short form: N for `nodes:N`.
-        registered: names of further backends.
+        registered: names of registered backends.
 
     Raises:
-        ConfigError: there is no such backend, or the arguments name different ones.
+        ConfigError: there is no such backend, or the arguments name different backends.
     """
     given: dict[str, tuple[object, BackendName]] = {}
     if workers is not None:
@@ -104,7 +104,7 @@ def _read(backend: str, registered: Collection[str]) -> BackendName:
     if kind == LOCAL and colon:
         raise ConfigError(f"backend = {backend!r}: 'local' has no number; use 'local'")
     if kind in (PROCESSES, NODES) and not colon:
-        raise ConfigError(f"backend = {backend!r}: does not say how many; use '{kind}:2' for two")
+        raise ConfigError(f"backend = {backend!r}: the number is missing; use '{kind}:2' for two")
     if colon and not (count.isascii() and count.isdigit() and int(count) > 0):
         raise ConfigError(
             f"backend = {backend!r}: the number {count!r} must be 1 or more; use '{kind}:2' for two"
@@ -121,10 +121,10 @@ def _read(backend: str, registered: Collection[str]) -> BackendName:
 
 
 def read_address(text: str) -> Address:
-    """Read HOST:PORT. Raises ConfigError: it is none."""
+    """Read HOST:PORT. Raises ConfigError: the text is something else."""
     host, colon, port = text.rpartition(":")
     if not (host and colon and port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):
-        raise ConfigError(f"{text!r}: must be HOST:PORT, as 192.168.1.10:7600")
+        raise ConfigError(f"{text!r}: must be HOST:PORT, like 192.168.1.10:7600")
     return host, int(port)
 
 

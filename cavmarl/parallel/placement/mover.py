@@ -1,4 +1,4 @@
-"""`Mover`: lets worlds, or zones of split worlds, change their worker while worlds are stepped."""
+"""`Mover`: moves worlds, or zones of split worlds, to other workers between steps."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.parallel.placement.work_shares import Part, parts_of
 from cavmarl.parallel.worlds.tasks import Task
 
-_OUTBOX_BYTES = 1 << 12  # of what a worker leaves for others; it grows
+_OUTBOX_BYTES = 1 << 12  # initial size of an outbox
 
 Run = Callable[[Task, Any, bool], None]
 
 
 class Mover:
-    """Measures shards, plans anew from time to time, and has moved what the plans move."""
+    """Counts steps, makes new plans from time to time, and moves what they move."""
 
     def __init__(
         self,
         placement: StepPlacement,  # the plans
         num_zones: int,  # of each world
-        every: int,  # so many steps from one round to the next
-        # (W, zones) processor time of each shard from the start on, which others add up; whole
-        # worlds count as one zone
+        every: int,  # steps from one round to the next
+        # (W, zones) total processor time of each shard, which others add up; a whole world is one
+        # zone
         spent_s: NDArray[np.float64],
     ) -> None:
         self._placement = placement
@@ -39,23 +39,23 @@ class Mover:
         self._spent_s = spent_s
         self._steps = 0
         self.moves = 0  # of shards, up to now
-        self.moved_s = 0.0  # how long they have taken together
+        self.moved_s = 0.0  # total duration of the moves
 
     def before_step(
         self,
         run: Run,
-        seen: Callable[[], LoadSnapshot],  # how busy workers are
+        seen: Callable[[], LoadSnapshot],  # measures how busy workers are
     ) -> list[Part] | None:
-        """Count a step; if it is time, plan anew and move.
+        """Count a step; if a round is due, make new plans and move.
 
         Returns:
-            which worker runs what now; None: what they did before.
+            the new part of each worker; None: nothing has moved.
         """
         if self._steps < self._every:
             self._steps += 1
             return None
         before = self._placement.plans
-        snapshot = seen()  # may add to what shards have cost
+        snapshot = seen()  # it may update `spent_s`
         moves = self._placement.round(self._spent_s, self._steps, snapshot)
         self._steps = 1
         if not moves:
@@ -82,20 +82,20 @@ class Mover:
 
 
 class MovingMemory:
-    """What shards have cost, and an outbox for each worker that may give whole worlds away.
+    """Shared memory for the costs of shards, and the outboxes of workers with whole worlds.
 
     Attributes:
-        message: what workers are told about it.
-        spent_s: (W, zones) processor time of each shard from the start on.
+        message: the part of the message to workers that describes the memory.
+        spent_s: (W, zones) total processor time of each shard.
 
     Raises:
-        WorkerError: there is none.
+        WorkerError: there is not enough memory.
     """
 
     def __init__(
         self,
         num_worlds: int,  # W
-        num_zones: int,  # of each world, as they are placed; whole worlds count as one
+        num_zones: int,  # of each world; 1 if whole worlds are placed
         outboxes: int,
     ) -> None:
         layout = {"spent_s": ("<f8", (num_worlds, num_zones))}

@@ -1,4 +1,4 @@
-"""`StepPlacement`: which worker hosts which shard of worlds that are stepped, round by round."""
+"""`StepPlacement`: which worker hosts which shard, with rounds of balancing between steps."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Floats = NDArray[np.float64]
 
 
 class StepPlacement:
-    """The plans of all workers: one of all worlds, or one of the zones of each world.
+    """The plans of all workers: one plan of all worlds, or one of the zones of each world.
 
     Raises:
-        ConfigError: more workers than zones of all worlds.
+        ConfigError: there are more workers than zones.
         NoAdmissibleWorkerError: workers are too busy.
     """
 
@@ -35,7 +35,7 @@ class StepPlacement:
         world: World,
         num_worlds: int,
         workers: int,
-        is_here: bool = True,  # they are on this machine; else each watches its own
+        is_here: bool = True,  # workers are on this machine; otherwise each watches its own
     ) -> None:
         settings = world.config.workers
         self._rule = BalanceRule(
@@ -54,6 +54,7 @@ class StepPlacement:
 
     @property
     def in_row(self) -> bool:
+        """Whether workers have whole worlds with consecutive numbers."""
         return self._balancers[0].plan.problem.in_row
 
     @property
@@ -61,7 +62,7 @@ class StepPlacement:
         return tuple(balancer.plan for balancer in self._balancers)
 
     def watch(self, pids: Mapping[int, int]) -> None:
-        """Look at the machine from now on, if that is wanted."""
+        """Watch the machine from now on, if the configuration wants it."""
         if self._watches:
             from cavmarl.balance.probe import Watch  # psutil is only needed here
 
@@ -69,12 +70,11 @@ class StepPlacement:
 
     def round(
         self,
-        # (W, zones) processor time of each shard from the start on; whole worlds count as one zone
-        spent_s: Floats,
+        spent_s: Floats,  # (W, zones) total processor time of each shard; a whole world is one zone
         steps: int,  # since the last round
         seen: LoadSnapshot,  # how busy workers are
-    ) -> bool:  # whether something has to be moved
-        """Plan anew by what shards have cost since the last round."""
+    ) -> bool:  # whether shards have to move
+        """Make new plans by the costs of shards since the last round."""
         cost_s = (spent_s - self._before_s) / (steps * self._ticks_per_step)
         self._before_s = spent_s.copy()
         for balancer in self._balancers:
@@ -91,21 +91,21 @@ class StepPlacement:
         return any(plan.moves for plan in self.plans)
 
     def take_back(self, plans: Sequence[Plan]) -> None:
-        """Everything is where it was by these plans."""
+        """Return to earlier plans after a failed move."""
         for balancer, plan in zip(self._balancers, plans, strict=True):
             balancer.plan = plan
 
-    def moved(self, lasted_s: float) -> int:  # how many shards have moved
-        """Note how long it took to make the present plans true: later moves are worth that."""
+    def moved(self, lasted_s: float) -> int:  # number of moved shards
+        """Note the duration of the moves, which later rounds compare with their gain."""
         moves = sum(len(plan.moves) for plan in self.plans)
         self._rule = replace(self._rule, move_s=lasted_s / moves)
         return moves
 
     def snapshot(
         self,
-        pids: Mapping[int, int],  # of the workers' processes
+        pids: Mapping[int, int],  # worker → process
     ) -> LoadSnapshot:
-        """How busy workers are; idle where not measured, and where one was replaced meanwhile."""
+        """Return how busy workers are; idle if not measured, or if a worker was replaced."""
         watch, before = self._watch, self._pids
         self.watch(pids)
         if watch is None or before != pids:

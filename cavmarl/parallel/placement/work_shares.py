@@ -1,4 +1,4 @@
-"""Which worker runs what: whole worlds each, or zones of one world."""
+"""The part of each worker: whole worlds, or zones of one world."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
 from cavmarl.zones.partition.zone_statistics import zone_statistics
 
-# Of a zone in which no lane lies, as a length of lanes: it is looked at in every tick.
-_EMPTY_KM = 0.01
+_EMPTY_KM = 0.01  # cost of a zone without lanes, since each tick visits it
 _EQUAL = "number"
 _LANES = "length of lanes"
 
 
 class Part(NamedTuple):
-    """What the workers of one team run; most teams are one worker."""
+    """The part of one team of workers; most teams are a single worker."""
 
-    first: int  # world
-    last: int  # the one after the last; where there are several workers it is the next
-    zones: list[list[int]]  # that each worker hosts
+    first: int  # first world
+    last: int  # world after the last one; a team of several workers has one world
+    zones: list[list[int]]  # of each worker
 
     @property
     def names(self) -> list[str]:
+        """Description of the part of each worker."""
         if self.last - self.first > 1:
             return [f"worlds {self.first} to {self.last - 1}"]
         if len(self.zones) == 1:
@@ -42,22 +42,23 @@ class Part(NamedTuple):
 
 
 def make_plans(
-    world: World,  # what each is made of
-    num_worlds: int,  # how many there are
-    workers: int,  # how many, at least 1
-    snapshot: LoadSnapshot | None = None,  # how busy they are; None: they are idle
-    rule: BalanceRule | None = None,  # of the plans
-) -> list[Plan]:  # one plan of all worlds, or one of the zones of each world
-    """Worlds to workers as evenly as may be; those are divided of which there are too few.
+    world: World,
+    num_worlds: int,
+    workers: int,  # number of workers, at least 1
+    snapshot: LoadSnapshot | None = None,  # how busy workers are; None: all are idle
+    rule: BalanceRule | None = None,
+) -> list[Plan]:  # one plan of all worlds, or one plan of the zones of each world
+    """Distribute worlds evenly over workers; divide the worlds if there are more workers.
 
     Raises:
+        ConfigError: there are more workers than zones.
         NoAdmissibleWorkerError: workers are too busy.
     """
     count = world.partition.count
     if workers > count * num_worlds:
         raise ConfigError(
-            f"workers = {workers}: {num_worlds} world(s) of {count} zone(s) each can be shared out "
-            f"over at most {count * num_worlds}; use fewer workers, more zones or more worlds"
+            f"workers = {workers}: {num_worlds} world(s) of {count} zone(s) each can use at most "
+            f"{count * num_worlds} workers; use fewer workers, more zones or more worlds"
         )
     seen, rule = snapshot or idle_snapshot(workers), rule or BalanceRule()
     if workers <= num_worlds:
@@ -72,7 +73,7 @@ def make_plans(
 
 
 def parts_of(plans: Sequence[Plan], num_zones: int) -> list[Part]:
-    """What the workers of each team run."""
+    """Return the part of each team."""
     parts = []
     for plan in plans:
         numbers = [candidate.worker for candidate in plan.problem.snapshot.workers]
@@ -88,7 +89,7 @@ def parts_of(plans: Sequence[Plan], num_zones: int) -> list[Part]:
 
 
 def _of_zones(world: World, number: int, seen: LoadSnapshot, rule: BalanceRule) -> Plan:
-    """The zones of one world to some workers, neighbours together; by length of lanes."""
+    """Distribute the zones of a world by length of lanes, neighbours together."""
     partition = world.partition
     lane_km = zone_statistics(partition, world.network).lane_km
     costs = tuple(ShardCost(number, zone, km + _EMPTY_KM) for zone, km in enumerate(lane_km))
@@ -97,7 +98,7 @@ def _of_zones(world: World, number: int, seen: LoadSnapshot, rule: BalanceRule) 
     hosted = list(plan.homes)
     excluded = {rejection.worker for rejection in plan.rejections}
     for worker in (candidate.worker for candidate in seen.workers):
-        if worker not in hosted and worker not in excluded:  # no worker is to be idle
+        if worker not in hosted and worker not in excluded:  # give each worker a zone
             fullest = max(hosted, key=hosted.count)
             hosted[len(hosted) - 1 - hosted[::-1].index(fullest)] = worker
     return make_plan(replace(problem, present=tuple(hosted))) if hosted != [*plan.homes] else plan

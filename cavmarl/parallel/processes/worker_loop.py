@@ -1,11 +1,11 @@
-"""The programs of a pool's processes: the fork server, and the workers that it forks.
+"""The programs of the processes of a pool: the fork server, and the workers that it forks.
 
-The pool starts one process as a program. That one makes every worker's job ready, with all kernels
-loaded, and has no threads; then it forks a worker whenever the pool asks for one. So a worker that
-has died is replaced in milliseconds, and its successor begins with what is ready.
+The pool starts the fork server as a program. The server has no threads; it makes the jobs of all
+workers, with all kernels loaded, and forks a worker when the pool requests one. So a dead worker is
+replaced in milliseconds by a successor that shares the prepared memory.
 
-No process outlives the pool: the forking process ends when the pool's process does, or when it
-hears no more of it, and the system kills the workers with the process that forked them.
+No process outlives the pool: the server ends with the process of the pool, or when its connection
+to the pool is closed, and the system kills the workers with the server.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from cavmarl.parallel.processes import process_barrier as barrier
 from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, WakeSignal, present_core
 from cavmarl.parallel.state.state_image import Arrays, Image
 
-# Words of the pool's line, behind those of `barrier`.
+# Words of the line of the pool, after those of `process_barrier`.
 TASK, PAYLOAD, SLOT, COMMITTED, LOADS = 2, 3, 4, 5, 6
-# Words of the worker's line: how its command ended, and on which core it began it.
+# Words of the line of a worker: how its command ended, and the core on which it began.
 ANSWER, CORE = 2, 3
 SILENT, ANSWERED, FAILED = 0, 1, 2
 
-NOTHING = -1  # a task: to be there
+NOTHING = -1  # the task that does nothing
 OUT_OF_MEMORY = 77  # exit status
 MAX_MESSAGE = 1 << 17
-MAIL = b"="  # begins a message with something in it
-MAX_TRACEBACK = 16_000  # characters, six bytes each at most; the end of a longer one is sent
+MAIL = b"="  # starts a message with content
+MAX_TRACEBACK = 16_000  # characters of at most six bytes; a longer traceback loses its start
 
 
 class TeamFailedError(Exception):
@@ -52,34 +52,34 @@ class TeamFailedError(Exception):
 
 
 class Job:
-    """What one worker does."""
+    """The work of one worker."""
 
     def perform(
         self,
-        task: int,  # which one; numbers from 0 on are the job's own
-        payload: Any,  # what the pool has to say to it, as JSON knows it; mostly nothing
+        task: int,  # its number, from 0 on; each kind of job has tasks of its own
+        payload: Any,  # JSON value from the pool, often None
     ) -> Any:
-        """Do a task; the answer, as JSON knows it, of those that have one."""
+        """Do a task, and return its answer, a JSON value, or None if it has none."""
         raise NotImplementedError
 
     def save(self) -> Arrays:
-        """All that a successor needs to go on from here; nothing if there is no such thing."""
+        """Return what a successor needs to resume from here; empty if it needs nothing."""
         return []
 
     def load(self, saved: Sequence[Any]) -> None:
-        """Go on from what `save` gave."""
+        """Resume from what `save` returned."""
 
     def on_idle(self) -> None:
-        """Called after a command's answer is sent: for work that is not waited for.
+        """Do work that the pool does not wait for, after the answer to a command was sent.
 
-        What it makes must not be needed before another command is carried out: that one may be
-        carried out by a successor, which finds what was committed.
+        The next command must not depend on this work: a successor may carry it out, which finds
+        only what was committed.
         """
 
     def before_fork(self) -> None:
-        """Called where workers are forked, before each fork that is to do this job.
+        """Prepare, in the fork server, for the fork of a worker with this job.
 
-        The worker that did it is dead; so are those it shares memory with, if it is their first.
+        The previous worker with this job is dead. If it led a team, the whole team is dead.
         """
 
 
@@ -87,8 +87,8 @@ MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]
 
 
 def serve(make_jobs: MakeJobs) -> NoReturn:
-    """The whole life of the forking process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pool, which sees to the rest
+    """Run the fork server until the pool is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pool, which ends all
     faulthandler.enable()
     start = json.loads(sys.argv[1])
     pool = socket.socket(fileno=start["pool"])
@@ -104,18 +104,18 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
         _send(pool, describe(error))
         os._exit(1)
     gc.collect()
-    gc.freeze()  # what is ready is not moved around by workers
+    gc.freeze()  # so that workers do not write to shared pages
     collapse_heap()
     _send(pool, {"ready": len(jobs)})
     _fork_on_demand(pool, parent, jobs, start)
 
 
 def _refuse_threads() -> None:
-    """A process with threads must not fork."""
+    """Raise RuntimeError if this process has threads, which a fork would lose."""
     threads = len(os.listdir("/proc/self/task"))
     if threads > 1:
         names = [thread.name for thread in threading.enumerate()]
-        raise RuntimeError(f"a process that forks has {threads} threads, of Python's: {names}")
+        raise RuntimeError(f"the fork server has {threads} threads, those of Python are {names}")
 
 
 def _read(fd: int, size: int) -> Any:
@@ -123,14 +123,14 @@ def _read(fd: int, size: int) -> Any:
 
 
 def describe(error: BaseException) -> dict[str, str]:
-    """An exception in words, not too many: its class, its message, its traceback."""
+    """Return the class, the message and the traceback of an exception, cut to size."""
     text = traceback_text(error)[-MAX_TRACEBACK:]
     message = str(error)[: MAX_TRACEBACK // 4]
     return {"kind": type(error).__name__, "text": message, "traceback": text}
 
 
 def _send(pool: socket.socket, what: Mapping[str, Any]) -> None:
-    """Tell the pool; that it is gone (Ctrl-C) is seen when its socket is read."""
+    """Send to the pool. If it is gone (Ctrl-C), the next read from its socket notices."""
     with suppress(BrokenPipeError, ConnectionResetError):
         pool.send(json.dumps(what).encode())
 
@@ -172,7 +172,7 @@ def _fork_on_demand(
 
 
 def _end(alive: set[int]) -> NoReturn:
-    """The pool is closed: nothing is left behind, not even a zombie."""
+    """End with all workers, and reap them, after the pool was closed."""
     for pid in alive:
         os.kill(pid, signal.SIGKILL)
     for pid in alive:
@@ -227,7 +227,7 @@ def _run_commands(job: Job, wake_signal: WakeSignal, slots: Sequence[Image]) -> 
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
                 wake_signal.wire.send(MAIL + json.dumps(answer).encode())
-        mine[CORE] = core  # now, and not before: the pool polls this line all the time
+        mine[CORE] = core  # only now, since the pool polls this line all the time
         wake_signal.post(number)
         if mine[ANSWER] != FAILED:
             try:
@@ -237,18 +237,18 @@ def _run_commands(job: Job, wake_signal: WakeSignal, slots: Sequence[Image]) -> 
 
 
 def _await(
-    wake_signal: WakeSignal,  # with the pool
-    order: int,
-    last_s: float,  # how long the last wait was that was one
-    work_s: float,  # how long was worked since
-) -> float:  # how long the last wait was, which may be this one
-    """Return when there is a command; end with the pool."""
+    wake_signal: WakeSignal,  # shared with the pool
+    order: int,  # number of the command
+    last_s: float,  # duration of the last real wait
+    work_s: float,  # duration of the work since then
+) -> float:  # duration of the last real wait, maybe this one
+    """Wait for a command; exit if the pool is closed."""
     if wake_signal.has(order):
         return last_s
     began = time.perf_counter()
     if not wake_signal.watch(order, last_s, work_s):
         while wake_signal.sleep(order):
-            # A payload may come before its command: it is left where it is.
+            # A payload may come before its command, so it stays unread.
             message = wake_signal.wire.recv(len(WAKE), socket.MSG_PEEK)
             wake_signal.wake()
             if not message:

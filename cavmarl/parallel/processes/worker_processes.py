@@ -1,4 +1,4 @@
-"""`WorkerProcesses` starts and replaces a pool's processes, and sends them commands."""
+"""`WorkerProcesses` starts and replaces the processes of a pool, and sends commands to them."""
 
 from __future__ import annotations
 
@@ -37,37 +37,37 @@ _FIRST_IMAGE_BYTES = 1 << 12
 class Program(NamedTuple):
     """What the workers of a pool run."""
 
-    module: str  # that is run as a program and calls `worker_loop.serve`
-    message: Mapping[str, Any]  # from which it makes the jobs, as JSON knows it
-    parts: tuple[str, ...]  # what each worker hosts, in words
+    module: str  # run as a program, which calls `worker_loop.serve`
+    message: Mapping[str, Any]  # JSON value from which the program makes the jobs
+    parts: tuple[str, ...]  # description of the part of each worker
     # memory shared by the jobs and the pool, which closes it; the message names the descriptors
     segments: tuple[Segment, ...]
-    tasks: tuple[str, ...]  # what each task is called, by its number
-    pins: bool = False  # each worker stays on a core of its own, as far as there are so many
-    # workers that share their state, by rising numbers: none of them can go on without the others.
-    # A worker in no team is alone
+    tasks: tuple[str, ...]  # name of each task, by its number
+    pins: bool = False  # pin each worker to a core of its own, as far as there are enough cores
+    # groups of workers that share their state, so that none can go on without the others; a worker
+    # in no team is alone
     teams: tuple[tuple[int, ...], ...] = ()
 
     def team_of(self, worker: int) -> tuple[int, ...]:
-        """The workers that share their state with a worker, itself among them."""
+        """Return the workers that share their state with a worker, including itself."""
         return next((team for team in self.teams if worker in team), (worker,))
 
 
 class WorkerProcesses:
-    """m worker processes and the one that forks them.
+    """m worker processes and the server that forks them.
 
     Attributes:
-        orders: (m, WORDS) the lines that this side writes.
+        orders: (m, WORDS) the lines of the pool, one for each worker.
 
     Raises:
-        WorkerError: no process, or those that start were killed too often.
-        WorkerFailureError: an exception while the jobs were made.
+        WorkerError: the server cannot be started, or was killed too often.
+        WorkerFailureError: an exception was raised while the jobs were made.
     """
 
     def __init__(
         self,
         program: Program,
-        repeats: int,  # how often a start that is killed is begun again
+        repeats: int,  # how often the start is repeated after the server was killed
     ) -> None:
         self._program = program
         self._repeats = repeats
@@ -76,7 +76,8 @@ class WorkerProcesses:
         self._poll = select.poll()
         self._resources = _OwnedResources(list(program.segments))
         self._signals: dict[int, WakeSignal] = {}
-        self._owners: dict[int, tuple[int, bool]] = {}  # descriptor → worker, whether of its death
+        # descriptor → worker, and whether it reports the death of the worker
+        self._owners: dict[int, tuple[int, bool]] = {}
         self._woken_by: set[int] = set()  # workers whose unread messages have woken this side
         try:
             if not hasattr(os, "pidfd_open"):
@@ -89,12 +90,12 @@ class WorkerProcesses:
 
     @property
     def release(self) -> Callable[[], None]:
-        """Ends the processes and gives all back, also when this object is collected."""
+        """A function that ends the processes and frees all resources."""
         return self._resources.release
 
     @property
     def processes(self) -> dict[int, Process]:
-        """By number of the worker; none when all have been given back."""
+        """The process of each worker; empty after `release`."""
         return self._resources.processes
 
     @property
@@ -106,16 +107,15 @@ class WorkerProcesses:
         self,
         workers: Sequence[int],
         head: tuple[int, ...],  # words of the command, from TASK to COMMITTED
-        stale: Sequence[bool],  # of all workers, whose memory is not what is committed
-        mail: bytes | None,  # what goes with it
-        # this side goes to sleep at once: what it does from here on it does on a core on which a
-        # worker waits to begin
+        stale: Sequence[bool],  # of all workers: whether the memory differs from what is committed
+        mail: bytes | None,  # payload
+        # this side sleeps at once, since a worker may wait for its core
         sleeps: bool = False,
     ) -> None:
-        """Send the next command; dead workers are detected in `wait`.
+        """Send the next command; `sleep` detects dead workers.
 
-        Polling workers have it before any is woken, and the worker that may take the core that
-        this process is on is woken last.
+        Polling workers get the command before any other is woken. A worker that may need the core
+        of this process is woken last.
         """
         if sleeps:
             for k in workers:
@@ -138,16 +138,17 @@ class WorkerProcesses:
         return self.orders.item(k, NUMBER)
 
     def has(self, k: int) -> bool:
+        """Return whether a worker has finished its command."""
         return self._signals[k].has(self.number(k))
 
     def watch(self, k: int, last_s: float = 0.0, is_soon: bool = False) -> bool:
-        """The same, but look for a moment; a longer one if it cannot take long."""
+        """Poll for a moment whether a worker finishes its command; longer if it is due soon."""
         return self._signals[k].watch(self.number(k), last_s, is_soon=is_soon)
 
     def sleep(
         self, pending: Sequence[int], limit_s: float, is_asleep: bool = False
-    ) -> dict[int, Process]:  # the dead, by worker
-        """Sleep until one of those is done, or one is dead, but not for ever."""
+    ) -> dict[int, Process]:  # dead processes by worker
+        """Sleep until a worker has finished or died, or until the limit."""
         ready: list[tuple[int, int]] = []
         if self._none_has_finished(pending) if is_asleep else self._fall_asleep(pending):
             ready = self._poll.poll(1000.0 * limit_s)
@@ -160,15 +161,15 @@ class WorkerProcesses:
         return {k: self.processes[k] for k, is_dead in found if is_dead}
 
     def _fall_asleep(self, pending: Sequence[int]) -> bool:
-        """Say that this side sleeps; False: a worker is through by now, or has called already."""
+        """Mark this side as asleep; return False if a worker has finished in the meantime."""
         self.drain_wakeups()
-        # Of several it is enough that one of them is through: an awake process is not woken.
+        # One finished worker is enough: it has not woken this side, which was awake.
         return all(self._signals[k].sleep(self.number(k)) for k in pending)
 
     def drain_wakeups(self) -> None:
         """Drain the sockets, so that old messages do not wake this side again.
 
-        Mostly it is one message; another one is read the next time.
+        Usually there is one message; the next call reads another one.
         """
         for k in self._woken_by:
             with suppress(BlockingIOError, ConnectionResetError):
@@ -176,10 +177,10 @@ class WorkerProcesses:
         self._woken_by.clear()
 
     def _none_has_finished(self, pending: Sequence[int]) -> bool:
-        """Forget also calls that came while this side was about to get up; False: one is through.
+        """Drain late wake-ups; return False if a worker has finished.
 
-        Only once they have their command, so that none waits for it: of a call that is forgotten
-        too much, the number is there before it.
+        It is called after the workers got their command. If it drains a wake-up that belongs to
+        this command, the number of that worker is already set.
         """
         for fd, _ in self._poll.poll(0):
             k, is_dead = self._owners[fd]
@@ -189,27 +190,27 @@ class WorkerProcesses:
         return not any(map(self.has, pending))
 
     def settle(self, k: int, limit_s: float) -> bool:
-        """Whether a worker has carried out its command or has died of it, after a while at most."""
+        """Wait up to a limit for a worker to finish or to die; return whether it did."""
         process = self.processes[k]
         if has_ended([process.pidfd], 0.0 if self.has(k) else limit_s):
-            self._statuses[k][NUMBER] = self.number(k)  # its writer is dead
+            self._statuses[k][NUMBER] = self.number(k)  # the worker, which writes it, is dead
         process.collect()
         process.mail.clear()
         return self.has(k)
 
     def is_left_alone(self, k: int) -> bool:
-        """Whether a process is dead without which a worker cannot go on."""
+        """Return whether another worker of the same team is dead."""
         others = [self.processes[j].pidfd for j in self._program.team_of(k) if j != k]
         return has_ended(others, 0.0)
 
     def keep_apart(self) -> None:
-        """Give workers that shared a core different ones, unless each has its own for good."""
+        """Separate workers that shared a core, unless workers are pinned."""
         cores = [status.item(CORE) for status in self._statuses]
         if len(set(cores)) < len(cores) and not self._program.pins:
             keep_apart([process.pid for process in self.processes.values()], cores)
 
     def answer(self, k: int) -> tuple[int, Any]:
-        """How a worker's command ended, as its line says, and what it has answered."""
+        """Return how the command of a worker ended, as its line says, and its answer."""
         kind = self._statuses[k].item(ANSWER)
         if kind == SILENT:
             return kind, None
@@ -218,10 +219,10 @@ class WorkerProcesses:
         return kind, json.loads(process.mail.pop(0))
 
     def replace(self, k: int, mail: bytes | None, ordered: Collection[int]) -> str:
-        """Give a worker's team new processes, and those the command, if it is not carried out yet.
+        """Replace the processes of the team of a worker, and repeat an unfinished command.
 
         Returns:
-            what the old process of the worker died of, if nothing else is known.
+            the cause of death of the old process.
         """
         team = self._program.team_of(k)
         old = {j: self.processes[j] for j in team}
@@ -250,14 +251,14 @@ class WorkerProcesses:
         process.collect()
 
     def _reopen_command(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
-        """Let a team, all of it dead, do a command again together that not all have carried out."""
+        """Let a dead team repeat a command that not all of its workers have carried out."""
         asked = [j for j in team if j in ordered]
         if not all(self.has(j) for j in asked):
             for j in asked:
-                self._statuses[j][NUMBER] = self.number(j) - 1  # no other process writes there
+                self._statuses[j][NUMBER] = self.number(j) - 1  # its writer is dead
 
     def _hand_over(self, k: int, old: Process, mail: bytes | None) -> None:
-        """To a new process, what has come from the old one, or what that one was sent."""
+        """Give a new process the mail from the old one, or else the payload again."""
         if self.has(k):
             self.processes[k].mail = old.mail
         else:
@@ -265,7 +266,7 @@ class WorkerProcesses:
         old.release()
 
     def _start_anew(self, dead: dict[int, Process], ordered: Collection[int]) -> dict[int, Process]:
-        """The process that forks is gone, or hangs: another one, and new workers for all.
+        """Restart the fork server, which is gone or hangs, and all workers.
 
         Returns:
             the old processes of all workers.
@@ -276,7 +277,7 @@ class WorkerProcesses:
             if process is dead.get(k):
                 continue
             self._dismiss(process)
-            if k in dead:  # its successor is of no use, either
+            if k in dead:  # the successor of a dead process is of no use, either
                 process.release()
         old = {**self.processes, **dead}
         for team in {self._program.team_of(k) for k in old}:
@@ -319,7 +320,7 @@ class WorkerProcesses:
         }
 
     def _start(self) -> None:
-        """Start the process that forks, and a process for every worker."""
+        """Start the fork server and a process for each worker."""
         fds = tuple(segment.fd for segment in self._resources.segments)
         causes: list[str] = []
         while len(causes) <= self._repeats:
@@ -332,12 +333,12 @@ class WorkerProcesses:
                 causes.append(str(error) or "no answer")
                 self._clear()
         raise WorkerError(
-            f"the process that starts workers ended {len(causes)} times before all were there: "
+            f"the process that starts workers ended {len(causes)} times before all had started: "
             f"{', '.join(causes)}"
         )
 
     def _clear(self) -> None:
-        """Give back what a start that came to nothing has left."""
+        """Free what a failed start has left."""
         for process in self.processes.values():
             if process.wire.fileno() in self._owners:
                 self._dismiss(process)
@@ -368,7 +369,7 @@ def _describe_status(status: int) -> str:
 
 
 class _OwnedResources:
-    """What has to be given back, in any case."""
+    """Processes and memory of a pool, which are released in any case."""
 
     def __init__(self, segments: list[Segment]) -> None:
         self.segments = segments
@@ -381,7 +382,7 @@ class _OwnedResources:
         return segment
 
     def release(self) -> None:
-        """End the processes; a fork of the pool's process has no right to."""
+        """End the processes, unless this process is a fork of the one that started them."""
         if os.getpid() != self._pid:
             return
         for process in self.processes.values():

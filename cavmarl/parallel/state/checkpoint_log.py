@@ -1,8 +1,8 @@
-"""`CheckpointLog`: an image of worlds now and then, and what their agents have done since.
+"""`CheckpointLog`: an occasional image of worlds, and the commands of the steps after it.
 
-An image takes a tenth of a step to write, and of ten thousand vehicles as long as half a tick that
-several workers share. What a step does follows from the state and the actions, so a successor may
-as well begin from an older image and go through the same steps again.
+To write an image takes a tenth of a step; for ten thousand vehicles it takes half a tick that
+several workers share. A step follows from the state and the commands, so a successor may resume
+from an older image and repeat the steps after it.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from cavmarl.parallel.state.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.shards.shard import COMMANDS, Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
-STEPS = 16  # from one image to the next: a successor repeats that many at most
+STEPS = 16  # most steps from one image to the next, which a successor repeats
 _FIRST_IMAGE_BYTES = 1 << 12
 
 
 def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
-    """Memory for the checkpoint log of some worlds, which outlives its writers.
+    """Make the memory of a checkpoint log, which outlives the writers of the log.
 
     Raises:
-        WorkerError: there is none.
+        WorkerError: there is not enough memory.
     """
     images = [Segment.make(_FIRST_IMAGE_BYTES) for _ in range(2)]
     steps = Segment.make(size_of(_layout(config, num_worlds)))
@@ -36,23 +36,23 @@ def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
 
 
 class CheckpointLog:
-    """What there is in it between two commands is the state of some worlds.
+    """The state of worlds between two commands: an image, and the steps after it.
 
-    There are two images, each with room for the steps after it: while one is written, the other one
-    is what was committed begins with. What SUMOs were told is kept beside each of them.
+    There are two images, each with room for the steps after it. While one image is written, the
+    committed state starts with the other one. Beside each image is a copy of the SUMO logs.
 
     Attributes:
-        place: (2,) which image it begins with, and how many steps follow; to be committed.
-        entries: what the agents do in each of the steps that there is room for, of both images.
+        place: (2,) number of the image, and number of steps after it; part of what is committed.
+        entries: commands of all steps for which there is room, for the first and the second image.
     """
 
     def __init__(self, config: EnvConfig, num_worlds: int, descriptors: list[int]) -> None:
         *images, steps = (Segment(fd, 0) for fd in descriptors[:3])
         self.place = np.zeros(2, dtype=np.int64)
-        self.is_prepared = False  # the other image is that of the state at the end of the log
+        self.is_prepared = False  # the other image has the state at the end of the log
         self._images = [Image(segment) for segment in images]
         kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
-        self._logs = kept[::2], kept[1::2]  # of each image, by world
+        self._logs = kept[::2], kept[1::2]  # for each image, by world
         arrays = arrays_in(steps.map(), _layout(config, num_worlds))
         self.entries = tuple(map(Commands, *(arrays[name] for name in COMMANDS)))
 
@@ -61,11 +61,11 @@ class CheckpointLog:
 
     @property
     def is_full(self) -> bool:
-        """Whether the next entry has to be an image."""
+        """Whether there is no room for another step."""
         return len(self) == STEPS
 
     def note(self, commands: Commands) -> None:
-        """Write down what the agents do in one more step."""
+        """Add the commands of a step."""
         entry = self.entries[self.place.item(0) * STEPS + len(self)]
         for name in COMMANDS:
             getattr(entry, name)[...] = getattr(commands, name)
@@ -73,7 +73,7 @@ class CheckpointLog:
         self.is_prepared = False
 
     def prepare(self, state: Arrays, logs: Sequence[ToldLog] = ()) -> None:
-        """Write the image of the present state that it will begin anew with."""
+        """Write the present state to the other image, with which the log can restart."""
         image = 1 - self.place.item(0)
         self._images[image].write(state)
         for kept, log in zip(self._logs[image], logs, strict=True):
@@ -81,34 +81,35 @@ class CheckpointLog:
         self.is_prepared = True
 
     def begin(self) -> None:
-        """Begin anew with the image that was prepared."""
+        """Restart with the prepared image."""
         self.place[:] = 1 - self.place.item(0), 0
         self.is_prepared = False
 
     def go_to(self, place: NDArray[np.int64]) -> None:
-        """Let it be what it was when that was its `place`."""
+        """Return to an earlier `place`."""
         self.place[:] = place
         self.is_prepared = False
 
     def state(self, like: Arrays) -> Arrays:
-        """The state it begins with, in arrays of the same dtypes as those.
+        """Return the state of the image, with the dtypes of `like`.
 
         Raises:
-            WorkerError: it is not what was written.
+            WorkerError: the image is damaged.
         """
         dtypes = [array.dtype for array in like]
         return list(self._images[self.place.item(0)].read(dtypes))
 
     def read_logs(self, logs: Sequence[ToldLog]) -> None:
-        """Let logs go on from what they were in that state.
+        """Restore the SUMO logs of that state.
 
         Raises:
-            WorkerError: it is not what was written.
+            WorkerError: a log is damaged.
         """
         for kept, log in zip(self._logs[self.place.item(0)], logs, strict=True):
             log.take_up(kept.read())
 
     def steps(self) -> tuple[Commands, ...]:
+        """Return the commands of the steps after the image."""
         first = self.place.item(0) * STEPS
         return self.entries[first : first + len(self)]
 

@@ -1,4 +1,4 @@
-"""`Image`: arrays in a segment, with a checksum; what a worker's successor begins from."""
+"""`Image`: arrays in a segment, with a checksum, from which another process can resume."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ Array = NDArray[Any]
 Arrays = Sequence[Array]
 
 _WORD = 8
-_HEAD = 3  # words: of everything, checksum, how many arrays
+_HEAD = 3  # words: number of all words, checksum, number of arrays
 
 
 class _Place(NamedTuple):
-    """Where an array goes in an image."""
+    """The place of an array in an image."""
 
     shape: tuple[int, ...]
-    end: int  # of it, in words from the image's begin
-    target: Array  # the place itself, as raw items
+    end: int  # in words from the start of the image
+    target: Array  # the place as an array of raw items
 
 
 class Image:
-    """Arrays as they were at one moment."""
+    """Arrays as they were at one moment, in a segment."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._memory: mmap.mmap | None = None
         self._words = np.zeros(0, dtype=np.int64)
-        self._begin = 0  # of the first array
+        self._begin = 0  # word at which the first array starts
         self._places: list[_Place] = []
-        self._written: Arrays = ()  # the last time
-        self._copies: list[tuple[Array, Array]] = []  # to where, from where
+        self._written: Arrays = ()  # arrays of the last `write`
+        self._copies: list[tuple[Array, Array]] = []  # target, source
 
     def write(self, arrays: Arrays) -> None:
-        """Copy arrays into it, of the same dtypes as the last time.
+        """Copy arrays into the image; dtypes must not change from call to call.
 
         Raises:
-            OSError: there is no memory for them.
+            OSError: there is not enough memory.
         """
         if len(arrays) != len(self._written) or not all(map(is_, arrays, self._written)):
             self._find_places(arrays)
@@ -67,9 +67,9 @@ class Image:
         ]
 
     def _lay_out(self, arrays: Arrays, same: int) -> None:
-        """Say where each array goes; the first ones go where they went the last time.
+        """Find the place of each array; the first `same` arrays keep their places.
 
-        Most arrays have the same shape every time, and are saved before those that have not.
+        Callers pass arrays of constant shapes before those whose shapes vary.
         """
         head = [array.ndim for array in arrays]
         for array in arrays:
@@ -87,7 +87,7 @@ class Image:
         for array in arrays[same:]:
             end = at + _num_words(array)
             if array.nbytes:
-                words[end - 1] = 0  # what rounds it up
+                words[end - 1] = 0  # padding
             raw = np.dtype((np.void, array.itemsize))  # NumPy copies records field by field
             place = words[at:end].view(np.uint8)[: array.nbytes]
             target = place.view(raw).reshape(array.shape)
@@ -95,12 +95,16 @@ class Image:
             at = end
 
     def read(self, dtypes: Sequence[np.dtype[Any]]) -> Iterator[Array]:
-        """The arrays, in their order, as views."""
+        """Yield the arrays in their order, as views.
+
+        Raises:
+            WorkerError: the image is damaged.
+        """
         self._map_all()
         words = self._words
         size = int(words[0]) if len(words) else 0
         if not _HEAD <= size <= len(words) or words[1] != _checksum(words[2:size]):
-            raise WorkerError("the state that a worker has left behind is not what it wrote")
+            raise WorkerError("the state of a worker in shared memory is not what it wrote")
         ranks = words[_HEAD : _HEAD + len(dtypes)].tolist()
         shape_at = _HEAD + len(ranks)
         at = shape_at + sum(ranks)
@@ -113,7 +117,7 @@ class Image:
             at = end
 
     def _make_room(self, size: int) -> bool:
-        """Whether it lies elsewhere from here on, because it was too small."""
+        """Grow to this number of bytes; return whether the image has moved for that."""
         if size <= _WORD * len(self._words):
             return False
         self._segment.grow(-(-size * 5 // 4 // mmap.PAGESIZE) * mmap.PAGESIZE)
@@ -121,7 +125,7 @@ class Image:
         return True
 
     def _map_all(self) -> None:
-        """Map the segment as large as it is by now, whichever process extended it."""
+        """Map the segment at its present size, which another process may have changed."""
         self._memory = self._segment.map()
         self._words = np.frombuffer(self._memory, dtype=np.int64)
 
@@ -131,7 +135,7 @@ def _num_words(array: Array) -> int:
 
 
 def _num_same(shapes: Sequence[tuple[int, ...]], places: Sequence[_Place]) -> int:
-    """How many of the first arrays have the shapes that they had before."""
+    """Return how many of the first arrays have the same shapes as before."""
     for n, (shape, place) in enumerate(zip(shapes, places, strict=False)):
         if shape != place.shape:
             return n
@@ -139,6 +143,6 @@ def _num_same(shapes: Sequence[tuple[int, ...]], places: Sequence[_Place]) -> in
 
 
 def _checksum(words: NDArray[np.int64]) -> int:
-    """XXH3 of 64 bits, as a word has it."""
+    """Return XXH3 of 64 bits, as a signed word."""
     found = xxh3_64_intdigest(words.data)
     return found - (found >> 63 << 64)

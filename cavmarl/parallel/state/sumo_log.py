@@ -1,4 +1,4 @@
-"""`KeptLog`: a copy of what a SUMO was told, in memory that outlives the process that wrote it."""
+"""`KeptLog`: a copy of the commands to a SUMO, in memory that outlives its writer."""
 
 from __future__ import annotations
 
@@ -16,22 +16,21 @@ _WORD = 8
 
 
 class KeptLog:
-    """The log of one world as it was at one moment; it is brought up to date now and then.
+    """The log of one world as it was at the last `write`.
 
-    A log only grows in an episode, so what is added costs no more than what happened since the last
-    time, however long the episode is.
+    Within an episode a log only grows, so a write costs only what was added since the last one.
     """
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._words = np.zeros(0, dtype=np.int64)
-        self._episode = 0  # of the log that this process has written here; 0: nothing
+        self._episode = 0  # of the log that this process wrote last; 0: none
         self._size = 0
 
     def write(self, log: ToldLog) -> None:
-        """Bring it up to date. Raises OSError: there is no memory for it."""
+        """Update the copy. Raises OSError: there is not enough memory."""
         words = log.words
-        # One word in front says how many there are: it is written last.
+        # The first word is the number of words of the log. It is written last.
         self._make_room(1 + len(words))
         known = self._size if log.episode == self._episode else 0
         self._words[1 : 1 + log.HEAD] = words[: log.HEAD]
@@ -40,11 +39,15 @@ class KeptLog:
         self._episode, self._size = log.episode, len(words)
 
     def read(self) -> NDArray[np.int64]:
-        """(n,) `ToldLog.words` of the last time, a view."""
+        """Return (n,) `ToldLog.words` of the last `write`, as a view.
+
+        Raises:
+            WorkerError: the copy is damaged.
+        """
         self._map_all()
         size = self._words.item(0)
         if not ToldLog.HEAD <= size < len(self._words):
-            raise WorkerError("what a worker's SUMO was told is not what was written")
+            raise WorkerError("the log of commands to SUMO in shared memory is damaged")
         return self._words[1 : 1 + size]
 
     def _make_room(self, size: int) -> None:
@@ -56,5 +59,5 @@ class KeptLog:
             self._map_all()
 
     def _map_all(self) -> None:
-        """Map the segment as large as it is by now, whichever process extended it."""
+        """Map the segment at its present size, which another process may have changed."""
         self._words = np.frombuffer(self._segment.map(), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Worlds as bytes: what goes into a file, whichever zones and workers run them before and after."""
+"""Worlds as bytes, independent of the zones and workers that run them before and after."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[Any]
 
 
 def to_bytes(arrays: Sequence[Array]) -> bytes:
-    """Arrays with their types and shapes."""
+    """Return arrays with their types and shapes as bytes."""
     pieces: list[bytes | memoryview] = []
     for array in arrays:
         there = np.ascontiguousarray(array)
@@ -28,18 +28,18 @@ def to_bytes(arrays: Sequence[Array]) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
-    """What stands before an array in a file of NumPy's; to put it together takes long."""
+    """Return the header of an array in a NumPy file. It is cached, since it is slow to make."""
     file, format_of = BytesIO(), np.lib.format
-    told = format_of.dtype_to_descr(dtype)
-    format_of.write_array_header_1_0(file, {"descr": told, "fortran_order": False, "shape": shape})
+    descr = format_of.dtype_to_descr(dtype)
+    format_of.write_array_header_1_0(file, {"descr": descr, "fortran_order": False, "shape": shape})
     return file.getvalue()
 
 
 def from_bytes(content: bytes | bytearray | memoryview, like: Sequence[Array]) -> list[Array]:
-    """What `to_bytes` was given, of the types and numbers of axes of others.
+    """Return the arrays passed to `to_bytes`, with the types and numbers of axes of `like`.
 
     Raises:
-        ConfigError: it was something else.
+        ConfigError: the bytes have other arrays.
     """
     file, found = BytesIO(content), []
     try:
@@ -49,17 +49,17 @@ def from_bytes(content: bytes | bytearray | memoryview, like: Sequence[Array]) -
                 raise ValueError(f"{array.dtype} for {other.dtype}")
             found.append(array.astype(other.dtype, copy=False))
         if file.read(1):
-            raise ValueError("more arrays than there are")
+            raise ValueError("there are more arrays")
     except ValueError as error:
         raise ConfigError(
-            "the state is one of other worlds, or of another version of cavmarl, which keeps "
+            "the state is one of other worlds, or of another version of cavmarl, which has "
             f"other arrays ({error}): use the environment and the version that saved it"
         ) from error
     return found
 
 
 class SavedWorlds:
-    """Some worlds as bytes, in memory that processes share."""
+    """Worlds as bytes, in memory that processes share."""
 
     def __init__(self, segment: Segment) -> None:
         self._image = Image(segment)
@@ -69,7 +69,7 @@ class SavedWorlds:
         self._image.write([sizes, np.frombuffer(b"".join(saved), dtype=np.uint8)])
 
     def read(self) -> list[bytes]:
-        """Raises WorkerError: it is not what was put there."""
+        """Return the worlds of the last `write`. Raises WorkerError: the memory is damaged."""
         dtypes: list[np.dtype[Any]] = [np.dtype(np.int64), np.dtype(np.uint8)]
         sizes, content = self._image.read(dtypes)
         return [one.tobytes() for one in np.split(content, np.cumsum(sizes)[:-1])]

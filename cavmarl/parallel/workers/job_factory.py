@@ -1,4 +1,4 @@
-"""The program of worker processes that run worlds: makes all their jobs, in the fork server."""
+"""The program of worker processes that run worlds. The fork server makes the jobs here."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from cavmarl.parallel.worlds.world_message import CHANGED, world_of
 
 
 def make_jobs(message: Mapping[str, Any]) -> list[Job]:
-    """The jobs of all workers, every kernel loaded.
+    """Make the jobs of all workers, and load all kernels.
 
     Raises:
-        WorkerError: a file is not what it was.
+        WorkerError: a file has changed since the pool read it.
         JournalError: a journal cannot be opened.
     """
     world = world_of(message, CHANGED)
@@ -39,7 +39,7 @@ def make_jobs(message: Mapping[str, Any]) -> list[Job]:
     one = LocalWorlds(without_journals(world), 1, warm=True)
     parts = [Part(*given) for given in message["parts"]]
 
-    runs = open_runs(message["runs"])  # which workers inherit
+    runs = open_runs(message["runs"])  # workers inherit the open files
 
     def make(first: int, last: int) -> LocalWorlds:
         return LocalWorlds(

@@ -1,4 +1,4 @@
-"""`PooledWorlds`: worlds shared out over worker processes."""
+"""`PooledWorlds`: worlds distributed over worker processes."""
 
 from __future__ import annotations
 
@@ -38,19 +38,20 @@ class PooledWorlds(CommandedWorlds):
     """W worlds over m worker processes.
 
     Raises:
-        WorkerError: no process, or no memory.
+        ConfigError: a setting that such worlds cannot have.
+        WorkerError: the processes cannot be started, or there is not enough memory.
     """
 
     pool: Pool
 
     def __init__(
         self,
-        world: World,  # what each is made of
-        base_dir: Path,  # the folder that its relative files start from
+        world: World,
+        base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
-        workers: int,  # m, from 1 to W times the zones of each; more than W divide the worlds
-        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
-        program: str | None = None,  # that the processes run; None: the one that runs worlds
+        workers: int,  # m, from 1 to W times the zones of a world; more than W divide the worlds
+        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+        program: str | None = None,  # module that the processes run; None: `job_factory`
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -62,8 +63,9 @@ class PooledWorlds(CommandedWorlds):
         if may_change and config.zones.repartition_steps:
             refuse_journal(
                 config.zones,
-                "of worlds that move from worker to worker, each of which cuts its zones anew",
-                "leave workers.balance_steps or zones.repartition_steps 0",
+                "with workers.balance_steps and zones.repartition_steps: worlds move between "
+                "workers, each of which repartitions its own worlds",
+                "leave one of the three out",
             )
         _warn_of_few_cores(workers)
         if not compiled_before():
@@ -115,7 +117,7 @@ class PooledWorlds(CommandedWorlds):
         self.placement.watch(self._pids())
 
     def _make_mover(self, num_worlds: int, workers: int) -> MovingMemory | None:
-        """What the workers are to share for it; None: nothing moves."""
+        """Make the mover, and return the memory that workers share for it; None: nothing moves."""
         every = self.world.config.workers.balance_steps
         if not every or workers == 1:
             return None
@@ -126,19 +128,19 @@ class PooledWorlds(CommandedWorlds):
 
     @property
     def simulation(self) -> Simulation:
-        """Refused: the worlds live in other processes."""
+        """Not available: the worlds are in other processes."""
         raise ConfigError(
-            "the worlds live in worker processes: use backend='local' to look into them"
+            "the worlds are in worker processes: use backend='local' for access to the simulation"
         )
 
     def save_worlds(self) -> list[bytes]:
-        self._order(Task.SAVE, commits=False)
+        self._command(Task.SAVE, commits=False)
         return [world for part in self._saved for world in part.read()]
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         for memory, part in zip(self._saved, self._parts, strict=True):
             memory.write(saved[part.first : part.last])
-        self._order(Task.LOAD)
+        self._command(Task.LOAD)
 
     def _settle(self, parts: list[Part]) -> None:
         self._parts = parts
@@ -159,8 +161,7 @@ def _warn_of_few_cores(workers: int) -> None:
     cores = len(usable_cores())
     if workers > cores:
         warnings.warn(
-            f"workers = {workers}: there are {cores} cores; more workers than cores do not make "
-            "it faster",
+            f"workers = {workers}: there are {cores} cores; more workers than cores are not faster",
             RuntimeWarning,
             stacklevel=5,
         )
@@ -169,13 +170,13 @@ def _warn_of_few_cores(workers: int) -> None:
 def _sensors_belong_to_a_worker(workers: WorkersConfig) -> ConfigError:
     return ConfigError(
         f"workers.balance_steps = {workers.balance_steps} with workers.sensors = "
-        f"{workers.sensors}: sensor workers belong to the worlds of one worker, which would "
-        "change; leave one of the two 0"
+        f"{workers.sensors}: sensor workers belong to the worlds of one worker, which balancing "
+        "moves; set one of the two to 0"
     )
 
 
 def _log_segments(config: EnvConfig, part: Part, may_change: bool) -> list[Segment]:
-    """Memory for the checkpoints of a worker."""
+    """Make the memory for the checkpoints of a worker."""
     if may_change:
         return []
     return make_segments(config, part.last - part.first)

@@ -1,4 +1,4 @@
-"""Worlds with a journal: where they can run, and what workers receive."""
+"""Worlds with a journal: the backends that support it, and what workers receive."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, WorldRun, prepare_runs
 
-RunText = tuple[str, str]  # the run in hex, and its journal; empty: it has none
+RunText = tuple[str, str]  # the run in hex, and the path of its journal, empty without one
 
 
 def without_journals(world: World) -> World:
-    """The same world without a journal, to make tables, copies or load kernels with."""
+    """Return the world without a journal, for tables, copies and the loading of kernels."""
     zones = replace(world.config.zones, journal="")
     return world._replace(config=replace(world.config, zones=zones))
 
 
 def refuse_journal(zones: ZonesConfig, where: str, cure: str) -> None:
-    """Refuse a journal where none can be written.
+    """Refuse a journal where it is not supported.
 
     Raises:
-        ConfigError: there is one.
+        ConfigError: the configuration names a journal.
     """
     if zones.journal:
         raise ConfigError(f"zones.journal = {zones.journal!r} {where}: {cure}")
 
 
 def runs_as_text(zones: ZonesConfig, num_worlds: int) -> list[RunText]:
-    """What the workers are told of all worlds; journals are begun.
+    """Create the journals of all worlds, and return what workers need to open them.
 
     Raises:
-        JournalError: one cannot be.
+        JournalError: a journal cannot be created.
     """
     if not zones.journal:
         return []
@@ -45,10 +45,10 @@ def runs_as_text(zones: ZonesConfig, num_worlds: int) -> list[RunText]:
 
 
 def open_runs(texts: Sequence[RunText]) -> list[OpenRun]:
-    """The same of all worlds, with the journals open for the workers that are forked.
+    """Open the journals of `runs_as_text`; forked workers inherit the open files.
 
     Raises:
-        JournalError: one cannot be opened.
+        JournalError: a journal cannot be opened.
     """
     return [
         OpenRun.of(WorldRun(bytes.fromhex(run), Path(journal) if journal else None))

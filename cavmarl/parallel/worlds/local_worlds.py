@@ -35,7 +35,7 @@ from cavmarl.v2x.v2x_messages import NetworkSimulator
 
 
 class LocalWorlds:
-    """W worlds of one environment; no loop of Python runs over agents or vehicles in a step.
+    """W worlds of one environment. A step has no Python loop over agents or vehicles.
 
     Attributes:
         simulation: the worlds.
@@ -43,20 +43,19 @@ class LocalWorlds:
 
     def __init__(
         self,
-        world: World,  # what each is made of
+        world: World,
         num_worlds: int,  # W
-        arrays: StepArrays | None = None,  # where to write; None: arrays of its own
-        warm: bool = False,  # have all kernels ready now
-        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        arrays: StepArrays | None = None,  # to write to; None: new arrays
+        warm: bool = False,  # load all kernels now
+        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
-        # worlds of the same environment, whose tables are used; None: they are made
-        like: LocalWorlds | None = None,
+        like: LocalWorlds | None = None,  # worlds of the same environment, to share their tables
         runs: Sequence[OpenRun] | None = None,  # see `Simulation`
-        late_ticks: int = 0,  # likewise
+        late_ticks: int = 0,  # see `Simulation`
     ) -> None:
         self.world = world
-        self.in_next_step = in_next_step  # when worlds begin anew
-        self.sensor_workers: SensorWorkers | None = None  # its sensor workers; None: there are none
+        self.in_next_step = in_next_step
+        self.sensor_workers: SensorWorkers | None = None
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
@@ -78,11 +77,11 @@ class LocalWorlds:
             arrays = _own_arrays(self.simulation, num_worlds)
             if not self._senses:
                 arrays = arrays._replace(observations=self.simulation.outputs.observations)
-        self.arrays = arrays  # what goes into a step, and what comes out
+        self.arrays = arrays  # inputs and outputs of a step
         self._horizon = world.config.max_steps
         self._late_ticks = late_ticks
         self._steps = np.zeros(num_worlds, dtype=np.int64)
-        self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
+        self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # episode over, reset in the next step
         self._results = Results(*(getattr(arrays, name) for name in Results._fields))
         self._report = specialized(report)
         self._report_continuation = specialized(report_continuation)
@@ -96,11 +95,11 @@ class LocalWorlds:
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
-        """What became of each change of owner, by worlds; none where they are undivided."""
+        """Changes of owner of each world; empty for undivided worlds."""
         return self.simulation.transfers
 
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
-        """Vehicles of one world whose next zone holds their state already."""
+        """Return the vehicles of a world whose next zone has their state already."""
         return self.simulation.zones.view(world).transfers
 
     def reset(self, seed: int | None, first_world: int) -> None:
@@ -120,14 +119,14 @@ class LocalWorlds:
             arrays.observations[~arrays.mask] = 0.0
 
     def step(self, commands: Commands) -> None:
-        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        """Let the agents act, and reset worlds whose episode is over, now or a step later."""
         simulation, arrays = self.simulation, self.arrays
         simulation.step(commands)
         self._show(simulation.everywhere)
         if self.in_next_step and self._waiting.any():
             waiting = self._waiting.copy()
             self._begin(waiting)
-            self._steps[waiting] = -1  # what they have done in this step counts for nothing
+            self._steps[waiting] = -1  # their first step comes next
         some_ended = self._write_results()
         if some_ended:
             simulation.retire_agents()
@@ -137,19 +136,19 @@ class LocalWorlds:
         arrays.ticks[:] = simulation.ticks()
 
     def _write_results(self) -> bool:
-        """Write what the agents have got; whether the trip of some vehicle has ended."""
+        """Write the results of the agents; return whether a trip has ended."""
         outputs = self.simulation.outputs
         return self._report(outputs, self._steps, self._horizon, self._results)
 
     def _write_continuation(self) -> bool:
-        """Write which agents act next and what is over; whether an episode is."""
+        """Write which agents act next; return whether an episode is over."""
         simulation = self.simulation
         return self._report_continuation(
             simulation.outputs, simulation.departures, self._steps, self._horizon, self._results
         )
 
     def _end(self, over: NDArray[np.bool_], some_over: bool) -> None:
-        """Keep the last observations of agents that have ended, and begin the new episodes."""
+        """Keep the last observations of what has ended, and start new episodes."""
         arrays = self.arrays
         self._keep_observations()
         if arrays.frames:
@@ -177,17 +176,17 @@ class LocalWorlds:
         self._waiting[chosen] = False
 
     def _show(self, chosen: NDArray[np.bool_]) -> None:
-        """Make what sensors have got in the chosen worlds (W,) what the agents observe."""
+        """Write the sensed frames of the chosen worlds (W,) to the observations."""
         if self._senses and self._is_flat:
             write_sensed(self.arrays.frames, chosen, self.arrays.observations)
 
     def suggest(self) -> None:
-        """Write what the built-in driver would do in the agents' place."""
+        """Write the actions of the built-in driver for all agents."""
         self.arrays.suggested[:] = 0.0
         self.simulation.suggest(self.arrays.suggested)
 
     def write_states(self) -> None:
-        """Write what `CavEnv.state` is of each world."""
+        """Write the `CavEnv.state` of each world."""
         simulation, space = self.simulation, state_space(self.simulation.capacity)
         for world, state in enumerate(self.arrays.states):
             state[:] = global_state(self.world.network, simulation.vehicles(world), space)
@@ -205,7 +204,7 @@ class LocalWorlds:
         return stats
 
     def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        """The vehicles of some agents of one world, in no order; some may have none."""
+        """Return the vehicles of some agents of a world, in no order, if they have any."""
         simulation = self.simulation
         rows = simulation.vehicles(world)
         rows = rows[np.isin(rows["agent"], agents)]
@@ -232,48 +231,48 @@ class LocalWorlds:
         return [list(map(int, row)) for row in heard.tolist()]
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
-        """(num_signals,) PHASE rows that are on in one world; a view."""
+        """Return (num_signals,) the present PHASE rows of a world, as a view."""
         return self.simulation.signal_phases(world)
 
     def save(self) -> list[NDArray[Any]]:
-        """All that the next step depends on; views, to be copied."""
+        """Return all that the next step depends on, as views."""
         return [self._steps, self._waiting, *self.simulation.save()]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave; errors as of `Simulation.load`."""
+        """Resume from what `save` returned; errors as of `Simulation.load`."""
         self._check_own(saved)
         self.simulation.load(saved[2:])
         self._steps[:], self._waiting[:] = saved[:2]
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
-        """The same where other processes hold zones; see `Simulation.load_own`."""
+        """Resume while other processes hold zones; see `Simulation.load_own`."""
         self._check_own(saved)
         self.simulation.load_own(saved[2:], home)
         self._steps[:], self._waiting[:] = saved[:2]
 
     def check(self, saved: Sequence[NDArray[Any]]) -> None:
-        """See that worlds can go on from what `save` gave. Raises ConfigError: they cannot."""
+        """Raise ConfigError if the worlds cannot resume from what `save` returned."""
         self._check_own(saved)
         self.simulation.check(saved[2:])
 
     def _check_own(self, saved: Sequence[NDArray[Any]]) -> None:
         if any(array.shape != self._steps.shape for array in saved[:2]):
-            raise ConfigError("the state is damaged: it is one of another number of worlds")
+            raise ConfigError("the state is damaged: it has another number of worlds")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """What a copy is made of: the worlds' parts, their state, and what is to be read of it.
+        """Return how to make a copy: from the world, its state and its step arrays.
 
-        A copy has no journal: the file is that of the worlds that are copied.
+        A copy has no journal, since the file belongs to the original.
 
         Raises:
-            ConfigError: the worlds have processes of their own, or what is registered could not be
-                registered where a pickle is read.
+            ConfigError: the worlds have processes of their own, or use extensions that the reader
+                of a pickle could not register.
         """
         config = self.world.config
         if key := kept_elsewhere(config):
             raise ConfigError(
-                f"{key}: worlds with processes of their own cannot be copied; make "
-                "the environment once more, with the same seed"
+                f"{key}: worlds with processes of their own cannot be copied; make another "
+                "environment with the same seed"
             )
         saved = [array.copy() for array in self.save()]
         shown = [array.copy() for array in every_array(self.arrays)]
@@ -281,13 +280,13 @@ class LocalWorlds:
         return _made_again, (modules, without_journals(self.world), self.in_next_step, saved, shown)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> LocalWorlds:
-        """With the same map and settings, which never change."""
+        """Copy the state; the map and the settings are shared, since they never change."""
         make, parts = self.__reduce__()
         copied: LocalWorlds = make(*parts)
         return copied
 
     def of_number(self, num_worlds: int) -> LocalWorlds:
-        """Return so many worlds of the same environment, which have not begun yet."""
+        """Return new worlds of the same environment, before their first reset."""
         return LocalWorlds(
             self.world,
             num_worlds,
@@ -297,28 +296,28 @@ class LocalWorlds:
         )
 
     def connect_network(self, network: NetworkSimulator) -> None:
-        """From now on let a network simulator decide receptions; errors as of `Bus.connect`."""
+        """Let a network simulator decide receptions; errors as of `Bus.connect`."""
         self.simulation.messages.connect(network)
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
-        """Keep what SUMO is told, which `load` needs: one log a world; see `SumoTraffic`."""
+        """Log the commands to SUMO, which `load` needs: one log per world; see `SumoTraffic`."""
         sumo = self.simulation.sumo
         return () if sumo is None else sumo.keep_logs()
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
-        """What `save` would give if there were no world but one; views, to be copied."""
+        """Return what `save` would return if there were only this world, as views."""
         only = slice(world, world + 1)
         return [self._steps[only], self._waiting[only], *self.simulation.share_of(world)]
 
     def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
-        """What `load` takes, of worlds of which each share has been one by itself."""
+        """Join the shares of single worlds to what `load` expects."""
         ended = [np.concatenate([share[n] for share in shares]) for n in range(2)]
         return [*ended, *self.simulation.join([share[2:] for share in shares])]
 
     def save_worlds(self) -> list[bytes]:
-        """The state of each world, for `load_worlds` of any number of zones and workers.
+        """Return the state of each world, for `load_worlds` with any zones and workers.
 
-        Owners are used by worlds of the same zones. A journal says that an episode begins.
+        Worlds with the same zones keep the owners. A journal records the start of an episode.
         """
         zones = self.world.partition.count
         saved = []
@@ -329,26 +328,26 @@ class LocalWorlds:
         return saved
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
-        """Go on from what `save_worlds` gave; `arrays` stay as they are.
+        """Resume from what `save_worlds` returned; `arrays` do not change.
 
         Raises:
-            ConfigError: it is of other worlds.
+            ConfigError: the state is one of other worlds.
         """
         self.load(self.read_worlds(saved))
 
     def read_worlds(self, saved: Sequence[bytes]) -> list[NDArray[Any]]:
-        """What `load` takes, of what `save_worlds` gave; errors as of `load_worlds`."""
+        """Convert what `save_worlds` returned to what `load` expects; errors as `load_worlds`."""
         zones = self.world.partition.count
         like = self.share_of(0)
         shares = [from_bytes(one, [*like[:-zones], like[-1]]) for one in saved]
         for share in shares:
             if any(array.shape != (1,) for array in share[:2]):
-                raise ConfigError("the state is damaged: it is not one of one world")
+                raise ConfigError("the state is damaged: it is not the state of one world")
             self.simulation.check_share(share[2:])
         return self.join([[*share, *[share[-1][:0]] * (zones - 1)] for share in shares])
 
     def refusal(self, saved: Sequence[bytes]) -> str:
-        """Why worlds cannot go on from these; empty: they can."""
+        """Return why the worlds cannot resume from these states; empty: they can."""
         try:
             self.check(self.read_worlds(saved))
         except ConfigError as error:
@@ -357,21 +356,21 @@ class LocalWorlds:
 
     @property
     def num_parts(self) -> int:
-        """Arrays at the end of `save` that are there once a zone of each world."""
+        """Number of arrays at the end of `save` that exist for each zone of each world."""
         return len(self._steps) * self.world.partition.count
 
     @property
     def plans(self) -> tuple[Plan, ...]:
-        """None: there are no workers."""
+        """Empty: there are no workers."""
         return ()
 
     @property
     def worker_pids(self) -> dict[int, int]:
-        """None, likewise."""
+        """Empty: there are no workers."""
         return {}
 
     def attach_sensor_workers(self, sensor_workers: SensorWorkers) -> None:
-        """From now on let others sense for the rigs; what they write is in `arrays`."""
+        """Let sensor workers write the frames of mounted sensors in `arrays`."""
         mounted = self.simulation.mounted
         assert mounted is not None
         mounted.rig.sense = sensor_workers
@@ -399,7 +398,7 @@ def _made_again(
 
 
 def kept_elsewhere(config: EnvConfig) -> str:
-    """The key by which worlds have state that is in none of their arrays; empty: none."""
+    """Return a key that gives the worlds state outside of their arrays; empty: there is none."""
     kept = {
         "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
         "workers.sensors": config.workers.sensors,
@@ -417,8 +416,10 @@ def every_array(arrays: StepArrays) -> Iterator[NDArray[Any]]:
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
     layout = layout_of(simulation.config, simulation.capacity, num_worlds)
-    there = frame_layout(simulation.config, num_worlds)
+    sensed = frame_layout(simulation.config, num_worlds)
     made = {
-        name: np.zeros(shape, dtype) for name, (dtype, shape) in layout.items() if name not in there
+        name: np.zeros(shape, dtype)
+        for name, (dtype, shape) in layout.items()
+        if name not in sensed
     }
     return StepArrays.of(made)._replace(frames=simulation.frames)

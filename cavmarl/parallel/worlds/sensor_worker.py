@@ -15,7 +15,7 @@ from cavmarl.parallel.worlds.world_message import world_of
 
 
 def make_sensor_jobs(message: Mapping[str, Any]) -> list[SensorJob]:
-    """The jobs of all sensor workers, every kernel loaded."""
+    """Make the jobs of all sensor workers, and load all kernels."""
     world = world_of(message)
     config = world.config
     shape = SceneShape(*message["shape"])

@@ -1,4 +1,4 @@
-"""Sensor workers of some worlds: what they are told, and the jobs that they make of it."""
+"""Worlds of this process with sensor workers, and the message from which these start."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ PROGRAM = "cavmarl.parallel.worlds.sensor_worker"
 def local_worlds(
     world: World, base_dir: Path, num_worlds: int, in_next_step: bool = False
 ) -> LocalWorlds:
-    """Worlds of this process, with as many sensor workers as `workers.sensors` says.
+    """Make worlds of this process, with `workers.sensors` sensor workers.
 
     Raises:
-        WorkerError: there is no memory that processes could share.
+        WorkerError: there is not enough shared memory.
     """
     config = world.config
     if not config.workers.sensors:
@@ -44,12 +44,12 @@ def local_worlds(
 
 
 def warn_if_crowded(sensor_workers: int, times: int) -> None:
-    """Warn of more sensor workers than cores; `times` processes have so many each."""
+    """Warn if `times` processes with sensor workers each have more of them than cores."""
     cores = len(usable_cores())
     if sensor_workers * times > cores:
         warnings.warn(
             f"{sensor_workers * times} sensor workers: there are {cores} cores; more workers than "
-            "cores do not make it faster",
+            "cores are not faster",
             RuntimeWarning,
             stacklevel=5,
         )
@@ -58,7 +58,7 @@ def warn_if_crowded(sensor_workers: int, times: int) -> None:
 def sensor_workers_of(
     world: World, base_dir: Path, arrays: Segment, part: tuple[int, int], num_worlds: int
 ) -> SensorWorkers:
-    """The sensor workers of some worlds, to be started when they are needed."""
+    """Return the sensor workers of worlds `part`; the first call starts them."""
     config = world.config
     first, last = part
     shape = SceneShape(
@@ -69,7 +69,7 @@ def sensor_workers_of(
         sensors=len(config.rig),
         workers=config.workers.sensors,
     )
-    # The same environment with all zones in one, and no sensor workers.
+    # The same environment without zones and without sensor workers.
     undivided = replace(config, zones=ZonesConfig(), workers=WorkersConfig())
     message = make_world_message(
         world._replace(config=undivided), base_dir, part=part, num_worlds=num_worlds

@@ -19,47 +19,47 @@ from cavmarl.sensors.registry import frame_layout, frames_in
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
-FINAL_FRAMES = "final_rig."  # begins their names in a layout
+FINAL_FRAMES = "final_rig."  # prefix of the names of final frames in a layout
 
 
 class StepArrays(NamedTuple):
-    """Arrays of W worlds with A agents each; the next step overwrites them.
+    """Arrays of W worlds with A agents each, which every step overwrites.
 
-    T is the number of terms, D the size of a flat observation, S that of a global state.
+    T is the number of terms, D the size of a flat observation, S the size of a global state.
     """
 
     observations: NDArray[np.float32]  # (W, A, D) for the next action
-    final_observations: NDArray[np.float32]  # (W, A, D) where something ended, before that
+    final_observations: NDArray[np.float32]  # (W, A, D) last ones of an agent or episode that ended
     rewards: NDArray[np.float32]  # (W, A)
-    terminations: NDArray[np.bool_]  # (W, A) the vehicle is gone
-    # (W, A) a horizon cut its trip: the episode's, or its own, and then it is gone, too
+    terminations: NDArray[np.bool_]  # (W, A) the vehicle has left
+    # (W, A) the horizon of the episode or of the trip was reached; a trip ends with its vehicle
     truncations: NDArray[np.bool_]
-    acted: NDArray[np.bool_]  # (W, A) agents that have acted
+    acted: NDArray[np.bool_]  # (W, A) agents that acted in the step
     vehicle_done: NDArray[np.bool_]  # (W, A)
-    vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: it had none
+    vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: none
     mask: NDArray[np.bool_]  # (W, A) agents that act next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
     ticks: NDArray[np.int64]  # (W,) the same
-    episode_over: NDArray[np.bool_]  # (W,) which worlds were reset, or will be in the next step
-    chosen: NDArray[np.bool_]  # (W,) which worlds are to be reset
-    controls: NDArray[np.float64]  # (W, A, 2) what agents do, as in `Commands`
+    episode_over: NDArray[np.bool_]  # (W,) worlds that were reset, or will be in the next step
+    chosen: NDArray[np.bool_]  # (W,) worlds to reset
+    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next three
     meta_actions: NDArray[np.int64]  # (W, A)
     declared: NDArray[np.int32]  # (W, A)
     inserted: NDArray[np.float64]  # (W, I, 3)
-    suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
-    states: NDArray[np.float32]  # (W, S) global states, of when they were last asked for
-    frames: Frames  # what the rigs have sensed
-    final_frames: Frames  # the same where something ended, before that
+    suggested: NDArray[np.float64]  # (W, A, 2) actions of the built-in driver
+    states: NDArray[np.float32]  # (W, S) global states at the last request
+    frames: Frames  # of mounted sensors
+    final_frames: Frames  # last ones of an agent or episode that ended
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]]) -> StepArrays:
-        """Made of arrays that are named as by `layout_of`."""
+        """Make them from arrays with the names of `layout_of`."""
         fields: dict[str, Any] = {name: arrays[name] for name in cls._fields if name in arrays}
         return cls(**fields, frames=frames_in(arrays), final_frames=frames_in(arrays, FINAL_FRAMES))
 
     def part(self, first: int, last: int) -> StepArrays:
-        """Those of some of the worlds, as views."""
+        """Return the arrays of the worlds [first, last), as views."""
         *arrays, frames, final_frames = self
         parts: list[Any] = [array[first:last] for array in arrays]
         for rig in (frames, final_frames):
@@ -68,7 +68,7 @@ class StepArrays(NamedTuple):
 
 
 def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
-    """Name → dtype and shape of the `StepArrays` of W worlds that hold so many vehicles each."""
+    """Return name → dtype and shape of the `StepArrays` of worlds with room for `capacity`."""
     agents = (num_worlds, config.population.num_ids)
     observations = ("<f4", (*agents, flat_observation_space(config).shape[0]))
     flags = ("|b1", agents)
@@ -95,52 +95,52 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
 
 
 class Driven(NamedTuple):
-    """An agent's vehicle, as plain numbers, for drivers outside the process."""
+    """The vehicle of an agent as plain numbers, for drivers outside the process."""
 
-    agent: int  # index of it
+    agent: int  # index
     vehicle_id: int
     vclass: int  # index into `roads.network.VEHICLE_CLASSES`
-    length_m: float  # of its body
-    width_m: float  # of its body
-    goal_edge: int  # EDGE row of where it is to go
+    length_m: float
+    width_m: float
+    goal_edge: int  # EDGE row of the goal
     speed_mps: float
-    # SPAT that it has received of each signal: SIGNAL row, PHASE row, ticks since it was sent;
-    # None: there are no messages
+    # last SPAT received from each signal: SIGNAL row, PHASE row, ticks since it was sent; None:
+    # there are no messages
     heard: list[list[int]] | None = None
 
 
 class SteppedWorlds(Protocol):
-    """W worlds that begin a new episode by themselves, as `CavVectorEnv` describes it."""
+    """W worlds with autoreset, see `CavVectorEnv`."""
 
-    world: World  # what each is made of
-    arrays: StepArrays  # what goes into a step, and what comes out
-    in_next_step: bool  # a new episode begins in the step after the one in which the old one ends
+    world: World
+    arrays: StepArrays  # inputs and outputs of a step
+    in_next_step: bool  # a new episode starts in the step after the one that ended the last one
 
     @property
     def simulation(self) -> Simulation:
-        """The worlds themselves, where they live in this process."""
+        """The simulation, if the worlds run in this process."""
         ...
 
     @property
     def plans(self) -> tuple[Plan, ...]:
-        """Which worker hosts what, one plan of all worlds, or one a world; none without workers."""
+        """One plan of all worlds, or one per world; empty without workers."""
         ...
 
     @property
     def worker_pids(self) -> Mapping[int, int]:
-        """Process of each worker or node by its number, as far as they are on this machine."""
+        """Worker or node → process, as far as they are on this machine."""
         ...
 
     def reset(
         self,
-        seed: int | None,  # root of all random numbers; None goes on with those of the last seed
-        first_world: int,  # number of the first of these worlds among all worlds of the seed
+        seed: int | None,  # root of all random numbers; None continues those of the last seed
+        first_world: int,  # number of the first world among all worlds of the seed
     ) -> None:
-        """Begin an episode in the worlds of `chosen`; writes `observations` and `mask`."""
+        """Start an episode in the worlds of `chosen`; write `observations` and `mask`."""
         ...
 
     def step(self, commands: Commands) -> None:
-        """Let the agents act; writes all that comes out."""
+        """Let the agents act, and write all outputs."""
         ...
 
     def suggest(self) -> None: ...
@@ -148,7 +148,7 @@ class SteppedWorlds(Protocol):
     def write_states(self) -> None: ...
 
     def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
+        """Return (W,) the ticks since the reset of each world."""
         ...
 
     def state_hash(self, world: int) -> str: ...
@@ -160,15 +160,15 @@ class SteppedWorlds(Protocol):
     def signal_phases(self, world: int) -> NDArray[np.int32]: ...
 
     def save_worlds(self) -> list[bytes]:
-        """The state of each world, for `load_worlds` of any number of zones and workers."""
+        """Return the state of each world, for `load_worlds` with any zones and workers."""
         ...
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
-        """Go on from what `save_worlds` gave; `arrays` stay as they are."""
+        """Resume from what `save_worlds` returned; `arrays` do not change."""
         ...
 
     def connect_network(self, network: NetworkSimulator) -> None:
-        """From now on let a network simulator decide receptions (`v2x.channel.external`)."""
+        """Let a network simulator decide receptions from now on (`v2x.channel.external`)."""
         ...
 
     def close(self) -> None: ...

@@ -1,4 +1,4 @@
-"""What worlds in other processes are asked for: one table of tasks for all of these processes."""
+"""Tasks of worlds in other processes, in one table for workers and nodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.shards.shard import Commands
 
 
 class Task(IntEnum):
-    """What a worker or a node can be asked for."""
+    """What a worker or a node can do."""
 
     STEP = 0
     RESET = 1
@@ -38,13 +38,13 @@ TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
 
 
 class WorldTask(NamedTuple):
-    """How the process that has the worlds does a task.
+    """How the process of the worlds does a task.
 
     Attributes:
         method: of the worlds.
-        read: makes its keywords of the payload, which names worlds by their numbers among all, and
-            of the number of the first world of this process.
-        write: makes the answer of what it returns.
+        read: converts the payload into keywords of the method. A payload names worlds by their
+            numbers among all worlds; the second argument is the first world of this process.
+        write: converts the returned value into the answer.
     """
 
     method: Callable[..., Any]
@@ -52,12 +52,12 @@ class WorldTask(NamedTuple):
     write: Callable[[Any], Any] = lambda found: found
 
     def perform(self, worlds: LocalWorlds, payload: Any, first: int = 0) -> Any:
-        """Do the task with some worlds, of which the first one has this number."""
+        """Do the task with worlds, the first of which has the number `first`."""
         return self.write(self.method(worlds, **self.read(payload, first)))
 
 
 def commands_of(arrays: StepArrays) -> Commands:
-    """Return what agents do in the next step, as views."""
+    """Return the commands of the agents in the next step, as views."""
     return Commands(arrays.controls, arrays.meta_actions, arrays.declared, arrays.inserted)
 
 
@@ -85,7 +85,7 @@ def _saved(payload: list[bytes], first: int) -> dict[str, Any]:
     return {"saved": payload}
 
 
-# A process that passes saved worlds on in another form than bytes has rows of its own for them.
+# A process that does not pass saved worlds as bytes replaces these rows.
 WORLD_TASKS: Mapping[Task, WorldTask] = {
     Task.STEP: WorldTask(_step, _nothing),
     Task.RESET: WorldTask(LocalWorlds.reset, _begin),

@@ -1,4 +1,4 @@
-"""Errors of worlds that other processes have: what they cannot do, and what they raise there."""
+"""Errors of worlds in other processes: what they do not support, and what they raise there."""
 
 from __future__ import annotations
 
@@ -8,29 +8,33 @@ from cavmarl.core.errors import CavmarlError, ConfigError, WorkerFailureError
 
 
 def copy_error() -> ConfigError:
-    """Return the refusal of a copy or a pickle of worlds in other processes."""
+    """Return the error for a copy or a pickle of worlds in other processes."""
     return ConfigError(
-        "workers: worlds that worker processes run cannot be copied; use backend='local', "
-        "or make the environment once more, with the same seed"
+        "workers: worlds in worker processes cannot be copied; use backend='local', or make "
+        "another environment with the same seed"
     )
 
 
 def network_error() -> ConfigError:
-    """Return the refusal to connect a network simulator with worlds in workers."""
+    """Return the error for a network simulator with worlds in worker processes."""
     return ConfigError(
-        "v2x.channel.external: a network simulator is in the caller's process, and worlds over "
-        "workers do not ask it; use backend='local', or nodes"
+        "v2x.channel.external: the network simulator is in the process of the caller, which "
+        "worlds in worker processes do not ask; use backend='local', or nodes"
     )
 
 
 def refuse_external(v2x: V2xConfig) -> None:
-    """Refuse what asks a part of the caller's process in each tick."""
+    """Refuse an external channel, which needs the process of the caller in each tick.
+
+    Raises:
+        ConfigError: the channel is external.
+    """
     if v2x.enabled and v2x.channel.external:
         raise network_error()
 
 
 def original_error(failure: WorkerFailureError) -> CavmarlError:
-    """Return an error that the worlds raise on purpose, as they would raise it in this process."""
+    """Return the error of cavmarl that a worker has raised; else the failure itself."""
     kind = getattr(cavmarl.core.errors, failure.kind, None)
     if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
         return failure

@@ -1,4 +1,4 @@
-"""What a process is told of the worlds that it is to run, and what it makes of that."""
+"""The message from which another process makes the same world."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from cavmarl.core.errors import WorkerError
 from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.engine.world_setup import World, make_world
 
-CHANGED = "have changed while workers were started: try again"
+CHANGED = "have changed while workers started: try again"
 
 
 def make_world_message(world: World, base_dir: Path, **more: Any) -> dict[str, Any]:
-    """The message of a world, and more, as JSON knows it."""
+    """Return the message of a world, a JSON value, with further entries."""
     return {
         "config": asdict(world.config),
         "extensions": extension_modules(world.config.registered),
@@ -27,10 +27,15 @@ def make_world_message(world: World, base_dir: Path, **more: Any) -> dict[str, A
 
 
 def world_of(message: Mapping[str, Any], trouble: str = "") -> World:
-    """The world of a message, made anew; `trouble` says what it means if its files differ.
+    """Make the world of a message.
+
+    Args:
+        message: made by `make_world_message`.
+        trouble: text for the error if files of the world differ; empty: do not compare.
 
     Raises:
-        CavmarlError: they cannot be read.
+        CavmarlError: the files cannot be read.
+        WorkerError: the files differ.
     """
     from cavmarl.config.io import validate  # pydantic is slow to import
 
@@ -43,6 +48,6 @@ def world_of(message: Mapping[str, Any], trouble: str = "") -> World:
 
 
 def fingerprint(world: World) -> str:
-    """Differs between two readings of the same files if one was changed in between."""
+    """Return a text that differs if a file of the world has changed."""
     made_of = (world.network, world.demand, world.partition)
     return " ".join("none" if part is None else part.content_hash for part in made_of)
