@@ -1,4 +1,4 @@
-"""`JoiningNodes`: nodes that have called, and host no zones yet."""
+"""`JoiningNodes`: nodes that have called and do not host zones yet."""
 
 from __future__ import annotations
 
@@ -23,39 +23,39 @@ from cavmarl.parallel.worlds.world_errors import original_error
 
 log = logging.getLogger("cavmarl.nodes")
 
-LOOK_MS = 20.0  # between looks for callers, before the worlds begin
-END_S = 1.0  # for those that wait to hear that they are needed no more
-ANYONE = (1 << 32) - 1  # the number of a node that takes any
+LOOK_MS = 20.0  # between looks for callers, before the worlds start
+END_S = 1.0  # time for waiting nodes to end
+ANYONE = (1 << 32) - 1  # number of a node that accepts any number
 
 
 @dataclass
 class JoiningNode:
-    """One of them."""
+    """A node that has called."""
 
     asked: int  # the number that it was started with, or ANYONE
     machine: str = "a machine"
-    pid: int = 0  # of its process, there
-    is_let_in: bool = False  # it runs what the caller runs
+    pid: int = 0  # on its machine
+    is_accepted: bool = False  # it runs the same code as the caller
     place: Place | None = None  # where other nodes can call, once it has loaded the world
-    neighbours: Neighbours | None = None  # between which zones vehicles change, by that world
+    neighbours: Neighbours | None = None  # zones between which vehicles change, in that world
 
 
 class JoiningNodes:
-    """Tells processes that may join which node to be, and waits until they are ready.
+    """Accepts nodes, sends them the world to load, and waits until they are ready.
 
     Attributes:
-        place: where they call.
-        ready: those that have loaded the world, by numbers of their own.
-        refused: why others were sent away.
-        failures: exceptions while they loaded the world.
+        place: where nodes call.
+        ready: nodes that have loaded the world, by their numbers here.
+        refused: why other nodes were rejected.
+        failures: exceptions of nodes that loaded the world.
     """
 
     def __init__(
         self,
         listener: TransportListener,
-        job: Any,  # what they are told, as JSON knows it
-        files: Sequence[WorldFile],  # that the world is made of
-        room: Callable[[], int],  # how many more would be of use
+        job: Any,  # JSON value for the nodes
+        files: Sequence[WorldFile],  # of the world
+        room: Callable[[], int],  # returns how many more nodes are of use
         zones: int,  # of each world
         system: NodeSystem = MACHINE,
     ) -> None:
@@ -72,7 +72,7 @@ class JoiningNodes:
         self.failures: list[WorkerFailureError] = []
 
     def look(self, wait_ms: float) -> None:
-        """Accept calls, and hear what earlier callers say."""
+        """Accept calls, and receive frames of earlier callers."""
         for asked, connection in self._listener.admit():
             self._all[self._next] = JoiningNode(asked)
             self._links.add(self._next, connection)
@@ -90,13 +90,13 @@ class JoiningNodes:
         self,
         num: int,
         timeout_s: float,
-        trouble: Callable[[], str | None],  # why they will not come, in words
+        trouble: Callable[[], str | None],  # returns why nodes will not come
     ) -> None:
-        """Return when as many are ready.
+        """Wait until this number of nodes is ready.
 
         Raises:
-            CavmarlError: what one of them has raised.
-            WorkerError: they have not come in time.
+            CavmarlError: a node has raised this error.
+            WorkerError: the nodes have not come in time.
         """
         until_s = self._links.now_s() + timeout_s
         log.info("waiting for %d nodes at %s", num, self.place)
@@ -117,60 +117,63 @@ class JoiningNodes:
                 raise WorkerError(why)
 
     def asked(self, number: int) -> int:
-        """Return the number with which one of them was started."""
+        """Return the number with which a node was started."""
         return self._all[number].asked
 
     def take(self, number: int) -> tuple[JoiningNode, Link]:
-        """One that is ready, and its connection."""
+        """Remove a ready node, and return it with its connection."""
         self.ready.remove(number)
         return self._all.pop(number), self._links.release(number)
 
     def _receive(self, number: int, frame: NodeFrame) -> None:
-        joining_node = self._all.get(number)
-        if joining_node is None:  # it has been sent away
+        node = self._all.get(number)
+        if node is None:  # it was rejected
             return
         try:
             with reading(number):
-                self._apply(number, joining_node, frame)
+                self._apply(number, node, frame)
         except LinkLostError as lost:  # it is no node
-            log.warning("a caller is sent away: %s", lost)
+            log.warning("a caller is rejected: %s", lost)
             self._forget(number)
 
-    def _apply(self, number: int, joining_node: JoiningNode, frame: NodeFrame) -> None:
+    def _apply(self, number: int, node: JoiningNode, frame: NodeFrame) -> None:
         match frame.kind:
-            case FrameKind.JOIN if not joining_node.is_let_in:
-                self._examine(number, joining_node, read_json(frame.data, dict))
-            case FrameKind.WANTED if joining_node.is_let_in:
+            case FrameKind.JOIN if not node.is_accepted:
+                self._examine(number, node, read_json(frame.data, dict))
+            case FrameKind.WANTED if node.is_accepted:
                 self._send_files(number, read_list(frame))
-            case FrameKind.READY if joining_node.is_let_in and joining_node.place is None:
+            case FrameKind.READY if node.is_accepted and node.place is None:
                 host, port, near, may_teleport = read_list(frame)
-                joining_node.neighbours = read_neighbours([near, may_teleport], self._zones)
-                joining_node.place = str(host), int(port)
+                node.neighbours = read_neighbours([near, may_teleport], self._zones)
+                node.place = str(host), int(port)
                 self.ready.append(number)
             case FrameKind.FAILED:
                 name, text, trace = map(str, read_list(frame))
-                where = f"node on {joining_node.machine}"
-                failure = WorkerFailureError(joining_node.asked, where, name, text, trace)
+                where = f"node on {node.machine}"
+                failure = WorkerFailureError(node.asked, where, name, text, trace)
                 self.failures.append(failure)
                 log.warning("%s", failure)
                 self._forget(number)
             case _:
-                raise MessageError(f"a frame of kind {frame.kind.name} is not its turn")
+                raise MessageError(f"a frame of kind {frame.kind.name} is out of turn")
 
-    def _examine(self, number: int, joining_node: JoiningNode, told: dict[str, Any]) -> None:
-        joining_node.machine, joining_node.pid = str(told["machine"]), int(told["pid"])
-        if told["code"] != code_stamp():
+    def _examine(self, number: int, node: JoiningNode, join: dict[str, Any]) -> None:
+        node.machine, node.pid = (
+            str(join["machine"]),
+            int(join["pid"]),
+        )
+        if join["code"] != code_stamp():
             why = (
-                f"it runs {told['code']}, the caller {code_stamp()}: install the same versions on "
-                "all machines, or results would differ"
+                f"it runs {join['code']}, the caller runs {code_stamp()}: install the same "
+                "versions on all machines, since results would differ"
             )
-        elif self._room() <= sum(each.is_let_in for each in self._all.values()):
-            why = "no more nodes are wanted: all zones have theirs, and one more waits"
+        elif self._room() <= sum(each.is_accepted for each in self._all.values()):
+            why = "no more nodes are needed: all zones have a node, and a spare one waits"
         else:
-            joining_node.is_let_in = True
+            node.is_accepted = True
             self._links.send(number, FrameKind.JOB, 0, [self._job])
             return
-        self.refused.append(f"a node on {joining_node.machine}: {why}")
+        self.refused.append(f"a node on {node.machine}: {why}")
         log.warning("refused %s", self.refused[-1])
         self._links.send(number, FrameKind.REFUSED, 0, [why.encode()])
         self._forget(number)
@@ -189,6 +192,6 @@ class JoiningNodes:
             self.ready.remove(number)
 
     def close(self) -> None:
-        """Send all away, and hear no more."""
+        """Dismiss all waiting nodes, and stop listening."""
         self._links.end(END_S)
         self._listener.close()

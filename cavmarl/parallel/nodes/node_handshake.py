@@ -1,4 +1,4 @@
-"""How nodes find each other: each proves that it knows the secret."""
+"""How nodes connect to each other; both ends prove that they know the secret."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from cavmarl.parallel.network.transport import READS, Connection, Place, Transpo
 from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
 
-LOOK_MS = 50.0  # so often it is looked whether those that are awaited still live
-ANSWER_S = 5.0  # for a node to answer a call
-_MOST = 1 << 16  # nodes, and generations that are told apart
+LOOK_MS = 50.0  # between checks that the awaited nodes still live
+ANSWER_S = 5.0  # time for a node to answer a call
+_MOST = 1 << 16  # nodes, and distinguished generations
 
 
 def caller_number(number: int, generation: int) -> int:
-    """What a node says when it calls another one: which it is, and for which attempt to begin."""
+    """Return the number that a node sends with a call: its own number and the generation."""
     return number + generation % _MOST * _MOST
 
 
 def accept_nodes(
     system: NodeSystem,
     listener: TransportListener,
-    wanted: Iterable[int],  # numbers of those that are to call
-    generation: int,  # how often nodes have come and gone; calls of other times count no more
+    wanted: Iterable[int],  # numbers of the nodes that will call
+    generation: int,  # number of changes of nodes; calls of other generations are rejected
     timeout_s: float,
-    check: Callable[[], None],  # raises if one will never call
+    check: Callable[[], None],  # raises if a node will never call
 ) -> dict[int, Connection]:
-    """The connections of all that are awaited; other callers are turned away.
+    """Accept the calls of all wanted nodes, and reject other callers.
 
     Raises:
-        LinkLostError: one has not called in time.
+        LinkLostError: a node has not called in time.
     """
     missing = {caller_number(number, generation): number for number in wanted}
     found: dict[int, Connection] = {}
@@ -43,9 +43,9 @@ def accept_nodes(
             if system.now_s() > until_s:
                 raise LinkLostError(min(missing.values()))
             poll.poll(LOOK_MS)
-            for said, connection in listener.admit():
-                if said in missing:
-                    found[missing.pop(said)] = connection
+            for caller, connection in listener.admit():
+                if caller in missing:
+                    found[missing.pop(caller)] = connection
                 else:
                     connection.close()
     except BaseException:
@@ -58,10 +58,10 @@ def accept_nodes(
 def call_node(
     system: NodeSystem, place: Place, secret: bytes, number: int, generation: int, of: int
 ) -> Connection:
-    """A connection to node `of` of node `number`.
+    """Call node `of` from node `number`, and return the connection.
 
     Raises:
-        LinkLostError: it cannot be reached.
+        LinkLostError: the node cannot be reached.
     """
     try:
         return system.open(place, secret, caller_number(number, generation), ANSWER_S)

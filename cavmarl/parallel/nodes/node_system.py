@@ -14,29 +14,31 @@ from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.world_message import world_of
 
-LOOKS = 25  # of about a microsecond each
+LOOKS = 25  # polls of about a microsecond each
 
 
 class NodeSystem(Transport, Protocol):
-    """`cavmarl.verify` has one beside this machine's, in which all processes are threads of one."""
+    """The system of a node: a real machine, or the simulated machine of `cavmarl.verify`."""
 
-    looks: int  # that a node takes for what another one sends before it sleeps
+    looks: int  # polls of a node for a frame of another node before it sleeps
 
     def now_s(self) -> float:
-        """A clock that never goes back; of this process alone."""
+        """Return the time of a monotonic clock of this process."""
         ...
 
     def worlds_of(
         self,
         message: Mapping[str, Any],
-        trouble: str,  # what it means if its files differ
+        trouble: str,  # text for the error if files differ
         num_worlds: int,
-        in_next_step: bool,  # when worlds begin anew
-    ) -> LocalWorlds: ...
+        in_next_step: bool,  # when new episodes start
+    ) -> LocalWorlds:
+        """Make the worlds of a message."""
+        ...
 
 
 class Machine:
-    """This machine's."""
+    """The system of this machine."""
 
     looks = LOOKS if (os.cpu_count() or 1) > 1 else 0
     now_s = staticmethod(time.monotonic)

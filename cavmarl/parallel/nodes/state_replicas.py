@@ -1,9 +1,9 @@
-"""`StateReplicas`: what a node keeps of its zones and of those of the node before it.
+"""`StateReplicas`: kept states of the zones of a node, and of the previous node of the ring.
 
-Now and then, between two steps, each node keeps what it needs to go on from there, and sends it to
-the next node that lives. When a node is lost, the next one hosts its zones, and all go back to the
-newest state that all nodes have. What was done since is done again, which gives the same bytes.
-Zones that change their node, as to a new one, do it in the same way.
+Now and then, between two steps, each node keeps its state, and sends a replica to the next living
+node. When a node is lost, the next one takes over its zones, and all nodes go back to the newest
+state that all of them have. They repeat the commands since then, which gives the same bytes. Zones
+that move to another node, such as a new one, do it in the same way.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
 Array = NDArray[Any]
-KEPT = 2  # so many states: the newest may not have come everywhere
+KEPT = 2  # states, since the newest one may not have arrived everywhere
 
 
 class StateReplicas:
-    """Those of one node."""
+    """The states that one node keeps."""
 
     def __init__(
         self, worlds: LocalWorlds, logs: Sequence[ToldLog], links: Links, number: int
     ) -> None:
         self._worlds = worlds
-        self._logs = logs  # of what SUMO is told
+        self._logs = logs  # of commands to SUMO
         self._links = links
         self._number = number
         self._own: dict[int, Bytes] = {}  # by numbers of states
-        self._others: dict[int, dict[int, Bytes]] = {}  # node → the same
-        self._given: dict[int, NodeFrame] = {}  # by nodes that have given zones away
-        self._is_settled = True  # nothing has been kept since `settle`
+        self._others: dict[int, dict[int, Bytes]] = {}  # node → its states, by numbers
+        self._given: dict[int, NodeFrame] = {}  # by nodes that give zones away
+        self._is_settled = True  # no state was kept since `settle`
 
     def begin_anew(self, worlds: LocalWorlds, logs: Sequence[ToldLog]) -> None:
-        """Keep states of other worlds; what other nodes have sent already may be of these."""
+        """Keep states of other worlds; replicas of other nodes stay, as they may be of these."""
         self._worlds, self._logs = worlds, logs
         self._own.clear()
         self._given.clear()
 
     def settle(self) -> None:
-        """What was kept here last has come everywhere: what is older is of no use any more."""
+        """Drop older states, since the newest one has arrived everywhere."""
         if self._is_settled:
             return
         self._is_settled = True
@@ -59,7 +59,7 @@ class StateReplicas:
                 del states[old]
 
     def keep(self, state: int, living: Sequence[int]) -> None:
-        """Keep what the worlds are now, here and at the next of the living nodes."""
+        """Keep the present state here, and send a replica to the next living node."""
         data = to_bytes(self._worlds.save())
         _add(self._own, state, data)
         self._is_settled = False
@@ -67,14 +67,14 @@ class StateReplicas:
             to = living[(living.index(self._number) + 1) % len(living)]
             self._links.send(to, FrameKind.KEEP, state, [data])
         else:
-            told = to_bytes([log.words for log in self._logs])
-            self._links.send(COORDINATOR, FrameKind.KEEP, state, [told, data])
+            logs = to_bytes([log.words for log in self._logs])
+            self._links.send(COORDINATOR, FrameKind.KEEP, state, [logs, data])
 
     def resume_from(self, state: int, data: Bytes) -> None:
-        """Have a state that the coordinator has kept for the node before this one.
+        """Take over a state that the coordinator has kept for the only node, which is lost.
 
         Raises:
-            ConfigError: it is of other worlds.
+            ConfigError: the state is one of other worlds.
         """
         _drop_later(self._own, -1)
         like = [*(log.words for log in self._logs), *self._worlds.save()]
@@ -86,30 +86,30 @@ class StateReplicas:
         self._own[state] = to_bytes(saved)
 
     def receive(self, number: int, frame: NodeFrame) -> None:
-        """What another node wants to have kept here."""
+        """Keep the replica of another node."""
         _add(self._others.setdefault(number, {}), frame.number, frame.data)
         self._is_settled = False
 
     def receive_given(self, number: int, frame: NodeFrame) -> None:
-        """What another node has had of zones that are hosted here from now on."""
+        """Take the state of another node, some of whose zones this node will host."""
         self._given[number] = frame
 
     def load(
         self,
         state: int,
-        lost: Sequence[int],  # nodes whose zones are hosted here from now on
-        donors: Sequence[int],  # nodes that give zones to this one
-        takers: Sequence[int],  # nodes that are given some of those that were here
-        zones: Sequence[int],  # all that are here from now on
-        generation: int,  # how often nodes have come and gone
-        check: Callable[[], None],  # raises if what is awaited will never come
+        lost: Sequence[int],  # nodes whose zones this node takes over
+        donors: Sequence[int],  # nodes that give zones to this node
+        takers: Sequence[int],  # nodes that get zones of this node
+        zones: Sequence[int],  # of this node from now on
+        generation: int,  # number of changes of nodes
+        check: Callable[[], None],  # raises if the awaited frames will never come
     ) -> None:
-        """Go back to a state, or go on from it if this node was not there.
+        """Resume from a kept state.
 
-        What was kept after that state is void: else it would count as the newest.
+        Later states are dropped: otherwise they would count as the newest ones.
 
         Raises:
-            WorkerError: what a lost node had is not here.
+            WorkerError: the state of a lost node is not here.
         """
         for states in (self._own, *self._others.values()):
             _drop_later(states, state)
@@ -119,11 +119,11 @@ class StateReplicas:
         for number in lost:
             found = self._others.get(number, {}).get(state)
             if saved is None or found is None:
-                raise WorkerError(f"what node {number} had is kept nowhere")
+                raise WorkerError(f"there is no replica of the state of node {number}")
             try:
                 theirs = self._read(found, like)
             except FAULTS as error:
-                raise WorkerError(f"what node {number} had cannot be read: {error}") from error
+                raise WorkerError(f"the state of node {number} is damaged: {error}") from error
             saved[self._first - 1] += self._join(saved, theirs, like)
         if takers and saved is not None:
             data = to_bytes(saved)
@@ -134,17 +134,17 @@ class StateReplicas:
             self._links.wanted = (donor,)
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
-                check()  # it may take what is awaited
+                check()  # it may receive the awaited frame
             self._links.wanted = ()
             with reading(donor):
                 given = self._read(self._given.pop(donor).data, like)
             if saved is None:
                 saved = given
-                saved[self._first - 1][...] = 0  # contacts stay where they were counted
+                saved[self._first - 1][...] = 0  # contacts stay with the node that counted them
             else:
                 self._join(saved, given, like)
         if saved is None:
-            raise WorkerError(f"state {state} is kept nowhere")
+            raise WorkerError(f"there is no replica of state {state}")
         count = self._worlds.world.partition.count
         for n in range(self._first, len(saved)):
             if (n - self._first) % count not in zones:
@@ -152,22 +152,22 @@ class StateReplicas:
         self._worlds.load_own(saved, zones[0])
 
     def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
-        """A state that is kept. Raises ConfigError: worlds cannot go on from it."""
+        """Read a kept state. Raises ConfigError: the worlds cannot resume from it."""
         saved = from_bytes(data, like)
         self._worlds.check(saved)
         return saved
 
     @property
     def _first(self) -> int:
-        """Where in what is saved the vehicles of the first zone stand."""
+        """Index of the vehicles of the first zone among the saved arrays."""
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
         return len(self._worlds.save()) - simulation.num_worlds * zones
 
     def _join(self, saved: list[Array], other: Sequence[Array], like: Sequence[Array]) -> Array:
-        """Add the vehicles of another node to the saved ones, and what is kept of its agents.
+        """Add the vehicles of another node, and the state of its agents, to a saved state.
 
         Returns:
-            (W,) the contacts that it has counted.
+            (W,) contacts that the other node has counted.
         """
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
         first = self._first

@@ -1,8 +1,9 @@
-"""`ZoneEndpoints`: the zones of a node as hosts of the ownership protocol.
+"""`ZoneEndpoints`: the zones of a node as endpoints of the ownership protocol.
 
-A vehicle that has crossed a border is offered to the node of the zone that it is in, by PREPARE;
-that node acknowledges it to the coordinator and to the source; the coordinator decides, and the
-next STEP of both zones says so. Until then the source goes on with it.
+When a vehicle has crossed a border, its owner offers it by PREPARE to the node of the zone that it
+is in. That node acknowledges the offer to the coordinator and to the source. The coordinator
+decides, and the next STEP of both zones contains the decision. Until then the source keeps the
+vehicle.
 """
 
 from __future__ import annotations
@@ -47,15 +48,15 @@ _LENGTH = struct.Struct("<II")
 
 
 class Report(NamedTuple):
-    """What the coordinator has to know of a world's tick beside DONE."""
+    """What the coordinator needs to know about a tick of a world beside DONE."""
 
-    # vehicle, zone that it is in, digest of its state as hex
+    # vehicle, zone that it is in, digest of its state in hex
     movers: list[tuple[int, int, str]]
-    births: list[tuple[int, int]]  # vehicle, zone that owns it first
-    began: bool  # the world has begun anew after the tick
-    # zone, vehicles that its rows say it owns, the sum of their `owner_hash`; where it is checked
+    births: list[tuple[int, int]]  # vehicle, first owner
+    began: bool  # an episode has started after the tick
+    # zone, number of vehicles that it owns by its rows, sum of their `owner_hash`; if checked
     owned: list[tuple[int, int, int]]
-    # a vehicle has crossed a border that is on no record yet: it is offered in a lease of no ticks
+    # a vehicle without a record has crossed a border; it needs a lease of no ticks
     is_late: bool = False
 
 
@@ -63,31 +64,32 @@ NOTHING = Report([], [], False, [])
 
 
 class ZoneEndpoints:
-    """Those of one node, of W worlds."""
+    """The endpoints of the zones of one node in W worlds."""
 
-    coordinators: tuple[LocalCoordinator, ...] = ()  # they are in another process
+    coordinators: tuple[LocalCoordinator, ...] = ()  # the coordinator is in another process
     needs_ghosts = True
 
     def __init__(
         self,
         division: ZonedShards,
         zones: Sequence[int],  # of this node
-        node_of: Sequence[int],  # zone → the node that hosts it
-        hostings: Sequence[Sequence[Hosting]],  # of each world, of these zones
+        node_of: Sequence[int],  # zone → node
+        hostings: Sequence[Sequence[Hosting]],  # of these zones, by worlds
         limits: Limits,
         links: Links,  # to the coordinator and to all other nodes
-        carried: Sequence[NDArray[Any]],  # (W, A, …) of agents: what they do, what is kept of them
-        checks: IndexCheck,  # of vehicles that are offered
+        carried: Sequence[NDArray[Any]],  # (W, A, …) actions and state of agents
+        checks: IndexCheck,  # checks offered vehicles
         *,
-        generation: int = 0,  # how often nodes have been lost
-        is_checked: bool = False,  # whether the caller checks what zones own
+        generation: int = 0,  # number of changes of nodes
+        is_checked: bool = False,  # the caller checks the vehicles that zones own
         ticks: int = 1,  # of a lease
     ) -> None:
         self._ticks, self._left = ticks, 0
         self._generation, self._is_checked = generation, is_checked
         self._owned_sum = specialized(owned_sum)
         self._carried = carried
-        self._come: dict[tuple[int, int], memoryview] = {}  # world, vehicle → what is to be kept
+        # world, vehicle → state of its agent
+        self._arrived_agents: dict[tuple[int, int], memoryview] = {}
         self._division, self._checks = division, checks
         self._zones = frozenset(zones)
         self._node_of = node_of
@@ -99,9 +101,10 @@ class ZoneEndpoints:
         self._leases: list[dict[int, Advance]] = [{} for _ in range(num_worlds)]
         self._births: list[list[tuple[int, int]]] = [[] for _ in range(num_worlds)]
         self._gone: list[dict[int, int]] = [{} for _ in range(num_worlds)]
-        # of vehicles that were offered, and have not left: the zones that they are to go to
+        # target zones of offered vehicles that have not left
         self._targets: list[dict[int, int]] = [{} for _ in range(num_worlds)]
-        self._early: list[tuple[int, Message]] = []  # of an episode that begins with the next lease
+        # messages for an episode that starts with the next lease
+        self._early: list[tuple[int, Message]] = []
         self._began = [False] * num_worlds
         self._stirred = [True] * num_worlds
         self._is_quiet = [False] * num_worlds  # the lease has come without a STEP
@@ -110,7 +113,7 @@ class ZoneEndpoints:
     # Called by a tick
 
     def begin(self, commands: Commands) -> None:
-        """Wait for the lease of the next ticks, and let vehicles change hands as it says."""
+        """Wait for the lease of the next ticks, and apply its changes of owner."""
         if self._is_open and self._left:
             self._left -= 1
             return
@@ -121,7 +124,7 @@ class ZoneEndpoints:
             if frame.kind is FrameKind.RECOVER:
                 raise RecoveryOrderedError(frame)
             if frame.kind is not FrameKind.LEASE:
-                error = MessageError(f"a frame of kind {frame.kind.name}, where a lease was due")
+                error = MessageError(f"a frame of kind {frame.kind.name} in place of a lease")
                 raise LinkLostError(COORDINATOR, error)
             with reading(COORDINATOR):
                 leased = unpacked(frame.data)
@@ -133,14 +136,14 @@ class ZoneEndpoints:
         self._left = self._ticks - 1
 
     def lease(self, messages: Sequence[tuple[int, Message]]) -> None:
-        """Take STEP messages; zones of worlds without any go on with what they own."""
-        told = {w for w, _ in messages}
+        """Apply STEP messages; zones of worlds without a message keep their vehicles."""
+        addressed = {w for w, _ in messages}
         with reading(COORDINATOR):
-            check_indices("world", told, len(self._endpoints))
+            check_indices("world", addressed, len(self._endpoints))
         for w, message in messages:
             self._apply(w, message)
         for w, endpoints in enumerate(self._endpoints):
-            if not (w in told or self._leases[w] or self._is_quiet[w]):
+            if not (w in addressed or self._leases[w] or self._is_quiet[w]):
                 self._is_quiet[w] = True
                 for endpoint in endpoints.values():
                     endpoint.go_on()
@@ -152,7 +155,7 @@ class ZoneEndpoints:
         return self._is_quiet[w] or len(self._leases[w]) == len(self._zones)
 
     def note(self, messages: Sequence[tuple[int, Message]]) -> None:
-        """Let a lease of no ticks begin and end: births come on record, and can be offered."""
+        """Apply a lease of no ticks: it records births, so that they can be offered."""
         self.lease(messages)
         self._enter_lease()
         self._stirred = [True] * len(self._stirred)
@@ -161,12 +164,12 @@ class ZoneEndpoints:
     def _enter_lease(self) -> None:
         for w, leases in enumerate(self._leases):
             if leases:
-                self._change_hands(w, leases)
+                self._change_owners(w, leases)
                 self._leases[w] = {}
         self._is_open = True
 
     def end(self) -> None:
-        """The tick is over here; `report` tells the coordinator."""
+        """Do nothing: `report` informs the coordinator."""
 
     def entered(self, departures: DepartureQueue) -> None:
         division = self._division
@@ -195,10 +198,10 @@ class ZoneEndpoints:
             self._stirred[w] = True
 
     def save(self, w: int) -> None:
-        """The coordinator, in another process, knows the owners."""
+        """Do nothing: the coordinator, in another process, knows the owners."""
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """Ownership begins anew, with the vehicles where they are."""
+        """Start ownership anew, with the vehicles where they are."""
         self.reset(np.ones(len(self._stirred), dtype=np.bool_))
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
@@ -211,7 +214,7 @@ class ZoneEndpoints:
     # Messages
 
     def report(self, more: Sequence[Bytes] = ()) -> None:
-        """End the leases: DONE of all zones, and offers of vehicles that have crossed a border."""
+        """End the leases: send DONE of all zones, and offer vehicles that have crossed borders."""
         messages: list[tuple[int, Message]] = []
         reports, checked = [], self._is_checked
         for w in range(len(self._endpoints)):
@@ -230,7 +233,7 @@ class ZoneEndpoints:
         self._is_open = False
 
     def _rests(self, w: int) -> bool:
-        """End a quiet lease of a world of which there is nothing to tell; whether it is one."""
+        """End a quiet lease if there is nothing to report; return whether that is so."""
         endpoints = self._endpoints[w].values()
         if self._began[w] or self._stirred[w] or self._gone[w] or self._births[w]:
             return False
@@ -248,7 +251,7 @@ class ZoneEndpoints:
 
     def _complete(self, w: int) -> Iterable[Done]:
         gone, self._gone[w] = self._gone[w], {}
-        if gone and self._births[w]:  # what comes and goes within a lease is on no record
+        if gone and self._births[w]:  # a vehicle that comes and goes within a lease has no record
             born = {vehicle for vehicle, _ in self._births[w]} & gone.keys()
             self._births[w] = [birth for birth in self._births[w] if birth[0] not in born]
             gone = {vehicle: reason for vehicle, reason in gone.items() if vehicle not in born}
@@ -256,7 +259,7 @@ class ZoneEndpoints:
         kept: dict[int, int] = {}
         for vehicle, reason in gone.items():
             zone = next((z for z, e in self._endpoints[w].items() if vehicle in e.owned), None)
-            if zone is None:  # it has been born since the lease was given
+            if zone is None:  # it was born during the lease
                 kept[vehicle] = reason
             else:
                 left.setdefault(zone, []).append(Removed(vehicle, reason))
@@ -266,10 +269,10 @@ class ZoneEndpoints:
                 yield endpoint.complete(0, left.get(zone, ()))
 
     def _offer(self, w: int, began: bool) -> tuple[list[tuple[int, int, str]], bool]:
-        """Offer the vehicles that have crossed to the zones that they are in.
+        """Offer vehicles that have crossed a border to the zones that they are in.
 
         Returns:
-            movers of the report, and whether there are others that have crossed.
+            movers of the report, and whether vehicles without a record have crossed, too.
         """
         division, endpoints = self._division, self._endpoints[w]
         everybody, self._stirred[w] = self._stirred[w] or began, False
@@ -293,7 +296,7 @@ class ZoneEndpoints:
         return movers, is_late
 
     def receive(self, frame: NodeFrame) -> None:
-        """Take messages of other nodes as soon as they come."""
+        """Apply messages of other nodes as soon as they come."""
         messages = unpacked(frame.data)
         check_indices("world", (w for w, _ in messages), len(self._endpoints))
         for w, message in messages:
@@ -308,7 +311,7 @@ class ZoneEndpoints:
             if endpoint is None:
                 continue
             if isinstance(message, Prepare) and message.episode > endpoint.episode:
-                self._early.append((w, message))  # its node has had the lease of the episode first
+                self._early.append((w, message))  # the other node got its lease first
                 continue
             reaction = endpoint.on_message(message)
             if reaction.advance is not None:
@@ -317,7 +320,7 @@ class ZoneEndpoints:
                 self._send(w, answer)
 
     def _send(self, w: int, message: Message) -> None:
-        """To the nodes of its zones, which may be this one, and to the coordinator."""
+        """Send a message to its zones, some of which may be here, and to the coordinator."""
         for destination in message.destinations():
             if destination in self._zones:
                 self._apply_own(w, destination, message)
@@ -330,7 +333,7 @@ class ZoneEndpoints:
         for answer in reaction.messages:
             self._send(w, answer)
 
-    def _change_hands(self, w: int, leases: dict[int, Advance]) -> None:
+    def _change_owners(self, w: int, leases: dict[int, Advance]) -> None:
         division = self._division
         left = set()
         for zone, advance in leases.items():
@@ -346,12 +349,12 @@ class ZoneEndpoints:
                     self._await_agent(w, vehicle)
 
     def _agent(self, w: int, vehicle: int) -> int:
-        """The agent whose vehicle it is; -1: none."""
+        """Return the agent of a vehicle; -1: none."""
         zone, row = self._division.changes.find(w, vehicle)
         return int(self._division.owned(w, zone)["agent"][row])
 
     def _send_agent(self, w: int, vehicle: int) -> None:
-        """Send what is kept of an agent to the node that its vehicle goes to, if it is another."""
+        """Send the state of an agent to the node of its vehicle, if that is another node."""
         target = self._targets[w].pop(vehicle, -1)
         if target in self._zones:
             return
@@ -362,48 +365,48 @@ class ZoneEndpoints:
             self._links.send(self._node_of[target], FrameKind.AGENT, self._generation, pieces)
 
     def _await_agent(self, w: int, vehicle: int) -> None:
-        """Wait for the same from the node that its vehicle comes from."""
+        """Wait for the state of an agent from the node that its vehicle comes from."""
         agent = self._agent(w, vehicle)
         if agent < 0:
             return
-        if (w, vehicle) not in self._come:
+        if (w, vehicle) not in self._arrived_agents:
             others = {node for zone, node in enumerate(self._node_of) if zone not in self._zones}
-            self._links.wanted = others  # all but the silent one have sent their next share
-            while (w, vehicle) not in self._come:
+            self._links.wanted = others  # all but a silent node have sent their next share
+            while (w, vehicle) not in self._arrived_agents:
                 self._links.check_recovery()
                 self._links.pump(None)
             self._links.wanted = ()
-        data, at = self._come.pop((w, vehicle)), 0
+        data, at = self._arrived_agents.pop((w, vehicle)), 0
         for array in self._carried:
             kept = array[w, agent : agent + 1]
             kept[...] = np.frombuffer(data, array.dtype, kept.size, at).reshape(kept.shape)
             at += kept.nbytes
 
     def receive_agent(self, frame: NodeFrame) -> None:
-        """Take what another node had of an agent, until its vehicle comes."""
+        """Keep the state of an agent from another node until its vehicle comes."""
         if frame.number == self._generation:
             w, _ = _LENGTH.unpack_from(frame.data)
             vehicle = int(np.frombuffer(frame.data, np.int64, 1, _LENGTH.size)[0])
             check_indices("world", [w], len(self._endpoints))
             size = sum(array[0, 0].nbytes for array in self._carried)
             if len(frame.data) != _LENGTH.size + 8 + size:
-                raise MessageError(f"{len(frame.data)} bytes are not what is kept of an agent")
-            self._come[w, vehicle] = frame.data[_LENGTH.size + 8 :]
+                raise MessageError(f"{len(frame.data)} bytes are not the state of an agent")
+            self._arrived_agents[w, vehicle] = frame.data[_LENGTH.size + 8 :]
 
 
 def hostings_as_json(hostings: Sequence[Sequence[Hosting]]) -> list[list[list[int]]]:
-    """What hosts have to know, as JSON does; by worlds and zones."""
+    """Return hostings as a JSON value, by worlds and zones."""
     return [[[h.episode, h.tick, h.zone, h.incarnation] for h in some] for some in hostings]
 
 
 def hosting_of(run: bytes, numbers: Sequence[int]) -> Hosting:
-    """One of them, read."""
+    """Read a hosting from its JSON value."""
     episode, tick, zone, incarnation = numbers
     return Hosting(run, episode, tick, zone, incarnation, {})
 
 
 def packed(messages: Sequence[tuple[int, Message]]) -> bytes:
-    """Messages with the world of each, one after the other."""
+    """Encode messages, each with its world."""
     parts: list[bytes] = []
     for w, message in messages:
         data = encode(message)
@@ -412,11 +415,11 @@ def packed(messages: Sequence[tuple[int, Message]]) -> bytes:
 
 
 def unpacked(data: memoryview) -> list[tuple[int, Message]]:
-    """The same, read. Raises MessageError: it is none."""
+    """Decode messages with their worlds. Raises MessageError: the bytes are damaged."""
     found, at = [], 0
     while at < len(data):
         if at + _LENGTH.size > len(data):
-            raise MessageError("messages end inside a length")
+            raise MessageError("the messages are cut off")
         w, size = _LENGTH.unpack_from(data, at)
         at += _LENGTH.size
         found.append((w, decode(bytes(data[at : at + size]))))
@@ -425,30 +428,30 @@ def unpacked(data: memoryview) -> list[tuple[int, Message]]:
 
 
 def packed_report(messages: Sequence[tuple[int, Message]], reports: Sequence[Report]) -> bytes:
-    """Messages and what is said of each world, in whole words of 8 bytes; what follows may be."""
+    """Encode messages and the report of each world, in whole words of 8 bytes."""
     data = packed(messages)
-    said = b"" if all(map(NOTHING.__eq__, reports)) else json.dumps(reports).encode()
-    end = b" " * (-(len(data) + len(said)) % 8)
-    return _LENGTH.pack(len(data), len(said) + len(end)) + data + said + end
+    text = b"" if all(map(NOTHING.__eq__, reports)) else json.dumps(reports).encode()
+    end = b" " * (-(len(data) + len(text)) % 8)
+    return _LENGTH.pack(len(data), len(text) + len(end)) + data + text + end
 
 
 def read_report(
     data: memoryview,
     num_worlds: int,
 ) -> tuple[list[tuple[int, Message]], list[Report], memoryview]:
-    """Messages, what is said of each world, none where that is nothing, and what follows."""
+    """Return the messages, the reports of the worlds, empty if none has any, and the rest."""
     size, length = _LENGTH.unpack_from(data)
     if not size and not length:
         return [], [], data[_LENGTH.size :]
     at = _LENGTH.size
     messages = unpacked(data[at : at + size])
     end = at + size + length
-    said = bytes(data[at + size : end]).rstrip()
+    text = bytes(data[at + size : end]).rstrip()
     reports = [NOTHING] * num_worlds
-    if said:
-        reports = [Report(*report) for report in read_json(said, list)]
+    if text:
+        reports = [Report(*report) for report in read_json(text, list)]
         if len(reports) != num_worlds:
-            raise MessageError(f"it tells of {len(reports)} worlds: there are {num_worlds}")
+            raise MessageError(f"it has reports of {len(reports)} worlds: there are {num_worlds}")
     if len(data) < end:
-        raise MessageError(f"a report of {end} bytes has {len(data)}")
+        raise MessageError(f"a report of {end} bytes is cut off after {len(data)}")
     return messages, reports, data[end:]

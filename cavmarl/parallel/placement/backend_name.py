@@ -52,7 +52,7 @@ class BackendName:
         return self.address == MPI
 
     def is_split(self, num_worlds: int) -> bool:
-        """Return whether there are more processes or nodes than worlds, so that they share zones."""
+        """Return whether there are more processes or nodes than worlds, which share zones."""
         return self.count is not None and self.count > num_worlds
 
 

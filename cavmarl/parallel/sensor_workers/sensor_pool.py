@@ -171,8 +171,8 @@ class SensorWorkers:
         plan = self._plan
         scene = Segment.make(size_of(plan.shape.layout))
         self.shared = SceneArrays.of(scene, plan.shape)
-        told = {"shape": plan.shape, "scene": scene.fd, "frames": plan.frames.fd}
-        message = {**plan.message, **told}
+        shared = {"shape": plan.shape, "scene": scene.fd, "frames": plan.frames.fd}
+        message = {**plan.message, **shared}
         names = tuple(f"sensor worker {k}" for k in range(plan.shape.workers))
         tasks = tuple(task.name.lower() for task in SensorTask)
         program = Program(
