@@ -1,6 +1,6 @@
 """Doors for users: what is added by one file from outside gives the same bytes however it is run.
 
-The files are the examples of docs/extending.md.
+The files are the examples of docs/guides/extending.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cavmarl.core.errors import ConfigError, RegisteredFunctionError
 from cavmarl.core.extensions import REGISTERED_MODELS, REGISTERED_SENSORS, REGISTERED_TERMS
 from cavmarl.sensors.registry import sensor_names
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "guides" / "extending.md"
 ENV, AGENTS, BACKGROUND, STEPS = "grid4x4", 12, 40, 40
 KINDS = ("A term", "A sensor", "A driver model", "A backend")
 
@@ -196,13 +196,13 @@ def test_unknown_and_taken_names_are_refused() -> None:
         cavmarl.parallel_env(ENV, overrides={"sensors.registered": ["nose"]})
     with pytest.raises(ConfigError, match=r"backend = 'moon': there is no backend"):
         cavmarl.parallel_env(ENV, backend="moon")
-    with pytest.raises(ConfigError, match="cavmarl has a backend of this name"):
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
         cavmarl.register_term("speeding", nothing)
-    with pytest.raises(ConfigError, match="cavmarl has a backend of this name"):
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
         cavmarl.register_sensor("lidar", nothing, features=[cavmarl.Feature("a", "b")])
-    with pytest.raises(ConfigError, match="cavmarl has a backend of this name"):
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
         cavmarl.register_driver_model("EIDM", nothing)
-    with pytest.raises(ConfigError, match="cavmarl has a backend of this name"):
+    with pytest.raises(ConfigError, match="one of cavmarl's own"):
         cavmarl.register_backend("ray", nothing)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="Numba cannot compile"):
         cavmarl.register_driver_model("wrong", lambda *_: open("x"))  # type: ignore[arg-type,return-value]

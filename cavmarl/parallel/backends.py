@@ -55,7 +55,7 @@ def register_backend(name: str, make: MakeWorlds) -> None:
     if not name.isidentifier():
         raise ConfigError(f"backend {name!r}: a name has letters, digits and _ only")
     if name in OWN:
-        raise ConfigError(f"backend '{name}': cavmarl has a backend of this name; use another name")
+        raise ConfigError(f"backend '{name}': one of cavmarl's own; take another name")
     _REGISTERED[name] = make
 
 

@@ -312,7 +312,7 @@ def test_files_are_kept_by_what_is_in_them(tmp_path: Path) -> None:
     digest = hashlib.sha256(content).hexdigest()
     file = WorldFile("map.source", -1, "/nowhere/map.net.xml", digest)
     assert file.found() is None
-    with pytest.raises(MessageError, match="something else"):
+    with pytest.raises(MessageError, match="another SHA-256 digest"):
         file.keep(content[:-1])
     file.keep(content)
     assert file.found() == cache_dir() / "files" / digest / "map.net.xml"
@@ -320,7 +320,7 @@ def test_files_are_kept_by_what_is_in_them(tmp_path: Path) -> None:
     assert file.found() is None
     file.kept.unlink()
     file.kept.parent.rmdir()
-    with pytest.raises(MessageError, match="no SHA-256"):
+    with pytest.raises(MessageError, match="not an SHA-256 digest"):
         _ = file._replace(digest="../../x").kept
 
 

@@ -60,11 +60,11 @@ def test_the_bytes_of_a_frame() -> None:
 @pytest.mark.parametrize(
     ("said", "words"),
     [
-        (b"GET / HTTP/1.1\r\n" * 9, "begins no frame"),
-        (head(FrameKind.PING, MAX_FRAME + 1), "is none"),
+        (b"GET / HTTP/1.1\r\n" * 9, "does not start a frame"),
+        (head(FrameKind.PING, MAX_FRAME + 1), f"more than {MAX_FRAME}"),
         (b"cavN\x09\x00" + bytes(34), "version 9"),
         (head(255, 0), "kind 255"),
-        (frame(FrameKind.PING, b"abc")[:-1] + b"d", "not what was sent"),
+        (frame(FrameKind.PING, b"abc")[:-1] + b"d", "are damaged"),
         (2 * frame(FrameKind.SYNC, b"abc"), "not the next one"),
         (frame(FrameKind.SYNC, b"abc")[:-1], "has ended"),
     ],
@@ -91,13 +91,13 @@ def test_a_node_speaks_for_its_own_zones() -> None:
     coordinator.check(0, [(0, done[1])])
     coordinator.check(1, [(0, done[2])])
     for number, zone in ((0, 2), (1, 1), (0, 9)):
-        with pytest.raises(MessageError, match=f"node {number} speaks for zone {zone}"):
+        with pytest.raises(MessageError, match=f"node {number} sends for zone {zone}"):
             coordinator.check(number, [(0, done[zone])])
     others, theirs = pair()
     others.send(0, FrameKind.MESSAGES, 0, [packed([(0, done[2])])])
     with far, theirs:
         far.sendall(theirs.recv(1 << 16))
-        with pytest.raises(LinkLostError, match="speaks for zone 2"):
+        with pytest.raises(LinkLostError, match="sends for zone 2"):
             links.pump(1000.0)
     others.close()
 

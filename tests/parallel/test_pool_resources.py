@@ -101,7 +101,7 @@ def test_a_program_that_does_not_come_up() -> None:
     with pytest.raises(WorkerFailureError, match="no jobs today") as caught:
         Pool(program(2, fails="no jobs today"), 60.0, 3)
     assert "make_jobs" in caught.value.traceback
-    with pytest.raises(WorkerError, match="ended with 3"):
+    with pytest.raises(WorkerError, match="ended with exit status 3"):
         Pool(program(2, ends=3), 60.0, 3)
     del caught
     gc.collect()

@@ -98,5 +98,5 @@ def test_ray_understands_the_file_of_machines() -> None:
 
 def test_a_client_is_no_member(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "ray://127.0.0.1:10001")
-    with pytest.raises(ConfigError, match="on a node of the cluster"):
+    with pytest.raises(ConfigError, match="on a machine of the cluster"):
         make_vec("ring", backend="ray:1")

@@ -93,6 +93,6 @@ def test_a_copy_of_another_episode_is_written_anew() -> None:
 
 def test_what_nobody_has_written_is_refused() -> None:
     segment = Segment.make(FIRST_LOG_BYTES)
-    with pytest.raises(WorkerError, match="not what was written"):
+    with pytest.raises(WorkerError, match="is damaged"):
         KeptLog(segment).read()
     segment.close()

@@ -240,7 +240,9 @@ def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError
         )
     if not is_next:
         return MessageError("the head of a frame is damaged, or not the next one")
-    return MessageError(f"a frame has the unknown kind {code}, or {size} bytes are too many")
+    if code not in _KINDS:
+        return MessageError(f"a frame has the unknown kind {code}")
+    return MessageError(f"a frame has {size} bytes, more than {MAX_FRAME}")
 
 
 def read_list(frame: NodeFrame) -> list[Any]:

@@ -65,7 +65,7 @@ class PooledWorlds(CommandedWorlds):
                 config.zones,
                 "with workers.balance_steps and zones.repartition_steps: worlds move between "
                 "workers, each of which repartitions its own worlds",
-                "leave one of the three out",
+                "leave workers.balance_steps or zones.repartition_steps 0",
             )
         _warn_of_few_cores(workers)
         if not compiled_before():
