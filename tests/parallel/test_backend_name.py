@@ -82,7 +82,7 @@ def test_short_forms_stand_for_backends(arguments: dict[str, Any], text: str) ->
         ({"hosts": "ray"}, "hosts was removed: use backend='ray:N'"),
     ],
 )
-def test_what_cannot_be_is_refused(arguments: dict[str, Any], words: str) -> None:
+def test_bad_backends_are_refused(arguments: dict[str, Any], words: str) -> None:
     for make in (cavmarl.make_vec, cavmarl.parallel_env):
         with pytest.raises(ConfigError, match=words):
             make("ring", **arguments)

@@ -1,4 +1,4 @@
-"""Leases of several ticks, and vehicles that cross a border before they are on record."""
+"""Leases of several ticks, and vehicles that cross a border before they have a record."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WAIT_S = 0.1
 
 
 @pytest.mark.parametrize("ticks", range(1, 2 * MOST + 2))
-def test_leases_are_for_all_ticks_of_a_step(ticks: int) -> None:
+def test_a_lease_covers_the_ticks_of_a_step(ticks: int) -> None:
     config = stepped(ticks)
     each = lease_ticks(config)
     assert each <= MOST
@@ -43,13 +43,13 @@ def test_leases_are_for_all_ticks_of_a_step(ticks: int) -> None:
 
 
 def stepped(ticks: int) -> EnvConfig:
-    """Settings with so many ticks a step."""
+    """Return settings with this number of ticks per step."""
     overrides = {"clock.ctrl_dt_s": 0.05 * ticks, "clock.sim_dt_s": 0.05}
     overrides["horizon_s"] = 5.0 * ticks
     return load_config("grid4x4", zones=2, overrides=overrides)[0]
 
 
-def test_zones_see_as_far_as_their_vehicles_get_in_a_lease() -> None:
+def test_zones_see_as_far_as_vehicles_drive_in_a_lease() -> None:
     config, base_dir = load_config("grid4x4", zones=2, agents=1)
     world = make_world(config, base_dir)
     halos = [
@@ -61,7 +61,7 @@ def test_zones_see_as_far_as_their_vehicles_get_in_a_lease() -> None:
 
 
 class Wires:
-    """Links that keep what is sent; those to oneself carry it at once."""
+    """Links that keep what is sent, and deliver it at once to the coordinator."""
 
     def __init__(self) -> None:
         self.reports: list[list[Report]] = []
@@ -85,7 +85,7 @@ class Wires:
 
 
 def begun() -> tuple[ZoneEndpoints, NodeCoordinator, ZonedShards, Any]:
-    """Hosts of two zones at one node, that have begun an episode and not reported it."""
+    """Return endpoints of two zones at one node, before the report of a new episode."""
     config, base_dir = load_config("grid4x4", zones=2, agents=1, background=20)
     worlds = LocalWorlds(make_world(config, base_dir), 1)
     worlds.arrays.chosen[:] = True
@@ -102,11 +102,14 @@ def begun() -> tuple[ZoneEndpoints, NodeCoordinator, ZonedShards, Any]:
     return hosts, coordinator, division, wires
 
 
-def test_a_vehicle_that_crosses_before_it_is_on_record_is_offered_without_a_tick() -> None:
+def test_a_vehicle_that_crosses_before_it_has_a_record_is_offered_in_a_lease_of_no_ticks() -> None:
     hosts, coordinator, division, wires = begun()
     row = division.owned(0, 0)[0]
     there = division.owned(0, 1)[0]
-    row["x"], row["y"] = there["x"], there["y"]  # of zone 0 on record, and far behind the border
+    row["x"], row["y"] = (
+        there["x"],
+        there["y"],
+    )  # zone 0 owns it on record, but it is far beyond the border
 
     hosts.report()
     ((report,),) = wires.reports
@@ -119,7 +122,7 @@ def test_a_vehicle_that_crosses_before_it_is_on_record_is_offered_without_a_tick
     assert coordinator.switched == 1
 
 
-def test_an_offer_that_comes_before_the_lease_of_its_episode_is_answered_after_it() -> None:
+def test_an_offer_before_the_lease_of_its_episode_is_answered_after_the_lease() -> None:
     hosts, coordinator, division, wires = begun()
     hosts.report()
     table, row = coordinator._worlds[0].directory.table, division.owned(0, 0)[0]

@@ -15,7 +15,7 @@ from cavmarl.parallel.network.listener import MAGIC, VERSION, Listener, PendingC
 
 
 class Caller:
-    """The caller's end: lets in whoever comes, in a thread."""
+    """The end that listens: accepts one connection, in a thread."""
 
     def __init__(self, busy_s: float = 0.0) -> None:
         self.door = Listener("127.0.0.1")
@@ -50,7 +50,9 @@ class Caller:
 
 
 @pytest.mark.parametrize("busy_s", [0.0, 0.5])
-def test_who_knows_the_secret_comes_in(monkeypatch: pytest.MonkeyPatch, busy_s: float) -> None:
+def test_a_caller_with_the_secret_is_admitted(
+    monkeypatch: pytest.MonkeyPatch, busy_s: float
+) -> None:
     monkeypatch.setattr(listener_module, "CALL_S", 0.1)
     caller = Caller(busy_s)
     wire = call(caller.door.place, caller.door.secret, 5)
@@ -63,7 +65,7 @@ def test_who_knows_the_secret_comes_in(monkeypatch: pytest.MonkeyPatch, busy_s: 
     connection.close()
 
 
-def test_a_caller_who_does_not_know_the_secret_is_not_obeyed() -> None:
+def test_a_listener_with_another_secret_is_refused() -> None:
     caller = Caller()
     with pytest.raises(MessageError, match="does not know the secret"):
         call(caller.door.place, b"another", 5)
@@ -79,7 +81,7 @@ def test_a_caller_who_does_not_know_the_secret_is_not_obeyed() -> None:
         (b"ca", EOFError),
     ],
 )
-def test_strangers_stay_outside(said: bytes, error: type[Exception]) -> None:
+def test_strangers_are_refused(said: bytes, error: type[Exception]) -> None:
     caller = Caller()
     stranger = socket.create_connection(caller.door.place)
     stranger.sendall(said)
@@ -88,7 +90,7 @@ def test_strangers_stay_outside(said: bytes, error: type[Exception]) -> None:
     stranger.close()
 
 
-def test_nobody_is_there() -> None:
+def test_no_process_listens() -> None:
     door = Listener("127.0.0.1")
     door.close()
     with pytest.raises(OSError, match="refused"):

@@ -1,4 +1,4 @@
-"""Frames between nodes: their bytes, what is none, and who may say what."""
+"""Frames between nodes: their bytes, bad frames, and which node may send what."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def frame(kind: FrameKind, data: bytes | memoryview) -> bytes:
 
 
 def head(kind: int, size: int) -> bytes:
-    """The head of a first frame."""
+    """Return the head of a first frame."""
     found = b"cavN\x07\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
     found += bytes(8)
     return found + xxh3_64_intdigest(found, 1).to_bytes(8, "little")
@@ -69,7 +69,7 @@ def test_the_bytes_of_a_frame() -> None:
         (frame(FrameKind.SYNC, b"abc")[:-1], "has ended"),
     ],
 )
-def test_what_is_no_frame_ends_a_connection(said: bytes, words: str) -> None:
+def test_a_bad_frame_ends_the_connection(said: bytes, words: str) -> None:
     links, far = pair()
     far.sendall(said)
     far.close()
@@ -77,8 +77,8 @@ def test_what_is_no_frame_ends_a_connection(said: bytes, words: str) -> None:
         _ = [links.receive([0], WAIT_S) for _ in range(3)]
 
 
-def test_a_node_speaks_for_its_own_zones() -> None:
-    """One that says something of another's zone is cut off."""
+def test_a_node_sends_for_its_own_zones_only() -> None:
+    """A node that sends something about a zone of another node is disconnected."""
     links, far = pair()
     coordinator = NodeCoordinator([bytes(16)], [0, 0, 1], Limits(), links, [None])
     coordinator.host(Neighbours((frozenset((1,)), frozenset((0, 2)), frozenset((1,)))))
@@ -103,8 +103,8 @@ def test_a_node_speaks_for_its_own_zones() -> None:
 
 
 @pytest.mark.parametrize(("size", "bits"), [(3, None), (9999, 99)])
-def test_each_bit_of_a_frame_is_guarded(size: int, bits: int | None) -> None:
-    """None makes another frame of it, or lets the receiver wait for more."""
+def test_each_changed_bit_of_a_frame_is_noticed(size: int, bits: int | None) -> None:
+    """No changed bit makes another frame, or lets the receiver wait for more bytes."""
     drawn = np.random.default_rng(size)
     sent = frame(FrameKind.SYNC, drawn.bytes(size))
     every = 8 * len(sent)
@@ -124,7 +124,7 @@ def test_words_are_sent_as_bytes() -> None:
 
 
 @pytest.mark.parametrize("is_encrypted", [False, True])
-def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool) -> None:
+def test_bytes_that_the_system_does_not_accept_are_sent_later(is_encrypted: bool) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         ends = socket.create_connection(server.getsockname()), server.accept()[0]
     if is_encrypted:
@@ -142,7 +142,7 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
         near.send(0, FrameKind.SYNC, 2, [b"small"])
     alone = parts[0, :-1].copy()
     near.send(0, FrameKind.SHARE, 3, [alone.data])
-    alone[:] = 0  # its owner writes the next one there
+    alone[:] = 0  # the sender reuses its memory
     with ThreadPoolExecutor() as pool:
         flushed = pool.submit(near.flush)
         for part in parts:
@@ -160,7 +160,7 @@ def test_a_list_is_a_list(said: bytes) -> None:
         read_list(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
 
 
-def test_machines_that_vanish_are_missed() -> None:
+def test_connections_probe_silent_machines() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         connection = socket.create_connection(server.getsockname())
     links = Links(lambda number, frame: None)
@@ -174,11 +174,11 @@ def test_machines_that_vanish_are_missed() -> None:
     links.close()
 
 
-def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
+def test_a_call_of_an_earlier_generation_is_rejected() -> None:
     listener = MACHINE.listen("127.0.0.1", b"secret")
 
     def call(generation: int) -> int:
-        """How many bytes come until the connection ends, at most 1."""
+        """Return the number of bytes, at most 1, until the connection ends."""
         room = memoryview(bytearray(1))
         with closing(call_node(MACHINE, listener.place, b"secret", 2, generation, of=1)) as found:
             poll = MACHINE.poll()
@@ -190,7 +190,7 @@ def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
     with closing(listener), ThreadPoolExecutor() as callers:
         earlier = callers.submit(call, 6)
         (found,) = accept_nodes(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
-        found.close()  # the attempt has come to nothing
+        found.close()  # the attempt has failed
         assert earlier.result() == 0
         earlier = callers.submit(call, 6)
         present: list[object] = []

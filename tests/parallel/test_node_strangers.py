@@ -1,4 +1,4 @@
-"""Callers that are no nodes of the run, or none that are wanted, at real sockets."""
+"""Callers that are no nodes of the run, or are not needed, at real sockets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.parallel.test_node_joining import WAIT_S, elsewhere
 
 
 class Door:
-    """A caller's end, in a thread."""
+    """The end that nodes call, in a thread."""
 
     def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
         self.listener = TcpListener(address, key)
@@ -44,7 +44,7 @@ class Door:
         self.joining_nodes.close()
 
 
-def test_who_has_another_key_stays_outside() -> None:
+def test_a_node_with_another_key_is_refused() -> None:
     for address in ("127.0.0.1", elsewhere()):
         with closing(Door(b"a" * 32, address)) as door:
             with pytest.raises(MessageError, match="give both the same key"):
@@ -52,7 +52,7 @@ def test_who_has_another_key_stays_outside() -> None:
 
 
 def answer(server: socket.socket, said: bytes) -> threading.Thread:
-    """Somebody who answers the first caller, and ends."""
+    """Start a process that answers the first caller, and ends."""
 
     def run() -> None:
         connection, _ = server.accept()
@@ -65,7 +65,7 @@ def answer(server: socket.socket, said: bytes) -> threading.Thread:
     return thread
 
 
-def test_who_does_not_encrypt_stays_outside() -> None:
+def test_a_peer_without_encryption_is_refused() -> None:
     with closing(Door(b"a" * 32, elsewhere())) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
@@ -79,14 +79,16 @@ def test_who_does_not_encrypt_stays_outside() -> None:
         answering.join()
 
 
-def test_encryption_needs_its_library_from_the_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_for_encryption_is_noticed_at_the_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "cryptography", None)
     with pytest.raises(MissingExtraError, match="nodes"):
         Listener(elsewhere(), secrets.token_bytes(32))
     Listener("127.0.0.1").close()
 
 
-def test_another_version_is_told_which_one_is_spoken() -> None:
+def test_another_version_of_the_handshake_is_refused() -> None:
     with closing(Door(b"a" * 32)) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
@@ -106,7 +108,7 @@ def test_another_version_is_told_which_one_is_spoken() -> None:
         ("", 0, "no more nodes are wanted"),
     ],
 )
-def test_nodes_that_are_not_wanted(
+def test_nodes_that_are_not_needed_are_refused(
     monkeypatch: pytest.MonkeyPatch, code: str, room: int, words: str
 ) -> None:
     if code:
@@ -117,7 +119,7 @@ def test_nodes_that_are_not_wanted(
             run_node(door.listener.place, b"a" * 32, ANYONE)
 
 
-def test_who_has_come_in_and_talks_nonsense_is_sent_away() -> None:
+def test_an_admitted_caller_with_bad_frames_is_disconnected() -> None:
     with closing(Door(b"a" * 32)) as door:
         for said in (b"no JSON", b"[]", b"{}"):
             links = Links(lambda number, frame: None)

@@ -1,4 +1,4 @@
-"""States that a node keeps: two at most, and one once the newest has come everywhere."""
+"""Kept states of a node: at most two, and one once the newest has arrived everywhere."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Wires:
         self.sent.append((to, number))
 
 
-def test_older_states_go_when_the_newest_has_come_everywhere() -> None:
+def test_older_states_are_dropped_when_the_newest_has_arrived_everywhere() -> None:
     worlds, wires = Worlds(), Wires()
     kept = StateReplicas(worlds, (), wires, 1)  # type: ignore[arg-type]
     for state in (1, 2, 3):
@@ -40,7 +40,7 @@ def test_older_states_go_when_the_newest_has_come_everywhere() -> None:
     assert (list(kept._own), list(kept._others[0])) == ([3], [3, 4]), "all may go back to 3"
 
 
-def test_arrays_are_written_as_numpy_writes_them() -> None:
+def test_arrays_have_the_format_of_numpy() -> None:
     rows = np.zeros(5, dtype=np.dtype([("id", np.int64), ("is_near", np.bool_)], align=True))
     rows["id"] = np.arange(5)
     arrays = [rows, rows[:0], np.zeros((2, 0)), np.arange(6).reshape(2, 3).T, np.ones(1, np.bool_)]
