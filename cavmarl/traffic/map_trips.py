@@ -173,7 +173,8 @@ class MapTrips:
     ) -> NDArray[np.int32]:
         """Return `_fitting`, thinned to at most `MAX_TRIPS` trips.
 
-        Raises ConfigError: there are none."""
+        Raises ConfigError: there are none.
+        """
         trips = self._fitting(plans, origins, goals, limits_m)
         if not len(trips):
             raise self._no_trip(plans["to_go"][np.ix_(goals, origins)], limits_m)

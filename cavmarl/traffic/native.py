@@ -434,7 +434,7 @@ class NativeTraffic:
     def accept(
         self, departures: DepartureQueue, worlds: Worlds, running: NDArray[np.int64]
     ) -> None:
-        """Choose among vehicles that could enter; `running` (W,): vehicles already in the worlds."""
+        """Choose which vehicles enter; `running` (W,): vehicles already in each world."""
         calls = self.calls(departures, worlds.ticks, worlds.keys)
         np.copyto(calls.running, running)
         calls.accept()
