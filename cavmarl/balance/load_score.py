@@ -162,10 +162,10 @@ def admissible(
     out = {rejection.worker for rejection in rejections}
     left = [candidate for candidate in candidates if candidate.worker not in out]
     if not left:
-        said = "; ".join(map(str, rejections)) or "there are no workers"
+        reasons = "; ".join(map(str, rejections)) or "there are no workers"
         raise NoAdmissibleWorkerError(
-            f"no admissible worker: {said}. Wait until they are less busy, add workers, or raise "
-            "the thresholds",
+            f"no admissible worker: {reasons}. Wait until they are less busy, add workers, or "
+            "raise the thresholds",
             tuple(rejections),
         )
     return tuple(sorted(left, key=lambda one: one.worker))

@@ -165,6 +165,6 @@ def _real(value: object, name: str) -> float:
 
 
 def _none(name: str, value: object, needed: str) -> ConfigError:
-    said = repr(value)
-    shown = said if len(said) <= LONGEST else f"{said[:LONGEST]}…"
+    text = repr(value)
+    shown = text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
     return ConfigError(f"not a plan: {name} is {shown}, must be {needed}")

@@ -105,7 +105,7 @@ class Surveyor:
         env = self._env
         for step in range(steps):
             for world in range(len(self._drives)):
-                self._look(world)
+                self._read_sensors(world)
             env.step(env.suggest_actions())
             told(step + 1)
         for world in range(len(self._drives)):
@@ -116,13 +116,13 @@ class Surveyor:
         named = Cloud(f"survey of '{env.network.name}'", cloud, counts)
         return Survey(named, self._frames, self._ended, off[:, 0], off[:, 1], off[:, 2])
 
-    def _look(self, world: int) -> None:
+    def _read_sensors(self, world: int) -> None:
         """Add the sensor samples of one world's vehicle from the last step."""
         env = self._env
         tick = int(env.worlds.ticks()[world])
-        sight = sight_of(*take_snapshot(env, [0], SnapshotTime(0, 0, tick, False), world))
-        view = sight.snapshot.vehicles.get(env.possible_agents[0])
-        time_s = sight.snapshot.time_s
+        seen = sight_of(*take_snapshot(env, [0], SnapshotTime(0, 0, tick, False), world))
+        view = seen.snapshot.vehicles.get(env.possible_agents[0])
+        time_s = seen.snapshot.time_s
         drive = self._drives[world]
         if drive is not None and (view is None or view.vehicle_id != drive.vehicle_id):
             self._end(world)
@@ -132,7 +132,7 @@ class Surveyor:
             drive = None
         if view is None:
             return
-        readings = sight.sensors[env.possible_agents[0]]
+        readings = seen.sensors[env.possible_agents[0]]
         if drive is None:
             drive = self._drives[world] = self._begin(view.vehicle_id, time_s)
         mission = Mission(0, view.vclass, view.length_m, view.width_m)

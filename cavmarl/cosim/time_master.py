@@ -181,7 +181,7 @@ class TimeFollower:
         self.master.let_go(self)
 
 
-class _Mastered:
+class _GuardedWorlds:
     """Guards an environment's worlds: only their master can step and reset them."""
 
     def __init__(self, worlds: _Worlds, master: TimeMaster) -> None:
@@ -236,7 +236,7 @@ class TimeMaster:
         on_drift: Literal["error", "record"] = "error",
         trace: StepTrace | None = None,
     ) -> None:
-        if isinstance(env.worlds, _Mastered):
+        if isinstance(env.worlds, _GuardedWorlds):
             raise ClockError(
                 "this environment has a time master already; follow it (TimeMaster.follow), or "
                 "release it first (TimeMaster.release)"
@@ -256,7 +256,7 @@ class TimeMaster:
         if trace is not None:
             worlds.simulation.trace(trace.around, trace.note)
         self._left = worlds.ticks()
-        self._mastered = env.worlds = _Mastered(worlds, self)
+        self._guard = env.worlds = _GuardedWorlds(worlds, self)
 
     @property
     def time_s(self) -> float:
@@ -265,7 +265,7 @@ class TimeMaster:
     @property
     def world_ticks(self) -> NDArray[np.int64]:
         """(W,) ticks of each world since its reset, made by any caller."""
-        return self._mine().ticks()
+        return self._guarded_worlds().ticks()
 
     @property
     def followers(self) -> tuple[TimeFollower, ...]:
@@ -295,26 +295,26 @@ class TimeMaster:
 
     def release(self) -> None:
         """Release the environment, which can then be stepped without a master."""
-        self.env.worlds = self._mine()
+        self.env.worlds = self._guarded_worlds()
         self._followers.clear()
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
-        self._mine()
+        self._guarded_worlds()
         self._is_turn = True
         try:
             yield
         finally:
             self._is_turn = False
 
-    def _mine(self) -> _Worlds:
+    def _guarded_worlds(self) -> _Worlds:
         """Return the guarded worlds.
 
         Raises ClockError: they have been released.
         """
-        if self.env.worlds is not self._mastered:
+        if self.env.worlds is not self._guard:
             raise ClockError("this master has been released; make another TimeMaster")
-        worlds: _Worlds = self._mastered.worlds
+        worlds: _Worlds = self._guard.worlds
         return worlds
 
     def check_turn(self, what: str) -> None:
@@ -357,7 +357,7 @@ class TimeMaster:
 
         Raises ClockError: there are some, and `on_drift` is `error`.
         """
-        found = self._mine().ticks()
+        found = self._guarded_worlds().ticks()
         if (found == self._left).all():
             return
         (drifted,) = np.nonzero(found != self._left)
@@ -388,7 +388,7 @@ class TimeMaster:
             )
         if self._answer == "ignore" or self._last is None:
             return False
-        self._mine().step(self._last)
+        self._guarded_worlds().step(self._last)
         return True
 
     def _keep(self, event: ClockEvent) -> None:

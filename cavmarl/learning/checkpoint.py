@@ -85,7 +85,7 @@ def _broken(path: Path, why: str) -> TrainingError:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """While a file of a run is written, convert OSError to a TrainingError that says what to do."""
+    """Convert OSError, while a file of a run is written, to a TrainingError with a cure."""
     try:
         yield
     except OSError as error:

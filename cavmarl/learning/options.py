@@ -120,13 +120,13 @@ def run_folder(runs: str, name: str, env: str, program: str, seed: int, resume: 
     return Path(runs) / (name or f"{stem}_{program}_{seed}")
 
 
-def run_program(train: Callable[[], Path], said: str = DRIVER) -> int:
+def run_program(train: Callable[[], Path], message: str = DRIVER) -> int:
     """Train, print the folder that `train` returns, and return the exit code.
 
     0: trained; 2: wrong usage or an error; 130: interrupted.
     """
     return run_to_end(
-        lambda: print(said.format(folder=train())),
+        lambda: print(message.format(folder=train())),
         "use --resume to continue from the last checkpoint",
     )
 

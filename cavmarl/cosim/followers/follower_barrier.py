@@ -108,7 +108,7 @@ class Barrier:
                     try:
                         if not ready:
                             raise seat.line.too_late("answered", self._timeout_s)
-                        if not self._hear(seat, moment, answers, found, left_s):
+                        if not self._receive(seat, moment, answers, found, left_s):
                             continue
                     except FollowerError as error:
                         found.failed[seat] = error
@@ -118,7 +118,7 @@ class Barrier:
         last.slowest += 1
         return answers
 
-    def _hear(
+    def _receive(
         self,
         seat: FollowerSeat,
         moment: SnapshotTime,
@@ -132,9 +132,9 @@ class Barrier:
         """
         # A frame that arrived just before the deadline is still read.
         within_s = max(within_s, 1e-3)
-        heard = seat.line.hear(within_s)
-        seat.line.skip(heard)
-        match heard.kind:
+        frame = seat.line.hear(within_s)
+        seat.line.skip(frame)
+        match frame.kind:
             case Say.TICK:
                 self._answer_tick(seat, within_s)
                 return False
@@ -142,7 +142,7 @@ class Barrier:
                 found.left.append(seat)
                 return True
             case Say.CONTROL:
-                control = read_payload(Control, heard.payload)
+                control = read_payload(Control, frame.payload)
             case kind:
                 raise FollowerError(
                     f"{seat.line.name} sent {kind.name}; controls of frame {moment.frame} are due"
@@ -173,10 +173,10 @@ class Barrier:
 
         Raises FollowerError: an action is invalid, and `bad_controls` is `error`.
         """
-        strangers = controls.keys() - set(vehicles)
-        if strangers:
+        unknown = controls.keys() - set(vehicles)
+        if unknown:
             raise FollowerError(
-                f"{seat.line.name}: controls of {min(strangers)[:80]}, which is not in the frame"
+                f"{seat.line.name}: controls of {min(unknown)[:80]}, which is not in the frame"
             )
         checked: dict[str, Any] = {}
         for vehicle in vehicles:

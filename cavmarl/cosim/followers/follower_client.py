@@ -48,7 +48,7 @@ class Follower:
     """Follows a world's clock: waits for snapshots and answers them.
 
         with Follower("/tmp/town.sock", vehicles=["car_0"]) as follower:
-            for sight in follower:
+            for view in follower:
                 follower.answer({"car_0": [0.2, 0.0]})
 
     `address`: path of a Unix socket, or a port of this machine. `vehicles`: agents to drive; none:
@@ -93,18 +93,18 @@ class Follower:
         Raises FollowerLostError: the world has ended without a goodbye; FollowerError: the world
         refuses this follower, its message is invalid, or a frame is missing.
         """
-        while (sight := self.wait()) is not None:
-            yield sight
+        while (view := self.wait()) is not None:
+            yield view
 
     def wait(self) -> FollowerView | None:
         """Return the next snapshot without time limit; None: the world has sent goodbye.
 
         Raises FollowerError: as of `__iter__`.
         """
-        heard = self._expect(None, Say.SNAPSHOT, Say.GOODBYE)
-        if heard.kind is Say.GOODBYE:
+        frame = self._expect(None, Say.SNAPSHOT, Say.GOODBYE)
+        if frame.kind is Say.GOODBYE:
             return None
-        snapshot, arrays = self._line.take(heard)
+        snapshot, arrays = self._line.take(frame)
         if self._frame is not None and snapshot.frame != self._frame + 1:
             raise FollowerError(f"frame {snapshot.frame} follows {self._frame}; a frame is missing")
         self._frame = snapshot.frame
@@ -145,15 +145,15 @@ class Follower:
         self._line.close()
 
     def _expect(self, within_s: float | None, *kinds: Say) -> ReceivedFrame:
-        heard = self._line.hear(within_s)
-        if heard.kind in kinds:
-            if heard.kind is not Say.SNAPSHOT:
-                self._line.skip(heard)
-            return heard
-        if heard.kind is Say.REFUSAL:
-            self._line.skip(heard)
-            raise FollowerError(read_payload(FollowerRefusal, heard.payload).reason)
-        raise FollowerError(f"{self._line.name} sent {heard.kind.name}, which is not expected now")
+        frame = self._line.hear(within_s)
+        if frame.kind in kinds:
+            if frame.kind is not Say.SNAPSHOT:
+                self._line.skip(frame)
+            return frame
+        if frame.kind is Say.REFUSAL:
+            self._line.skip(frame)
+            raise FollowerError(read_payload(FollowerRefusal, frame.payload).reason)
+        raise FollowerError(f"{self._line.name} sent {frame.kind.name}, which is not expected now")
 
 
 def sight_of(snapshot: FollowerSnapshot, arrays: Sequence[NDArray[Any]]) -> FollowerView:

@@ -55,7 +55,7 @@ class ReceivedFrame(NamedTuple):
     size: int  # number of bytes of its data
 
 
-class _Patient(socket.socket):
+class _DeadlineSocket(socket.socket):
     """A socket with one deadline for all calls, and with a buffer for reading ahead."""
 
     until_s: float | None = None  # by `time.monotonic`; None: no deadline
@@ -76,7 +76,7 @@ class _Patient(socket.socket):
                 self.ahead += more
         return len(self.ahead) >= size
 
-    def _hurry(self) -> None:
+    def _set_timeout(self) -> None:
         if self.until_s is None:
             self.settimeout(None)
             return
@@ -90,11 +90,11 @@ class _Patient(socket.socket):
             count = min(len(buffer), len(self.ahead))
             buffer[:count], self.ahead = self.ahead[:count], self.ahead[count:]
             return count
-        self._hurry()
+        self._set_timeout()
         return super().recv_into(buffer, *arguments, **named)
 
     def sendmsg(self, *arguments: Any, **named: Any) -> int:
-        self._hurry()
+        self._set_timeout()
         return super().sendmsg(*arguments, **named)
 
 
@@ -106,7 +106,7 @@ class FollowerConnection:
     """
 
     def __init__(self, connection: socket.socket, name: str, cure: str = "") -> None:
-        self._socket = _Patient(fileno=connection.detach())
+        self._socket = _DeadlineSocket(fileno=connection.detach())
         self._wire = FramedSocket(self._socket, FOLLOWERS)
         self.name = name
         self._cure = f"; {cure}" if cure else ""
@@ -132,9 +132,9 @@ class FollowerConnection:
         Raises:
             FollowerLostError: the other end does not read, or has ended.
         """
-        self._allow(within_s)
+        self._set_deadline(within_s)
         payload = None if message is None else payload_of(message)
-        with self._blaming("read", within_s):
+        with self._peer_errors("read", within_s):
             self._wire.send(kind, 0, payload, arrays)
 
     def hear(self, within_s: float | None = None) -> ReceivedFrame:
@@ -143,8 +143,8 @@ class FollowerConnection:
         Raises FollowerLostError: none arrives in time, or the other end has ended; FollowerError:
         the frame is invalid or of another version.
         """
-        self._allow(within_s)
-        with self._blaming("answered", within_s):
+        self._set_deadline(within_s)
+        with self._peer_errors("answered", within_s):
             frame = self._wire.receive()
         return ReceivedFrame(Say(frame.kind), frame.payload, frame.size)
 
@@ -153,33 +153,33 @@ class FollowerConnection:
 
         Raises FollowerError: as of `hear`.
         """
-        with self._blaming("introduced itself", None):
+        with self._peer_errors("introduced itself", None):
             if not self._socket.read_ahead(HEAD_BYTES):
                 return False
             head = self._socket.ahead[:HEAD_BYTES]
             return self._socket.read_ahead(bytes_before_data(head, FOLLOWERS))
 
-    def skip(self, heard: ReceivedFrame) -> None:
+    def skip(self, frame: ReceivedFrame) -> None:
         """Check that a frame has no data, and finish reading it.
 
         Raises FollowerError: as of `hear`; or the frame has data.
         """
-        if heard.size:
+        if frame.size:
             raise FollowerError(
-                f"{self.name}: {heard.size} bytes of data with a {heard.kind.name}, which has none"
+                f"{self.name}: {frame.size} bytes of data with a {frame.kind.name}, which has none"
             )
         self._take([])
 
-    def take(self, heard: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
+    def take(self, frame: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
         """Return the snapshot of a frame, with its arrays.
 
         Raises FollowerError: as of `hear`.
         """
-        snapshot = read_payload(FollowerSnapshot, heard.payload)
+        snapshot = read_payload(FollowerSnapshot, frame.payload)
         sizes = [_size(view) for view in snapshot.arrays]
-        if sum(sizes) != heard.size:
+        if sum(sizes) != frame.size:
             raise FollowerError(
-                f"{self.name}: {heard.size} bytes of data, but its arrays have {sum(sizes)}"
+                f"{self.name}: {frame.size} bytes of data, but its arrays have {sum(sizes)}"
             )
         arrays = [np.empty(view.shape, dtype=view.dtype) for view in snapshot.arrays]
         self._take(arrays)
@@ -189,11 +189,11 @@ class FollowerConnection:
         self._wire.close()
 
     def _take(self, arrays: list[Array]) -> None:
-        with self._blaming("sent its data", None):
+        with self._peer_errors("sent its data", None):
             self._wire.take(arrays)
 
     @contextmanager
-    def _blaming(self, what: str, within_s: float | None) -> Iterator[None]:
+    def _peer_errors(self, what: str, within_s: float | None) -> Iterator[None]:
         """Raise errors of the connection as errors of the other end, which had to do `what`."""
         try:
             yield
@@ -204,11 +204,11 @@ class FollowerConnection:
         except MessageError as error:
             raise FollowerError(f"{self.name}: {error}") from error
 
-    def _allow(self, within_s: float | None) -> None:
+    def _set_deadline(self, within_s: float | None) -> None:
         self._socket.until_s = None if within_s is None else time.monotonic() + within_s
 
     def too_late(self, what: str, within_s: float | None) -> FollowerLostError:
-        """Return the error for the other end not having done `what` in time."""
+        """Return the error of a peer that has not done `what` in time."""
         span = "in time" if within_s is None else f"within {within_s:.3g} s"
         return FollowerLostError(
             f"{self.name} has not {what} {span}; it is dead, stopped or too slow{self._cure}",
@@ -254,7 +254,7 @@ def listen(address: Address) -> socket.socket:
         except (OSError, OverflowError) as error:
             raise ConfigError(f"port {address}: cannot be opened ({error}); use another") from error
     path = _path_of(address)
-    _remove_leftover(path)
+    _remove_dead_socket(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     before = os.umask(0o177)
     try:
@@ -293,7 +293,7 @@ def _path_of(address: str | Path) -> Path:
     return path
 
 
-def _remove_leftover(path: Path) -> None:
+def _remove_dead_socket(path: Path) -> None:
     """Remove the socket of a world that has died, but no other file."""
     if not path.exists() or not stat.S_ISSOCK(path.stat().st_mode):
         return
@@ -351,8 +351,8 @@ class Reception:
         Args:
             within_s: how long to wait for the first; 0: not at all.
         """
-        heard = self._selector.select(within_s)
-        for key, _ in sorted(heard, key=lambda found: found[0].fd):
+        ready = self._selector.select(within_s)
+        for key, _ in sorted(ready, key=lambda found: found[0].fd):
             if key.fileobj is self._listener:
                 self._open()
                 continue
@@ -369,7 +369,7 @@ class Reception:
                 continue
             self._forget(line)
             yield line, hello
-        self._dismiss_the_silent()
+        self._drop_silent_callers()
 
     def turn_away(self, line: FollowerConnection, reason: str) -> None:
         self.turned_away += 1
@@ -390,32 +390,32 @@ class Reception:
                 connection, _ = self._listener.accept()
             except OSError as error:  # no more callers, or the caller has already gone
                 if error.errno in (errno.EMFILE, errno.ENFILE):
-                    self._find_descriptor()
+                    self._free_descriptor()
                 return
             line = FollowerConnection(connection, "a caller", GOES_ON)
             if len(self._since) == MAX_CALLERS:
-                self._dismiss_the_oldest("too many callers have not introduced themselves")
+                self._drop_oldest_caller("too many callers have not introduced themselves")
             self._since[line] = time.monotonic()
             self._selector.register(line, selectors.EVENT_READ, line)
 
-    def _find_descriptor(self) -> None:
+    def _free_descriptor(self) -> None:
         """Free a file descriptor by dropping a caller; without callers, wait."""
         if self._since:
-            self._dismiss_the_oldest("this process has no descriptors left")
+            self._drop_oldest_caller("this process has no descriptors left")
         else:
             time.sleep(NO_DESCRIPTORS_S)
 
-    def _dismiss_the_oldest(self, reason: str) -> None:
+    def _drop_oldest_caller(self, reason: str) -> None:
         line = next(iter(self._since))
         self._forget(line)
         self.turn_away(line, reason)
 
     def _greeting(self, line: FollowerConnection) -> Hello:
-        heard = line.hear()
-        if heard.kind is not Say.HELLO:
-            raise FollowerError(f"a caller sent {heard.kind.name} first; it must be HELLO")
-        line.skip(heard)
-        hello = read_payload(Hello, heard.payload)
+        frame = line.hear()
+        if frame.kind is not Say.HELLO:
+            raise FollowerError(f"a caller sent {frame.kind.name} first; it must be HELLO")
+        line.skip(frame)
+        hello = read_payload(Hello, frame.payload)
         if self._secret and not compare_digest(hello.secret.encode(), self._secret):
             raise FollowerError("a caller does not know the secret of this world")
         if not hello.name.isprintable():
@@ -427,7 +427,7 @@ class Reception:
         line.name = f"follower '{hello.name[:80]}'"
         return hello
 
-    def _dismiss_the_silent(self) -> None:
+    def _drop_silent_callers(self) -> None:
         for line, since in list(self._since.items()):
             if time.monotonic() - since > GREETING_S:
                 self._forget(line)

@@ -51,16 +51,16 @@ class StackDriver:
         self.stacks: dict[str, Stack] = {}
         Stack(self._vehicle, self._config)  # reports missing sensors before the first snapshot
 
-    def drive(self, sight: FollowerView) -> dict[str, list[float]]:
+    def drive(self, snapshot_view: FollowerView) -> dict[str, list[float]]:
         """Return the controls of a snapshot's vehicles; a new vehicle gets a new stack."""
-        signals = sight.sensors.get("", {}).get("signals")
+        signals = snapshot_view.sensors.get("", {}).get("signals")
         shown = None if signals is None else np.asarray(signals.values[-1], dtype=np.uint8)
         controls = {}
-        for agent, view in sight.snapshot.vehicles.items():
-            stack = self._stack_of(agent, sight.snapshot.episode, view.vehicle_id)
+        for agent, view in snapshot_view.snapshot.vehicles.items():
+            stack = self._stack_of(agent, snapshot_view.snapshot.episode, view.vehicle_id)
             mission = self._mission(view)
-            readings = sight.sensors.get(agent, {})
-            driven = stack.drive(readings, shown, mission, sight.snapshot.time_s)
+            readings = snapshot_view.sensors.get(agent, {})
+            driven = stack.drive(readings, shown, mission, snapshot_view.snapshot.time_s)
             numbers = np.array(driven) / self._scale
             controls[agent] = np.clip(numbers, -1.0, 1.0).tolist()
         return controls

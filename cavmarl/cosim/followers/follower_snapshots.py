@@ -82,9 +82,9 @@ def take_snapshot(
                 data = np.ascontiguousarray(seen.data)
                 views.append(_array(name, sensor, data, seen.stamp_s, seen.lost))
                 arrays.append(data)
-            heard = by_agent[k].heard
-            if heard is not None:
-                data = np.array(heard, dtype=np.int32).reshape(1, -1, 3)
+            messages = by_agent[k].heard
+            if messages is not None:
+                data = np.array(messages, dtype=np.int32).reshape(1, -1, 3)
                 views.append(_array(name, SPAT, data, np.array([time_s]), np.zeros(1, np.bool_)))
                 arrays.append(data)
         shown = _signals(env, world)

@@ -90,13 +90,13 @@ class GnssInertial:
         elif elapsed_s > 0.0:
             self._predict(readings, mission, elapsed_s)
         if fix is not None:
-            self._take_fix(fix)
+            self._update_by_fix(fix)
         speed = self._newest(readings, "odometry")
         if speed is not None:
             deviation = self._deviation("odometry", 0, _LEAST["odometry"])
             ahead = float(speed[0]) - float(self._get()[3])
-            self._take(np.array([0.0, 0.0, 0.0, 1.0]), ahead, deviation, gate=math.inf)
-        self._take_lane(readings)
+            self._update(np.array([0.0, 0.0, 0.0, 1.0]), ahead, deviation, gate=math.inf)
+        self._update_by_lane(readings)
         return self._pose()
 
     def _pose(self) -> EgoPose:
@@ -109,7 +109,7 @@ class GnssInertial:
         self._spread = np.diag([*deviations, self.bias_m, self.bias_m]) ** 2
 
     def _set_by_fix(self, place: Sequence[float], deviations: Sequence[float]) -> None:
-        """As `_set`, with a position from a fix, whose error includes the bias."""
+        """Set the state as `_set`, by the position of a fix, whose error includes the bias."""
         self._set(place, deviations)
         for axis in (0, 1):
             self._spread[axis, axis] += self.bias_m**2
@@ -197,14 +197,14 @@ class GnssInertial:
         wheels = self._newest(readings, "odometry")
         return 0.0, self._yaw_rate if wheels is None else float(wheels[1])
 
-    def _take_fix(self, fix: tuple[float, float]) -> None:
+    def _update_by_fix(self, fix: tuple[float, float]) -> None:
         state = self._get()
         x_m, y_m = _centre(fix, self._by_type["gnss"].mount, float(state[2]))
         for axis, seen in enumerate((x_m, y_m)):
             row = np.zeros(_SIZE)
             row[axis] = row[4 + axis] = 1.0
             deviation = self._deviation("gnss", axis, _LEAST["gnss"])
-            self._take(row, seen - float(row @ self._get()), deviation, gate=math.inf)
+            self._update(row, seen - float(row @ self._get()), deviation, gate=math.inf)
         self._compare_course(fix)
 
     def _compare_course(self, fix: tuple[float, float]) -> None:
@@ -220,7 +220,7 @@ class GnssInertial:
         self._anchor = fix
         self._driven_m = self._turned_rad = 0.0
 
-    def _take_lane(self, readings: Readings) -> None:
+    def _update_by_lane(self, readings: Readings) -> None:
         seen = self._newest(readings, "lane_boundary")
         if seen is None:
             return
@@ -241,12 +241,12 @@ class GnssInertial:
         _, place = min(candidates, key=lambda found: found[0])
         row = np.array([-math.sin(place.heading_rad), math.cos(place.heading_rad), 0.0, 0.0])
         deviation = self._deviation("lane_boundary", 0, _LEAST["lane_d"])
-        if self._take(row, offset - place.d_m, deviation):
+        if self._update(row, offset - place.d_m, deviation):
             turn = wrap(place.heading_rad + float(seen[3]) - float(self._get()[2]))
             deviation = self._deviation("lane_boundary", 3, _LEAST["lane_heading"])
-            self._take(np.array([0.0, 0.0, 1.0, 0.0]), turn, deviation)
+            self._update(np.array([0.0, 0.0, 1.0, 0.0]), turn, deviation)
 
-    def _take(
+    def _update(
         self, row: NDArray[np.float64], surprise: float, deviation: float, gate: float = _GATE
     ) -> bool:
         """Update the state by one number; return whether it was accepted.

@@ -64,13 +64,13 @@ class LidarObjects:
                 scan = np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
                 echoes.extend(_groups(lidar, scan, pose))
         if echoes:
-            self._look(readings, pose, echoes)
+            self._read_others(readings, pose, echoes)
             boxes = [box for group in echoes if (box := self._box(group, pose)) is not None]
             self._last = [self._follow(box, time_s) for box in boxes]
             self._tracks = [track for track in self._tracks if time_s - track.seen_s < _FORGET_S]
         return self._last
 
-    def _look(
+    def _read_others(
         self, readings: Readings, pose: EgoPose, groups: Sequence[NDArray[np.float64]]
     ) -> None:
         """Read other sensors before groups of echoes (n, 2) are classified."""

@@ -48,7 +48,7 @@ _LEAST_M = 0.1
 _BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # of fixes, and its change per second
 _SURE_M = 0.5  # standard deviation of the position below which a scan is tried only there
 _SIGMAS, _STEPS = 2.5, 6  # else: radius of the search in deviations, steps to each side
-_TRIED, _TRY_EVERY = 150, 5  # echoes used of a scan, and every which scan
+_TRIED, _TRY_EVERY = 150, 5  # echoes used per try, and scans between tries
 _FIRST_TRIED = 3  # best places that are then matched fully
 _FAR_COST = 0.05  # penalty at the edge of the tried area, as a share of fitting echoes
 _LOST_SCANS = 20  # consecutive scans without a fit after which the position is unknown
@@ -89,7 +89,7 @@ class ScanMatching(GnssInertial):
         self._walls = _Walls(cloud)
         self.matched = self.refused = 0  # number of scans
         self.lost = 0  # number of times that the position was lost
-        self._astray = 0  # consecutive scans without a fit
+        self._num_unmatched = 0  # consecutive scans without a fit
         self._next_try = 0  # scans until one is tried at many places
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
@@ -101,8 +101,8 @@ class ScanMatching(GnssInertial):
         fits = self._match(lidar_points(self._lidar, scan, _RANGE_M))
         self.matched += fits
         self.refused += not fits
-        self._astray = 0 if fits else self._astray + 1
-        if self._astray >= _LOST_SCANS:
+        self._num_unmatched = 0 if fits else self._num_unmatched + 1
+        if self._num_unmatched >= _LOST_SCANS:
             self._forget()
         return self._pose()
 
@@ -111,7 +111,7 @@ class ScanMatching(GnssInertial):
         state = self._get()
         place = (state[:2] + self.bias).tolist()
         self._set_by_fix((*place, float(state[2]), float(state[3])), (1.0, 1.0, 0.1, 1.0))
-        self._astray = self._next_try = 0
+        self._num_unmatched = self._next_try = 0
         self.lost += 1
 
     def _match(self, echoes: Points) -> bool:
@@ -130,7 +130,7 @@ class ScanMatching(GnssInertial):
             return False
         if self._apart(best.pose) > _GATE:
             return False
-        self._take_match(target, best)
+        self._update_by_match(target, best)
         return True
 
     def _apart(self, pose: Points) -> float:
@@ -161,7 +161,7 @@ class ScanMatching(GnssInertial):
             starts.append(start)
         return starts
 
-    def _take_match(self, target: Target, fit: _Fit) -> None:
+    def _update_by_match(self, target: Target, fit: _Fit) -> None:
         """Update position and heading, as far as the normals of pairs determine them."""
         normals = _normals(target, fit)
         free = [
@@ -185,7 +185,7 @@ class ScanMatching(GnssInertial):
             off[2] = wrap(float(off[2]))
             row = axis * (1.0, 1.0, _TURN_M)
             deviation = max(1.0 / math.sqrt(share), _LEAST_M * math.sqrt(strength[-1] / share))
-            self._take(row, float(row @ off), deviation, gate=math.inf)
+            self._update(row, float(row @ off), deviation, gate=math.inf)
 
 
 class _Walls:
@@ -286,12 +286,12 @@ def _normals(target: Target, fit: _Fit) -> Points:
 
 
 def _fit(target: Target, points: Points, start: Points) -> _Fit:
-    motion = _laid(target, points, start)
+    motion = _align(target, points, start)
     placed = moved(points, motion)
     return _Fit(motion, placed, *target.nearest(placed))
 
 
-def _laid(target: Target, points: Points, begin: Points) -> Points:
+def _align(target: Target, points: Points, begin: Points) -> Points:
     """Return the motion (4, 4) that aligns the vehicle's points with walls, from a guess."""
     gicp: Any = require("small_gicp", "maps")
     shift = np.eye(4)
@@ -305,5 +305,5 @@ def _laid(target: Target, points: Points, begin: Points) -> Points:
         )
         motion = np.asarray(found.T_target_source)
     shift[:3, 3] = target.middle_m
-    laid: Points = shift @ motion
-    return laid
+    aligned: Points = shift @ motion
+    return aligned

@@ -36,10 +36,10 @@ class SpatSignals:
         network = self._network
         shown = np.full(len(network.links), SIGNAL_NONE, dtype=np.uint8)
         shown[self._has_one] = SIGNAL_RED
-        heard = readings.get(SPAT)
-        if heard is None or not len(heard.values):
+        messages = readings.get(SPAT)
+        if messages is None or not len(messages.values):
             return shown
-        for signal, phase, _ in heard.values[-1].tolist():
+        for signal, phase, _ in messages.values[-1].tolist():
             links = np.flatnonzero(network.links["signal"] == signal)
             letters = network.phases["first_state"][phase] + network.links["signal_index"][links]
             shown[links] = network.phase_states[letters]

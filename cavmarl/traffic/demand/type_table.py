@@ -197,7 +197,7 @@ class TypeTable:
         return None if row < 0 else Options((row,), (1.0,))
 
     def records(self) -> NDArray[np.void]:
-        """VTYPE (num_types,)."""
+        """Return VTYPE (num_types,)."""
         records = np.zeros(len(self._rows), dtype=VTYPE)
         for row, record in enumerate(self._rows):
             records[row] = record

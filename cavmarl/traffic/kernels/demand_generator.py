@@ -343,7 +343,7 @@ def choose_goals(
     worlds: Worlds,
     dt: float,
 ) -> None:
-    """Give each vehicle of `next_rows` that needs another goal one that is in reach, if any.
+    """Give vehicles of `next_rows` that need another goal one within reach, if any.
 
     Runs once a second. A goal farther away does not count as lost progress of an agent.
     """

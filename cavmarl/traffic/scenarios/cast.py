@@ -36,7 +36,7 @@ def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
     The other agents follow on the approach of the first, with its speed and goal. Their lanes are
     outside junctions, and no actor rides along them, because actors do not react to vehicles.
 
-    Raises ConfigError: there is no room for so many agents behind the first.
+    Raises ConfigError: there is no room for this many agents behind the first.
     """
     rides = [act for actor in scene.actors for act in actor.acts if isinstance(act, Ride)]
     closed = {lane for ride in rides for lane in ride.lanes}
@@ -91,7 +91,7 @@ class Cast:
         `goals`: row of the plans' table by EDGE. `first_type`: number of vehicle types before those
         of the actors. `num_agents`: agents per world.
 
-        Raises ConfigError: the scene has no room for so many agents.
+        Raises ConfigError: the scene has no room for this many agents.
         """
         seats = take_seats(Streets(network), scene, num_agents)
         scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)

@@ -140,7 +140,7 @@ class SumoTraffic:
             self.worlds.begin(w, int(worlds.keys[w]))
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
-        """From the next reset on, log what SUMO receives, one log per world, for `catch_up`.
+        """Log what SUMO receives from the next reset on, one log per world, for `catch_up`.
 
         Returns the logs; empty if SUMO moves no vehicles, since then it receives nothing.
         """
@@ -155,12 +155,12 @@ class SumoTraffic:
         Raises SumoError: SUMO had received the places of vehicles, and they are not recorded.
         """
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
-            told: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
+            logged: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
             if self.drives:
                 log = self.worlds.logs[w] if self.worlds.logs else ToldLog(0)
-                told = log.ticks(tick)
+                logged = log.ticks(tick)
             self.worlds.begin(w, int(key))
-            for passed, moved in enumerate(told):
+            for passed, moved in enumerate(logged):
                 self.worlds.step_one(w, passed, moved)
 
     def step(self, worlds: Worlds, side: int) -> None:

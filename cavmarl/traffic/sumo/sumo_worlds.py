@@ -128,14 +128,14 @@ class SumoWorlds:
                     f"world {w} is at tick {tick}, its SUMO at tick {last.tick}; reset the world"
                 )
             asked.append(w)
-        told = {}
+        places = {}
         try:
             for w in asked:
-                told[w] = moved(w)
-                self._process(w).begin_step(told[w])
+                places[w] = moved(w)
+                self._process(w).begin_step(places[w])
             for w in asked:
                 self._ticks[w] = self._take(w, ticks[w] + 1, self._process(w).end_step())
-                self._note(w, told[w])
+                self._note(w, places[w])
         except (SumoError, ConfigError) as error:
             # Other SUMOs may have taken the step, but their worlds have not.
             for w in asked:
