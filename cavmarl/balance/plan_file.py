@@ -13,7 +13,7 @@ from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.core.errors import ConfigError
 
-# Keys of a manifest: the plans at the begin and at the end of the run.
+# Keys of a manifest: the plans at the start and at the end of the run.
 PLACEMENT, PLACEMENT_AT_END = "placement", "placement_at_end"
 
 LARGEST = 1 << 53  # larger integers are not exact in every JSON reader
@@ -28,7 +28,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def read_plans(path: Path) -> list[Plan]:
-    """Return the plan of a file, or the plans of a manifest: at the begin, then at the end."""
+    """Return the plan of a file, or the plans of a manifest: at the start, then at the end."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:

@@ -91,7 +91,7 @@ class NetworkPolicy(Policy):
 
 
 class SharedPolicy(Policy):
-    """Several drivers in one world: driver k modulo their number drives agent k."""
+    """Several drivers in one world: agent k has driver k modulo the number of drivers."""
 
     def __init__(self, env: Environment, drivers: Sequence[Policy]) -> None:
         super().__init__(env)
@@ -117,7 +117,7 @@ class SharedPolicy(Policy):
 
 
 def built_in_actions(env: Environment, mask: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return the built-in driver's actions: a new array (W, A, …) as of `Policy.act_batch`.
+    """Return the built-in driver's actions: a new array (W, A, …) as in `Policy.act_batch`.
 
     `mask`: (W, A), defines the shape. Raises PolicyError: actions are discrete.
     """

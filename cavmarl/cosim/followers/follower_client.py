@@ -99,7 +99,7 @@ class Follower:
     def wait(self) -> FollowerView | None:
         """Return the next snapshot without time limit; None: the world has sent goodbye.
 
-        Raises FollowerError: as of `__iter__`.
+        Raises FollowerError: as in `__iter__`.
         """
         frame = self._expect(None, Say.SNAPSHOT, Say.GOODBYE)
         if frame.kind is Say.GOODBYE:

@@ -151,7 +151,7 @@ class FollowerConnection:
     def has_come(self) -> bool:
         """Return whether the next frame has arrived except for its data; then `hear` does not wait.
 
-        Raises FollowerError: as of `hear`.
+        Raises FollowerError: as in `hear`.
         """
         with self._peer_errors("introduced itself", None):
             if not self._socket.read_ahead(HEAD_BYTES):
@@ -162,7 +162,7 @@ class FollowerConnection:
     def skip(self, frame: ReceivedFrame) -> None:
         """Check that a frame has no data, and finish reading it.
 
-        Raises FollowerError: as of `hear`; or the frame has data.
+        Raises FollowerError: as in `hear`; or the frame has data.
         """
         if frame.size:
             raise FollowerError(
@@ -173,7 +173,7 @@ class FollowerConnection:
     def take(self, frame: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
         """Return the snapshot of a frame, with its arrays.
 
-        Raises FollowerError: as of `hear`.
+        Raises FollowerError: as in `hear`.
         """
         snapshot = read_payload(FollowerSnapshot, frame.payload)
         sizes = [_size(view) for view in snapshot.arrays]

@@ -39,7 +39,8 @@ _BESIDE_WALKER_M = 0.8  # the same for a pedestrian
 _WALK_S = 3.0  # time for which a pedestrian's walk is extrapolated
 _BEND_MPS2 = 2.0  # maximum lateral acceleration
 _BRAKE_FOR_YELLOW = 3.0
-_CLEAR_S = 4.0  # yield to vehicles with the right of way that are nearer in time,
+# Yield to a vehicle with the right of way that is nearer to its line, in time or in distance.
+_CLEAR_S = 4.0
 _CLEAR_M = 12.0
 _CHANGE_BEHIND_M, _CHANGE_AHEAD_M = 10.0, 6.0
 _SIGHT_M = 50.0  # distance before a line from which it is considered

@@ -131,7 +131,7 @@ ROUTE = record(
     ("first_edge", np.int32),  # route_edges[first_edge : first_edge + num_edges]
     ("num_edges", np.int32),
     ("exact", np.bool_),  # False: the edges are waypoints of a way still to be found
-    ("first_stop", np.int32),  # STOP rows of all its vehicles
+    ("first_stop", np.int32),  # STOP rows that all its vehicles make
     ("num_stops", np.int32),
 )
 
@@ -155,7 +155,7 @@ class Options(NamedTuple):
 
 
 class Choices:
-    """Many choices with probabilities, drawn from by arrays.
+    """Many choices with probabilities, for drawing whole arrays.
 
     Attributes:
         start: (C + 1,) options of choice c are [start[c], start[c + 1]).

@@ -70,7 +70,7 @@ def _regular(
 
 
 def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]:
-    """Return times as sums of random gaps after the begin, one draw per vehicle.
+    """Return times as sums of random gaps after the start, one draw per vehicle.
 
     Gaps are exponential, -ln(1 - u) / rate, or count trials: with a probability p in each full
     second, the next success comes after 1 + floor(ln(1 - u) / ln(1 - p)) trials, for any step.

@@ -101,7 +101,7 @@ class SumoProcess:
         return self._receive().line
 
     def start(self, words: list[str]) -> SumoAnswer:
-        """Start a new simulation with a command line; errors as of `look_up`."""
+        """Start a new simulation with a command line; errors as in `look_up`."""
         self._send(child.START, {"words": words})
         return self._receive()
 
@@ -117,7 +117,7 @@ class SumoProcess:
         self._send(child.STEP, {}, moved.tobytes())
 
     def end_step(self) -> SumoAnswer:
-        """Return the answer of the step; errors as of `look_up`."""
+        """Return the answer of the step; errors as in `look_up`."""
         return self._receive()
 
     def close(self) -> None:

@@ -135,7 +135,7 @@ class SumoTraffic:
         ).astype(np.int32)
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
-        """Restart SUMO in the chosen worlds (W,); errors as of `SumoWorlds.begin`."""
+        """Restart SUMO in the chosen worlds (W,); errors as in `SumoWorlds.begin`."""
         for w in np.flatnonzero(chosen).tolist():
             self.worlds.begin(w, int(worlds.keys[w]))
 
@@ -164,14 +164,14 @@ class SumoTraffic:
                 self.worlds.step_one(w, passed, moved)
 
     def step(self, worlds: Worlds, side: int) -> None:
-        """Let SUMO take its step; errors as of `SumoWorlds.step`.
+        """Let SUMO take its step; errors as in `SumoWorlds.step`.
 
         `worlds`: the worlds of any shard. `side`: side that holds the next rows.
         """
         self.worlds.step(worlds.ticks.tolist(), lambda w: self._moved(w, side))
 
     def mirror(self, worlds: Worlds, side: int) -> int:
-        """Move SUMO's vehicles to their places after its step; arguments as of `step`.
+        """Move SUMO's vehicles to their places after its step; arguments as in `step`.
 
         Returns the number of vehicles that leave, in all worlds.
         """

@@ -143,7 +143,7 @@ class SumoWorlds:
             raise SumoError(f"world {w}: {error}") from error
 
     def step_one(self, w: int, tick: int, moved: NDArray[np.void]) -> None:
-        """Let the SUMO of one world take a step from a tick; errors as of `step`."""
+        """Let the SUMO of one world take a step from a tick; errors as in `step`."""
         process = self._process(w)
         process.begin_step(moved)
         self._ticks[w] = self._take(w, tick + 1, process.end_step())
