@@ -58,7 +58,7 @@ def step_tensors(env: Any) -> list[bytes]:
     """The same of TorchRL, whose worlds begin anew by themselves."""
     tensors = env.full_action_spec.zero()
     tensors["car", "action"][:] = 0.3
-    told = env._step(tensors)
+    told = env.step(tensors)["next"]
     return [told["car", name].numpy().tobytes() for name in ("observation", "reward", "done")]
 
 

@@ -28,9 +28,9 @@ def test_all_views_step_the_same_world() -> None:
         "background": 0,
         "overrides": {"population.mode": "respawn", "action.kind": "continuous"},
     }
-    arrays = libraries._arrays("merge", settings)
-    dicts = libraries._dicts("merge", settings)
-    rows = libraries._gymnasium("merge", settings)
+    arrays = libraries.VIEWS["arrays"]("merge", settings)
+    dicts = libraries.VIEWS["dicts"]("merge", settings)
+    rows = libraries.VIEWS["gymnasium"]("merge", settings)
     for _ in range(20):
         wanted = arrays()[1].ravel().tolist()  # type: ignore[index]
         assert list(dicts()[1].values()) == wanted  # type: ignore[index]

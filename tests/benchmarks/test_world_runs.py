@@ -160,7 +160,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         world_folder(job.out, seed).mkdir()
         return a_row(seed, mean_speed_mps=10.0 + 0.1 * seed)
 
-    monkeypatch.setattr(world_runs, "_run_world", run_world)
+    monkeypatch.setattr(world_runs, "run_world", run_world)
     return ran
 
 

@@ -29,7 +29,7 @@ from cavmarl.prebuild.call_list import (
     recorded_calls,
     write_manifest,
 )
-from cavmarl.prebuild.compile_calls import _compile
+from cavmarl.prebuild.compile_calls import compile_call
 from cavmarl.prebuild.kernel_list import called_kernels
 from cavmarl.prebuild.linking import link
 
@@ -44,7 +44,7 @@ TYPES = "float64;float64"
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A library of one kernel."""
     folder = tmp_path_factory.mktemp("built")
-    link([_compile(KernelCall(NAME, json.dumps(signature_of((1.0, 2.0)))))], folder)
+    link([compile_call(KernelCall(NAME, json.dumps(signature_of((1.0, 2.0)))))], folder)
     return folder
 
 
@@ -56,11 +56,11 @@ def copied(built: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     """Let this process look again where kernels come from, and forget it afterwards."""
-    for cached in (machine_code.kernel_source, machine_code._explain):
+    for cached in (machine_code.kernel_source, machine_code.explain):
         cached.cache_clear()
     yield monkeypatch
     monkeypatch.undo()
-    for cached in (machine_code.kernel_source, machine_code._explain):
+    for cached in (machine_code.kernel_source, machine_code.explain):
         cached.cache_clear()
 
 
@@ -140,8 +140,7 @@ def test_a_processor_without_avx2_is_told(built: Path, monkeypatch: pytest.Monke
     opened = ctypes.CDLL(str(built / LIBRARY_FILE))
     flags = Path("/proc/cpuinfo").read_text()
     assert (library.missing_features(opened, "x86-64-v3") == []) == (" avx2 " in flags)
-    monkeypatch.setitem(library._LEAF_7_EBX, "a feature of nobody", 1 << 6)
-    monkeypatch.setattr(library, "_LEVEL_WORDS", ({}, {"AVX2": 5, "no such feature": 60}, {}, {}))
+    monkeypatch.setattr(library, "LEVEL_WORDS", ({}, {"AVX2": 5, "no such feature": 60}, {}, {}))
     with pytest.raises(UnusableLibraryError, match="this processor lacks no such feature"):
         Library(built)
 
@@ -210,11 +209,12 @@ def test_registered_driver_models_reach_the_library(built: Path) -> None:
     ) -> float:  # fmt: skip
         return 0.0
 
-    opened = Library(built)
+    Library(built)
     register_driver_model("hold_of_the_library_test", hold)
     try:
         row = REGISTERED_MODELS["hold_of_the_library_test"] - 16
-        copy = (ctypes.c_int64 * 64).in_dll(opened._library, "cavmarl_driver_models")
+        opened = ctypes.CDLL(str(built / LIBRARY_FILE))
+        copy = (ctypes.c_int64 * 64).in_dll(opened, "cavmarl_driver_models")
         assert copy[row] != 0
     finally:
         REGISTERED_MODELS.remove("hold_of_the_library_test")
