@@ -107,7 +107,7 @@ def _measure(job: SumoJob, contacts: bool) -> TrafficRun:
         trips = folder / "trips.xml"
         libsumo = start_sumo(job, folder, f"--tripinfo-output={trips}")
         meter = TrafficMeter(network)
-        reader = _VehicleReader(libsumo, network)
+        reader = VehicleReader(libsumo, network)
         departed = arrived = teleports = 0
         ticks_per_s = round(1.0 / job.dt_s)
         try:
@@ -150,7 +150,7 @@ def _keep_shared(libsumo: Any, job: SumoJob) -> int:
     return sum(map(job.is_shared, entered))
 
 
-class _VehicleReader:
+class VehicleReader:
     """SUMO's vehicles as VEHICLE records.
 
     SUMO speaks of the middle of the front bumper and of degrees clockwise from north.
