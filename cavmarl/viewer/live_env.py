@@ -40,6 +40,8 @@ class ShownEnv:
 
     Attributes:
         address: of the page.
+        audiences: the pages that watch each world.
+        publishers: of the frames of each world.
         changes: how often pages have asked for something that changes a world.
     """
 

@@ -42,6 +42,7 @@ class ShownRun:
         clock: of its steps.
         publisher: of its frames.
         steps: that it has taken.
+        seats: agents that a page drives, and the number of its watcher.
     """
 
     def __init__(self, env: CavEnv, policy: Policy, stage: Stage, seed: int) -> None:
@@ -50,7 +51,7 @@ class ShownRun:
         self._audience = stage.audience
         self.clock = RunClock()
         self.publisher = FramePublisher(stage.audience, stage.encoder)
-        self.seats: dict[int, int] = {}  # watchers by agent
+        self.seats: dict[int, int] = {}
         self._driving: dict[int, tuple[float, float, float]] = {}  # time, throttle, steering
         self.steps = 0
         self._observations, _ = env.reset(seed=seed)

@@ -20,7 +20,7 @@ from cavmarl.bench.highway_worlds import (
     length_m,
     straight_road,
 )
-from cavmarl.bench.step_speed import MORE, Row, our_sides, measure_step_speed
+from cavmarl.bench.step_speed import MORE, Row, measure_step_speed, our_sides
 from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.maps.check import check_map
 

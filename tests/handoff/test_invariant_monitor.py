@@ -10,8 +10,8 @@ import pytest
 from cavmarl.core.errors import ProtocolError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff import shard_setup as dividing
-from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor
+from cavmarl.handoff.division import ZonedShards
 from cavmarl.ownership.messages import Birth
 from cavmarl.zones.kernels.zone_lookup import is_inside, squared_distance
 from tests.support.driving import drive, make_simulation, start
