@@ -88,9 +88,7 @@ def test_rows_of_a_map_point_to_rows_of_the_same_map() -> None:
     parts = [network("ring"), network("grid4x4"), network("ring")]
     whole = join(parts)
     assert len(set(whole.map_names)) == 3
-    starts = {
-        key: np.cumsum([0, *(len(getattr(part, key)) for part in parts)]) for key in POINTERS
-    }
+    starts = {key: np.cumsum([0, *(len(getattr(part, key)) for part in parts)]) for key in POINTERS}
     for key, fields in POINTERS.items():
         for number, part in enumerate(parts):
             rows = slice(starts[key][number], starts[key][number + 1])
