@@ -42,11 +42,7 @@ EVERYTHING: dict[str, Any] = {
     "observation.mode": "sensors",
     "observation.kind": "dict",
 }
-CROWD = {
-    "population.mode": "respawn",
-    "population.agents": 4,
-    "population.background": 80,
-}
+CROWD = {"population.mode": "respawn", "population.agents": 4, "population.background": 80}
 
 
 def test_every_type_of_sensor_is_on() -> None:

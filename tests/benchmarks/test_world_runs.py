@@ -23,14 +23,7 @@ from benchmarks.world_rows import (
     sumo_beside_itself,
     worst,
 )
-from benchmarks.world_runs import (
-    KEPT,
-    ROWS_FILE,
-    WorldSeries,
-    read_rows,
-    run_worlds,
-    world_folder,
-)
+from benchmarks.world_runs import KEPT, ROWS_FILE, WorldSeries, read_rows, run_worlds, world_folder
 from cavmarl.core.errors import ConfigError, MissingExtraError
 
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
@@ -131,9 +124,7 @@ def test_the_worst_are_failed_ones_then_contacts_then_speeds() -> None:
     assert [row["seed"] for row in worst(rows, 3)] == [3, 2, 1]
 
 
-def test_the_table_of_the_worst_keeps_its_words_whole_on_a_narrow_terminal(
-    tmp_path: Path,
-) -> None:
+def test_the_table_of_the_worst_keeps_its_words_whole_on_a_narrow_terminal(tmp_path: Path) -> None:
     features = ["grid", "right_before_left", "turn_lanes", "random_priority", "near_capacity"]
     row = a_row(7, mean_speed_mps=9.0, contacts=3) | {"features": features}
     console = Console(width=80, record=True)

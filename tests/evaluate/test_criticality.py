@@ -9,12 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap
-from cavmarl.evaluate.scenarios.criticality import (
-    TRACE,
-    box,
-    least_ttc_s,
-    post_encroachment_s,
-)
+from cavmarl.evaluate.scenarios.criticality import TRACE, box, least_ttc_s, post_encroachment_s
 
 
 def body(

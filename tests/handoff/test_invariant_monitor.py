@@ -275,9 +275,7 @@ def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> 
         drive(simulation)
 
 
-def test_the_monitor_takes_as_much_memory_as_it_began_with(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_monitor_takes_as_much_memory_as_it_began_with(monkeypatch: pytest.MonkeyPatch) -> None:
     monitors: set[InvariantMonitor] = set()
     look = InvariantMonitor.end
 

@@ -110,11 +110,7 @@ def test_tolerant_builds_list_what_was_dropped(
     ],
 )
 def test_corrections_and_warnings_are_counted_by_kind(
-    shared_maps: Path,
-    tmp_path: Path,
-    name: str,
-    corrections: set[str],
-    warnings: dict[str, int],
+    shared_maps: Path, tmp_path: Path, name: str, corrections: set[str], warnings: dict[str, int]
 ) -> None:
     result = build_network(shared_maps / "osm" / name, tmp_path / "built.net.xml")
 

@@ -17,12 +17,7 @@ def philox4x32(counter: list[int], key: list[int]) -> list[int]:
 
 def random_bits(key: int, vehicle: int, tick: int, stream: int) -> int:
     """The first 64 bits at the counter layout of `kernels.rng`, first word on top."""
-    counter = [
-        vehicle & MASK_32,
-        tick & MASK_32,
-        (vehicle >> 32) | (tick >> 32) << 16,
-        stream,
-    ]
+    counter = [vehicle & MASK_32, tick & MASK_32, (vehicle >> 32) | (tick >> 32) << 16, stream]
     words = philox4x32(counter, [key & MASK_32, key >> 32])
     return words[0] << 32 | words[1]
 

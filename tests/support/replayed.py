@@ -74,11 +74,7 @@ def record(
     return found
 
 
-def replay(
-    run: Recorded,
-    zones: int,
-    settings: Mapping[str, Any] | None = None,
-) -> CavVectorEnv:
+def replay(run: Recorded, zones: int, settings: Mapping[str, Any] | None = None) -> CavVectorEnv:
     """Drive a divided world through the same run; it is the same after every step.
 
     The trace of each world is checked, too, and hand-overs happen.

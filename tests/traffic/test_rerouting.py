@@ -94,12 +94,7 @@ def test_a_closed_edge_is_driven_around_as_in_sumo(net: Path, tmp_path: Path) ->
         ('<closingReroute id="out"/>', "", 0, 0),  # no way around: it drives on
         ('<closingReroute id="out"/><destProbReroute id="long2"/>', "", 65, 75),
         ('<destProbReroute id="long2"/>', "", 65, 75),
-        (
-            '<destProbReroute id="long2"/><destProbReroute id="keepDestination"/>',
-            "",
-            22,
-            48,
-        ),
+        ('<destProbReroute id="long2"/><destProbReroute id="keepDestination"/>', "", 22, 48),
         ('<routeProbReroute id="far"/>', "", 65, 75),
         ('<routeProbReroute id="far"/><routeProbReroute id="near" probability="3"/>', "", 8, 30),
     ],
