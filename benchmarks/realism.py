@@ -1,4 +1,4 @@
-"""The table of docs/realism.md: demands of real and known maps over seeds, ours beside SUMO's.
+"""Make the table of docs/explanation/realism.md: our traffic beside SUMO's, over maps and seeds.
 
 The maps that are not in the eclipse-sumo wheel come from a folder; a demand whose files are not
 there is left out and named.

@@ -1,7 +1,7 @@
 """What the paper on distributed CARLA (A) has in scope, beside what a short run here shows.
 
-What A says is cited by its sections and Table 1 (`docs/papers.md`). Each row of ours is checked: it
-holds, or the exit code is 1.
+What A says is cited by its sections and Table 1 (`docs/explanation/papers.md`). Each row of
+ours is checked: it holds, or the exit code is 1.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def on_files(files: Files, config: Any) -> Files:
     """Add the pages that are made."""
     made = {address: path.read_text(encoding="utf-8") for address, path in sources().items()}
     made["gallery.md"] = gallery()
-    made["reference.md"] = reference()
+    made["reference/api.md"] = reference()
     for address, text in made.items():
         files.append(File.generated(config, address, content=text))
     return files

@@ -1,7 +1,7 @@
 """What cavmarl pulls in: exact files with hashes, and licences.
 
 python -m docs.supply_chain lock       # writes constraints/hashes.txt, by pip's own resolver
-python -m docs.supply_chain licences   # prints the table of docs/licences.md
+python -m docs.supply_chain licences   # prints the table of docs/reference/licences.md
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`docs/architecture.md` says what the tree and the contract of imports say."""
+"""`docs/explanation/architecture.md` says what the tree and the contract of imports say."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
 PACKAGE = ROOT / "cavmarl"
 MAX_WORDS = 1_500
 ELSEWHERE = {"cavmarl/data/", "kernels/"}  # in the wheel; in many folders

@@ -53,7 +53,8 @@ def optional_table() -> str:
 
 
 @pytest.mark.parametrize(
-    "page", ["docs/environments.md", *(f"envs/{name}/README.md" for name in sorted(entries()))]
+    "page",
+    ["docs/reference/environments.md", *(f"envs/{name}/README.md" for name in sorted(entries()))],
 )
 def test_a_page_has_the_sensors_that_can_be_switched_on(page: str) -> None:
     check_block(ROOT / page, "optional sensors", optional_table())

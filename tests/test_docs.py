@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import shlex
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -13,20 +12,18 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
-import typer
 
-from cavmarl.cli import app
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import dotted_keys
 from cavmarl.config.rig import CollisionConfig, SampledConfig
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import missing
 from cavmarl.sensors.registry import TYPES
+from tests.support.command_lines import check_command
 from tests.support.generated import check_block, table
 
 ROOT = Path(__file__).resolve().parents[1]
 MAX_LINE = 120
-USAGE: Any = typer.BadParameter.__base__  # what a command line that is not understood raises
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("envs/*/README.md")])
 UNITS = {
     "m": "m", "s": "s", "mps": "m/s", "mps2": "m/s²", "rad": "rad", "ticks": "ticks", "hz": "Hz",
@@ -39,11 +36,11 @@ def test_the_page_of_environments_lists_every_key() -> None:
     assert [row[0].strip("`") for row in rows] == dotted_keys(EnvConfig)
     assert all(row[-1] for row in rows), "a key without a word under Attributes:"
     header = ("key", "type", "unit", "default", "meaning")
-    check_block(ROOT / "docs/environments.md", "keys", table(header, rows))
+    check_block(ROOT / "docs/reference/environments.md", "keys", table(header, rows))
 
 
 def test_the_page_of_sensors_lists_every_type_and_key() -> None:
-    page = ROOT / "docs/sensors.md"
+    page = ROOT / "docs/reference/sensors.md"
     types = [
         (
             f"`{kind.type}`",
@@ -69,7 +66,7 @@ def test_the_page_of_sensors_lists_every_type_and_key() -> None:
 
 
 def test_the_page_of_environments_explains_every_term() -> None:
-    text = (ROOT / "docs/environments.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/reference/environments.md").read_text(encoding="utf-8")
     assert tuple(re.findall(r"^\| `(\w+)` \|", text.split("## Terms")[1], re.MULTILINE)) == TERMS
 
 
@@ -237,26 +234,7 @@ def default_text(value: object) -> str:
 def test_commands_of_pages_are_understood(page: Path) -> None:
     """Each command is there, and has the options that it is given."""
     for line in commands_of(page.read_text(encoding="utf-8")):
-        command = whole_command()
-        context = command.make_context("cavmarl", [], resilient_parsing=True)
-        words = shlex.split(line.replace("…", ""), comments=True)[1:]
-        while hasattr(command, "get_command") and words and not words[0].startswith("-"):
-            found = command.get_command(context, words[0])
-            assert found is not None, line
-            context = type(context)(found, parent=context, **found.context_settings)
-            command, words = found, words[1:]
-        try:
-            _, left, _ = command.make_parser(context).parse_args(words)
-        except USAGE as error:
-            if "requires an argument" not in str(error):  # as a page may name an option
-                raise
-            left = []
-        assert not left or context.ignore_unknown_options, line
-
-
-@cache
-def whole_command() -> Any:
-    return typer.main.get_command(app)
+        check_command(line)
 
 
 def commands_of(text: str) -> list[str]:

@@ -1,6 +1,6 @@
 """Doors for users: what is added by one file from outside gives the same bytes however it is run.
 
-The files are the examples of docs/extending.md.
+The files are the examples of docs/guides/extending.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cavmarl.core.errors import ConfigError, RegisteredFunctionError
 from cavmarl.core.extensions import REGISTERED_MODELS, REGISTERED_SENSORS, REGISTERED_TERMS
 from cavmarl.sensors.registry import sensor_names
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "guides" / "extending.md"
 ENV, AGENTS, BACKGROUND, STEPS = "grid4x4", 12, 40, 40
 KINDS = ("A term", "A sensor", "A driver model", "A backend")
 

@@ -19,7 +19,7 @@ def test_the_page_tells_the_licence_of_each_package() -> None:
         pytest.skip("an installation of less than cavmarl[dev]: `make test` has all of it")
     lines = ["| package | needed by | licence |", "|---|---|---|"]
     lines += ["| {} |".format(" | ".join(row)) for row in rows]
-    check_block(ROOT / "docs" / "licences.md", "licences", "\n".join(lines))
+    check_block(ROOT / "docs" / "reference" / "licences.md", "licences", "\n".join(lines))
 
 
 def test_each_locked_file_has_the_version_of_the_constraints() -> None:

@@ -5,7 +5,8 @@
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
 From top to bottom: settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
-the update; `Run`, which takes turns (Schulman et al. 2017; de Witt et al. 2020; docs/learning.md).
+the update; `Run`, which takes turns (Schulman et al. 2017; de Witt et al. 2020;
+docs/guides/train.md).
 """
 
 from __future__ import annotations

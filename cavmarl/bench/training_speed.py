@@ -180,7 +180,7 @@ def training_program() -> Any:
 
 
 def _recipe(folder: Path, settings: Any) -> Any:
-    """The same road with what we learn best with: see docs/learning.md."""
+    """The same road with what we learn best with: see docs/guides/train.md."""
     entry = yaml.safe_load((folder / "env.yaml").read_text(encoding="utf-8"))
     for key, value in RECIPE_KEYS.items():
         shadow(entry, key, value)

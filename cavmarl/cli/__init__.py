@@ -1,4 +1,4 @@
-"""The command line, `cavmarl`: one small file a command; each loads what it needs when it runs."""
+"""The command line `cavmarl`. Each command is a file and imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -35,25 +35,34 @@ from cavmarl.cli import (
     view,
     zoo,
 )
-from cavmarl.cli.output import about, print_error
+from cavmarl.cli.output import (
+    SERVICE,
+    add_command,
+    flag,
+    print_error,
+)
 from cavmarl.config.removed_keys import removed_option
 from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.core.tracebacks import print_traceback
 
 __all__ = ["app", "main"]
 
+# Groups of commands in the help.
+START, TRAIN, MAPS = "Start here", "Train and evaluate", "Maps and demand"
+DIVIDE, COSIM = "Divide worlds", "Co-simulation"
 
-REMOVED = {"verify-determinism": "verify determinism"}  # command → what replaces it
+
+REMOVED = {"verify-determinism": "verify determinism"}  # command → its replacement
 
 
 class _Group(TyperGroup):
-    """The commands; those that were removed are refused, with what replaces them.
+    """The group of all commands.
 
-    `map` is loaded when it is asked for: its imports take longer than the rest.
+    A removed command or option raises ConfigError with its replacement. `map` is imported on
+    demand, as its imports take longer than all others.
     """
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; of an option that was removed, say what replaced it."""
         try:
             return super().invoke(ctx)
         except Exception as error:
@@ -62,15 +71,18 @@ class _Group(TyperGroup):
             raise
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*super().list_commands(ctx), "map"]
+        names = super().list_commands(ctx)
+        names.insert(names.index("demand"), "map")
+        return names
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name in REMOVED:
-            raise ConfigError(f"{cmd_name} is no command: use cavmarl {REMOVED[cmd_name]}")
+            raise ConfigError(f"{cmd_name} was removed: use cavmarl {REMOVED[cmd_name]}")
         if cmd_name != "map":
             return super().get_command(ctx, cmd_name)
         found = typer.main.get_group(import_module("cavmarl.cli.map").app)
         found.name = "map"
+        vars(found)["rich_help_panel"] = MAPS
         return found
 
 
@@ -81,34 +93,173 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command()(evaluate.evaluate)
-app.command()(evaluate.report)
-app.command()(suite.suite)
-app.command()(baseline.baseline)
-app.command()(journal.journal)
-app.command()(plan.plan)
-app.command()(lead.lead)
-app.command()(follow.follow)
-app.command(context_settings={"allow_interspersed_args": False})(node.node)
-app.command()(view.view)
-app.command()(replay.replay)
-app.command()(demo.demo)
-app.command(context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})(
-    train.train
+
+
+add_command(
+    app,
+    "demo",
+    demo.demo,
+    "cavmarl demo --minutes 2",
+    panel=START,
 )
-app.command()(service.serve)
-app.command()(service.grant)
-app.command()(service.submit)
-app.command()(service.nodes)
-app.command()(service.sessions)
-app.command()(service.events)
-app.command()(service.manifest)
-app.command("list")(listing.list_entries)
-app.add_typer(demand.app, name="demand")
-app.add_typer(bench.app, name="bench")
-app.add_typer(scenario.app, name="scenario")
-app.add_typer(verify.app, name="verify")
-app.add_typer(zoo.app, name="zoo")
+add_command(
+    app,
+    "list",
+    listing.list_entries,
+    "cavmarl list",
+    panel=START,
+)
+add_command(
+    app,
+    "view",
+    view.view,
+    "cavmarl view merge --web",
+    "cavmarl view town --policy idm --video town.mp4 --seconds 60",
+    "cavmarl view grid4x4 --agents 20 --zones 4 --backend processes:2 --web",
+    panel=START,
+)
+add_command(
+    app,
+    "replay",
+    replay.replay,
+    "cavmarl replay runs/recording --web",
+    "cavmarl replay runs/recording --episode 2 --mcap episode.mcap",
+    panel=START,
+)
+add_command(
+    app,
+    "train",
+    train.train,
+    "cavmarl train",
+    "cavmarl train ppo --config merge",
+    panel=TRAIN,
+    ignore_unknown_options=True,
+    allow_interspersed_args=False,
+)
+add_command(
+    app,
+    "evaluate",
+    evaluate.evaluate,
+    "cavmarl evaluate merge --policy idm --policy cities_ippo",
+    "cavmarl evaluate grid4x4 --episodes 64 --repeats 3 --html report.html",
+    "cavmarl evaluate merge --set sensors.lidar.rays=32 --json result.json",
+    panel=TRAIN,
+)
+add_command(
+    app,
+    "report",
+    evaluate.report,
+    "cavmarl report runs/evaluate/merge-1 --html report.html",
+    panel=TRAIN,
+)
+add_command(
+    app,
+    "suite",
+    suite.suite,
+    "cavmarl suite standard --maps maps --policy cities_ippo",
+    panel=TRAIN,
+)
+add_command(
+    app,
+    "baseline",
+    baseline.baseline,
+    "cavmarl baseline city.net.xml --agents 8 --episodes 6",
+    panel=TRAIN,
+)
+add_command(
+    app,
+    "manifest",
+    service.manifest,
+    "cavmarl manifest runs/evaluate/merge-1",
+    panel=TRAIN,
+)
+app.add_typer(zoo.app, name="zoo", rich_help_panel=TRAIN)
+app.add_typer(scenario.app, name="scenario", rich_help_panel=TRAIN)
+app.add_typer(demand.app, name="demand", rich_help_panel=MAPS)
+add_command(
+    app,
+    "plan",
+    plan.plan,
+    "cavmarl plan town --zones 9 --workers 3",
+    "cavmarl plan town --snapshot idle --json plan.json",
+    panel=DIVIDE,
+)
+add_command(
+    app,
+    "node",
+    node.node,
+    "cavmarl node --join 10.0.0.5:7000 --key-file node.key",
+    "cavmarl node --service https://10.0.0.5:8700 --secret-file node.secret --slots 4",
+    "mpirun -n 5 cavmarl node --mpi train.py",
+    panel=DIVIDE,
+    allow_interspersed_args=False,
+)
+add_command(
+    app,
+    "journal",
+    journal.journal,
+    "cavmarl journal run.jsonl --at 1200",
+    panel=DIVIDE,
+)
+app.add_typer(verify.app, name="verify", rich_help_panel=DIVIDE)
+app.add_typer(bench.app, name="bench", rich_help_panel=DIVIDE)
+add_command(
+    app,
+    "lead",
+    lead.lead,
+    "cavmarl lead town --at 7100 --secret-file world.secret --followers 1",
+    panel=COSIM,
+)
+add_command(
+    app,
+    "follow",
+    follow.follow,
+    "cavmarl follow town --at 7100 --secret-file world.secret --vehicles car_0,car_1",
+    panel=COSIM,
+)
+add_command(
+    app,
+    "serve",
+    service.serve,
+    "cavmarl serve --store runs/service.sqlite",
+    panel=SERVICE,
+)
+add_command(
+    app,
+    "grant",
+    service.grant,
+    "cavmarl grant alice --role client --secret-file admin.secret",
+    panel=SERVICE,
+)
+add_command(
+    app,
+    "submit",
+    service.submit,
+    "cavmarl submit merge --policy idm --episodes 32 --secret-file alice.secret",
+    panel=SERVICE,
+)
+add_command(
+    app,
+    "nodes",
+    service.nodes,
+    "cavmarl nodes",
+    "cavmarl nodes --drain node-1",
+    panel=SERVICE,
+)
+add_command(
+    app,
+    "sessions",
+    service.sessions,
+    "cavmarl sessions",
+    panel=SERVICE,
+)
+add_command(
+    app,
+    "events",
+    service.events,
+    "cavmarl events --follow",
+    panel=SERVICE,
+)
 
 
 def _print_version(wanted: bool) -> None:
@@ -120,17 +271,18 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _exit_codes(
     _version: Annotated[
-        bool, about("Show the version.", "--version", callback=_print_version, is_eager=True)
+        bool, flag("Show the version.", "--version", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     """Exit codes: 0 success; 1 failed check; 2 wrong use; 130 interrupted; 143 terminated."""
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run a command; an error that cavmarl raises on purpose is one line and exit code 2.
+    """Run a command.
 
-    Of an exception in the code of a user, the frames of that code are shown. SIGTERM ends a
-    command as an interrupt does: what it has begun is closed and removed.
+    A CavmarlError is printed as one line, with exit code 2. For an exception in a user's code, the
+    frames of that code are shown. SIGTERM ends a command like an interrupt: it closes and removes
+    what it has created.
     """
     try:
         with _ended_by_sigterm():
@@ -147,7 +299,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
 @contextmanager
 def _ended_by_sigterm() -> Iterator[None]:
-    """SIGTERM raises SystemExit here, unless the program that calls has a handler of its own."""
+    """Raise SystemExit on SIGTERM, unless the calling program has its own handler."""
     held = signal.getsignal(signal.SIGTERM)
     if threading.current_thread() is not threading.main_thread() or held != signal.SIG_DFL:
         yield

@@ -1,4 +1,4 @@
-"""`cavmarl baseline`: chance, the built-in driver, a trained one and an oracle on your own map."""
+"""`cavmarl baseline`: compares random, built-in, trained and oracle drivers on a map."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from cavmarl.cli.evaluate import report_cell
 from cavmarl.cli.output import (
+    OUTPUT,
     Agents,
     Background,
     JsonPath,
@@ -28,16 +29,27 @@ from cavmarl.core.progress import progress_bar
 def baseline(
     where: MapName,
     policy: Annotated[
-        str, about("The trained driver: a name or a folder.", "--policy", "-p")
+        str, about("Trained driver: its name or folder.", "--policy", "-p", metavar="POLICY")
     ] = "cities_ippo",
-    episodes: Annotated[int, about("Episodes of each driver.", "--episodes", "-n")] = 6,
+    episodes: Annotated[
+        int, about("Number of episodes of each driver.", "--episodes", "-n", metavar="N")
+    ] = 6,
     agents: Agents = None,
     background: Background = None,
     seed: Seed = 0,
-    out: Annotated[Path | None, about("A new folder; default: one in runs/.")] = None,
+    out: Annotated[
+        Path | None,
+        about(
+            "New folder for the results [default: a folder in runs/].", metavar="DIR", panel=OUTPUT
+        ),
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Drive a map as chance, `idm` and a trained driver do, and as `idm` does alone; one page."""
+    """Compare four drivers on a map, and write a page.
+
+    The drivers are random actions, `idm`, a trained driver, and as the oracle `idm` alone on the
+    road.
+    """
     require("matplotlib", "report")
     require("jinja2", "report")
     from cavmarl.evaluate.baseline import baseline_rows, figures, run_baseline, write_baseline
@@ -45,7 +57,7 @@ def baseline(
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
     folder = out or Path("runs/baseline") / f"{Path(where).name.split('.')[0]}-{stamp}"
     if folder.exists() and any(folder.iterdir()):
-        raise ConfigError(f"--out {folder}: there is something already; give a new folder")
+        raise ConfigError(f"--out {folder}: the folder is not empty; name a new folder")
     make_folder(folder)
     console = Console()
     with progress_bar(console) as bar:

@@ -1,4 +1,4 @@
-"""`cavmarl demand`: make files of demand."""
+"""`cavmarl demand`: generates demand files."""
 
 from __future__ import annotations
 
@@ -7,27 +7,35 @@ from typing import Annotated
 
 import typer
 
-from cavmarl.cli.output import JsonPath, MapName, Seed, about, write_json
+from cavmarl.cli.output import (
+    JsonPath,
+    MapName,
+    Seed,
+    about,
+    add_command,
+    write_json,
+)
 
-app = typer.Typer(help="Make files of demand.", no_args_is_help=True)
+app = typer.Typer(help="Generate demand files.", no_args_is_help=True)
 
 
 @app.callback()
 def _group() -> None:
-    """Keep `random` a command of its own while there is no other."""
+    """Keep `random` a subcommand although it is the only one."""
 
 
-@app.command()
 def random(
     map_name: MapName,
-    out: Annotated[Path, about("The .rou.xml to write.", "--out", "-o")],
-    vehicles: Annotated[int, about("Number of cars.")] = 1000,
-    within: Annotated[float, about("Seconds in which they depart, evenly.")] = 60.0,
-    route: Annotated[float, about("Shortest route, in metres.")] = 10_000.0,
+    out: Annotated[Path, about("The .rou.xml file to write.", "--out", "-o", metavar="FILE")],
+    vehicles: Annotated[int, about("Number of cars.", metavar="N")] = 1000,
+    within: Annotated[
+        float, about("Length of the interval in which the cars depart, evenly spaced.", metavar="S")
+    ] = 60.0,
+    route: Annotated[float, about("Minimum length of a route in metres.", metavar="M")] = 10_000.0,
     seed: Seed = 0,
     json_path: JsonPath = None,
 ) -> None:
-    """Cars with explicit random routes, from edges drawn by the length of their lanes."""
+    """Write cars with random routes; start edges are drawn in proportion to their lane length."""
     from cavmarl.engine.world_setup import find_map
     from cavmarl.roads.cache import load_network
     from cavmarl.traffic.random_trips import write_random_demand
@@ -37,3 +45,11 @@ def random(
     typer.echo(f"{out}: {vehicles} vehicles on {network.name}")
     asked = {"vehicles": vehicles, "within_s": within, "route_m": route, "seed": seed}
     write_json(json_path, {"file": str(out), "map": network.name, **asked})
+
+
+add_command(
+    app,
+    "random",
+    random,
+    "cavmarl demand random town --vehicles 500 --out town.rou.xml",
+)

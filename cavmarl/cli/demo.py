@@ -1,4 +1,4 @@
-"""`cavmarl demo`: adapts a driver, evaluates it, and leaves a page and videos."""
+"""`cavmarl demo`: trains and evaluates a driver, and writes a page and videos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.evaluate import evaluate_showing, report_table
-from cavmarl.cli.output import JsonPath, Seed, about, make_folder, write_json
+from cavmarl.cli.output import (
+    OUTPUT,
+    JsonPath,
+    Seed,
+    about,
+    make_folder,
+    write_json,
+)
 from cavmarl.cli.view import drive
 from cavmarl.config.registry import find_settings, programs
 from cavmarl.config.world_spec import WorldSpec
@@ -20,25 +27,30 @@ from cavmarl.core.errors import ConfigError, require
 
 EVALUATION_SEED = 1000  # far from the seeds of training
 EPISODES = 32
-FAILURES = 12  # that are shown from near
+FAILURES = 12  # trips shown in failures.html
 
 
 def demo(
-    minutes: Annotated[float, about("Minutes of training.")] = 2.0,
-    seconds: Annotated[float, about("Simulated seconds in each video.")] = 60.0,
-    out: Annotated[Path, about("Output folder.")] = Path("runs/demo"),
+    minutes: Annotated[float, about("Minutes of training.", metavar="MIN")] = 2.0,
+    seconds: Annotated[float, about("Simulated seconds of each video.", metavar="S")] = 60.0,
+    out: Annotated[Path, about("Folder for all results.", metavar="DIR", panel=OUTPUT)] = Path(
+        "runs/demo"
+    ),
     seed: Seed = 0,
     json_path: JsonPath = None,
 ) -> None:
-    """Adapt `cities_ippo` to `merge`, evaluate, drive `town`; leave a page and videos."""
+    """Train the driver `cities_ippo` for `merge`, evaluate it, and make videos."""
     from cavmarl.env.parallel import parallel_env
     from cavmarl.evaluate.page import write_page
     from cavmarl.policies.loading import driver_keys
 
     if not 0.0 < minutes <= 600.0 or not 0.0 < seconds <= 3600.0:
-        raise ConfigError("--minutes must be above 0, at most 600; --seconds above 0, at most 3600")
+        raise ConfigError(
+            f"--minutes {minutes:g}, --seconds {seconds:g}: --minutes must be above 0 and at most "
+            "600, --seconds above 0 and at most 3600"
+        )
     require("torch", "train")
-    require("sumo", "sumo")  # it has the map of town
+    require("sumo", "sumo")  # the map of town comes with it
     require("imageio_ffmpeg", "render")
     require("matplotlib", "report")
     make_folder(out)
@@ -82,7 +94,7 @@ def demo(
 
 
 def _train(out: Path, name: str, minutes: float, seed: int) -> Path:
-    """Run the training program; the folder of the driver."""
+    """Run the training program and return the folder of the driver."""
     settings = find_settings("train", "demo")
     command = [sys.executable, str(programs()["ppo"]), "--config", str(settings)]
     command += ["--minutes", str(minutes), "--seed", str(seed), "--runs", str(out), "--name", name]

@@ -16,11 +16,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import (
+    OUTPUT,
+    PAGE,
+    Episodes,
     JsonPath,
+    Policies,
     RecordAlso,
     RecordPath,
+    Repeats,
     about,
     about_file,
+    flag,
     grid,
     make_folder,
     number,
@@ -42,47 +48,51 @@ if TYPE_CHECKING:
     from cavmarl.ownership.transfer_summary import TransferSummary
 
 HtmlPath = Annotated[
-    Path | None, about_file("Write a page with tables, plots and the map here.", "--html")
+    Path | None,
+    about_file("Write a page with tables, plots and the map to this file.", "--html"),
 ]
 
 
 @with_world()
 def evaluate(
     world: WorldSpec,
-    policy: Annotated[
-        list[str] | None,
-        about(
-            "A name of `cavmarl list`, or a path; repeat it to compare with the first. "
-            "Default: idm.",
-            "--policy",
-            "-p",
-        ),
-    ] = None,
-    episodes: Annotated[int, about("Episodes of each run.", "--episodes", "-n")] = 32,
-    repeats: Annotated[
-        int, about("Independent runs, each in a fresh process.", "--repeats", "-r")
-    ] = 1,
+    policy: Policies = None,
+    episodes: Episodes = 32,
+    repeats: Repeats = 1,
     out: Annotated[
-        Path | None, about("Folder of manifest and raw results; default: a new one in runs/.")
+        Path | None,
+        about(
+            "Folder for the manifest and the raw results [default: a new folder in runs/].",
+            metavar="DIR",
+            panel=OUTPUT,
+        ),
     ] = None,
     record: RecordPath = None,
     record_also: RecordAlso = "",
     failures: Annotated[
-        int, about("Write failures.html with so many of the worst trips, each with a replay.")
+        int,
+        about(
+            "Write the N worst trips, with replays, to failures.html.", metavar="N", panel=OUTPUT
+        ),
     ] = 0,
     html: HtmlPath = None,
     page: Annotated[
         bool,
-        about("Show the episodes in a browser while they are driven, from a page served here."),
+        flag("Serve a page that shows the episodes while they run.", panel=PAGE),
     ] = False,
     port: WebPort = DEFAULT_PORT,
     json_path: JsonPath = None,
 ) -> None:
-    """Drive seeded episodes and show success, safety, comfort, delay, throughput and fairness."""
+    """Evaluate drivers in seeded episodes.
+
+    The report shows success, safety, comfort, delay, throughput and fairness.
+    """
     _check_page(html)
     console = Console()
     drivers = policy or ["idm"]
-    world = with_sensors_of_drivers(world, drivers)  # before a progress bar has the terminal
+    world = with_sensors_of_drivers(
+        world, drivers
+    )  # prints to the terminal: before the progress bar
     folder = out or _new_folder(world.env)
     more: dict[str, Any] = {
         "episodes": episodes,
@@ -100,7 +110,7 @@ def evaluate(
 
 
 def _watched(stack: ExitStack, options: WebOptions, vec: CavVectorEnv) -> Callable[[], None]:
-    """Serve a page that shows the worlds of an evaluation until `stack` ends."""
+    """Serve a page of an evaluation until `stack` closes; return the function to call per step."""
     from cavmarl.viewer.live_env import ShownEnv
 
     shown = ShownEnv(vec, options, title="evaluation", looks_itself=False, tell=say)
@@ -109,11 +119,14 @@ def _watched(stack: ExitStack, options: WebOptions, vec: CavVectorEnv) -> Callab
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="Output folder of `cavmarl evaluate`.")],
+    folder: Annotated[Path, typer.Argument(help="Results folder of `cavmarl evaluate`.")],
     html: HtmlPath = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Show the results in a folder again; refused without their closed manifest."""
+    """Show the results of an evaluation again.
+
+    The folder must contain the complete manifest of a finished evaluation.
+    """
     from cavmarl.evaluate import load_report
 
     _check_page(html)
@@ -123,7 +136,7 @@ def report(
 def evaluate_showing(
     console: Console, world: WorldSpec, policies: Any, *, out: Path, **counts: Any
 ) -> EvaluationReport:
-    """`cavmarl.evaluate.evaluate` into a folder, with a progress bar."""
+    """Run `cavmarl.evaluate.evaluate` with a progress bar."""
     from cavmarl.evaluate import evaluate as run
 
     with progress_bar(console) as bar:
@@ -137,7 +150,7 @@ def evaluate_showing(
 
 
 def report_table(found: EvaluationReport) -> Table:
-    """Drivers side by side."""
+    """Return a table of all metrics with one column per driver."""
     drivers = found.policies.values()
     rows = [["trips", *(str(driver.trips) for driver in drivers)]]
     rows += _metric_rows(
@@ -156,12 +169,12 @@ def report_table(found: EvaluationReport) -> Table:
     world = found.manifest["world"]["environment"]
     runs = f"{found.repeats} runs of " if found.repeats > 1 else ""
     title = f"{world}, {runs}{found.episodes} episodes, seed {found.seeds[0]}"
-    # Narrow enough for three drivers on eighty columns.
+    # Three drivers fit into eighty columns.
     return grid(_heads(found.policies), rows, escape(title), _caption(found.repeats), wraps=True)
 
 
 def difference_table(found: EvaluationReport) -> Table:
-    """Each further driver minus the first one, on the same episodes."""
+    """Return a table of differences to the first driver, paired by episode."""
     first, *others = found.policies
     rows = _metric_rows(
         lambda metric: [_change(metric, found[name].minus_first[metric.name]) for name in others]
@@ -172,7 +185,7 @@ def difference_table(found: EvaluationReport) -> Table:
 
 
 def place_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
-    """What a driver does near borders of zones and inside; an effect of borders would show."""
+    """Return a table of incidents near zone borders and inside zones, to reveal border effects."""
     events, means = ("collision", "off_road", "red_light"), ("jerk", "ttc_risk")
     keys = ["agent_hours", *(f"{event}_per_h" for event in events), *means]
     heads = ["zone", "hours", "collisions/h", "off road/h", "red lights/h", "jerk", "ttc risk"]
@@ -187,7 +200,7 @@ def place_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def map_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
-    """What a driver does on each map, the worst first."""
+    """Return a table of a driver's results on each map, worst first."""
     from cavmarl.evaluate.map_table import SHOWN
     from cavmarl.evaluate.metrics import METRICS
 
@@ -209,7 +222,7 @@ def _heads(names: Iterable[str]) -> list[str]:
 
 
 def _metric_rows(cells_of: Callable[[Metric], list[str]]) -> Iterator[list[str]]:
-    """Title and cells of each metric that has any, but for parts of the reward."""
+    """Yield title and cells of each metric that has values, except for terms of the reward."""
     from cavmarl.evaluate.metrics import METRICS
 
     for metric in METRICS:
@@ -219,7 +232,7 @@ def _metric_rows(cells_of: Callable[[Metric], list[str]]) -> Iterator[list[str]]
 
 
 def _transfer_rows(found: Sequence[TransferSummary | None]) -> Iterator[list[str]]:
-    """Title and cells of what is told of changes of owner; nothing of undivided worlds."""
+    """Yield title and cells of the transfer statistics; undivided worlds have none."""
     summaries = [summary for summary in found if summary is not None]
     if not summaries:
         return
@@ -263,7 +276,7 @@ def _new_folder(env: str) -> Path:
 
 
 def _check_page(html: Path | None) -> None:
-    """Refuse a page that cannot be written before any work is done for it."""
+    """Raise an error before the evaluation starts if the page cannot be written."""
     if html is None:
         return
     require("matplotlib", "report")
@@ -278,7 +291,7 @@ def _caption(repeats: int) -> str:
 
 
 def report_cell(metric: Metric, found: Found) -> str:
-    """Mean, then its interval between runs or Wilson's, then the SD within a run."""
+    """Return mean, interval (between runs, or Wilson's) and SD within a run as a text."""
     if found.mean is None:
         return number(None)
     parts = [_figure(metric.scale * found.mean)]

@@ -1,4 +1,4 @@
-"""`cavmarl follow`: the reference stack in a process of its own, at the clock of another."""
+"""`cavmarl follow`: drives agents of a world that another process runs."""
 
 from __future__ import annotations
 
@@ -24,22 +24,31 @@ from cavmarl.core.errors import ConfigError
 def follow(
     env: Environment,
     at: Annotated[
-        str, about("Where the world listens.", "--at", metavar="ADDRESS")
+        str, about("Unix socket or port at which the world listens.", "--at", metavar="ADDRESS")
     ] = DEFAULT_PLACE,
-    vehicles: Annotated[str, about("Agents to drive.", metavar="NAME,…")] = "car_0",
-    name: Annotated[str, about("Name shown in messages.")] = "reference",
+    vehicles: Annotated[
+        str, about("Agents to drive, comma-separated.", metavar="NAME,…")
+    ] = "car_0",
+    name: Annotated[str, about("Name of this follower in messages.", metavar="NAME")] = "reference",
     stage: Annotated[
-        list[str] | None, about("A stage of the stack to replace.", metavar="STAGE=NAME")
+        list[str] | None,
+        about(
+            "Replace a stage of the driving stack. Repeat it for more stages.", metavar="STAGE=NAME"
+        ),
     ] = None,
     cloud: Annotated[
-        Path | None, about("A point-cloud map, for localisation=scan_matching.", exists=True)
+        Path | None,
+        about("Point-cloud map for localisation=scan_matching.", metavar="FILE", exists=True),
     ] = None,
     settings: Settings = None,
-    joins_s: Annotated[float, about("Seconds that the world may take to answer.")] = 60.0,
+    joins_s: Annotated[float, about("Seconds in which the world must answer.", metavar="S")] = 60.0,
     secret_file: SecretFile = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Drive agents of a world that `cavmarl lead` runs, from their sensors and the map of ENV."""
+    """Drive agents of a world that `cavmarl lead` runs.
+
+    The reference driving stack uses the sensors of the agents and the map of ENV.
+    """
     from cavmarl.config.registry import load_config
     from cavmarl.cosim.followers.follower_client import Follower
     from cavmarl.cosim.followers.follower_driver import StackDriver
@@ -66,7 +75,7 @@ def _stages(words: list[str], known: tuple[str, ...]) -> dict[str, str]:
     for word in words:
         stage, equals, name = word.partition("=")
         if not equals or stage not in known:
-            raise ConfigError(f"--stage {word}: must be STAGE=NAME, a stage of {', '.join(known)}")
+            raise ConfigError(f"--stage {word}: must be STAGE=NAME; stages are {', '.join(known)}")
         chosen[stage] = name
     return chosen
 

@@ -1,4 +1,4 @@
-"""`cavmarl journal`: replays a coordinator's log and prints the owners."""
+"""`cavmarl journal`: replays the log of ownership and prints the owners."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ if TYPE_CHECKING:
 def journal(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="A journal of a run.", exists=True, dir_okay=False),
+        typer.Argument(metavar="FILE", help="Journal of a run.", exists=True, dir_okay=False),
     ],
-    at: Annotated[int | None, about("Print the owners at this tick.", metavar="TICK")] = None,
+    at: Annotated[
+        int | None, about("Print the owners at this tick [default: at the end].", metavar="TICK")
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Replay the log of a divided run: hand-offs, hosts, and the owners at its end or at a tick."""
+    """Replay the ownership log of a divided run: hand-offs, hosts and owners."""
     from cavmarl.handoff.coordinator.journal_summary import owners_at, summarize
 
     console = Console()
@@ -38,14 +40,16 @@ def journal(
     console.print(_counts(summary))
     console.print(_zones(table))
     if summary.unfinished >= 0:
-        console.print(f"note: tick {summary.unfinished} was begun and not committed")
+        console.print(f"note: tick {summary.unfinished} was started but not committed")
     if summary.torn:
-        console.print(f"note: {escape(summary.torn)}; left out", soft_wrap=True, style="yellow")
+        console.print(
+            f"note: {escape(summary.torn)}; it is ignored", soft_wrap=True, style="yellow"
+        )
     write_json(json_path, {**summary.to_dict(), "tick": table.tick, "owners": _rows(table)})
 
 
 def _rows(table: OwnerTable) -> list[list[int]]:
-    """Vehicle, zone, epoch and ticks of waiting, by vehicle."""
+    """Return rows of vehicle, zone, epoch and ticks of delay, sorted by vehicle."""
     return [
         [vehicle, zone, epoch, table.deferred.get(vehicle, 0)]
         for vehicle, (zone, epoch) in sorted(table.owners.items())
@@ -73,7 +77,7 @@ def _counts(summary: JournalSummary) -> Table:
 
 
 def _zones(table: OwnerTable) -> Table:
-    """The host of each zone at the end, and how many vehicles it owns."""
+    """Return a table of each zone's host at the end and its number of vehicles."""
     owned = [zone for zone, _ in table.owners.values()]
     rows = [
         (*map(str, (zone, owned.count(zone), *host)), table.states[zone].name.lower())

@@ -1,4 +1,4 @@
-"""`cavmarl lead`: a world as time master, for followers that join over a socket."""
+"""`cavmarl lead`: runs a world as the time master of programs that join over a socket."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import (
+    WORLD,
     Backend,
     JsonPath,
     Workers,
+    Zones,
     about,
     grid,
     print_error,
@@ -34,18 +36,25 @@ if TYPE_CHECKING:
 DEFAULT_PLACE = "cavmarl.sock"
 
 Place = Annotated[
-    str, about("A socket's path, or a port of this machine.", "--at", metavar="ADDRESS")
+    str,
+    about("Path of a Unix socket, or a port of this machine.", "--at", metavar="ADDRESS"),
 ]
 
 
 SecretFile = Annotated[
     Path | None,
-    about("File with the secret of a world at a port; `lead` makes it if there is none."),
+    about(
+        "File with the secret for a world at a port. `cavmarl lead` creates it if it is missing.",
+        metavar="FILE",
+    ),
 ]
 
 
 def read_secret(path: Path | None, may_make: bool = False) -> str:
-    """The secret of a file, which no other user can read; none without a file."""
+    """Return the secret in a file, or an empty text without a file.
+
+    With `may_make`, create a missing file that only this user can read.
+    """
     if path is None:
         return ""
     try:
@@ -56,12 +65,14 @@ def read_secret(path: Path | None, may_make: bool = False) -> str:
     except (OSError, UnicodeError) as error:
         raise ConfigError(f"--secret-file {path}: {error}") from error
     if not secret:
-        raise ConfigError(f"--secret-file {path}: is empty; delete it, and `lead` makes another")
+        raise ConfigError(
+            f"--secret-file {path}: the file is empty; delete it: `cavmarl lead` creates a new one"
+        )
     return secret
 
 
 def address_of(text: str) -> str | int:
-    """A port, if it is a number; else the path of a Unix socket."""
+    """Return a port if `text` is a number, otherwise the path of a Unix socket."""
     return int(text) if text.isdecimal() else text
 
 
@@ -69,40 +80,59 @@ def address_of(text: str) -> str | int:
 def lead(
     world: WorldSpec,
     at: Place = DEFAULT_PLACE,
-    followers: Annotated[int, about("Followers that have to join before the first step.")] = 1,
-    steps: Annotated[int | None, about("Most steps; default: one episode.")] = None,
-    timeout_s: Annotated[float, about("Seconds that a step waits for its followers.")] = 10.0,
-    joins_s: Annotated[float, about("Seconds that followers may take to join.")] = 600.0,
+    followers: Annotated[
+        int, about("Number of followers that must join before the first step.", metavar="N")
+    ] = 1,
+    steps: Annotated[
+        int | None, about("Maximum number of steps [default: one episode].", metavar="N")
+    ] = None,
+    timeout_s: Annotated[
+        float, about("Seconds that a step waits for its followers.", metavar="S")
+    ] = 10.0,
+    joins_s: Annotated[
+        float, about("Seconds in which the followers must join.", metavar="S")
+    ] = 600.0,
     secret_file: SecretFile = None,
     on_lost: Annotated[
-        Literal["go-on", "end"], about("What a follower's fault ends: itself, or the run.")
+        Literal["go-on", "end"],
+        about(
+            "After a follower fails: drive its vehicles with the built-in driver, or end the run."
+        ),
     ] = "go-on",
     own_ticks: Annotated[
-        Literal["refuse", "ignore"], about("How to treat a follower's own ticks.")
+        Literal["refuse", "ignore"],
+        about("Whether a follower that ticks the world itself is refused or ignored."),
     ] = "refuse",
     bad_controls: Annotated[
-        Literal["error", "hold"], about("How to treat invalid controls.")
+        Literal["error", "hold"],
+        about("After invalid controls: raise an error, or keep the previous controls."),
     ] = "error",
     pace: Annotated[
-        float | None, about("Simulated seconds a second; default: as fast as possible.")
+        float | None,
+        about(
+            "Simulated seconds per second of real time [default: as fast as possible].", metavar="X"
+        ),
     ] = None,
     rig: Annotated[
         Literal["none", "reference", "camera"],
-        about("Mount the sensors that the reference stack drives with."),
+        about("Mount the sensors that the reference driving stack needs.", panel=WORLD),
     ] = "none",
-    zones: Annotated[int | None, about("Shadows zones.count.")] = None,
+    zones: Zones = None,
     backend: Backend = None,
     workers: Workers = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Run a world as its time master; followers that join over a socket drive its agents."""
+    """Run a world whose agents are driven by programs that join over a socket."""
     from cavmarl.cosim.followers.followed_world import FollowedWorld
     from cavmarl.cosim.stack.stack import RIGS
     from cavmarl.cosim.time_master import RealTime
     from cavmarl.env.parallel import parallel_env
 
     if followers < 0 or (steps is not None and steps < 1):
-        raise ConfigError("--followers must be 0 or more, --steps 1 or more")
+        raise ConfigError(
+            f"--followers {followers}, --steps {steps}: --followers must be at least 0 and --steps "
+            "at least 1"
+        )
     console = Console()
     pacer = None if pace is None else RealTime(pace)
     if rig in RIGS:
@@ -131,7 +161,7 @@ def lead(
 
 
 def _run(world: FollowedWorld, seed: int, steps: int | None, on_lost: str) -> dict[str, Any]:
-    """One episode; what came of it."""
+    """Run one episode and return its figures."""
     master, lost = world.master, []
 
     def go_on(act: Callable[[], object]) -> None:
@@ -140,7 +170,7 @@ def _run(world: FollowedWorld, seed: int, steps: int | None, on_lost: str) -> di
         except FollowerError as error:
             if on_lost == "end":
                 raise
-            print_error(f"{error} (the built-in driver takes its vehicles)")
+            print_error(f"{error} (the built-in driver drives its vehicles from here on)")
             lost.append(str(error))
 
     go_on(partial(world.reset, seed))
@@ -182,5 +212,5 @@ def _table(found: dict[str, Any]) -> Table:
         )
         for row in found["barrier"]
     )
-    heads = ("follower", "answers", "late", "bad", "waited for, s", "slowest in")
+    heads = ("follower", "answers", "late", "invalid", "waited for, s", "slowest in")
     return grid(heads, rows, f"{found['steps']} steps, {found['time_s']:g} s")

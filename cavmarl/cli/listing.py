@@ -14,7 +14,7 @@ from cavmarl.core.errors import ConfigError
 
 
 def list_entries(json_path: JsonPath = None) -> None:
-    """Show the environments and the drivers that a name can mean."""
+    """List the environments and drivers that have a name."""
     console = Console()
     environments = Table("environment", "population", "background", "action", "folder")
     names = {}

@@ -1,19 +1,53 @@
-"""`cavmarl map`: builds road networks, checks, exports, compares and divides them."""
+"""`cavmarl map`: builds, checks, exports, compares and divides road networks."""
 
 from __future__ import annotations
 
 import typer
 
 from cavmarl.cli import map_build, map_check, map_export, map_fidelity, map_survey, map_zones
+from cavmarl.cli.output import add_command
 
 app = typer.Typer(
-    help="Build road networks, check that they can be driven, export, compare and divide them.",
+    help="Build, check, export, compare and divide road networks.",
     no_args_is_help=True,
 )
 
-app.command("build")(map_build.build)
-app.command("check")(map_check.check)
-app.command("export")(map_export.export)
-app.command("zones")(map_zones.zones)
-app.command("fidelity")(map_fidelity.fidelity)
-app.command("survey")(map_survey.survey)
+add_command(
+    app,
+    "build",
+    map_build.build,
+    "cavmarl map build city.osm.xml --dem heights.tif",
+    "cavmarl map build road.xodr --out road.net.xml --tolerant",
+)
+add_command(
+    app,
+    "check",
+    map_check.check,
+    "cavmarl map check city.net.xml --page check.html",
+    "cavmarl map check city.net.xml --fix repaired.net.xml",
+)
+add_command(
+    app,
+    "export",
+    map_export.export,
+    "cavmarl map export city.net.xml --opendrive city.xodr --geojson lanes.geojson",
+)
+add_command(
+    app,
+    "zones",
+    map_zones.zones,
+    "cavmarl map zones town --count 9 --picture zones.png",
+    "cavmarl map zones town --count 4 --avoid-junctions --out zones.json",
+)
+add_command(
+    app,
+    "fidelity",
+    map_fidelity.fidelity,
+    "cavmarl map fidelity city.net.xml scan.laz --frame utm --page fidelity.html",
+)
+add_command(
+    app,
+    "survey",
+    map_survey.survey,
+    "cavmarl map survey town --out cloud.ply --vehicles 4",
+)

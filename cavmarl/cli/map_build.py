@@ -1,4 +1,4 @@
-"""`cavmarl map build`: a road network of a map file, with heights."""
+"""`cavmarl map build`: builds a road network from a map file, with heights."""
 
 from __future__ import annotations
 
@@ -11,7 +11,14 @@ from rich.table import Table
 from rich.text import Text
 
 from cavmarl.cli.map_check import print_report
-from cavmarl.cli.output import JsonPath, about, grid, write_json
+from cavmarl.cli.output import (
+    OUTPUT,
+    JsonPath,
+    about,
+    flag,
+    grid,
+    write_json,
+)
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import in_stages
 from cavmarl.maps.check import check_map
@@ -21,9 +28,7 @@ from cavmarl.roads.sumo_net.reader import map_name
 
 Source = Annotated[
     Path,
-    typer.Argument(
-        help="A SUMO network, an OSM or an OpenDRIVE file.", exists=True, dir_okay=False
-    ),
+    typer.Argument(help="Map file: a SUMO network, OSM or OpenDRIVE.", exists=True, dir_okay=False),
 ]
 
 _NETWORK_ENDINGS = (".net.xml", ".net.xml.gz")
@@ -33,44 +38,74 @@ _SHOWN = 12
 def build(
     source: Source,
     out: Annotated[
-        Path | None, about("Default: NAME.net.xml in this folder.", "--out", "-o")
+        Path | None,
+        about(
+            "Network file to write [default: NAME.net.xml in this folder].",
+            "--out",
+            "-o",
+            metavar="FILE",
+            panel=OUTPUT,
+        ),
     ] = None,
     dem: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Heights of the ground: GeoTIFF or HGT; may be repeated.",
+            help="Elevation model: GeoTIFF or HGT. Repeat it for more files.",
+            metavar="FILE",
             exists=True,
             dir_okay=False,
         ),
     ] = None,
     origin: Annotated[
-        str | None, about("LAT,LON of the map's x = y = 0; default: UTM, the roads' corner.")
+        str | None,
+        about(
+            "Geographic position of x = y = 0 [default: UTM, the corner of the roads].",
+            metavar="LAT,LON",
+        ),
     ] = None,
     limit_grade: Annotated[
         float | None,
-        about("Flatten roads to this grade, as 0.15; default: as they are.", min=0.01),
+        about(
+            "Flatten roads to this grade, for example 0.15 [default: no limit].",
+            metavar="X",
+            min=0.01,
+        ),
     ] = None,
     max_grade: Annotated[
-        float, about("Refuse roads that are steeper than the model may be.", min=0.01)
+        float, about("Refuse maps with roads steeper than this grade.", metavar="X", min=0.01)
     ] = MOST_GRADE,
-    licence: Annotated[str, about("Of the source; default: ODbL for OpenStreetMap.")] = "",
-    dem_licence: Annotated[str, about("Of the heights.")] = "",
-    tolerant: Annotated[bool, about("Leave out what netconvert cannot use, and list it.")] = False,
+    licence: Annotated[
+        str, about("Licence of the map file [default: ODbL for OSM].", metavar="NAME")
+    ] = "",
+    dem_licence: Annotated[str, about("Licence of the elevation model.", metavar="NAME")] = "",
+    tolerant: Annotated[
+        bool, flag("Leave out elements that netconvert cannot use, and list them.")
+    ] = False,
     bbox: Annotated[
         str | None,
-        about("Keep roads within min,min,max,max: degrees lon,lat for OSM, else metres."),
+        about(
+            "Keep only roads in this box, in degrees for OSM and otherwise in metres.",
+            metavar="WEST,SOUTH,EAST,NORTH",
+        ),
     ] = None,
-    timeout_s: Annotated[float | None, about("Seconds of netconvert; default 600.", min=1)] = None,
+    timeout_s: Annotated[
+        float | None,
+        about("Time limit of netconvert in seconds [default: 600].", metavar="S", min=1),
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Make a SUMO network of a map file; its statistics go beside it, to NAME.stats.json."""
+    """Build a SUMO network from a map file.
+
+    The statistics are written to NAME.stats.json beside it. If the map cannot be driven, exit with
+    1.
+    """
     target = out or Path(f"{map_name(source)}.net.xml")
     if not target.name.endswith(_NETWORK_ENDINGS):
         raise typer.BadParameter(
             f"'{target}' must end in {' or '.join(_NETWORK_ENDINGS)}", param_hint="--out"
         )
     if limit_grade is not None and not dem:
-        raise ConfigError("--limit-grade: is for heights: give --dem too")
+        raise ConfigError("--limit-grade: needs heights; add --dem FILE")
     heights = HeightOptions(tuple(dem), limit_grade, max_grade) if dem else None
     console = Console()
     with in_stages(console, [*STAGES, "checks"]) as told:
@@ -102,7 +137,7 @@ def _box(text: str | None) -> Box | None:
         west, south, east, north = map(float, text.split(","))
     except ValueError as error:
         raise typer.BadParameter(
-            f"'{text}' is not four numbers: min,min,max,max", param_hint="--bbox"
+            f"'{text}' must be four numbers, WEST,SOUTH,EAST,NORTH", param_hint="--bbox"
         ) from error
     return west, south, east, north
 
@@ -114,7 +149,7 @@ def _origin(text: str | None) -> tuple[float, float] | None:
         latitude, longitude = map(float, text.split(","))
     except ValueError as error:
         raise typer.BadParameter(
-            f"'{text}' is not two numbers: LAT,LON", param_hint="--origin"
+            f"'{text}' must be two numbers, LAT,LON", param_hint="--origin"
         ) from error
     return latitude, longitude
 
@@ -137,13 +172,13 @@ def _print_build(console: Console, result: BuildResult) -> None:
         console.print(table)
         hidden = len(result.warnings) - _SHOWN
         if hidden > 0:
-            console.print(f"… and {hidden} more kinds (all in the JSON)", style="dim")
+            console.print(f"… and {hidden} more kinds; --json lists all", style="dim")
     if result.defaults:
         rows = [
             [row.kind, row.guessed, row.value, f"{row.used_for} of {row.edges}"]
             for row in result.defaults
         ]
-        console.print(grid(["kind of road", "not said", "taken", "edges"], rows))
+        console.print(grid(["kind of road", "missing", "default", "edges"], rows))
     if result.heights is not None:
         _print_heights(console, result.heights)
 
@@ -165,4 +200,4 @@ def _print_heights(console: Console, heights: HeightReport) -> None:
         console.print(Text(f"warning: steeper than {STEEP_GRADE:.0%}: {line}", style="yellow"))
     hidden = len(heights.steep) - _SHOWN
     if hidden > 0:
-        console.print(f"… and {hidden} more (all in the JSON)", style="dim")
+        console.print(f"… and {hidden} more; --json lists all", style="dim")

@@ -1,4 +1,4 @@
-"""`cavmarl map check`: what a map holds, and what looks wrong in it."""
+"""`cavmarl map check`: prints statistics and defects of a map."""
 
 from __future__ import annotations
 
@@ -23,27 +23,37 @@ from cavmarl.maps.repair import mend
 from cavmarl.roads.cache import load_network
 
 _SHOWN = 12
-_READ, _COUNT, _PAGE, _MEND = "reading", "figures", "page", "mending"
+_READ, _COUNT, _PAGE, _REPAIR = "reading", "figures", "page", "repair"
 
 
 def check(
     env: Environment,
     buildings: Annotated[
-        Path | None, about("OSM or SUMO polygons: those on roads are told.", exists=True)
+        Path | None,
+        about(
+            "OSM file or SUMO polygons; buildings on roads are reported.",
+            metavar="FILE",
+            exists=True,
+        ),
     ] = None,
     fix: Annotated[
-        Path | None, about_file("Write a mended network here (.net.xml), and list what was done.")
+        Path | None, about_file("Write a repaired network to this .net.xml file.")
     ] = None,
-    page: Annotated[Path | None, about_file("Write a page with a picture, places marked.")] = None,
+    page: Annotated[
+        Path | None, about_file("Write a page with a picture in which defects are marked.")
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Say what a map holds and whether it can be driven; exit code 1 if it cannot."""
+    """Print the statistics and defects of a map.
+
+    If the map cannot be driven, exit with 1.
+    """
     if fix is not None and not fix.name.endswith(".net.xml"):
         raise ConfigError(f"--fix {fix}: must end in .net.xml")
     console = Console()
     done: list[str] = []
     left: list[Defect] = []
-    with in_stages(console, [_READ, _COUNT, *SEARCHES, _PAGE, _MEND]) as told:
+    with in_stages(console, [_READ, _COUNT, *SEARCHES, _PAGE, _REPAIR]) as told:
         told(_READ)
         path = find_map(env)
         network = load_network(path)
@@ -54,16 +64,18 @@ def check(
             told(_PAGE)
             write_check_page(page, network, defects)
         if fix is not None:
-            told(_MEND)
+            told(_REPAIR)
             done, left = mend(path, fix, defects)
     print_report(console, report)
     _print_defects(console, defects)
     document = report.to_dict() | {"defects": [defect.to_dict() for defect in defects]}
     if fix is not None:
         for line in done:
-            console.print(Text(f"mended: {line}"))
-        console.print(Text(f"{fix}: {len(done)} mended, {len(left)} left, to be mended by hand"))
-        document |= {"mended": done, "left": [defect.to_dict() for defect in left]}
+            console.print(Text(f"repaired: {line}"))
+        console.print(
+            Text(f"{fix}: {len(done)} defects repaired, {len(left)} left for you to repair")
+        )
+        document |= {"repaired": done, "left": [defect.to_dict() for defect in left]}
     write_json(json_path, document)
     raise typer.Exit(0 if report.drivable else 1)
 
@@ -79,11 +91,13 @@ def _print_defects(console: Console, defects: Sequence[Defect]) -> None:
     if rows:
         console.print(grid(["kind", "name", "x, y (m)", ""], rows, wraps=True))
     if len(defects) > _SHOWN:
-        console.print(f"… and {len(defects) - _SHOWN} more (--page, --json)", style="dim")
+        console.print(
+            f"… and {len(defects) - _SHOWN} more; --page and --json list all", style="dim"
+        )
 
 
 def print_report(console: Console, report: MapReport) -> None:
-    """What a map holds, as a table, and what is wrong with it."""
+    """Print a map's statistics as a table, and its problems."""
     table = Table(title=Text(report.name), show_header=False)
     min_x, min_y, max_x, max_y = report.extent_m
     share = f"{report.connected_share:.0%}"

@@ -1,4 +1,4 @@
-"""`cavmarl map export`: a map for other programs."""
+"""`cavmarl map export`: writes a map for other programs."""
 
 from __future__ import annotations
 
@@ -25,14 +25,21 @@ _LOAD, _LANELETS, _LINES = "map", "Lanelet2", "GeoJSON"
 
 def export(
     env: Environment,
-    opendrive: Annotated[Path | None, about_file("Write OpenDRIVE, and read it back.")] = None,
-    lanelet2: Annotated[Path | None, about_file("Write Lanelet2 (.osm), and read it back.")] = None,
+    opendrive: Annotated[
+        Path | None, about_file("Write OpenDRIVE, and check it by reading it back.")
+    ] = None,
+    lanelet2: Annotated[
+        Path | None, about_file("Write Lanelet2 (.osm), and check it by reading it back.")
+    ] = None,
     geojson: Annotated[Path | None, about_file("Write the lanes as GeoJSON.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Write a map for other programs; exit code 1 if what is read back differs."""
+    """Write a map for other programs.
+
+    If a written file differs when it is read back, exit with 1.
+    """
     if opendrive is None and lanelet2 is None and geojson is None:
-        raise ConfigError("nothing to export: give --opendrive, --lanelet2 or --geojson")
+        raise ConfigError("the format is missing: give --opendrive, --lanelet2 or --geojson")
     console = Console()
     document: dict[str, Any] = {}
     sound = True
@@ -70,7 +77,7 @@ def _show(console: Console, target: Path, trip: RoundTrip) -> None:
         console.print(Text(f"{target}: {problem}", style="red"))
     if trip.read.links < trip.map.links or trip.read_off > MOST_OFF:
         words = (
-            "netconvert's reader leaves out lanes that merge into one lane, and cuts roads at "
-            "junctions anew; the file has them"
+            "netconvert leaves out lanes that merge into one lane and splits roads at junctions "
+            "when it reads the file; the file itself is complete"
         )
         console.print(Text(f"note: {words}", style="yellow"))

@@ -1,4 +1,4 @@
-"""`cavmarl map fidelity`: how true a map, or a cloud, is to measured point clouds."""
+"""`cavmarl map fidelity`: compares measured point clouds with a map or another cloud."""
 
 from __future__ import annotations
 
@@ -29,13 +29,11 @@ from cavmarl.roads.network import RoadNetwork
 
 _ALIGNMENTS = ("icp", "edges", "none")
 _STAGES = ("points", "surroundings", "distances", "roads")
-_MARGIN_M = 5.0  # around the map, and of the map around a cloud
+_MARGIN_M = 5.0  # points this far outside of the map are kept, and the map this far around a cloud
 
-Reference = Annotated[
-    str, typer.Argument(metavar="MAP", help="A map, or a cloud that others are compared with.")
-]
+Reference = Annotated[str, typer.Argument(metavar="MAP", help="Reference: a map or a point cloud.")]
 Measured = Annotated[
-    Path, typer.Argument(help="A point cloud: csv, ply, pcd, las, laz.", dir_okay=False)
+    Path, typer.Argument(help="Point cloud: csv, ply, pcd, las or laz.", dir_okay=False)
 ]
 
 
@@ -43,34 +41,56 @@ def fidelity(
     reference: Reference,
     cloud: Measured,
     cloud2: Annotated[
-        Path | None, typer.Argument(help="Another one, in a second column.", dir_okay=False)
+        Path | None,
+        typer.Argument(help="Second point cloud, shown in its own column.", dir_okay=False),
     ] = None,
-    frame: Annotated[str, about(f"Of the clouds: {', '.join(FRAMES)}.")] = "map",
+    frame: Annotated[
+        str, about(f"Frame of the clouds: {', '.join(FRAMES)}.", metavar="FRAME")
+    ] = "map",
     start: Annotated[
-        str | None, about("Where a cloud lies about: x,y,z,yaw, m and degrees.")
+        str | None,
+        about("Approximate pose of a cloud in metres and degrees.", metavar="X,Y,Z,YAW"),
     ] = None,
-    voxel: Annotated[float, about("Side of the voxel filter's cubes, m; 0: no filter.")] = 0.05,
+    voxel: Annotated[
+        float, about("Cube side of the voxel filter in metres; 0 turns it off.", metavar="M")
+    ] = 0.05,
     outliers: Annotated[
-        float, about("Sigmas beyond which the outlier filter removes points; 0: no filter.")
+        float,
+        about(
+            "Outlier filter: remove points beyond this many sigmas; 0 turns it off.", metavar="X"
+        ),
     ] = 4.0,
-    keep: Annotated[float, about("Share of the nearest pairs that trimmed ICP keeps.")] = 0.8,
+    keep: Annotated[
+        float, about("Share of nearest pairs that trimmed ICP keeps.", metavar="X")
+    ] = 0.8,
     align: Annotated[
-        str, about("By icp, by the edges and heights of roads, or none: as they are.")
+        str,
+        about(
+            "How clouds are aligned: icp, edges (road edges and heights) or none.", metavar="METHOD"
+        ),
     ] = "icp",
     buildings: Annotated[
-        Path | None, about("OSM or SUMO polygons: their walls are part of the map's surface.")
+        Path | None,
+        about("OSM file or SUMO polygons; their walls join the map's surface.", metavar="FILE"),
     ] = None,
-    points: Annotated[Path | None, about_file("Write each point's distance: .csv, .ply.")] = None,
-    page: Annotated[Path | None, about_file("Write a page with a picture to turn.")] = None,
+    points: Annotated[
+        Path | None, about_file("Write the distance of each point (.csv, .ply).")
+    ] = None,
+    page: Annotated[Path | None, about_file("Write a page with a 3-D picture.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Compare clouds with a map's surface or a cloud; exit code 1 if an alignment fails."""
+    """Compare point clouds with a map's surface or with another cloud.
+
+    If an alignment does not converge, exit with 1.
+    """
     if align not in _ALIGNMENTS:
-        raise ConfigError(f"--align {align}: is none of {', '.join(_ALIGNMENTS)}")
+        raise ConfigError(f"--align {align}: must be one of {', '.join(_ALIGNMENTS)}")
     begin = start_transform(start)
     network = None if is_cloud(Path(reference)) else _network(reference, buildings)
     if network is None and align == "edges":
-        raise ConfigError(f"--align edges: {reference} is a cloud and has no roads: give a map")
+        raise ConfigError(
+            f"--align edges: {reference} is a cloud without roads; name a map instead"
+        )
     console = Console()
     rows, fits = [], []
     paths = list(filter(None, (cloud, cloud2)))
@@ -128,7 +148,7 @@ def _filtered(
 def _beside_map(
     cloud: Cloud, network: RoadNetwork, begin: Any, align: str
 ) -> tuple[Cloud, Any, Cloud]:
-    """The cloud, where it begins, and the map's surface around it."""
+    """Return the cloud, its initial transform, and the map's surface around it."""
     placed = moved(cloud.points, begin)
     box = (*(placed[:, :2].min(axis=0) - _MARGIN_M), *(placed[:, :2].max(axis=0) + _MARGIN_M))
     if align == "edges":
@@ -136,7 +156,7 @@ def _beside_map(
         if fit.transform is None:
             raise ConfigError(
                 f"{cloud.name}: {len(fit.edge_offset_m)} road edges of {fit.stations} sections "
-                "were found, too few or all of one direction: use --align icp or none"
+                "were found, which are too few or all in one direction; use --align icp or none"
             )
         begin = fit.transform @ begin
     return cloud, begin, map_surface(network, box)[0]

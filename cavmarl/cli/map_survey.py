@@ -1,4 +1,4 @@
-"""`cavmarl map survey`: a point-cloud map made by driving with a lidar through a world."""
+"""`cavmarl map survey`: makes a point-cloud map by driving through a world with a lidar."""
 
 from __future__ import annotations
 
@@ -20,20 +20,31 @@ _TICK_S = 0.05
 
 def survey(
     env: Environment,
-    out: Annotated[Path, about_file("Write the cloud: .ply or .csv.", "--out", "-o")],
-    time_s: Annotated[float, about("Simulated seconds that each vehicle drives.", min=10.0)] = 60.0,
-    vehicles: Annotated[int, about("Vehicles, each in a world of its own.", min=1, max=64)] = 4,
+    out: Annotated[Path, about_file("Point cloud to write (.ply or .csv).", "--out", "-o")],
+    time_s: Annotated[
+        float, about("Simulated seconds that each vehicle drives.", metavar="S", min=10.0)
+    ] = 60.0,
+    vehicles: Annotated[
+        int, about("Number of vehicles, each in its own world.", metavar="N", min=1, max=64)
+    ] = 4,
     seed: Seed = 0,
     buildings: Annotated[
-        str | None, about("As map.buildings: osm, or a file beside the map.")
+        str | None,
+        about("Buildings: osm, or a file beside the map (key map.buildings).", metavar="SOURCE"),
     ] = None,
-    range_m: Annotated[float, about("Of the echoes that are kept, m.", "--range", min=2.0)] = 30.0,
-    voxel: Annotated[float, about("One point is kept in a cube of this side, m.", min=0.02)] = 0.2,
-    points: Annotated[Path | None, about_file("Write each point's distance: .csv, .ply.")] = None,
-    page: Annotated[Path | None, about_file("Write a page with a picture to turn.")] = None,
+    range_m: Annotated[
+        float, about("Keep echoes up to this range in metres.", "--range", metavar="M", min=2.0)
+    ] = 30.0,
+    voxel: Annotated[
+        float, about("Keep one point per cube of this side in metres.", metavar="M", min=0.02)
+    ] = 0.2,
+    points: Annotated[
+        Path | None, about_file("Write the distance of each point (.csv, .ply).")
+    ] = None,
+    page: Annotated[Path | None, about_file("Write a page with a 3-D picture.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Map a world by lidar, GNSS and IMU; say how far the cloud is from the map's surface."""
+    """Map a world with lidar, GNSS and IMU, and compare the cloud with the map's surface."""
     from cavmarl.cosim.lidar_survey import SURVEY_RIG, Surveyor
     from cavmarl.cosim.survey_fit import fit_survey
     from cavmarl.env.vector import make_vec
@@ -53,7 +64,9 @@ def survey(
         with counting(console, "driving") as told:
             found = Surveyor(worlds, range_m, voxel).run(steps, lambda step: told(step, steps))
         if not len(found.cloud.points):
-            raise ConfigError(f"--time-s {time_s:g}: no frame was taken: drive for longer")
+            raise ConfigError(
+                f"--time-s {time_s:g}: no lidar frame was recorded; choose a longer time"
+            )
         with console.status("comparing with the map …"):
             fit, comparison = fit_survey(found.cloud, worlds.network)
     finally:

@@ -1,4 +1,4 @@
-"""`cavmarl map zones`: cuts a map into zones and prints their statistics."""
+"""`cavmarl map zones`: divides a map into zones and prints their statistics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavmarl.cli.output import Environment, JsonPath, about, about_file, write_json
+from cavmarl.cli.output import (
+    Environment,
+    JsonPath,
+    about,
+    about_file,
+    flag,
+    write_json,
+)
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
@@ -26,21 +33,34 @@ from cavmarl.zones.partition.zone_statistics import ZoneStatistics, zone_statist
 def zones(
     env: Environment,
     count: Annotated[
-        int | None, about("Number of zones; default: 4, or as many as a zone file has.")
+        int | None, about("Number of zones [default: 4, or as in a zone file].", metavar="K")
     ] = None,
-    layout: Annotated[str, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")] = "bisection",
+    layout: Annotated[
+        str,
+        about(f"Shape of the zones: {', '.join(ZONE_LAYOUTS)}, or a zone file.", metavar="LAYOUT"),
+    ] = "bisection",
     avoid_junctions: Annotated[
-        bool, about("Move cuts aside to keep junctions whole.", "--avoid-junctions")
+        bool, flag("Move borders so that they cut no junctions.", "--avoid-junctions")
     ] = False,
     weight: Annotated[
-        str, about("What bisection shares out: lane_length, or uniform for area.")
+        str,
+        about("Quantity that bisection divides: lane_length, or uniform (area).", metavar="NAME"),
     ] = "lane_length",
-    halo: Annotated[float, about("How far zones see over their borders, m.", min=0.0)] = 100.0,
-    out: Annotated[Path | None, about_file("Write a zone file here.", "--out", "-o")] = None,
-    picture: Annotated[Path | None, about_file("Draw the map with its zones here, a .png.")] = None,
+    halo: Annotated[
+        float,
+        about(
+            "Width of the halo in metres: how far zones see past their borders.",
+            metavar="M",
+            min=0.0,
+        ),
+    ] = 100.0,
+    out: Annotated[Path | None, about_file("Write the zones to this file.", "--out", "-o")] = None,
+    picture: Annotated[
+        Path | None, about_file("Draw the map with its zones to this .png file.")
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Divide a map into zones; print what is in each, and how evenly lanes are shared out."""
+    """Divide a map into zones, and print the statistics of each zone."""
     if picture is not None and picture.suffix != ".png":
         raise typer.BadParameter(f"'{picture}' must end in .png", param_hint="--picture")
     network = load_network(find_map(env))
@@ -51,7 +71,9 @@ def zones(
     loopless = zones_without_loop(network, partition)
     _print_notes(console, partition, statistics, halo)
     if loopless:
-        console.print(f"note: no loop to drive in: zones {_named(loopless)}", soft_wrap=True)
+        console.print(
+            f"note: zones without a closed loop of roads: {_named(loopless)}", soft_wrap=True
+        )
     if out is not None:
         write_zones(out, partition)
         console.print(f"zones: {out}", markup=False)
@@ -104,7 +126,7 @@ def _print_notes(
     if statistics.narrow:
         console.print(
             f"note: narrower than the halo of {halo_m:g} m: zones {_named(statistics.narrow)}; "
-            "results stay exact, but such a zone works more on ghosts than on its own vehicles",
+            "results stay exact, but such a zone processes more ghosts than own vehicles",
             style="yellow",
             soft_wrap=True,
         )
@@ -122,4 +144,4 @@ def _draw(network: RoadNetwork, partition: ZonePartition, halo_m: float, path: P
     try:
         load_pygame().image.save(surface, str(path))
     except (OSError, load_pygame().error) as error:
-        raise ConfigError(f"{path}: cannot be written ({error})") from error
+        raise ConfigError(f"{path}: cannot be written: {error}") from error

@@ -1,4 +1,4 @@
-"""`cavmarl node`: hosts zones of one world, or worlds for a coordination service."""
+"""`cavmarl node`: hosts zones of one world, or worlds of a coordination service."""
 
 from __future__ import annotations
 
@@ -13,67 +13,113 @@ from typing import Annotated, Literal, NoReturn
 import typer
 from rich.console import Console
 
-from cavmarl.cli.output import about
+from cavmarl.cli.output import (
+    SERVICE,
+    about,
+    flag,
+)
 from cavmarl.cli.service import Authority, Certificate, Key, SecretFile, read_secret
 from cavmarl.core.errors import ConfigError, WorkerError, require
 
-AGAIN_S = 0.5  # between two calls while no caller listens
+AGAIN_S = 0.5  # between two attempts while no caller listens
 
 
 def node(
     program: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="PROGRAM", help="With --mpi: what rank 0 runs, with its own options behind it."
+            metavar="PROGRAM",
+            help="With --mpi: the program that rank 0 runs, followed by the program's own options.",
         ),
     ] = None,
     join: Annotated[
-        str | None, about("Where the caller of a world listens.", "--join", metavar="HOST:PORT")
+        str | None,
+        about("Address at which the caller of a world listens.", "--join", metavar="HOST:PORT"),
     ] = None,
     key_file: Annotated[
-        Path | None, about("With --join: file with the key that the caller has, too.")
+        Path | None, about("With --join: file with the key of the caller.", metavar="FILE")
     ] = None,
     mpi: Annotated[
-        bool, about("Be a rank of an MPI run, whose rank 0 is the caller.", "--mpi")
+        bool, flag("Join the MPI run as one of its ranks; rank 0 is the caller.", "--mpi")
     ] = False,
     wait_s: Annotated[
-        float, about("With --join and --mpi: seconds that the caller may take to listen.")
+        float, about("With --join and --mpi: seconds in which the caller must answer.", metavar="S")
     ] = 300.0,
     service: Annotated[
-        str | None, about("URL of a coordination service.", "--service", metavar="URL")
+        str | None,
+        about(
+            "URL of the coordination service to work for.",
+            "--service",
+            metavar="URL",
+            panel=SERVICE,
+        ),
     ] = None,
-    name: Annotated[str | None, about("Name of the node; default: the machine's.")] = None,
-    host: Annotated[str, about("Address that clients reach it at.")] = "127.0.0.1",
-    port: Annotated[int, about("Port of clients; 0: any.", min=0, max=65535)] = 0,
-    slots: Annotated[int, about("Sessions and jobs at most.", min=1)] = 4,
+    name: Annotated[
+        str | None,
+        about("Name of the node [default: name of the machine].", metavar="NAME", panel=SERVICE),
+    ] = None,
+    host: Annotated[
+        str, about("Address at which clients reach the node.", metavar="ADDRESS", panel=SERVICE)
+    ] = "127.0.0.1",
+    port: Annotated[
+        int,
+        about(
+            "Port for clients; 0 picks a free port.",
+            metavar="PORT",
+            min=0,
+            max=65535,
+            panel=SERVICE,
+        ),
+    ] = 0,
+    slots: Annotated[
+        int,
+        about(
+            "Maximum number of sessions and jobs at the same time.",
+            metavar="N",
+            min=1,
+            panel=SERVICE,
+        ),
+    ] = 4,
     capability: Annotated[
-        list[str] | None, about("What sessions can ask for; may be repeated.")
+        list[str] | None,
+        about(
+            "Capability that sessions can require. Repeat it for more.",
+            metavar="NAME",
+            panel=SERVICE,
+        ),
     ] = None,
     allow: Annotated[
-        list[str] | None, about("Names of identities that it serves; default: all.")
+        list[str] | None,
+        about(
+            "Identity that the node serves. Repeat it for more [default: all].",
+            metavar="NAME",
+            panel=SERVICE,
+        ),
     ] = None,
     snapshot: Annotated[
-        Literal["measured", "idle"], about("Load that it tells: this machine's, or none.")
+        Literal["measured", "idle"],
+        about("Load that the node reports: as measured on this machine, or idle.", panel=SERVICE),
     ] = "measured",
     secret_file: SecretFile = None,
     certificate: Certificate = None,
     key: Key = None,
     authority: Authority = None,
 ) -> None:
-    """Host zones of a world until its caller ends (--join, --mpi), or work for a service.
+    """Host zones of a world until its caller ends, or work for a coordination service.
 
-    Exit code 1: the caller is gone. SIGTERM drains a node of a service.
+    If the connection to the caller is lost, exit with 1. On SIGTERM, a node of a service finishes
+    its sessions and accepts no new ones.
     """
     if (join is not None) + (service is not None) + mpi != 1:
-        raise ConfigError("give one of --join HOST:PORT, --mpi and --service URL")
+        raise ConfigError("give exactly one of --join HOST:PORT, --mpi and --service URL")
     if program and not mpi:
-        raise ConfigError(f"{program[0]!r}: only rank 0 of MPI (--mpi) runs a program")
+        raise ConfigError(f"{program[0]!r}: only rank 0 of an MPI run has a program; add --mpi")
     if mpi:
         _be_rank(program or [], wait_s)
         return
     if service is None:
         if key_file is None:
-            raise ConfigError("--join needs --key-file, the file with the caller's key")
+            raise ConfigError("--join needs the key of the caller: add --key-file FILE")
         _join(str(join), key_file, wait_s)
     require("fastapi", "service")
     from cavmarl.service.node_host import NodeOptions, host_node
@@ -96,7 +142,7 @@ def node(
 
 
 def _join(join: str, key_file: Path, wait_s: float) -> NoReturn:
-    """Host zones until the caller ends; it does not return."""
+    """Host zones until the caller ends, then exit."""
     from cavmarl.parallel.backend_name import read_address
     from cavmarl.parallel.nodes.newcomers import ANYONE
     from cavmarl.parallel.nodes.node_process import run_node
@@ -110,20 +156,20 @@ def _join(join: str, key_file: Path, wait_s: float) -> NoReturn:
         except (OSError, EOFError) as error:
             if time.monotonic() > until_s:
                 raise WorkerError(
-                    f"no caller lets this node in at {join} within {wait_s:g} s ({error}): start "
-                    "the caller, and look whether the two can reach each other"
+                    f"no caller admitted this node at {join} within {wait_s:g} s ({error}): start "
+                    "the caller, and check that the two machines can reach each other"
                 ) from error
             time.sleep(AGAIN_S)
 
 
 def _be_rank(program: list[str], wait_s: float) -> None:
-    """Run the program as rank 0 of MPI; as another one host zones until the caller ends."""
+    """Run the program if this is rank 0 of MPI; otherwise host zones until the caller ends."""
     from cavmarl.parallel.network.mpi_transport import CALLER, HOW, MPI, mpi_transport
     from cavmarl.parallel.nodes.node_process import run_node
     from cavmarl.parallel.nodes.node_system import Machine
 
     require("mpi4py", MPI)
-    # MPI begins when all ranks have begun, and waits for them so that no signal is heard.
+    # MPI starts only when all ranks have started, and ignores signals while it waits.
     faulthandler.dump_traceback_later(wait_s, exit=True)
     transport = mpi_transport()
     faulthandler.cancel_dump_traceback_later()
@@ -131,11 +177,11 @@ def _be_rank(program: list[str], wait_s: float) -> None:
     if transport.rank != CALLER:
         try:
             run_node((MPI, CALLER), b"", transport.rank - 1, _note, Machine(transport))
-            _end(is_done=True)  # a caller that does not end by itself is MPI's affair
+            _end(is_done=True)  # MPI itself ends all ranks if the caller fails
         except (OSError, EOFError) as error:
-            raise WorkerError(f"no caller is there within {wait_s:g} s: {error}") from error
+            raise WorkerError(f"no caller answered within {wait_s:g} s: {error}") from error
     if not program:
-        raise ConfigError(f"rank {CALLER} is the caller: name its program behind --mpi, or {HOW}")
+        raise ConfigError(f"rank {CALLER} is the caller: name its program after --mpi, or {HOW}")
     sys.argv = program
     sys.path[0] = str(Path(program[0]).resolve().parent)
     runpy.run_path(program[0], run_name="__main__")
@@ -146,5 +192,5 @@ def _note(text: str) -> None:
 
 
 def _end(is_done: bool) -> NoReturn:
-    Console().print("the caller has ended" if is_done else "the caller is gone")
+    Console().print("the caller has ended" if is_done else "the connection to the caller is lost")
     raise SystemExit(0 if is_done else 1)

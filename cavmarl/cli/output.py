@@ -1,4 +1,4 @@
-"""What the commands share: reading overrides, writing JSON, printing errors."""
+"""Parts that commands share: world options, overrides, tables, JSON files and error messages."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+from typer.core import TyperCommand
 
 from cavmarl.bench.harness import check_positive
 from cavmarl.config.world_spec import WorldSpec
@@ -29,12 +30,13 @@ Made = TypeVar("Made")
 
 
 def _writable(option: typer.CallbackParam, path: Path | None) -> Path | None:
-    """Refuse a path that cannot be written before any work is done for it."""
+    """Raise ConfigError before the command starts if `path` cannot be written."""
     if path is None:
         return None
     if not path.parent.is_dir():
         raise ConfigError(
-            f"{option.opts[0]} {path}: cannot be written (there is no folder {path.parent})"
+            f"{option.opts[0]} {path}: cannot be written: there is no folder {path.parent}; create "
+            "it, or name another file"
         )
     try:
         there = path.exists()
@@ -48,76 +50,185 @@ def _writable(option: typer.CallbackParam, path: Path | None) -> Path | None:
 
 
 def _unwritable(path: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"{path}: cannot be written ({error.strerror or error})")
+    return ConfigError(f"{path}: cannot be written: {error.strerror or error}")
 
 
 def check_bound(value: float | None) -> float | None:
-    """Refuse a value of `--at-least` that nothing can be measured against."""
+    """Return the value of `--at-least`; raise ConfigError unless it is positive."""
     check_positive("--at-least", value)
     return value
 
 
-def about(text: str, *names: str, **more: Any) -> Any:
-    """An option with a help text."""
-    return typer.Option(*names, help=text, **more)
+# Groups of options in the help.
+WORLD, RUN, OUTPUT, PAGE, SERVICE = "World", "Where it runs", "Output", "Page", "Service"
 
 
-def about_file(text: str, *names: str) -> Any:
-    """An option that takes a file to write, which is tried at once."""
-    return about(text, *names, callback=_writable)
+def about(text: str, *names: str, panel: str | None = None, **more: Any) -> Any:
+    """Return an option with a help text; `panel` is the group in which the help shows it.
+
+    If the text ends in "[default: …].", that is shown in place of the default of the parameter.
+    """
+    text, told, default = text.removesuffix("].").partition(" [default: ")
+    if told:
+        text, more["show_default"] = f"{text}.", default
+    return typer.Option(*names, help=text, rich_help_panel=panel, **more)
+
+
+def flag(text: str, *names: str, panel: str | None = None, **more: Any) -> Any:
+    """Return an option without a value."""
+    return about(text, *names, panel=panel, metavar="", **more)
+
+
+def about_file(text: str, *names: str, metavar: str = "FILE") -> Any:
+    """Return an option for an output file, which is opened for writing before the command runs."""
+    return about(text, *names, metavar=metavar, callback=_writable, panel=OUTPUT)
+
+
+def add_command(
+    app: typer.Typer,
+    name: str,
+    command: Callable[..., None],
+    *examples: str,
+    panel: str | None = None,
+    cls: type[TyperCommand] = TyperCommand,
+    **settings: Any,
+) -> None:
+    """Add a command whose help ends with examples; `panel` is its group in the help of `app`."""
+    end = "\n\n".join(("Examples:", *examples))
+    app.command(name, cls=cls, rich_help_panel=panel, epilog=end, context_settings=settings)(
+        command
+    )
 
 
 Backend = Annotated[
     str | None,
     about(
         "Where the worlds run: local, processes:N, nodes:N, nodes:N@HOST:PORT, nodes:N@mpi, ray:N "
-        "or ray [default: local]."
+        "or ray [default: local].",
+        metavar="BACKEND",
+        panel=RUN,
     ),
 ]
-Workers = Annotated[int | None, about("Short form: N for --backend processes:N, 0 for local.")]
+Workers = Annotated[
+    int | None,
+    about("Short form of --backend processes:N; 0 means local.", metavar="N", panel=RUN),
+]
 Environment = Annotated[
-    str, typer.Argument(metavar="ENV", help="Environment: a name, folder or map file.")
+    str, typer.Argument(metavar="ENV", help="Environment: its name, its folder, or a map file.")
 ]
 OptionalEnvironment = Annotated[
-    str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
+    str, typer.Argument(metavar="[ENV]", help="Environment: its name, its folder, or a map file.")
 ]
 MapName = Annotated[
-    str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
+    str, typer.Argument(metavar="MAP", help="Map file, or the name or folder of an environment.")
 ]
 PolicyName = Annotated[
-    str, about("A name of `cavmarl list`, or a policy's path.", "--policy", "-p")
+    str,
+    about(
+        "Driver of the agents: a name from `cavmarl list`, a .py file or a folder.",
+        "--policy",
+        "-p",
+        metavar="POLICY",
+    ),
 ]
-Seed = Annotated[int, about("Root of all random numbers.", callback=check_seed)]
-Agents = Annotated[int | None, about("Agents a world; default: the environment's.")]
-Background = Annotated[int | None, about("Background vehicles a world; default: likewise.")]
+Policies = Annotated[
+    list[str] | None,
+    about(
+        "Driver to evaluate: a name from `cavmarl list`, a .py file or a folder. Repeat the option "
+        "to compare drivers with the first one [default: idm].",
+        "--policy",
+        "-p",
+        metavar="POLICY",
+    ),
+]
+Seed = Annotated[
+    int, about("Root of all random numbers.", metavar="N", callback=check_seed, panel=WORLD)
+]
+Agents = Annotated[
+    int | None,
+    about(
+        "Number of agents in each world [default: as configured by the environment].",
+        metavar="N",
+        panel=WORLD,
+    ),
+]
+Background = Annotated[
+    int | None,
+    about(
+        "Number of background vehicles in each world [default: as configured by the environment].",
+        metavar="N",
+        panel=WORLD,
+    ),
+]
+Zones = Annotated[
+    int | None,
+    about(
+        "Number of zones of each world [default: as configured by the environment].",
+        metavar="K",
+        panel=WORLD,
+    ),
+]
 Settings = Annotated[
-    list[str] | None, about("Any key of env.yaml; may be repeated.", "--set", metavar="KEY=VALUE")
+    list[str] | None,
+    about(
+        "Override a key of env.yaml, for example sensors.lidar.rays=32. Repeat it for more keys.",
+        "--set",
+        metavar="KEY=VALUE",
+        panel=WORLD,
+    ),
 ]
 SensorsOf = Annotated[
     str | None,
-    about("Give the agents the sensors and actions of this trained driver.", metavar="DRIVER"),
+    about(
+        "Give the agents the sensors and actions of this trained driver.",
+        metavar="DRIVER",
+        panel=WORLD,
+    ),
 ]
-JsonPath = Annotated[Path | None, about_file("Write the result here as JSON.", "--json")]
+Episodes = Annotated[int, about("Number of episodes of each run.", "--episodes", "-n", metavar="N")]
+Repeats = Annotated[
+    int,
+    about("Number of independent runs, each in a new process.", "--repeats", "-r", metavar="N"),
+]
+JsonPath = Annotated[Path | None, about_file("Write the result to this file as JSON.", "--json")]
 RecordPath = Annotated[
-    Path | None, about("Record into this new folder, for `cavmarl replay`.", "--record")
+    Path | None,
+    about(
+        "Record the run in this new folder; `cavmarl replay` plays it.",
+        "--record",
+        metavar="DIR",
+        panel=OUTPUT,
+    ),
 ]
 RecordAlso = Annotated[
-    str, about("Record these, too: observations, samples, messages; with commas.", "--record-also")
+    str,
+    about(
+        "Additional data to record, comma-separated: observations, samples, messages.",
+        "--record-also",
+        metavar="NAME,…",
+        panel=OUTPUT,
+    ),
 ]
 AtLeast = Annotated[
-    float | None, about("Exit with 1 if it is not so many times as fast.", callback=check_bound)
+    float | None,
+    about(
+        "Exit with 1 if the ratio of speeds is below X.",
+        metavar="X",
+        callback=check_bound,
+        panel=OUTPUT,
+    ),
 ]
 
 
 def recorded(path: Path | None, also: str) -> RecordOptions | None:
-    """What `--record` and `--record-also` ask for; None: nothing.
+    """Return the options of the recording that the command line asks for, or None.
 
-    Raises ConfigError: more is to be recorded, but not where.
+    Raises ConfigError if `--record-also` is given without `--record`.
     """
     include = tuple(name.strip() for name in also.split(",") if name.strip())
     if path is None:
         if include:
-            raise ConfigError(f"--record-also {also}: say where, with --record FOLDER")
+            raise ConfigError(f"--record-also {also}: goes with --record; add --record FOLDER")
         return None
     from cavmarl.recordings.extra_tables import RecordOptions
 
@@ -125,10 +236,11 @@ def recorded(path: Path | None, also: str) -> RecordOptions | None:
 
 
 def with_world(*names: str) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
-    """Makes a command of a function that takes a `world: WorldSpec`.
+    """Return a decorator for commands that take a `world: WorldSpec`.
 
-    In its place stand the options that make one: all, or the environment and those of these names.
-    Where the function has one of them, too, it says how it is given, and gets it.
+    The command line gets the options from which the WorldSpec is made instead: ENV and the options
+    called `names`, by default all of them. A parameter of the function with the name of such an
+    option replaces that option, and the function receives its value, too.
     """
     chosen = names or ("agents", "background", "seed", "settings", "sensors_of")
     return partial(_with_world, ("env", *chosen))
@@ -167,25 +279,31 @@ def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callabl
 
 
 def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
-    """`sensors.lidar.rays=32` and the like as overrides; a value is JSON, else text."""
+    """Return overrides from texts like `sensors.lidar.rays=32`.
+
+    A value that is not JSON is text. Raises ConfigError if a text is not KEY=VALUE, has no value,
+    or names a key that another text has named.
+    """
     overrides: dict[str, Any] = {}
     for setting in settings or ():
         key, equals, text = setting.partition("=")
         if not equals or not key:
-            raise ConfigError(f"--set {setting}: must be KEY=VALUE, as sensors.lidar.rays=32")
+            raise ConfigError(
+                f"--set {setting}: must be KEY=VALUE, for example sensors.lidar.rays=32"
+            )
         if key in overrides:
-            raise ConfigError(f"--set {key}: given twice")
+            raise ConfigError(f"--set {key}: the key is given twice; keep one of them")
         try:
             overrides[key] = json.loads(text)
-        except (ValueError, RecursionError):  # not all of JSON's are its own
+        except (ValueError, RecursionError):  # deeply nested JSON exhausts the stack
             overrides[key] = text
         if overrides[key] == "":
-            raise ConfigError(f"--set {key}=: has no value")
+            raise ConfigError(f"--set {key}=: the value is missing; write KEY=VALUE")
     return overrides
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that files can be written into, or see that it is one."""
+    """Create a folder unless it exists; raise ConfigError if no file can be written there."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=path):
@@ -195,7 +313,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_json(path: Path | None, document: dict[str, Any]) -> None:
-    """Write `document` where `--json` asks for it."""
+    """Write `document` to the file given by `--json`, if there is one."""
     if path is None:
         return
     try:
@@ -205,7 +323,7 @@ def write_json(path: Path | None, document: dict[str, Any]) -> None:
 
 
 def number(value: float | None, scale: float = 1.0) -> str:
-    """A number for a table, times `scale`; a dash where there is none."""
+    """Return `scale * value` for a table cell, or a dash for None."""
     return "-" if value is None else f"{scale * value:.2f}"
 
 
@@ -217,7 +335,7 @@ def grid(
     lefts: int = 1,
     wraps: bool = False,
 ) -> Table:
-    """A table without a frame; all columns but the first `lefts` are right-aligned numbers."""
+    """Return a table without a frame; the columns after the first `lefts` are right-aligned."""
     table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, pad_edge=False)
     for place, head in enumerate(heads):
         if place < lefts:
@@ -230,7 +348,7 @@ def grid(
 
 
 def pairs_grid(rows: Iterable[tuple[str, str]]) -> Table:
-    """Names and what is told of them, without a head."""
+    """Return a table of names and values without a heading."""
     table = Table.grid(padding=(0, 2))
     for row in rows:
         table.add_row(*row)
@@ -238,7 +356,7 @@ def pairs_grid(rows: Iterable[tuple[str, str]]) -> Table:
 
 
 def say_difference(difference: Difference, sides: tuple[str, str]) -> str:
-    """One sentence: when, whose, and what each of the two sides has."""
+    """Return one sentence: where two runs first differ, and the value of each side."""
     thing = difference.what if difference.vehicle is None else f"vehicle {difference.vehicle}"
     one, other = difference.values
     return (
@@ -248,6 +366,6 @@ def say_difference(difference: Difference, sides: tuple[str, str]) -> str:
 
 
 def print_error(message: str) -> None:
-    """Say on stderr, in red, what went wrong; what would steer the terminal is spelled out."""
+    """Print an error to stderr in red; control characters are escaped."""
     shown = "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in message)
     Console(stderr=True).print(Text(f"error: {shown}", style="red"), soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`cavmarl plan`: places shards on workers by the zones' measured costs."""
+"""`cavmarl plan`: assigns shards to workers by measured costs of the zones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from cavmarl.cli.output import JsonPath, about, print_error, with_world, write_json
+from cavmarl.cli.output import (
+    WORLD,
+    JsonPath,
+    about,
+    print_error,
+    with_world,
+    write_json,
+)
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
@@ -21,7 +28,7 @@ if TYPE_CHECKING:
     from cavmarl.zones.partition.zone_partition import ZonePartition
 
 NOW, IDLE = "now", "idle"
-LASTING_S = 3600  # of the worlds: longer than any measurement
+LASTING_S = 3600  # length of an episode: longer than any measurement
 
 
 @with_world()
@@ -29,38 +36,55 @@ def plan(
     world: WorldSpec,
     env: Annotated[
         str | None,
-        typer.Argument(metavar="[ENV]", help="Name, folder or map file; not with --again."),
+        typer.Argument(
+            metavar="[ENV]",
+            help="Environment: its name, its folder, or a map file; not with --again.",
+        ),
     ] = None,
-    zones: Annotated[int, about("Zones of each world.")] = 9,
-    workers: Annotated[int, about("Workers that shards are placed on.")] = 3,
-    worlds: Annotated[int, about("Number of parallel worlds.", min=1)] = 1,
-    layout: Annotated[str, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")] = "bisection",
+    zones: Annotated[int, about("Number of zones of each world.", metavar="K", panel=WORLD)] = 9,
+    workers: Annotated[int, about("Number of workers.", metavar="N")] = 3,
+    worlds: Annotated[
+        int, about("Number of parallel worlds.", metavar="N", min=1, panel=WORLD)
+    ] = 1,
+    layout: Annotated[
+        str,
+        about(
+            f"Shape of the zones: {', '.join(ZONE_LAYOUTS)}, or a zone file.",
+            metavar="LAYOUT",
+            panel=WORLD,
+        ),
+    ] = "bisection",
     snapshot: Annotated[
         str,
-        about(f"How busy workers are: {NOW} as this machine is, {IDLE}, or the plan of a file."),
+        about(
+            f"Load of the workers: {NOW} (as measured on this machine), {IDLE}, or a stored plan.",
+            metavar="LOAD",
+        ),
     ] = NOW,
-    steps: Annotated[int, about("Measured steps of each world.")] = 50,
-    before: Annotated[int, about("Unmeasured steps of each world, first.")] = 50,
-    tolerance: Annotated[float, about("Imbalance below which nothing moves.")] = 0.1,
+    steps: Annotated[int, about("Number of measured steps of each world.", metavar="N")] = 50,
+    before: Annotated[int, about("Number of steps before the measurement.", metavar="N")] = 50,
+    tolerance: Annotated[
+        float, about("Imbalance below which no shard is moved.", metavar="X")
+    ] = 0.1,
     again: Annotated[
         Path | None,
         about(
-            "Make a stored plan, or those of a run's manifest, once more from what they say; "
-            "exit code 1 if one is another.",
+            "Recompute a stored plan, or the plans in the manifest of a run. If one differs, exit "
+            "with 1.",
             metavar="FILE",
         ),
     ] = None,
     cut: Annotated[
         Path | None,
         about(
-            "Extension: write a zone file here that shares out what was measured.",
-            "--cut-anew",
+            "Write a zone file whose zones have about equal measured costs (an extension).",
+            "--write-zones",
             metavar="FILE",
         ),
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Measure what each zone costs, place the shards, and print the plan; nothing is started."""
+    """Measure the cost of each zone, assign the shards to workers, and print the plan."""
     from cavmarl.balance.balance_plan import make_plan
     from cavmarl.balance.plan_text import describe_plan
     from cavmarl.balance.problem import BalanceRule, Problem
@@ -71,9 +95,11 @@ def plan(
         _make_again(again)
         return
     if env is None:
-        raise ConfigError("name an environment, or give --again with a stored plan")
+        raise ConfigError(
+            "the environment is missing: name one, or give --again with a stored plan"
+        )
     if workers < 1:
-        raise ConfigError(f"workers = {workers}: must be at least 1")
+        raise ConfigError(f"--workers {workers}: must be at least 1")
     rule = BalanceRule(tolerance=tolerance)
     seen = _snapshot(snapshot, workers)
     console = Console()
@@ -87,7 +113,7 @@ def plan(
         made = make_plan(Problem(measured.costs, partition.side_neighbors, seen, rule))
     except NoAdmissibleWorkerError as error:
         raise NoAdmissibleWorkerError(
-            f"{error}; --snapshot {IDLE} supposes that they are otherwise idle", error.rejections
+            f"{error}; with --snapshot {IDLE} the plan assumes idle workers", error.rejections
         ) from error
     console.print(describe_plan(made), markup=False, highlight=False, soft_wrap=True)
     if cut is not None:
@@ -103,7 +129,7 @@ def _cut_anew(
     tolerance: float,
     path: Path,
 ) -> str:
-    """Write zones of about the same cost, if that gains anything, and say what."""
+    """Write zones of about equal cost if that improves the balance; return what was done."""
     from cavmarl.handoff.repartition_plan import propose_zones
     from cavmarl.zones.partition.zone_file import write_zones
 
@@ -111,11 +137,13 @@ def _cut_anew(
         network, partition, measured.places, measured.zone_costs_s(), tolerance=tolerance
     )
     if found is None:
-        return f"cut anew: no other zones are more even by the tolerance; {path} is not written"
+        return (
+            f"no other zones are better balanced by more than the tolerance; {path} is not written"
+        )
     write_zones(path, found.partition)
     return (
-        f"cut anew: costs of zones, max / mean, from {found.before:.3f} to {found.after:.3f}; "
-        f"{found.moved} of {len(measured.places)} vehicles are in other zones: {path}"
+        f"new zones in {path}: cost of zones, max / mean, {found.before:.3f} before and "
+        f"{found.after:.3f} after; {found.moved} of {len(measured.places)} vehicles change zone"
     )
 
 
@@ -130,7 +158,9 @@ def _snapshot(said: str, workers: int) -> LoadSnapshot:
         return idle_snapshot(workers)
     found = read_plan(Path(said)).problem.snapshot
     if len(found.workers) != workers:
-        raise ConfigError(f"{said}: has {len(found.workers)} workers, not {workers}: --workers")
+        raise ConfigError(
+            f"{said}: has {len(found.workers)} workers, but --workers is {workers}; make them equal"
+        )
     return found
 
 
@@ -144,5 +174,5 @@ def _make_again(path: Path) -> None:
     text = "\n\n".join(map(describe_plan, made))
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
     if made != stored:
-        print_error(f"{path}: its shards do not stand where its own figures put them")
+        print_error(f"{path}: the recomputed plan differs from the stored one")
         raise typer.Exit(1)

@@ -1,4 +1,4 @@
-"""`cavmarl replay`: shows a recording, or exports it."""
+"""`cavmarl replay`: shows or exports a recording."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from cavmarl.cli.output import JsonPath, about, about_file, write_json
+from cavmarl.cli.output import (
+    OUTPUT,
+    PAGE,
+    JsonPath,
+    about,
+    about_file,
+    flag,
+    write_json,
+)
 from cavmarl.cli.view import check_display
 from cavmarl.cli.web import WatchToken, WebHost, WebPort, WebToken, say
 from cavmarl.core.progress import progress_bar
@@ -21,41 +29,50 @@ if TYPE_CHECKING:
 
 
 def replay(
-    path: Annotated[Path, typer.Argument(help="What --record was given.")],
-    world: Annotated[int, about("Number of the world.")] = 0,
-    episode: Annotated[int, about("Number of its episode, from 0.")] = 0,
+    path: Annotated[Path, typer.Argument(help="The folder that --record wrote.")],
+    world: Annotated[int, about("Number of the world, from 0.", metavar="N")] = 0,
+    episode: Annotated[int, about("Number of the episode, from 0.", metavar="N")] = 0,
     video: Annotated[
-        Path | None, about("Write an .mp4 here; default: show a window, unless exported.")
+        Path | None,
+        about(
+            "Write the video to this .mp4 file [default: show a window unless data are exported].",
+            metavar="FILE",
+            panel=OUTPUT,
+        ),
     ] = None,
-    ghosts_of: Annotated[int | None, about("Outline the ghosts of this zone.")] = None,
-    fcd: Annotated[Path | None, about_file("Write SUMO's floating car data here.")] = None,
-    csv: Annotated[Path | None, about_file("Write a line a vehicle and frame here.")] = None,
-    mcap: Annotated[Path | None, about_file("Write MCAP for Foxglove here.")] = None,
-    web: Annotated[bool, about("Show all of it in a browser, from a page served here.")] = False,
+    ghosts_of: Annotated[
+        int | None, about("Outline the ghosts of this zone.", metavar="ZONE")
+    ] = None,
+    fcd: Annotated[Path | None, about_file("Write floating car data as SUMO does.")] = None,
+    csv: Annotated[Path | None, about_file("Write one line per vehicle and frame.")] = None,
+    mcap: Annotated[Path | None, about_file("Write an MCAP file for Foxglove.")] = None,
+    web: Annotated[
+        bool, flag("Serve a page that shows the whole recording in a browser.", panel=PAGE)
+    ] = False,
     port: WebPort = DEFAULT_PORT,
     host: WebHost = "127.0.0.1",
     token: WebToken = "",
     watch_token: WatchToken = "",
-    watch_only: Annotated[bool, about("Pages may not pause it or go to another moment.")] = False,
+    watch_only: Annotated[bool, flag("Browsers may not pause or search.", panel=PAGE)] = False,
     json_path: JsonPath = None,
 ) -> None:
-    """Show a recording from above, or export it; see docs/recordings.md."""
+    """Show a recording from above, or export it."""
     from cavmarl.core.errors import ConfigError, RecordingError
     from cavmarl.recordings.recording import Recording
     from cavmarl.recordings.recording_exports import EXPORTS
 
     if web and video is not None:
-        raise ConfigError(f"--web and --video {video}: give one of them")
+        raise ConfigError(f"--web and --video {video}: use only one of the two")
     recording = Recording.open(path)
     ticks = recording.ticks(world, episode)
     if not ticks:
         raise RecordingError(
-            f"{path}: no episode {episode} of world {world}; there are "
+            f"{path}: world {world} has no episode {episode}; it has "
             f"{recording.episodes(world) or 'none'}"
         )
     console = Console()
     if not recording.is_whole:
-        console.print(f"{path}: was not closed: it has what was committed", markup=False)
+        console.print(f"{path}: was not closed; shown up to its last complete part", markup=False)
     wanted = {name: file for name, file in {"fcd": fcd, "csv": csv, "mcap": mcap}.items() if file}
     for name, file in wanted.items():
         with progress_bar(console) as bar:
@@ -91,7 +108,7 @@ def _show(
     ghosts_of: int | None,
     console: Console,
 ) -> None:
-    """Draw the frames, into a window or a video."""
+    """Draw the frames in a window or a video."""
     from cavmarl.recordings.replay_pictures import ReplayPictures
     from cavmarl.render.video import VideoWriter
 

@@ -1,4 +1,4 @@
-"""Makes commands of functions that measure something and return a `BenchmarkReport`."""
+"""Turns functions that return a `BenchmarkReport` into commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.cli.output import JsonPath, write_json
 
 
 def report_command(measure: Callable[..., BenchmarkReport]) -> Callable[..., None]:
-    """Return a benchmark as a command of typer: without `say`, and with `--json`."""
+    """Return a benchmark as a Typer command: without the parameter `say`, and with `--json`."""
     hints = get_type_hints(measure, include_extras=True)
     given = inspect.signature(measure).parameters.values()
     wanted = [

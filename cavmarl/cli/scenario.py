@@ -1,4 +1,4 @@
-"""`cavmarl scenario`: lists scenarios, and plays one to a driver."""
+"""`cavmarl scenario`: lists scenarios and tests drivers in them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from cavmarl.cli.output import JsonPath, about, about_file, number, with_world, write_json
+from cavmarl.cli.output import (
+    WORLD,
+    JsonPath,
+    Zones,
+    about,
+    about_file,
+    add_command,
+    number,
+    with_world,
+    write_json,
+)
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import counting
@@ -23,14 +33,13 @@ from cavmarl.core.progress import counting
 if TYPE_CHECKING:
     from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun
 
-WIDTH = 140  # of the table of a sweep, which goes into pages: it is never cut off
+WIDTH = 140  # columns of the table of a sweep; it is pasted into pages and must not be cut off
 
-app = typer.Typer(help="Scripted conflicts for agents.", no_args_is_help=True)
+app = typer.Typer(help="List safety scenarios, and test drivers in them.", no_args_is_help=True)
 
 
-@app.command("list")
 def list_scenarios(json_path: JsonPath = None) -> None:
-    """Show the scenarios, what each needs of a map, and its parameters."""
+    """List the scenarios with their parameters and requirements on the map."""
     from cavmarl.traffic.scenarios.library import load_scenario, scenario_names, summary_of
     from cavmarl.traffic.scenarios.scene import describe
 
@@ -54,30 +63,51 @@ def list_scenarios(json_path: JsonPath = None) -> None:
     write_json(json_path, document)
 
 
-@app.command("run")
 @with_world("agents", "seed", "settings", "sensors_of")
 def run(
     world: WorldSpec,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A scenario, or a .py file.")],
-    env: Annotated[str, about("Name, folder or map file of an environment.", "--map")] = "grid4x4",
-    place: Annotated[str, about("Place on the map; default: drawn by the seed.")] = "",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a scenario, or a .py file.")],
+    env: Annotated[
+        str,
+        about(
+            "Environment: its name, its folder, or a map file.", "--map", metavar="ENV", panel=WORLD
+        ),
+    ] = "grid4x4",
+    place: Annotated[
+        str, about("Place on the map [default: drawn by the seed].", metavar="PLACE")
+    ] = "",
     param: Annotated[
         list[str] | None,
-        about("A parameter of the scenario; may be repeated.", "--param", metavar="KEY=VALUE"),
+        about(
+            "Set a parameter of the scenario. Repeat it for more.", "--param", metavar="KEY=VALUE"
+        ),
     ] = None,
-    driver: Annotated[str, about("Driver of the agents: a name, or a path.")] = "idm",
+    driver: Annotated[
+        str, about("Driver of the agents: a name, a .py file or a folder.", metavar="POLICY")
+    ] = "idm",
     agents: Annotated[
-        int, about("Number of agents: one in the conflict, the others behind.", min=1)
+        int,
+        about(
+            "Number of agents: one in the conflict, the others behind it.",
+            metavar="N",
+            min=1,
+            panel=WORLD,
+        ),
     ] = 1,
-    density: Annotated[str, about("Other traffic: none, low or high.")] = "none",
-    zones: Annotated[
-        int | None, about("Zones of the world; default: as the environment says.")
+    density: Annotated[
+        str, about("Density of other traffic: none, low or high.", metavar="DENSITY")
+    ] = "none",
+    zones: Zones = None,
+    picture: Annotated[
+        Path | None, about_file("Draw the closest moment to this .png file.")
     ] = None,
-    picture: Annotated[Path | None, about_file("Write a .png of the closest moment here.")] = None,
-    video: Annotated[Path | None, about_file("Write an .mp4 of the run here.")] = None,
+    video: Annotated[Path | None, about_file("Write a video of the run to this .mp4 file.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Play a scenario to a driver; exit code 1 unless all come through and hurt no one."""
+    """Test a driver in a scenario.
+
+    If an agent does not reach its goal, or causes a collision, exit with 1.
+    """
     from cavmarl.evaluate.scenarios.scenario_films import ScenarioCamera
     from cavmarl.evaluate.scenarios.scenario_runs import make_scenario, run_scenario
 
@@ -97,22 +127,34 @@ def run(
         raise typer.Exit(1)
 
 
-@app.command("sweep")
 def sweep(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Scenarios; default: all.")
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="Names of scenarios.", show_default="all"),
     ] = None,
     map_names: Annotated[
-        list[str] | None, about("An environment's map; may be repeated. Default: grid4x4.", "--map")
+        list[str] | None,
+        about(
+            "Environment or map file. Repeat it for more [default: grid4x4].",
+            "--map",
+            metavar="ENV",
+        ),
     ] = None,
-    seeds: Annotated[int, about("Number of seeds, from 0 on.", min=1)] = 5,
-    passes: Annotated[str, about("The driver that is to pass all.")] = "idm",
-    fails: Annotated[str, about("The one that is to pass none.")] = "never_yield",
-    density: Annotated[str, about("Other traffic: none, low or high.")] = "none",
-    agents: Annotated[int, about("Agents in each world.", min=1)] = 1,
+    seeds: Annotated[int, about("Number of seeds, starting from 0.", metavar="N", min=1)] = 5,
+    passes: Annotated[str, about("Driver that must pass every run.", metavar="POLICY")] = "idm",
+    fails: Annotated[
+        str, about("Driver that must fail every run.", metavar="POLICY")
+    ] = "never_yield",
+    density: Annotated[
+        str, about("Density of other traffic: none, low or high.", metavar="DENSITY")
+    ] = "none",
+    agents: Annotated[int, about("Number of agents in each world.", metavar="N", min=1)] = 1,
     json_path: JsonPath = None,
 ) -> None:
-    """Play scenarios on maps to two drivers; exit code 1 unless one passes all, the other none."""
+    """Test two drivers in many scenarios and maps.
+
+    If the first driver does not pass all runs, or the second passes one, exit with 1.
+    """
     from cavmarl.evaluate.scenarios.scenario_sweep import sweep_scenarios
     from cavmarl.traffic.scenarios.library import scenario_names
 
@@ -152,7 +194,9 @@ def _params(given: list[str] | None) -> dict[str, bool | float]:
         except ValueError:
             read = None
         if not key or not isinstance(read, bool | int | float):
-            raise ConfigError(f"--param {text}: must be KEY=VALUE, a number, true or false")
+            raise ConfigError(
+                f"--param {text}: must be KEY=VALUE with a number, true or false as the value"
+            )
         params[key] = read
     return params
 
@@ -176,3 +220,18 @@ def _table(found: ScenarioRun) -> Table:
     for row in rows.items():
         table.add_row(*map(escape, row))
     return table
+
+
+add_command(app, "list", list_scenarios, "cavmarl scenario list")
+add_command(
+    app,
+    "run",
+    run,
+    "cavmarl scenario run cut_in --map grid4x4 --driver idm --video cut_in.mp4",
+)
+add_command(
+    app,
+    "sweep",
+    sweep,
+    "cavmarl scenario sweep cut_in --map grid4x4 --seeds 5",
+)

@@ -1,4 +1,4 @@
-"""`cavmarl serve` and what is asked of a service: nodes, sessions, events, jobs."""
+"""`cavmarl serve` and the commands for its users: grant, submit, nodes, sessions, events."""
 
 from __future__ import annotations
 
@@ -11,8 +11,14 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.output import (
+    OUTPUT,
+    SERVICE,
+    Episodes,
     JsonPath,
+    Policies,
+    Repeats,
     about,
+    flag,
     grid,
     make_folder,
     pairs_grid,
@@ -30,29 +36,60 @@ URL_VARIABLE = "CAVMARL_SERVICE"
 SECRET_VARIABLE = "CAVMARL_SECRET"
 DEFAULT_URL = "http://127.0.0.1:8700"
 
-Url = Annotated[str, about("URL of the service.", "--service", envvar=URL_VARIABLE)]
+Url = Annotated[
+    str,
+    about("URL of the service.", "--service", metavar="URL", envvar=URL_VARIABLE, panel=SERVICE),
+]
 SecretFile = Annotated[
     Path | None,
-    about(f"File with a secret; default: ${SECRET_VARIABLE}.", "--secret-file"),
+    about(
+        f"File with your secret [default: the variable {SECRET_VARIABLE}].",
+        "--secret-file",
+        metavar="FILE",
+        panel=SERVICE,
+    ),
 ]
 Authority = Annotated[
-    Path | None, about("Certificate of the authority that has signed the service's.")
+    Path | None,
+    about(
+        "Certificate of the authority that signed the certificate of the service.",
+        metavar="FILE",
+        panel=SERVICE,
+    ),
 ]
-Certificate = Annotated[Path | None, about("Certificate for TLS, PEM.")]
-Key = Annotated[Path | None, about("Its private key, PEM.")]
+Certificate = Annotated[
+    Path | None, about("Certificate for TLS (PEM).", metavar="FILE", panel=SERVICE)
+]
+Key = Annotated[
+    Path | None, about("Private key of the certificate (PEM).", metavar="FILE", panel=SERVICE)
+]
 
 
 def serve(
-    host: Annotated[str, about("Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, about("Port; 0: any.", min=0, max=65535)] = 8700,
-    store: Annotated[str, about("File of SQLite, or postgresql://…")] = "runs/service.sqlite",
+    host: Annotated[str, about("Address to listen on.", metavar="ADDRESS")] = "127.0.0.1",
+    port: Annotated[
+        int, about("Port to listen on; 0 picks a free port.", metavar="PORT", min=0, max=65535)
+    ] = 8700,
+    store: Annotated[
+        str,
+        about("Event store: an SQLite file, or the URL of a PostgreSQL database.", metavar="STORE"),
+    ] = "runs/service.sqlite",
     certificate: Certificate = None,
     key: Key = None,
-    beat_s: Annotated[float, about("Seconds from beat to beat of nodes.", min=0.05)] = 1.0,
-    missed_beats: Annotated[int, about("After so many a node is down.", min=1)] = 3,
-    lease_s: Annotated[float, about("Seconds of a session's lease.", min=1.0)] = 30.0,
+    beat_s: Annotated[
+        float, about("Seconds between heartbeats of a node.", metavar="S", min=0.05)
+    ] = 1.0,
+    missed_beats: Annotated[
+        int, about("Number of missed heartbeats after which a node is down.", metavar="N", min=1)
+    ] = 3,
+    lease_s: Annotated[
+        float, about("Duration of a session's lease in seconds.", metavar="S", min=1.0)
+    ] = 30.0,
 ) -> None:
-    """Coordinate nodes and sessions; at the first start the admin's secret is shown, once."""
+    """Run the coordination service.
+
+    The first start prints the secret of the admin. It is not shown again.
+    """
     require("fastapi", "service")
     from cavmarl.service.broker import BrokerRules
     from cavmarl.service.server import ServerOptions
@@ -60,39 +97,43 @@ def serve(
 
     rules = BrokerRules(beat_s=beat_s, missed_beats=missed_beats, lease_s=lease_s)
     options = ServerOptions(host, port, store, certificate, key, rules=rules)
-    run(options, _tell)
+    run(options, _print)
 
 
 def grant(
-    name: Annotated[str, typer.Argument(help="Name of a person, a program or a node.")],
-    role: Annotated[str, about("viewer, client, operator, admin or node.")] = "client",
+    name: Annotated[str, typer.Argument(help="Name of the person, program or node.")],
+    role: Annotated[
+        str, about("Role: viewer, client, operator, admin or node.", metavar="ROLE")
+    ] = "client",
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
 ) -> None:
-    """Make an identity, and print its secret: it is shown this once."""
+    """Create an identity and print its secret, which is not shown again."""
     with connect(service, secret_file, authority) as client:
-        _tell(client.post("/identities", {"name": name, "role": role})["secret"])
+        _print(client.post("/identities", {"name": name, "role": role})["secret"])
 
 
 @with_world()
 def submit(
     world: WorldSpec,
-    policy: Annotated[
-        list[str] | None, about("A name of `cavmarl list`; may be repeated.", "--policy", "-p")
-    ] = None,
-    episodes: Annotated[int, about("Episodes of each run.", "--episodes", "-n")] = 32,
-    repeats: Annotated[int, about("Independent runs.", "--repeats", "-r")] = 1,
+    policy: Policies = None,
+    episodes: Episodes = 32,
+    repeats: Repeats = 1,
     wait_s: Annotated[
-        float | None, about("Fail if no node has taken it after so many seconds.", min=0.0)
+        float | None,
+        about("Fail if no node has started the job after S seconds.", metavar="S", min=0.0),
     ] = None,
-    out: Annotated[Path | None, about("Folder of the results; default: runs/submit/JOB.")] = None,
+    out: Annotated[
+        Path | None,
+        about("Folder for the results [default: runs/submit/JOB].", metavar="DIR", panel=OUTPUT),
+    ] = None,
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Have a node of the service evaluate drivers; wait, fetch the results and show them."""
+    """Evaluate drivers on a node of the service, and show the results."""
     from cavmarl.cli.evaluate import report_table
     from cavmarl.evaluate import load_report
 
@@ -120,20 +161,22 @@ def submit(
     found = load_report(folder)
     console.print(report_table(found))
     write_json(json_path, found.to_dict())
-    _tell(f"job: {job}\nresults: {folder} (`cavmarl report` shows them again)")
+    _print(f"job: {job}\nresults: {folder} (`cavmarl report` shows them again)")
 
 
 def nodes(
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
-    drain: Annotated[str | None, about("Drain this node first.", metavar="NAME")] = None,
+    drain: Annotated[
+        str | None, about("Drain this node: it accepts no new sessions.", metavar="NODE")
+    ] = None,
     resume: Annotated[
-        str | None, about("Let this node take sessions again.", metavar="NAME")
+        str | None, about("Let this node accept sessions again.", metavar="NODE")
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Show the nodes of a service: state, load, LoadScore, sessions."""
+    """Show the nodes of a service with state, load, LoadScore and sessions."""
     with connect(service, secret_file, authority) as client:
         for name, word in ((drain, "drain"), (resume, "resume")):
             if name is not None:
@@ -145,7 +188,7 @@ def nodes(
          _share(one["score"]), f"{one['sessions']}/{one['slots']}", f"{one['age_s']:.1f}")
         for one in found["nodes"]
     ]  # fmt: skip
-    heads = ("node", "address", "state", "cpu", "ram", "gpu", "score", "sessions", "heard, s ago")
+    heads = ("node", "address", "state", "cpu", "ram", "gpu", "score", "sessions", "age, s")
     Console().print(grid(heads, rows, lefts=3))
     write_json(json_path, found)
 
@@ -153,20 +196,23 @@ def nodes(
 def sessions(
     page: Annotated[
         str | None,
-        about("Have its node serve a page of this session, to watch and control it."),
+        about(
+            "Open a page of this session on its node, and print its address and tokens.",
+            metavar="SESSION",
+        ),
     ] = None,
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Show sessions and jobs: your own, or all; or the worlds of one, in a browser."""
+    """Show the sessions and jobs that you may see, or open the page of one session."""
     with connect(service, secret_file, authority) as client:
         if page is not None:
             told = client.take_up(page).page()
-            _tell(f"viewer: {told['address']}")
-            _tell(f"token: {told['token']}")
-            _tell(f"token to watch only: {told['watch_token']}")
+            _print(f"viewer: {told['address']}")
+            _print(f"token: {told['token']}")
+            _print(f"token to watch only: {told['watch_token']}")
             write_json(json_path, told)
             return
         found = client.get("/sessions")
@@ -180,36 +226,41 @@ def sessions(
 
 
 def events(
-    after: Annotated[int, about("Those after this number.", min=0)] = 0,
-    follow: Annotated[bool, about("Go on as they come.", "--follow", "-f")] = False,
+    after: Annotated[int, about("Print only events after this number.", metavar="N", min=0)] = 0,
+    follow: Annotated[bool, flag("Keep printing new events.", "--follow", "-f")] = False,
     subject: Annotated[
-        str | None, about("Only those of this session, job, node or configuration.")
+        str | None,
+        about("Print only events of this session, job, node or configuration.", metavar="NAME"),
     ] = None,
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
 ) -> None:
-    """Print the log of a service, one event a line, as JSON."""
+    """Print the event log of a service as JSON, one event per line."""
     with connect(service, secret_file, authority) as client:
         if follow:
             for event in client.follow(after):
                 if subject in (None, event["subject"]):
-                    _tell(json.dumps(event))
+                    _print(json.dumps(event))
             return
         params = {"limit": 1000} | ({} if subject is None else {"subject": subject})
         while lines := client.get("/events", after=after, **params)["events"]:
             for event in lines:
-                _tell(json.dumps(event))
+                _print(json.dumps(event))
             after = lines[-1]["sequence"]
 
 
 def manifest(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A manifest.json, or its folder.", exists=True)
+        Path,
+        typer.Argument(metavar="FILE", help="A manifest.json file, or its folder.", exists=True),
     ],
     json_path: JsonPath = None,
 ) -> None:
-    """Show what results were made with; exit code 2 if a file beside it is not as it was."""
+    """Show how results were made, and check their files.
+
+    If a file differs from its recorded hash, exit with 2.
+    """
     from cavmarl.evaluate.provenance.manifest import read_closed
 
     document = read_closed(file if file.is_dir() else file.parent)
@@ -221,14 +272,14 @@ def manifest(
         "policies": ", ".join(document.get("policies", ())),
         "seeds": ", ".join(map(str, document.get("seeds", ()))),
         "time": f"{document['started']} to {document['ended']}",
-        "files": f"{len(document['results_sha256'])}, each with the hash on record",
+        "files": f"{len(document['results_sha256'])}, each with the recorded hash",
     }
     Console().print(pairs_grid((name, str(value)) for name, value in shown.items()))
     write_json(json_path, document)
 
 
 def connect(service: str, secret_file: Path | None, authority: Path | None) -> Client:
-    """A client with the secret of the caller."""
+    """Return a client that is authenticated with the user's secret."""
     require("httpx", "service")
     from cavmarl.client import Client
 
@@ -237,17 +288,22 @@ def connect(service: str, secret_file: Path | None, authority: Path | None) -> C
 
 
 def read_secret(secret_file: Path | None) -> str:
-    """The secret in a file, or in the environment: not on the command line, which all can read."""
+    """Return the secret from a file or an environment variable.
+
+    No option takes the secret itself, as other users can read the command line.
+    """
     if secret_file is not None:
         try:
             return secret_file.read_text(encoding="utf-8").strip()
         except OSError as error:
-            raise ServiceError(f"{secret_file}: cannot be read ({error.strerror})") from error
+            raise ServiceError(
+                f"--secret-file {secret_file}: cannot be read: {error.strerror}"
+            ) from error
     secret = os.environ.get(SECRET_VARIABLE, "")
     if not secret:
         raise ServiceError(
-            f"no secret: give --secret-file, or set {SECRET_VARIABLE}; `cavmarl serve` shows the "
-            "admin's, `cavmarl grant NAME` makes others"
+            f"the secret is missing: give --secret-file or set {SECRET_VARIABLE}; `cavmarl serve` "
+            "prints the secret of the admin, `cavmarl grant NAME` creates others"
         )
     return secret
 
@@ -261,5 +317,5 @@ def _share(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _tell(line: str) -> None:
+def _print(line: str) -> None:
     typer.echo(line)

@@ -11,31 +11,49 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.evaluate import report_cell
-from cavmarl.cli.output import JsonPath, Seed, about, grid, make_folder, write_json
+from cavmarl.cli.output import (
+    OUTPUT,
+    Episodes,
+    JsonPath,
+    Policies,
+    Repeats,
+    Seed,
+    about,
+    grid,
+    make_folder,
+    write_json,
+)
 from cavmarl.config.registry import find_settings
 from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
 
-SHOWN = ("success", "collision", "off_road", "delay_s")  # as many as eighty columns hold
+SHOWN = ("success", "collision", "off_road", "delay_s")  # metrics that fit eighty columns
 
 
 def suite(
     name: Annotated[
-        str, typer.Argument(metavar="SUITE", help="A name in configs/suites/, or a .yaml.")
+        str,
+        typer.Argument(
+            metavar="SUITE", help="Name of a suite in configs/suites/, or a .yaml file."
+        ),
     ] = "standard",
-    maps: Annotated[Path, about("Folder of the map files.")] = Path("maps"),
-    policy: Annotated[
-        list[str] | None, about("A driver; may be repeated. Default: idm.", "--policy", "-p")
-    ] = None,
-    episodes: Annotated[int, about("Episodes of each run.", "--episodes", "-n")] = 4,
-    repeats: Annotated[int, about("Number of independent runs.", "--repeats", "-r")] = 5,
+    maps: Annotated[Path, about("Folder of the map files.", metavar="DIR")] = Path("maps"),
+    policy: Policies = None,
+    episodes: Episodes = 4,
+    repeats: Repeats = 5,
     seed: Seed = 0,
-    out: Annotated[Path, about("Folder of the results, one folder a world.")] = Path("runs/suite"),
+    out: Annotated[
+        Path,
+        about("Folder for the results, with one folder per world.", metavar="DIR", panel=OUTPUT),
+    ] = Path("runs/suite"),
     json_path: JsonPath = None,
 ) -> None:
-    """Evaluate drivers in every world of a suite; `cavmarl report` shows any of them whole."""
+    """Evaluate drivers in every world of a suite.
+
+    `cavmarl report` shows all results of one world.
+    """
     from cavmarl.evaluate.suite import load_suite, run_suite, worlds_of
 
     loaded = load_suite(find_settings("suite", name))

@@ -1,4 +1,4 @@
-"""`cavmarl train`: runs the training programs of `train/`, which the wheel carries."""
+"""`cavmarl train`: runs a training program of `train/`, which is part of the wheel."""
 
 from __future__ import annotations
 
@@ -18,14 +18,20 @@ from cavmarl.core.errors import ConfigError
 
 def train(
     name: Annotated[
-        str | None, typer.Argument(metavar="PROGRAM", help="One of them; none: say what there is.")
+        str | None,
+        typer.Argument(
+            metavar="PROGRAM", help="Name of a program; without a name, list the programs."
+        ),
     ] = None,
     options: Annotated[
         list[str] | None,
-        typer.Argument(metavar="OPTIONS", help="Its own; --help shows them. --config takes names."),
+        typer.Argument(
+            metavar="OPTIONS",
+            help="Options of the program; `cavmarl train NAME --help` shows them.",
+        ),
     ] = None,
 ) -> None:
-    """Train with one of the programs of `train/`: `cavmarl train ppo --config merge`."""
+    """Train a driver, for example with `cavmarl train ppo --config merge`."""
     known = programs()
     if name is None:
         shown = Table("program", "what it does")
@@ -34,13 +40,15 @@ def train(
         Console().print(shown)
         return
     if name not in known:
-        raise ConfigError(f"no training program {name!r}: there are {', '.join(known)}")
+        raise ConfigError(
+            f"there is no training program {name!r}: choose one of {', '.join(known)}"
+        )
     command = [sys.executable, str(known[name]), *with_config(options or [])]
-    os.execv(sys.executable, command)  # so that signals and the exit code are the program's own
+    os.execv(sys.executable, command)  # signals and the exit code are then those of the program
 
 
 def with_config(words: list[str]) -> list[str]:
-    """The words, with the path of a file in `configs/train/` where `--config` has its name."""
+    """Return the words with names after `--config` replaced by paths in `configs/train/`."""
     found = [
         f"--config={find_settings('train', word.removeprefix('--config='))}"
         if word.startswith("--config=")
@@ -54,6 +62,6 @@ def with_config(words: list[str]) -> list[str]:
 
 
 def _first_line(path: Path) -> str:
-    """Of the program's docstring; it is not run, as it may need what is not installed."""
+    """Return the first line of the program's docstring, without importing the program."""
     text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     return text.partition("\n")[0]

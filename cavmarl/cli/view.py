@@ -1,4 +1,4 @@
-"""`cavmarl view`: shows a driver, in a window or in a video."""
+"""`cavmarl view`: shows a driver in a window, in a video or on a page."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 
 from cavmarl.cli.output import (
+    OUTPUT,
+    PAGE,
     Backend,
     JsonPath,
     PolicyName,
     RecordAlso,
     RecordPath,
     Workers,
+    Zones,
     about,
+    flag,
     recorded,
     with_world,
     write_json,
@@ -29,7 +33,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import progress_bar
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
-MOST_WORLDS = 16  # of a page
+MOST_WORLDS = 16  # that one page can show
 
 if TYPE_CHECKING:
     from cavmarl.env.parallel import CavEnv
@@ -40,27 +44,42 @@ def view(
     world: WorldSpec,
     policy: PolicyName = "idm",
     seconds: Annotated[
-        float | None, about("Seconds of simulated time; default: 30, on a page without end.")
+        float | None,
+        about(
+            "Length of the run in simulated seconds [default: 30; unlimited on a page].",
+            metavar="S",
+        ),
     ] = None,
-    video: Annotated[Path | None, about("Write an .mp4 here; default: show a window.")] = None,
+    video: Annotated[
+        Path | None,
+        about(
+            "Write the video to this .mp4 file [default: show a window].",
+            metavar="FILE",
+            panel=OUTPUT,
+        ),
+    ] = None,
     ghosts_of: Annotated[
-        int | None, about("Outline the ghosts of this zone of a divided world.")
+        int | None, about("Outline the ghosts of this zone of a divided world.", metavar="ZONE")
     ] = None,
-    zones: Annotated[int | None, about("Zones that the world is divided into.")] = None,
+    zones: Zones = None,
     backend: Backend = None,
     workers: Workers = None,
-    web: Annotated[bool, about("Show it in a browser, from a page that is served here.")] = False,
+    web: Annotated[
+        bool, flag("Serve a page that shows the world in a browser.", panel=PAGE)
+    ] = False,
     port: WebPort = DEFAULT_PORT,
     host: WebHost = "127.0.0.1",
     token: WebToken = "",
     watch_token: WatchToken = "",
-    watch_only: Annotated[bool, about("Pages may not pause, step or drive.")] = False,
-    worlds: Annotated[int, about("Worlds that the page can choose among.")] = 1,
+    watch_only: Annotated[bool, flag("Browsers may not pause, step or drive.", panel=PAGE)] = False,
+    worlds: Annotated[
+        int, about("Number of worlds; the page can show each of them.", metavar="N", panel=PAGE)
+    ] = 1,
     record: RecordPath = None,
     record_also: RecordAlso = "",
     json_path: JsonPath = None,
 ) -> None:
-    """Drive one world and show it from above."""
+    """Drive a world and show it from above."""
     from cavmarl.env.parallel import parallel_env
 
     kept = recorded(record, record_also)
@@ -85,10 +104,10 @@ def view(
         write_json(json_path, {"video": None, "traffic": stats})
         return
     if worlds != 1:
-        raise ConfigError(f"--worlds {worlds}: only a page shows several; add --web")
+        raise ConfigError(f"--worlds {worlds}: only a page shows several worlds; add --web")
     seconds = 30.0 if seconds is None else seconds
     if not 0.0 < seconds <= 3600.0:
-        raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600")
+        raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600, or add --web")
     if video is None:
         check_display()
     mode = "human" if video is None else "rgb_array"
@@ -116,31 +135,35 @@ def _check_web(
     worlds: int,
     record: Path | None,
 ) -> None:
-    """Refuse what a page cannot be told with its options."""
+    """Raise ConfigError for options that a page does not support."""
     check_count("--worlds", worlds, MOST_WORLDS)
     if worlds > 1 and record is not None:
-        raise ConfigError(f"--worlds {worlds} and --record {record}: only one world is recorded")
+        raise ConfigError(
+            f"--worlds {worlds} and --record {record}: only one world can be recorded"
+        )
     if seconds is not None and not 0.0 < seconds < float("inf"):
         raise ConfigError(f"--seconds {seconds:g}: must be above 0")
     if video is not None:
-        raise ConfigError(f"--web and --video {video}: give one of them")
+        raise ConfigError(f"--web and --video {video}: use only one of the two")
     if ghosts_of is not None:
-        raise ConfigError("--web and --ghosts-of: the page has a choice of zones; leave it out")
+        raise ConfigError(
+            "--web and --ghosts-of: remove --ghosts-of and choose the zone on the page"
+        )
 
 
 def check_display() -> None:
-    """Refuse a window where SDL would draw it nowhere and say nothing: Linux without a display."""
+    """Raise ConfigError on Linux without a display, where SDL would draw the window nowhere."""
     shows = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     if sys.platform == "linux" and not any(os.environ.get(name) for name in shows):
-        raise ConfigError("there is no display for a window: use --video FILE")
+        raise ConfigError("this machine has no display for a window: use --video FILE or --web")
 
 
 def drive(
     world: CavEnv, policy: str, seconds: float, seed: int, video: Path | None, console: Console
 ) -> dict[str, float]:
-    """Drive `world` for some seconds, and film it where `video` is a path.
+    """Drive `world` for some simulated seconds; write a video if `video` is a path.
 
-    Episodes follow one another; the traffic of the last one is returned.
+    When an episode ends, the next one begins. Return the traffic statistics of the last episode.
     """
     from cavmarl.policies.loading import load_policy
     from cavmarl.render.video import VideoWriter

@@ -1,4 +1,4 @@
-"""What commands with a page share: its options, and how its address is told."""
+"""Options of commands that serve a page, and the function that prints its address."""
 
 from __future__ import annotations
 
@@ -6,19 +6,44 @@ from typing import Annotated
 
 from rich.console import Console
 
-from cavmarl.cli.output import about
+from cavmarl.cli.output import (
+    PAGE,
+    about,
+)
 
 TOKEN_VARIABLE = "CAVMARL_VIEWER_TOKEN"
 
-WebPort = Annotated[int, about("Of the page; 0: any that is free.", "--port")]
-WebHost = Annotated[
-    str, about("Address of the page; others than this machine's need a token.", "--host")
+WebPort = Annotated[
+    int, about("Port of the page; 0 picks a free port.", "--port", metavar="PORT", panel=PAGE)
 ]
-WebToken = Annotated[str, about("Token that a page has to give.", "--token", envvar=TOKEN_VARIABLE)]
+WebHost = Annotated[
+    str,
+    about(
+        "Address that the page is served at; an address other than this machine's needs a token.",
+        "--host",
+        metavar="ADDRESS",
+        panel=PAGE,
+    ),
+]
+WebToken = Annotated[
+    str,
+    about(
+        "Token that browsers must present to watch and control.",
+        "--token",
+        metavar="TOKEN",
+        envvar=TOKEN_VARIABLE,
+        panel=PAGE,
+    ),
+]
 
-WatchToken = Annotated[str, about("Token of pages that may only watch.", "--watch-token")]
+WatchToken = Annotated[
+    str,
+    about(
+        "Token that allows browsers to watch only.", "--watch-token", metavar="TOKEN", panel=PAGE
+    ),
+]
 
 
 def say(text: str) -> None:
-    """Print a line as it is, an address among them."""
+    """Print a line without markup, highlighting or wrapping."""
     Console().print(text, markup=False, highlight=False, soft_wrap=True)

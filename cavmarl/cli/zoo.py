@@ -1,4 +1,4 @@
-"""`cavmarl zoo`: the trained drivers, their results, and how they drive among each other."""
+"""`cavmarl zoo`: lists, verifies and compares trained drivers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, about, grid, number, print_error, with_world, write_json
+from cavmarl.cli.output import (
+    JsonPath,
+    about,
+    add_command,
+    grid,
+    number,
+    print_error,
+    with_world,
+    write_json,
+)
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.progress import progress_bar
 
@@ -18,7 +27,7 @@ if TYPE_CHECKING:
     from cavmarl.evaluate.episodes import Progress
     from cavmarl.evaluate.zoo import Cross
 
-# Shares of a result that eighty columns hold, and their heads.
+# Metrics that fit eighty columns, and their headings.
 SHORT = {
     "success": "success",
     "collision": "crash",
@@ -26,12 +35,14 @@ SHORT = {
     "red_light": "red",
 }
 
-app = typer.Typer(help="Trained drivers: list, verify, compare.", no_args_is_help=True)
+app = typer.Typer(help="List, verify and compare trained drivers.", no_args_is_help=True)
 
 
-@app.command("list")
 def list_drivers(json_path: JsonPath = None) -> None:
-    """Show the trained drivers, and what their results say; exit code 1 if one cannot be read."""
+    """List the trained drivers with their results.
+
+    If a driver cannot be read, exit with 1.
+    """
     from cavmarl.evaluate.zoo import zoo_entries
 
     heads = ("driver", "kB", "result of", "trips", *SHORT.values())
@@ -53,12 +64,16 @@ def list_drivers(json_path: JsonPath = None) -> None:
         raise typer.Exit(1)
 
 
-@app.command()
 def verify(
-    name: Annotated[str, typer.Argument(metavar="DRIVER", help="A trained driver, or its folder.")],
+    name: Annotated[
+        str, typer.Argument(metavar="DRIVER", help="Name or folder of a trained driver.")
+    ],
     json_path: JsonPath = None,
 ) -> None:
-    """Drive the episodes of a driver's result again; exit code 1 if a byte differs."""
+    """Repeat the recorded evaluation of a driver.
+
+    If a byte of a result differs, exit with 1.
+    """
     from cavmarl.evaluate.zoo import verify_entry
 
     console = Console()
@@ -80,15 +95,21 @@ def verify(
         raise typer.Exit(1)
 
 
-@app.command()
 @with_world()
 def cross(
     world: WorldSpec,
-    policy: Annotated[list[str], about("A driver; repeat it, two or more.", "--policy", "-p")],
-    episodes: Annotated[int, about("Episodes of each pair.", "--episodes", "-n")] = 8,
+    policy: Annotated[
+        list[str], about("Driver. Give two or more.", "--policy", "-p", metavar="POLICY")
+    ],
+    episodes: Annotated[
+        int, about("Number of episodes of each pair.", "--episodes", "-n", metavar="N")
+    ] = 8,
     json_path: JsonPath = None,
 ) -> None:
-    """Let each driver drive among each other's vehicles; success and collisions as matrices."""
+    """Evaluate each driver among the vehicles of each other driver.
+
+    The results are matrices of success and collisions.
+    """
     from cavmarl.evaluate.zoo import cross as run
 
     console = Console()
@@ -119,10 +140,20 @@ def _matrix(found: Cross, column: str, title: str) -> Table:
 
 
 def _progress(bar: Any) -> Progress:
-    """Shows how far a driver has come."""
+    """Return a function that shows the progress of a driver."""
     task = bar.add_task("")
 
     def show(policy: str, steps: int, most: int) -> None:
         bar.update(task, description=policy, completed=steps, total=most)
 
     return show
+
+
+add_command(app, "list", list_drivers, "cavmarl zoo list")
+add_command(app, "verify", verify, "cavmarl zoo verify cities_ippo")
+add_command(
+    app,
+    "cross",
+    cross,
+    "cavmarl zoo cross merge --policy idm --policy cities_ippo",
+)

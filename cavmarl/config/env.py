@@ -108,7 +108,8 @@ class EnvConfig(Section, key=""):
     Attributes:
         name: of the entry, as its folder.
         version: goes up whenever results change that others may have reported.
-        rig: sensors that are mounted on every agent's vehicle, by name; see docs/sensors.md.
+        rig: sensors that are mounted on every agent's vehicle, by name; see
+            docs/reference/sensors.md.
         horizon_s: when an episode is truncated; 0: after a time by the size of the map.
     """
 

@@ -26,7 +26,10 @@ REMOVED_KEYS = {
 }
 
 # Option of the command line → what replaced it.
-REMOVED_OPTIONS = {"--hosts": "use --backend; nodes are killed by cavmarl verify nodes --kill K"}
+REMOVED_OPTIONS = {
+    "--hosts": "use --backend; nodes are killed by cavmarl verify nodes --kill K",
+    "--cut-anew": "use --write-zones",
+}
 
 # Keyword of `make_vec` and `parallel_env` → what replaced it.
 REMOVED_ARGUMENTS = {"hosts": "use backend='ray:N' or backend='nodes:N@HOST:PORT'"}

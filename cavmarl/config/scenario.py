@@ -10,7 +10,7 @@ from cavmarl.config.checks import Section
 
 @dataclass(frozen=True)
 class ScenarioConfig(Section, key="scenario"):
-    """One scripted conflict for the agents of each world; docs/scenarios.md.
+    """One scripted conflict for the agents of each world; docs/guides/scenarios.md.
 
     Attributes:
         name: of a scenario, or the path of a `.py` file with one; empty: none.

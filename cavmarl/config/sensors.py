@@ -366,8 +366,8 @@ class SensorsConfig(Section, key="sensors"):
 
     Attributes:
         stack: observations in one: the last ones, oldest first. At first all are the first.
-        registered: sensors from outside of the package that are on, by name (docs/extending.md);
-            their features follow those of all others.
+        registered: sensors from outside of the package that are on, by name
+            (docs/guides/extending.md); their features follow those of all others.
     """
 
     stack: Annotated[int, Whole(1, 64)] = 1

@@ -10,7 +10,7 @@ from cavmarl.config.checks import Section, Whole
 
 @dataclass(frozen=True)
 class SumoConfig(Section, key="sumo"):
-    """Read where `traffic.source` is `sumo-demand` or `sumo-traffic`; see docs/sumo.md.
+    """Read where `traffic.source` is `sumo-demand` or `sumo-traffic`; see docs/guides/sumo.md.
 
     Attributes:
         interface: `libsumo`, `traci` (slower, the same results), or `auto`: the first of them that

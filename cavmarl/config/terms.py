@@ -27,7 +27,7 @@ TERMS = (
 
 @dataclass(frozen=True)
 class TermsConfig(Section, key="terms"):
-    """Reward = Σ weight · term; see `TERMS` and docs/environments.md for what each term is.
+    """Reward = Σ weight · term; docs/reference/environments.md says what each of `TERMS` is.
 
     Attributes:
         weights: weight of each named term; terms that are not named weigh 0.

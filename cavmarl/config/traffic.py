@@ -29,7 +29,8 @@ class TrafficConfig(Section, key="traffic"):
             `closed` world does: 150 m before it, to one that is farther than that.
         speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
         model: how the generator's vehicles follow their leader: `IDM`, `Krauss`, `ACC`, or a model
-            that is registered (docs/extending.md). Those of `demand` drive as their type says.
+            that is registered (docs/guides/extending.md). Those of `demand` drive as their type
+            says.
         trip_horizon: so many times what its way takes at the limits, and one cycle of each signal
             on it, an agent's trip may take; then the vehicle leaves, and the trip is truncated.
             0: only the episode's horizon cuts it.

@@ -12,7 +12,7 @@ MAX_SENSOR_WORKERS = 256  # of one process
 
 @dataclass(frozen=True)
 class WorkersConfig(Section, key="workers"):
-    """How worker processes are watched and given work, where there are some; see docs/workers.md.
+    """How worker processes are watched and given work; see docs/guides/divide_a_world.md.
 
     Attributes:
         timeout_s: for so long a worker may be busy with one step or reset; then it is taken to hang
@@ -32,9 +32,9 @@ class WorkersConfig(Section, key="workers"):
             their machines for `balance_steps`.
         sensors: processes that the sensors of `rig` are shared out over, for each process that
             keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
-            docs/sensor_workers.md.
+            docs/guides/sensor_workers.md.
         sensor_placement: which of them senses what: by what it `cost` of late, or `in_turn`.
-        join_timeout_s: for so long is waited for zone nodes to join; see docs/nodes.md.
+        join_timeout_s: for so long is waited for zone nodes to join; see docs/guides/nodes.md.
         key_file: with the key that nodes started by hand have to know; relative to the environment.
     """
 

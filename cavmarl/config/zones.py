@@ -14,7 +14,7 @@ ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
 
 @dataclass(frozen=True)
 class ZonesConfig(Section, key="zones"):
-    """How the map is divided; see docs/zones.md.
+    """How the map is divided; see docs/reference/zones.md.
 
     Attributes:
         layout: how zones are cut: `grid`, `strips`, `bisection`, or a zone file named as

@@ -247,7 +247,7 @@ class ServiceError(CavmarlError):
 
     Attributes:
         status: of the HTTP answer; 0: there was none.
-        problem: name of what was wrong, as in the table of `docs/service.md`.
+        problem: name of what was wrong, as in the table of `docs/guides/service.md`.
         retry_s: when to try again; None: that is of no use.
     """
 

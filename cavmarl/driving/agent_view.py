@@ -27,7 +27,7 @@ class AgentView:
     """An agent's vehicle and the others near it, at the end of a step; all read-only.
 
     Attributes:
-        own: the fields of `VEHICLE` (docs/extending.md) of its vehicle.
+        own: the fields of `VEHICLE` (docs/guides/extending.md) of its vehicle.
         others: (n,) those of the vehicles whose centres are within the reach, by rising id.
         network: the roads; `own["lane"]` is a row of `network.lanes`.
         step_s: seconds a step.
@@ -46,7 +46,7 @@ class BatchView:
     Which agents are in a batch depends on the division: each answer must be of its agent alone.
 
     Attributes:
-        own: (n,) the fields of `VEHICLE` (docs/extending.md) of their vehicles.
+        own: (n,) the fields of `VEHICLE` (docs/guides/extending.md) of their vehicles.
         others: (m,) those of the vehicles near them, agent after agent, each by rising id. One that
             is near two agents is there twice.
         agent: (m,) the row of `own` that each of `others` is near.

@@ -77,11 +77,12 @@ def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
 class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
     """One world.
 
-    Observations, actions and rewards are described in docs/environments.md. The infos of each agent
-    hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that vehicle's
-    trip ended in this step) and `vehicle_id`; all are plain numbers.
+    Observations, actions and rewards are described in docs/reference/environments.md. The infos of
+    each agent hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that
+    vehicle's trip ended in this step) and `vehicle_id`; all are plain numbers.
 
-    It runs here, or its zones over worker processes (docs/workers.md): the same bit for bit.
+    It runs here, or its zones over worker processes, the same bit for bit
+    (docs/guides/divide_a_world.md).
 
     Args:
         worlds: the one world; it begins anew in the next step, which never comes: a reset does.
@@ -238,7 +239,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         return self._dicts.infos(self.worlds.arrays, self.agents, self._listed)
 
     def declare_event(self, agent: str, cause: str) -> None:
-        """Let an agent's vehicle tell others of an event in the next step (docs/v2x.md).
+        """Let an agent's vehicle tell others of an event in the next step (docs/reference/v2x.md).
 
         Args:
             agent: which has a vehicle.

@@ -102,7 +102,8 @@ class CavVectorEnv(WorldsEnvironment):
     - `DISABLED`: by `reset(options={"reset_mask": infos["episode_over"]})` before the next step,
       and never by itself. What a step returns is that of `NEXT_STEP`.
 
-    Worlds run here, or over processes (docs/workers.md), which changes no bit of what comes out.
+    Worlds run here, or over processes, which changes no bit of what comes out
+    (docs/guides/divide_a_world.md).
 
     Args:
         worlds: that are stepped.
@@ -165,7 +166,7 @@ class CavVectorEnv(WorldsEnvironment):
     def plans(self) -> tuple[Plan, ...]:
         """Which worker hosts which worlds, or zones of each world; empty without workers.
 
-        See docs/balance.md; where worlds or zones move, it is the present plan.
+        See docs/explanation/balance.md; where worlds or zones move, it is the present plan.
         """
         return self.worlds.plans
 
@@ -313,11 +314,11 @@ class CavVectorEnv(WorldsEnvironment):
         }
 
     def frames(self) -> dict[str, SensorFrames]:
-        """What the sensors of `rig` have got in the last step, by name; see docs/sensors.md.
+        """What the sensors of `rig` have got in the last step, by name.
 
-        Agents whose vehicle ended in the step have its last samples. Of a world that begins anew in
-        the same step it is what the new episode begins with. With `copy=False` they are arrays that
-        the next step overwrites.
+        See docs/reference/sensors.md. Agents whose vehicle ended in the step have its last samples.
+        Of a world that begins anew in the same step it is what the new episode begins with. With
+        `copy=False` they are arrays that the next step overwrites.
         """
         frames = self.worlds.arrays.frames
         return {name: sensor.copy() if self._copy else sensor for name, sensor in frames.items()}

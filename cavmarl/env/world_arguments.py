@@ -23,24 +23,25 @@ class WorldArguments(TypedDict, total=False):
 
     Attributes:
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
-        backend: where the worlds run (docs/workers.md). Results do not depend on it.
+        backend: where the worlds run (docs/guides/divide_a_world.md). Results do not depend on it.
             "local": in the caller's process. "processes:N": in N worker processes of this machine.
-            "nodes:N": in N processes that share nothing (docs/nodes.md), started on this machine.
-            "nodes:N@HOST:PORT": in N nodes that are started by hand and join there.
+            "nodes:N": in N processes that share nothing, started on this machine
+            (docs/guides/nodes.md). "nodes:N@HOST:PORT": in N nodes that are started by hand and
+            join there.
             "nodes:N@mpi": in N other ranks of an MPI run. "ray:N": in N actors of a Ray cluster
-            (docs/cluster.md), "ray": in as many as are of use.
+            (docs/guides/cluster.md), "ray": in as many as are of use.
             The name of a registered backend: there, "name:N" with N workers.
         workers: short form: N for "processes:N", 0 for "local".
         nodes: short form: N for "nodes:N".
         sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
-            out over (docs/sensor_workers.md). Results do not depend on it.
+            out over (docs/guides/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
         sensors_of: a trained driver, whose sensors and actions the agents get.
         render_mode: `rgb_array` or None; `parallel_env` also takes `human`.
-        record: a new folder to record into, or `RecordOptions` (docs/recordings.md).
+        record: a new folder to record into, or `RecordOptions` (docs/guides/recordings.md).
         overrides: values for any other key, such as `{"sensors.lidar.rays": 32}`.
     """
 

@@ -162,7 +162,9 @@ class WorldsEnvironment(OwnWorlds):
         return self._session.watch(look)
 
     def record(self, record: Record | None) -> None:
-        """Record all worlds from the next reset or step on, until `close`; see docs/recordings.md.
+        """Record all worlds from the next reset or step on, until `close`.
+
+        See docs/guides/recordings.md.
 
         Args:
             record: a new folder, or that and what else is recorded; None: record nothing.

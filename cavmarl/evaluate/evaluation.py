@@ -110,7 +110,7 @@ def evaluate(
         repeats: independent runs.
         out: folder for manifest and raw results; None keeps nothing but the report.
         record: a new folder for recordings, or `RecordOptions`; their worlds are episodes; with
-            several policies or runs, in subfolders POLICY/run-N (docs/recordings.md).
+            several policies or runs, in subfolders POLICY/run-N (docs/guides/recordings.md).
         failures: how many failed trips the page `failures.html` in `out` shows; 0: there is none.
         progress: called after every step of a run with the policy's name, the steps that it has
             done in this run, and the most there can be.

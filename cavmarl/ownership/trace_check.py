@@ -1,4 +1,4 @@
-"""Judges a trace by the rules of docs/ownership.md, without any of the protocol's code.
+"""Judges a trace by the rules of docs/explanation/ownership.md, without any of the protocol's code.
 
 It accepts what every correct run leaves behind, and refuses a trace in which a vehicle has two
 owners or none, a hand-off begins without the exact state at its target (PREPARE < ACK < SWITCH <

@@ -32,7 +32,7 @@ class NodeLink:
     Args:
         url: of the service.
         secret: of an identity with the role `node`.
-        body: with which it registers; docs/service.md has its fields.
+        body: with which it registers; docs/guides/service.md has its fields.
         is_supposed_idle: tell no load, so that selection goes by sessions alone.
     """
 

@@ -2,7 +2,7 @@
 
 The session's own node leads: it takes the commands, and awaits the others at a door that it tells.
 They are chosen as nodes of sessions are, on as many machines as there are; one that is lost or
-drained is replaced, and the worlds go on from what their buddies have kept (docs/nodes.md).
+drained is replaced, and the worlds go on from what their buddies have kept (docs/guides/nodes.md).
 """
 
 from __future__ import annotations

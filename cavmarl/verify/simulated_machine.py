@@ -151,8 +151,12 @@ class SimulatedMachine:
         following.baton.release()
 
     def at(self, delay_s: float, act: Callable[[], None]) -> None:
-        """Let something happen later."""
-        heapq.heappush(self._events, (self.now_s + delay_s, next(self._event_numbers), act))
+        """Call `act` after `delay_s` simulated seconds."""
+        self.at_time(self.now_s + delay_s, act)
+
+    def at_time(self, time_s: float, act: Callable[[], None]) -> None:
+        """Call `act` at a simulated time; calls of the same time keep their order."""
+        heapq.heappush(self._events, (time_s, next(self._event_numbers), act))
 
     def end(self, process: SimulatedProcess) -> None:
         """As SIGKILL: it does nothing more, and its connections end."""
@@ -311,7 +315,8 @@ class SimulatedSocket:
                     arrived(receiver.newest_come > number)
                 receiver.newest_come = max(receiver.newest_come, number)
 
-        machine.at(self._last_s - machine.now_s, come)
+        # A delay from now could round to a time before that of the bytes sent earlier.
+        machine.at_time(self._last_s, come)
 
     def receive(self, room: memoryview) -> int:
         if not self.come:

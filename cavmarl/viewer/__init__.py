@@ -1,4 +1,4 @@
 """The web viewer: a page that shows a running world, and the server that feeds it.
 
-See docs/viewer.md.
+See docs/guides/viewer.md.
 """

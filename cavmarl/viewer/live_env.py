@@ -166,7 +166,7 @@ def show(
     control: bool = False,
     title: str = "",
 ) -> ShownEnv:
-    """Serve a page that shows an environment while a program steps it (docs/viewer.md).
+    """Serve a page that shows an environment while a program steps it (docs/guides/viewer.md).
 
     Args:
         env: of `parallel_env` or `make_vec`.

@@ -1,4 +1,4 @@
-"""Figures of the two papers, drawn from what is measured here; see docs/papers.md.
+"""Figures of the two papers, drawn from what is measured here; see docs/explanation/papers.md.
 
 `python -m docs.pictures.paper_figures docs/images` draws `drift.svg` anew, in a minute. The plot of
 the sensor workers is that of `python -m benchmarks sensors --plot`.

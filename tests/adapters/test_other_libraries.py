@@ -1,4 +1,4 @@
-"""The examples of docs/libraries.md for libraries without a view of their own run as they stand."""
+"""Run the examples of docs/guides/libraries.md for libraries without a view of their own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "libraries.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "libraries.md"
 LIBRARIES = ("supersuit", "tianshou", "skrl", "agilerl")
 
 

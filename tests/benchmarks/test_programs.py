@@ -92,9 +92,10 @@ def test_an_error_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]
 def test_what_is_in_scope_holds_and_stands_on_its_page() -> None:
     found = scope.measure(steps=25, seed=0)
     assert [row["what"] for row in found.rows if not row["holds"]] == []
-    page = (Path(__file__).parents[2] / "docs" / "papers.md").read_text(encoding="utf-8")
+    page = Path(__file__).parents[2] / "docs/explanation/papers.md"
+    text = page.read_text(encoding="utf-8")
     for row in found.rows:
-        assert f"| {row['what']} | {row['A']} | " in page
+        assert f"| {row['what']} | {row['A']} | " in text
 
 
 def test_worlds_that_move_are_measured() -> None:

@@ -52,7 +52,7 @@ def test_what_was_left_out_is_named(written: Path, capsys: pytest.CaptureFixture
     written.write_bytes(written.read_bytes()[:-5])
     assert run("journal", str(written)) == 0
     said = words(capsys)
-    assert "tick 6 was begun and not committed" in said
+    assert "tick 6 was started but not committed" in said
     assert "is cut short" in said
 
 

@@ -57,7 +57,7 @@ def test_a_mended_network_that_cannot_be_written_is_refused_at_once(tmp_path: Pa
     place = tmp_path / "none" / "out.net.xml"
     refused = runner.invoke(app, ["check", "ring", "--fix", str(place)])
     assert isinstance(refused.exception, ConfigError)
-    assert f"--fix {place}: cannot be written (there is no folder" in str(refused.exception)
+    assert f"--fix {place}: cannot be written: there is no folder" in str(refused.exception)
 
 
 @pytest.mark.parametrize("name", ["net/mcity/mcity.net.xml", "osm/berlin_siegessaeule.osm.gz"])

@@ -28,7 +28,7 @@ def test_a_plan_is_printed_kept_and_made_again(
     document["shards"][0]["worker"] = 1 - document["shards"][0]["worker"]
     path.write_text(json.dumps(document))
     assert run("plan", "--again", str(path)) == 1
-    assert "do not stand" in capsys.readouterr().err
+    assert "the recomputed plan differs" in capsys.readouterr().err
 
 
 def test_a_plan_that_cannot_be_is_refused(
@@ -36,8 +36,8 @@ def test_a_plan_that_cannot_be_is_refused(
 ) -> None:
     few = ("plan", "ring", "--zones", "2", "--snapshot", "idle", *QUICK)
     assert "3 workers for 2 shards" in refusal(capsys, *few, "--workers", "3")
-    assert "workers = 0" in refusal(capsys, *few, "--workers", "0")
-    assert "name an environment" in refusal(capsys, "plan")
+    assert "--workers 0" in refusal(capsys, *few, "--workers", "0")
+    assert "the environment is missing" in refusal(capsys, "plan")
     assert "cannot be read" in refusal(capsys, "plan", "--again", str(tmp_path / "none"))
     path = tmp_path / "other.json"
     path.write_text("[]")
@@ -55,9 +55,9 @@ def test_nobody_admissible_says_so(capsys: pytest.CaptureFixture[str], tmp_path:
     path.write_text(json.dumps(document))
     said = refusal(capsys, *words, str(path))
     assert "no admissible worker: worker 0: cpu 0.99 > 0.85; worker 1: cpu 0.99 > 0.85" in said
-    assert "--snapshot idle supposes" in said
+    assert "with --snapshot idle the plan assumes" in said
     three = ("plan", "ring", "--zones", "3", "--workers", "3", *QUICK, "--snapshot")
-    assert "has 2 workers, not 3" in refusal(capsys, *three, str(path))
+    assert "has 2 workers, but --workers is 3" in refusal(capsys, *three, str(path))
 
 
 def test_zones_can_be_cut_by_what_was_measured(
@@ -77,14 +77,15 @@ def test_zones_can_be_cut_by_what_was_measured(
         "50",
     )
     short = ("--steps", "5", "--before", "5")
-    assert run(*rush, *short, "--layout", "grid", "--cut-anew", str(path)) == 0
+    assert run(*rush, *short, "--layout", "grid", "--write-zones", str(path)) == 0
     said = capsys.readouterr().out.splitlines()[-1]
-    assert f"of 50 vehicles are in other zones: {path}" in said
+    assert said.startswith(f"new zones in {path}: ")
+    assert "of 50 vehicles change zone" in said
     assert run(*rush, *short, "--layout", str(path)) == 0
     assert (
         run("verify", "zones", "rush", "--zones", "4", "--layout", str(path), "--steps", "5") == 0
     )
     path.unlink()
-    assert run(*rush, *short, "--tolerance", "4", "--cut-anew", str(path)) == 0
+    assert run(*rush, *short, "--tolerance", "4", "--write-zones", str(path)) == 0
     assert "is not written" in capsys.readouterr().out
     assert not path.exists()

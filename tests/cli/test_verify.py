@@ -32,7 +32,7 @@ def test_without_a_check_the_checks_are_named(
     words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = refusal(capsys, *words)
-    assert f"verify {words[1]}: name what to check first: {CHECKS}" in said
+    assert f"verify {words[1]}: the name of a check must come first: {CHECKS}" in said
 
 
 def test_the_command_of_another_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,7 +107,7 @@ def test_a_wrong_run_is_done_again_by_the_command_that_is_printed(
     words = ("--faults", "simulated", "--mix", "stale_heartbeat", "--first-seed", "4")
     assert run(*FEW, *words, "--set", "zones.check_invariants=true") == 1
     first = capsys.readouterr().out
-    ((_, again),) = re.findall(r"(to run it again: cavmarl) (.+)", first)
+    ((_, again),) = re.findall(r"(to repeat this run: cavmarl) (.+)", first)
     assert run(*shlex.split(again)) == 1
     wrong = [
         [line for line in said.splitlines() if line.startswith("3 nodes, ")]

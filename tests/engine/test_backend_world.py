@@ -194,9 +194,9 @@ def test_what_is_no_snapshot_is_refused() -> None:
 
 
 def test_the_page_s_example_runs() -> None:
-    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guides" / "extending.md").read_text(encoding="utf-8")
     block = re.search(r"```python\n(.*?)```", page.split("## A simulator for zones")[1], re.DOTALL)
     assert block
     names: dict[str, Any] = {}
-    exec(compile(block[1], "docs/extending.md", "exec"), names)
+    exec(compile(block[1], "docs/guides/extending.md", "exec"), names)
     assert names["seen"].size > 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from cavmarl.evaluate.scenarios.scenario_runs import make_scenario, run_scenario
 from cavmarl.traffic.scenarios.library import scenario_names
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/scenarios.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs/guides/scenarios.md"
 
 
 def blocks(name: str) -> list[str]:

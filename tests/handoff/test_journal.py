@@ -31,7 +31,7 @@ from tests.ownership.test_simulator import campaign
 from tests.support.forks import said_in_fork
 from tests.support.generated import check_block, table
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/ownership.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs/explanation/ownership.md"
 
 
 def eventful() -> Bench:

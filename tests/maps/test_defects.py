@@ -146,7 +146,7 @@ def test_what_is_cut_off_is_mended(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     told = json.loads(report.read_text())
     assert {defect["kind"] for defect in told["defects"]} == {"unreachable part"}
-    assert len(told["mended"]) == len(told["defects"])
+    assert len(told["repaired"]) == len(told["defects"])
     assert told["left"] == []
     assert found(fixed) == []
     assert "ODbL" in fixed.read_text()

@@ -59,7 +59,7 @@ def number(key: int, receiver: int, sender: int, tick: int, kind: int) -> float:
 
 
 def chance(config: ChannelConfig, distance_m: float, blocked: bool, busy: float) -> float:
-    """Of a reception, by the formulas of docs/v2x.md."""
+    """Of a reception, by the formulas of docs/reference/v2x.md."""
     result = 1.0 - config.loss
     if config.path_loss_exponent > 0.0:
         lost = 10.0 * config.path_loss_exponent * math.log10(max(distance_m, 1.0))

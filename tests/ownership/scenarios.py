@@ -1,4 +1,4 @@
-"""One scenario for each remedy of the protocol; docs/ownership.md lists them with their holes."""
+"""One scenario for each remedy of the protocol that docs/explanation/ownership.md lists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One test for each numbered rule of docs/ownership.md on borders, deadlines and neighbours."""
+"""One test for each rule of docs/explanation/ownership.md on borders, deadlines and neighbours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/ownership.md says what the code does: its tables and diagrams are made from the code."""
+"""The tables and diagrams of docs/explanation/ownership.md are made from the code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.ownership import test_border_rules, test_rules
 from tests.ownership.scenarios import SCENARIOS
 from tests.support.generated import check_block, table
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/ownership.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs/explanation/ownership.md"
 
 
 def meaning(kind: object) -> str:

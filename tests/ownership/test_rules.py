@@ -1,4 +1,4 @@
-"""One test for each numbered rule of docs/ownership.md."""
+"""One test for each numbered rule of docs/explanation/ownership.md."""
 
 from __future__ import annotations
 

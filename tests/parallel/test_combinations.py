@@ -191,5 +191,5 @@ def test_the_table_of_the_page_is_this_one() -> None:
         (feature, *("refused" if (feature, place) in REFUSED else "yes" for place in PLACES))
         for feature in FEATURES
     ]
-    page = Path(__file__).resolve().parents[2] / "docs" / "workers.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "guides" / "divide_a_world.md"
     check_block(page, "combinations", table(("", *PLACES), rows))

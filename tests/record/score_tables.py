@@ -352,7 +352,7 @@ def _pages() -> Iterator[ScoreTable]:
     """Tables of other pages."""
     yield ScoreTable("README.md", "environments", (WORLDS,), worlds_table, tuple(WORLD_TEXTS))
     yield ScoreTable("envs/ring22/README.md", "mean speed", (RING22,), ring_page)
-    page = "docs/figures.md"
+    page = "docs/figures/README.md"
     columns: list[tuple[str, str, str, Figure]] = [
         ("trips of `idm`", SCRIPTED, "idm", trips),
         *(

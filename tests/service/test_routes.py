@@ -140,10 +140,10 @@ def test_the_page_has_the_routes_and_the_problems() -> None:
             else ", ".join(role for role in ROLES if role in rule.roles)
         )
         rows.append(f"| `{name}` | {roles} | {route.description.splitlines()[0]} |")
-    check_block(ROOT / "docs" / "service.md", "routes", "\n".join(rows))
+    check_block(ROOT / "docs" / "guides" / "service.md", "routes", "\n".join(rows))
     rows = ["| problem | status | what |", "|---|---|---|"]
     rows += [f"| `{name}` | {status} | {text} |" for name, (status, text) in PROBLEMS.items()]
-    check_block(ROOT / "docs" / "service.md", "problems", "\n".join(rows))
+    check_block(ROOT / "docs" / "guides" / "service.md", "problems", "\n".join(rows))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`docs/service.md` is true: its session runs, its tests exist, its containers can run.
+"""`docs/guides/service.md` is true: its session runs, its tests exist, its containers can run.
 
 The session is in each run, though it starts a service and two nodes: it is what readers try first.
 """
@@ -20,7 +20,7 @@ from cavmarl.cli import app
 from tests.support.service import Cluster, running_service
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "guides" / "service.md").read_text(encoding="utf-8")
 CONTAINERS = ROOT / "configs" / "service"
 
 
@@ -74,7 +74,7 @@ def test_the_page_s_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         example = example.replace("range(100)", "range(3)").replace("episodes=8", "episodes=1")
         example = example.replace("agents=4, ", "agents=4, wait_s=10.0, ")
         try:
-            exec(compile(example, "docs/service.md", "exec"), {"secret": service.secret})
+            exec(compile(example, "docs/guides/service.md", "exec"), {"secret": service.secret})
         finally:
             cluster.stop()
     assert (tmp_path / "runs" / "there" / "manifest.json").is_file()

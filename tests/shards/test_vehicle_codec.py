@@ -410,4 +410,4 @@ def test_the_page_says_what_stands_in_a_state() -> None:
         for group, names in GROUPS.items()
     ]
     header = ("group", "fields of the record", "beside it")
-    check_block(ROOT / "docs/ownership.md", "state", table(header, rows))
+    check_block(ROOT / "docs/explanation/ownership.md", "state", table(header, rows))

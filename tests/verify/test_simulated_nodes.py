@@ -92,6 +92,19 @@ def test_bytes_that_change_on_the_way_are_noticed(world: World) -> None:
         exchange(world, 3, double)
 
 
+def test_bytes_that_are_held_arrive_in_the_order_in_which_they_were_sent(world: World) -> None:
+    machine = SimulatedMachine(0, world)
+    sender, receiver = (SimulatedSocket(machine, machine.caller) for _ in range(2))
+    sender.other, receiver.other = receiver, sender
+    sender.held_until_s = 1.937175702743636
+    sent = [n.to_bytes(4, "big") for n in range(3000)]
+    for data in sent:
+        machine.now_s += 0.0004 / 3.0
+        sender.send([data])
+    machine.wait(machine.caller, lambda: len(receiver.come) == len(sent), None)
+    assert list(receiver.come) == sent
+
+
 def test_a_connection_without_answers_ends(world: World) -> None:
     with pytest.raises(LinkLostError):
         exchange(world, 3, SimulatedSocket.fall_silent)

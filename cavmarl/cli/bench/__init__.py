@@ -1,4 +1,4 @@
-"""`cavmarl bench`: how fast it is, as ratios measured side by side in one run."""
+"""`cavmarl bench`: speed relative to other simulators, measured side by side."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from cavmarl.cli.bench import step, traffic, train
+from cavmarl.cli.output import add_command
 from cavmarl.cli.report_command import report_command
 from cavmarl.core.errors import ConfigError
 
-# Commands and options that were removed, each with the benchmark that replaces it.
+# Removed commands and options, with the benchmarks that replace them.
 _MOVED = {"workers": "workers", "sensors": "sensors", "clock": "clock"}
 _MOVED_OF_TRAFFIC = dict.fromkeys(
     ("--worlds", "--first-seed", "--out", "--without", "--maps"), "traffic_worlds"
@@ -20,12 +21,12 @@ _MOVED_OF_TRAFFIC = dict.fromkeys(
 
 def _refuse(word: str, name: str) -> None:
     raise ConfigError(
-        f"cavmarl bench {word} was moved: run python -m benchmarks {name} in a checkout"
+        f"cavmarl bench {word} was moved: run `python -m benchmarks {name}` in a checkout"
     )
 
 
 class _Bench(TyperGroup):
-    """Names the replacement of a command that was moved."""
+    """A group that names the replacement of a command that was moved."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name in _MOVED:
@@ -34,7 +35,7 @@ class _Bench(TyperGroup):
 
 
 class _Traffic(TyperCommand):
-    """Names the replacement of an option that was moved."""
+    """A command that names the replacement of an option that was moved."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         for word in args:
@@ -44,7 +45,26 @@ class _Traffic(TyperCommand):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(cls=_Bench, help="How fast it is, measured side by side.", no_args_is_help=True)
-app.command("step")(report_command(step.step))
-app.command("traffic", cls=_Traffic)(report_command(traffic.traffic))
-app.command("train")(report_command(train.train))
+app = typer.Typer(
+    cls=_Bench, help="Measure speed side by side with other simulators.", no_args_is_help=True
+)
+add_command(
+    app,
+    "step",
+    report_command(step.step),
+    "cavmarl bench step --agents 20 --repeats 3",
+)
+add_command(
+    app,
+    "traffic",
+    report_command(traffic.traffic),
+    "cavmarl bench traffic city.net.xml --demand city.rou.xml --seconds 900",
+    "cavmarl bench traffic city.net.xml --demand city.rou.xml --speed",
+    cls=_Traffic,
+)
+add_command(
+    app,
+    "train",
+    report_command(train.train),
+    "cavmarl bench train --agents 20 --workers 2",
+)

@@ -1,4 +1,4 @@
-"""`cavmarl bench step`: agent-steps a second next to highway-env's."""
+"""`cavmarl bench step`: compares the speed of steps with highway-env."""
 
 from __future__ import annotations
 
@@ -20,22 +20,30 @@ _SIDES = {
 
 
 def step(
-    agents: Annotated[int, about("Controlled vehicles in each world.")] = 100,
-    worlds: Annotated[int, about("Number of parallel worlds.")] = 16,
-    repeats: Annotated[int, about("Number of measurements of each row.")] = 5,
+    agents: Annotated[
+        int, about("Number of controlled vehicles in each world.", metavar="N")
+    ] = 100,
+    worlds: Annotated[int, about("Number of parallel worlds.", metavar="N")] = 16,
+    repeats: Annotated[int, about("Number of measurements of each row.", metavar="N")] = 5,
     at_least: Annotated[
-        float | None, about("Exit with 1 if the ratio with a lidar is below.", callback=check_bound)
+        float | None,
+        about(
+            "Exit with 1 if the ratio with a lidar is below X.", metavar="X", callback=check_bound
+        ),
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Agent-steps a second next to highway-env's: same road, vehicles and rates; one core."""
+    """Compare agent-steps per second on one core with highway-env.
+
+    Both have the same road, vehicles and rates.
+    """
     from cavmarl.bench.step_speed import measure_step_speed
 
     found = measure_step_speed(agents, worlds, repeats, say)
     return BenchmarkReport(
         f"agent-steps/s of one core: {found.rows[0].agents} controlled vehicles on "
         f"{found.road_m / 1000.0:.1f} km of four lanes,\n"
-        f"two ticks a step; ours with 16 neighbours too; {found.repeats} turns",
+        f"two ticks per step; cavmarl also observes 16 neighbours; {found.repeats} turns",
         {
             "observation": "observation",
             "side": "shown_side",
@@ -53,8 +61,8 @@ def step(
             f"batched over highway-env: [bold]{found.ratio:,.0f}[/] with a lidar, "
             f"[bold]{found.ratio_kinematics:,.0f}[/] without "
             f"({found.ratio_kinematics_raw:,.0f} over its raw observation)",
-            f"an agent among ten times as many costs [bold]{found.cost_of_more:.2f}[/] times as "
-            f"much; dicts add [bold]{found.dict_us:.2f} µs[/] an agent and step",
+            f"with ten times as many agents, each costs [bold]{found.cost_of_more:.2f}[/] times as "
+            f"much; dicts add [bold]{found.dict_us:.2f} µs[/] per agent and step",
         ],
         facts=asdict(found),
         holds=is_kept(at_least, found.ratio),

@@ -1,4 +1,4 @@
-"""`cavmarl bench traffic`: our traffic beside SUMO's on the same map and demand."""
+"""`cavmarl bench traffic`: compares traffic with SUMO on the same map and demand."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ import typer
 from rich.markup import escape
 
 from cavmarl.bench.harness import BenchmarkReport, Say, silent
-from cavmarl.cli.output import Seed, about, about_file, number
+from cavmarl.cli.output import (
+    Seed,
+    about,
+    about_file,
+    flag,
+    number,
+)
 from cavmarl.core.errors import ConfigError, require
 
 _ROWS = {
@@ -29,29 +35,49 @@ _ROWS = {
 
 def traffic(
     map_name: Annotated[
-        str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
+        str,
+        typer.Argument(metavar="MAP", help="Map file, or the name or folder of an environment."),
     ],
     demand: Annotated[
         list[Path],
-        about("A .rou.xml, .add.xml or .sumocfg; may be repeated.", "--demand", "-d"),
+        about(
+            "Demand: a .rou.xml, .add.xml or .sumocfg file. Repeat it for more.",
+            "--demand",
+            "-d",
+            metavar="FILE",
+        ),
     ],
-    seconds: Annotated[int, about("Simulated seconds, from the demand's beginning.")] = 900,
-    dt: Annotated[float, about("Step length of both, in seconds.")] = 0.1,
+    seconds: Annotated[
+        int, about("Simulated seconds, from the beginning of the demand.", metavar="S")
+    ] = 900,
+    dt: Annotated[float, about("Step length of both simulators in seconds.", metavar="S")] = 0.1,
     seed: Seed = 0,
-    teleports: Annotated[bool, about("Let SUMO teleport vehicles that stand for too long.")] = True,
+    teleports: Annotated[bool, flag("Let SUMO teleport vehicles that wait too long.")] = True,
     plot: Annotated[
-        Path | None, about_file("Draw the fundamental diagram here (.png, .svg, .pdf).")
+        Path | None,
+        about_file("Draw the fundamental diagram to this file (.png, .svg, .pdf)."),
     ] = None,
     speed: Annotated[
-        bool, about("Measure how fast both are, not what they do.", "--speed")
+        bool, flag("Compare the speed of the simulators instead of their traffic.", "--speed")
     ] = False,
-    after: Annotated[int, about("With --speed: simulated seconds before the first turn.")] = 120,
-    repeats: Annotated[int, about("With --speed: turns of 10 simulated seconds of each side.")] = 5,
+    after: Annotated[
+        int, about("With --speed: simulated seconds before the first turn.", metavar="S")
+    ] = 120,
+    repeats: Annotated[
+        int,
+        about(
+            "With --speed: number of turns of each simulator; a turn is 10 simulated seconds.",
+            metavar="N",
+        ),
+    ] = 5,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Our traffic beside SUMO's own run: same map, demand, seed and step length."""
+    """Compare traffic with SUMO, with the same map, demand, seed and step length."""
     if speed and plot is not None:
-        raise ConfigError("--plot: draws flow and density, which --speed does not measure; use one")
+        raise ConfigError(
+            "--plot and --speed: --plot draws flow and density, which --speed does not measure; "
+            "use only one of the two"
+        )
     if speed:
         return _speed(map_name, demand, dt, seed, after, repeats, say)
     return _comparison(map_name, demand, seconds, dt, seed, teleports, plot, say)
@@ -113,7 +139,7 @@ def _comparison(
         f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s, seed {found.seed}",
         {"": "figure", "cavmarl": "cavmarl", "SUMO": "SUMO", "ratio": "ratio"},
         rows,
-        notes=["tolerated in our reading of the demand:", *notes] if notes else [],
+        notes=["tolerated while reading the demand:", *notes] if notes else [],
         facts=found.to_dict(),
     )
 

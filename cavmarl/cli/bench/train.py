@@ -1,4 +1,4 @@
-"""`cavmarl bench train`: how fast PPO is from end to end."""
+"""`cavmarl bench train`: compares the end-to-end speed of PPO training."""
 
 from __future__ import annotations
 
@@ -26,25 +26,28 @@ _PHASES = {
 
 
 def train(
-    agents: Annotated[int, about("Agents in each world, on both sides.")] = 20,
+    agents: Annotated[
+        int, about("Number of agents in each world, on both sides.", metavar="N")
+    ] = 20,
     worlds: Annotated[
-        int, about("Number of our parallel worlds; highway-env has one a worker.")
+        int,
+        about("Number of parallel worlds; highway-env has one per worker.", metavar="N"),
     ] = 16,
-    workers: Annotated[int, about("Worker processes of each side.")] = 2,
-    repeats: Annotated[int, about("Number of measured updates of each side.")] = 3,
+    workers: Annotated[int, about("Number of worker processes of each side.", metavar="N")] = 2,
+    repeats: Annotated[int, about("Number of measured updates of each side.", metavar="N")] = 3,
     at_least: AtLeast = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """PPO from end to end next to stable-baselines3's on highway-env, and where the time goes.
+    """Compare PPO training from end to end with Stable-Baselines3 on highway-env.
 
-    Same road, vehicles, observation, network, batch and epochs. How fast our worlds are alone, with
-    their sensors and without learning, is another benchmark and reported apart.
+    Both sides have the same road, vehicles, observation, network, batch and epochs. The report
+    shows the share of time of each phase, and the speed of the worlds without learning.
     """
     from cavmarl.bench.training_speed import measure_training
 
     found = measure_training(agents, worlds, workers, repeats, say)
     notes = [
-        f"end to end, ours over theirs: [bold]{found.ratio:,.1f}[/]; our own recipe "
+        f"end to end, cavmarl over SB3: [bold]{found.ratio:,.1f}[/]; cavmarl's own recipe "
         f"({found.recipe_numbers} numbers): [bold]{found.recipe_rate:,.0f}[/] agent-steps/s",
         f"worlds and sensors alone, without learning: {median(found.stepping):,.0f} agent-steps/s",
     ]

@@ -1,4 +1,4 @@
-"""`cavmarl verify`: whether a world gives the same bits however it is run."""
+"""`cavmarl verify`: checks that results do not depend on how a world is run."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
+from cavmarl.cli.output import add_command
 from cavmarl.cli.verify import determinism, nodes, workers, zones
 from cavmarl.core.errors import ConfigError
 
@@ -14,12 +15,12 @@ __all__ = ["app"]
 
 
 class _Checks(TyperGroup):
-    """Refuses an environment or an option in the place of a check, and names the checks."""
+    """A group that names the checks if an environment or an option is given in their place."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in (*self.commands, *ctx.help_option_names):
             raise ConfigError(
-                f"verify {args[0]}: name what to check first: "
+                f"verify {args[0]}: the name of a check must come first: "
                 f"cavmarl verify {'|'.join(self.commands)} …"
             )
         return super().parse_args(ctx, args)
@@ -27,10 +28,31 @@ class _Checks(TyperGroup):
 
 app = typer.Typer(
     cls=_Checks,
-    help="Check that a world gives the same bits however it is run; exit code 1 if it does not.",
+    help="Check bit for bit that results do not depend on how a world is run.",
     no_args_is_help=True,
 )
-app.command("zones")(zones.verify_zones)
-app.command("nodes")(nodes.verify_nodes)
-app.command("workers")(workers.verify_workers)
-app.command("determinism")(determinism.verify_determinism)
+add_command(
+    app,
+    "zones",
+    zones.verify_zones,
+    "cavmarl verify zones town --zones 1,4,9 --steps 200",
+)
+add_command(
+    app,
+    "nodes",
+    nodes.verify_nodes,
+    "cavmarl verify nodes grid4x4 --nodes 2,4 --kill 1",
+    "cavmarl verify nodes --faults simulated --seeds 5",
+)
+add_command(
+    app,
+    "workers",
+    workers.verify_workers,
+    "cavmarl verify workers merge --kill 10 --backend processes:2",
+)
+add_command(
+    app,
+    "determinism",
+    determinism.verify_determinism,
+    "cavmarl verify determinism town --steps 300",
+)

@@ -1,4 +1,4 @@
-"""`cavmarl verify determinism`: checks that the same scenario gives the same bits."""
+"""`cavmarl verify determinism`: checks that repeated runs give the same bits."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from cavmarl.core.progress import counting
 def verify_determinism(
     world: WorldSpec,
     policy: PolicyName = "idm",
-    steps: Annotated[int, about("Number of steps to compare.")] = 600,
+    steps: Annotated[int, about("Number of steps to compare.", metavar="N")] = 600,
     json_path: JsonPath = None,
 ) -> None:
-    """Compare three fresh processes that run the same world.
+    """Compare runs of the same world in three new processes.
 
     On the first difference, print it and exit with 1.
     """
@@ -38,7 +38,7 @@ def verify_determinism(
         raise typer.Exit(1)
     console.print(
         f"equal: {found.steps} steps in {len(found.hash_seeds)} processes (PYTHONHASHSEED "
-        f"{', '.join(found.hash_seeds)}), with load beside; state {found.state_hash}",
+        f"{', '.join(found.hash_seeds)}) on a loaded machine; state {found.state_hash}",
         markup=False,
         highlight=False,
         soft_wrap=True,

@@ -1,4 +1,4 @@
-"""`cavmarl verify nodes`: zones over node processes, also while nodes and connections fail."""
+"""`cavmarl verify nodes`: checks worlds over node processes, also while processes fail."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ Env = Annotated[
     str | None,
     typer.Argument(
         metavar="[ENV]",
-        help="Environment: a name, folder or map file [default with --faults: a busy grid4x4].",
+        help="Environment: its name, its folder, or a map file.",
+        show_default="with --faults: a busy grid4x4",
     ),
 ]
 Nodes = Annotated[str, about("Numbers of node processes to compare.", "--nodes", metavar="N,N,…")]
@@ -48,7 +49,8 @@ Faults = Annotated[
 Mix = Annotated[
     str | None,
     about(
-        "On the simulated machine: the kinds of faults, as in docs/faults.md [default: all].",
+        "On the simulated machine: the kinds of faults, as in docs/explanation/faults.md "
+        "[default: all].",
         metavar="NAME,…",
     ),
 ]
@@ -84,11 +86,13 @@ def verify_nodes(
         int | None,
         about(
             f"Number of steps to compare [default: {STEPS}; with --faults 16, with processes "
-            "40 or more]."
+            "40 or more].",
+            metavar="N",
         ),
     ] = None,
     worlds: Annotated[
-        int | None, about("Number of parallel worlds [default: 1; with --faults always 1].")
+        int | None,
+        about("Number of parallel worlds [default: 1; with --faults always 1].", metavar="N"),
     ] = None,
     policy: PolicyName = "idm",
     check: options.Check = False,
@@ -119,8 +123,8 @@ def verify_nodes(
     _refuse({"--kill": kill, "--worlds": worlds}, "does not go with --faults")
     if faults not in (SIMULATED, PROCESSES, CAMPAIGN):
         raise ConfigError(
-            f"--faults {faults}: must be {SIMULATED}, {PROCESSES} or {CAMPAIGN}; a plan of faults "
-            "is not taken any more"
+            f"--faults {faults}: must be {SIMULATED}, {PROCESSES} or {CAMPAIGN}; plans of faults "
+            "were removed"
         )
     if faults == SIMULATED:
         _refuse({"--process-runs": process_runs}, f"goes with {PROCESSES} or {CAMPAIGN}")
@@ -157,7 +161,7 @@ def _checked(world: WorldSpec, check: bool) -> WorldSpec:
 
 
 def _busy(world: WorldSpec) -> WorldSpec:
-    """Return the world of a campaign that names none: many vehicles change their zone."""
+    """Return the default world of a campaign, in which many vehicles change their zone."""
     from cavmarl.verify.simulated_nodes import BUSY
 
     return replace(BUSY, seed=world.seed, overrides={**BUSY.overrides, **world.overrides})
@@ -170,7 +174,7 @@ def _compare(
     json_path: Path | None,
     runs: dict[str, Any],
 ) -> None:
-    """Compare worlds over nodes with undivided ones; exit code 1 if anything differs."""
+    """Compare worlds over nodes with undivided ones; on a difference, exit with 1."""
     from cavmarl.verify import node_losses
 
     with counting(console, f"{world.env} over {', '.join(map(str, nodes))} nodes") as progress:
@@ -197,7 +201,7 @@ def _compare(
 def _simulated(
     console: Console, world: WorldSpec, nodes: list[int], runs: dict[str, Any]
 ) -> dict[str, Any]:
-    """Inject faults on the simulated machine; print a table, figures and runs that went wrong."""
+    """Inject faults on the simulated machine; print a table, figures and wrong runs."""
     from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 
     with counting(console, f"faults between simulated nodes of {world.env}") as progress:
@@ -225,14 +229,14 @@ def _simulated(
             where = f"{line.nodes} nodes, {line.mix}, seed {seed}"
             console.print(f"{where}: {text}", markup=False, soft_wrap=True, style="red")
             again = _again(world, found, line.nodes, line.mix, seed, str(runs["policy"]))
-            console.print(f"to run it again: {again}", markup=False, soft_wrap=True)
+            console.print(f"to repeat this run: {again}", markup=False, soft_wrap=True)
     return figures
 
 
 def _again(
     world: WorldSpec, found: SimulatedCampaign, nodes: int, mix: str, seed: int, policy: str
 ) -> str:
-    """Return the command that does exactly one run of a campaign."""
+    """Return the command that repeats one run of a campaign."""
     words = ["cavmarl", "verify", "nodes", world.env, "--faults", SIMULATED, "--nodes", str(nodes)]
     words += ["--mix", mix, "--first-seed", str(seed), "--seeds", "1", "--policy", policy]
     words += ["--zones", str(found.zones), "--steps", str(found.steps), "--seed", str(world.seed)]

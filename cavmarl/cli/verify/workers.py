@@ -1,4 +1,4 @@
-"""`cavmarl verify workers`: worker processes are killed, and results stay the same."""
+"""`cavmarl verify workers`: checks that results survive the death of worker processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, PolicyName, about, grid, with_world, write_json
+from cavmarl.cli.output import (
+    RUN,
+    JsonPath,
+    PolicyName,
+    about,
+    grid,
+    with_world,
+    write_json,
+)
 from cavmarl.cli.verify import options
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.progress import counting
@@ -20,7 +28,7 @@ if TYPE_CHECKING:
     from cavmarl.verify.worker_kills import Kill, KillReport
 
 BOUNDS_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-WIDTH = 30  # letters of the longest bar
+WIDTH = 30  # characters of the longest bar
 
 
 @with_world()
@@ -30,15 +38,23 @@ def verify_workers(
         int, about("Number of workers to kill or to stop at random times.", metavar="N")
     ] = 10,
     backend: Annotated[
-        str | None, about("Where the worlds run: processes:N [default: processes:2].")
+        str | None,
+        about(
+            "Where the worlds run: processes:N [default: processes:2].",
+            metavar="BACKEND",
+            panel=RUN,
+        ),
     ] = None,
-    workers: Annotated[int | None, about("Short form: N for --backend processes:N.")] = None,
+    workers: Annotated[
+        int | None, about("Short form of --backend processes:N.", metavar="N", panel=RUN)
+    ] = None,
     worlds: Annotated[
-        int | None, about("Number of parallel worlds [default: two for each worker].")
+        int | None,
+        about("Number of parallel worlds [default: two for each worker].", metavar="N"),
     ] = None,
     zones: options.ZoneCount = None,
     steps: Annotated[
-        int | None, about("Number of steps to compare [default: three for each kill].")
+        int | None, about("Number of steps to compare [default: three for each kill].", metavar="N")
     ] = None,
     policy: PolicyName = "idm",
     json_path: JsonPath = None,
@@ -67,7 +83,7 @@ def _print(console: Console, found: KillReport) -> None:
     console.print(
         f"{escape(Path(found.env).name)}: {found.worlds} worlds over {found.workers} workers, "
         f"{found.steps} steps of {found.step_ms:.3g} ms; {len(found.kills)} deaths\n"
-        f"an empty order to all workers: {found.ping_us:.3g} µs\n"
+        f"an empty command to all workers: {found.ping_us:.3g} µs\n"
         f"{hardware['cpu']}, {hardware['usable_cores']} cores",
         highlight=False,
     )
@@ -86,10 +102,10 @@ def _spreads(found: KillReport) -> Table:
 
     rows = []
     for text, kind, name in (
-        ("killed at work: noticed after, ms", "SIGKILL", "noticed_ms"),
-        ("stopped at work: noticed after, ms", "SIGSTOP", "noticed_ms"),
-        ("successor has the order after, ms", None, "replaced_ms"),
-        ("successor has done it after, ms", None, "recovered_ms"),
+        ("killed during a step: detected after, ms", "SIGKILL", "noticed_ms"),
+        ("stopped during a step: detected after, ms", "SIGSTOP", "noticed_ms"),
+        ("replacement has the command after, ms", None, "replaced_ms"),
+        ("replacement has finished it after, ms", None, "recovered_ms"),
     ):
         values = [
             getattr(kill, name)
@@ -114,4 +130,4 @@ def _histogram(kills: tuple[Kill, ...]) -> Table:
         if any(counts[name][n] for name in names):
             found = [counts[name][n] for name in names]
             rows.append((label, *(f"{'█' * -(-WIDTH * n // most)} {n}" for n in found)))
-    return grid(("ms", "noticed", "recovered"), rows, lefts=3)
+    return grid(("ms", "detected", "recovered"), rows, lefts=3)

@@ -1,4 +1,4 @@
-"""`cavmarl verify zones`: divided worlds beside the undivided one."""
+"""`cavmarl verify zones`: compares divided worlds with the undivided one."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import (
+    OUTPUT,
+    WORLD,
     JsonPath,
     PolicyName,
     about,
@@ -38,12 +40,15 @@ Zones = Annotated[
 Layout = Annotated[
     str | None,
     about(
-        f"How the map is divided: {', '.join(ZONE_LAYOUTS)}, or a zone file [default: as "
-        "configured by the environment]."
+        f"Shape of the zones: {', '.join(ZONE_LAYOUTS)}, or a zone file [default: as "
+        "configured by the environment].",
+        metavar="LAYOUT",
+        panel=WORLD,
     ),
 ]
 Journal = Annotated[
-    Path | None, about("Write the ownership journals into this folder.", metavar="DIR")
+    Path | None,
+    about("Write the ownership journals into this folder.", metavar="DIR", panel=OUTPUT),
 ]
 
 
@@ -51,10 +56,10 @@ Journal = Annotated[
 def verify_zones(
     world: WorldSpec,
     zones: Zones = None,
-    steps: Annotated[int, about("Number of steps to compare.")] = 200,
+    steps: Annotated[int, about("Number of steps to compare.", metavar="N")] = 200,
     layout: Layout = None,
     policy: PolicyName = "idm",
-    worlds: Annotated[int, about("Number of parallel worlds.")] = 1,
+    worlds: Annotated[int, about("Number of parallel worlds.", metavar="N", panel=WORLD)] = 1,
     check: options.Check = False,
     journal: Journal = None,
     json_path: JsonPath = None,
@@ -98,7 +103,9 @@ def _table(found: Equivalence, seed: int) -> Table:
         )
         for result in found.results
     )
-    title = escape(f"{Path(found.env).name}, {many}, seed {seed}: beside the undivided")
+    title = escape(
+        f"{Path(found.env).name}, {many}, seed {seed}: compared with the undivided world"
+    )
     return grid(("zones", "steps", "vehicles", "crossings", ""), rows, title, lefts=0)
 
 

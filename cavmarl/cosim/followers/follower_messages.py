@@ -1,4 +1,4 @@
-"""The messages between a world and its followers; docs/followers.md specifies them.
+"""The messages between a world and its followers; docs/guides/cosimulation.md specifies them.
 
 A frame is that of `framed_socket`: a head, a payload in msgpack, and the bytes of arrays. A payload
 is data and never code. Each is one of these classes, as a map of its fields; a payload with other

@@ -18,7 +18,8 @@ RANGE_MARGIN_M = 0.05  # what is nearer than so much to the range is an echo
 def lidar_points(lidar: StackSensor, scan: Points, range_m: float = math.inf) -> Points:
     """Echoes (n, 3), the lowest layer first; x ahead, y to the left, z above the ground.
 
-    `scan`: (layers, rays) distances in m, see `docs/imaging.md`. `range_m`: of those that are used.
+    `scan`: (layers, rays) distances in m, see `docs/reference/imaging.md`. `range_m`: of
+    those that are used.
     """
     settings = lidar.settings
     layers, rays = scan.shape

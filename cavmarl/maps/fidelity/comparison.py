@@ -1,8 +1,8 @@
 """Two clouds compared: ICP's RMSE, mean distances both ways, and their report.
 
 Equations (1) and (2) and Table I are those of the paper on the hybrid digital twin that
-`docs/maps.md` names: RMSE = sqrt(mean |T(p) - q|²) over nearest pairs, and the mean of the
-distance from each p to the cloud Q, which is not symmetric.
+`docs/reference/map_fidelity.md` names: RMSE = sqrt(mean |T(p) - q|²) over nearest pairs, and the
+mean of the distance from each p to the cloud Q, which is not symmetric.
 """
 
 from __future__ import annotations

@@ -1,0 +1,62 @@
+"""The help of each command: groups, values, examples that can be copied."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.support.command_lines import check_command, whole_command
+
+
+def commands(group: Any = None, words: str = "cavmarl") -> Iterator[tuple[str, Any]]:
+    """Yield each command with the words that call it."""
+    group = group or whole_command()
+    context = group.make_context(words, [], resilient_parsing=True)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if hasattr(command, "list_commands"):
+            yield from commands(command, f"{words} {name}")
+        else:
+            yield f"{words} {name}", command
+
+
+COMMANDS = dict(commands())
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_help_ends_with_examples_that_are_understood(words: str) -> None:
+    title, *examples = COMMANDS[words].epilog.split("\n\n")
+    assert title == "Examples:"
+    assert examples
+    for line in examples:
+        assert words in line
+        check_command(line[line.index("cavmarl") :])
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_options_say_what_their_value_is(words: str) -> None:
+    command = COMMANDS[words]
+    context = command.make_context(words, [], resilient_parsing=True)
+    for parameter in command.params:
+        text = parameter.help or ""
+        assert text.endswith("."), f"{parameter.name}: {text}"
+        assert text[:1].isupper() or text[:1].isdigit(), f"{parameter.name}: {text}"
+        assert "[default" not in text, f"{parameter.name}: the markup hides it"
+        if parameter.param_type_name == "option":
+            value = parameter.display_type_rich(context)
+            assert not value or "|" in value or not value.startswith("<"), (
+                f"{parameter.name}: name the value"
+            )
+
+
+def test_the_commands_are_grouped_by_task(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        whole_command()(["--help"])
+    shown = capsys.readouterr().out
+    panels = ("Start here", "Train and evaluate", "Maps and demand", "Divide worlds", "Service")
+    places = [shown.index(panel) for panel in panels]
+    assert places[0] == min(places)
+    assert shown.index(" demo ") < shown.index(" evaluate ") < shown.index(" serve ")
+    assert "Commands" not in shown, "each command belongs to a group"

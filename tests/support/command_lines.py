@@ -1,0 +1,38 @@
+"""Checks that commands in pages and in help texts exist and take their options."""
+
+from __future__ import annotations
+
+import shlex
+from functools import cache
+from typing import Any
+
+import typer
+
+from cavmarl.cli import app
+
+USAGE: Any = typer.BadParameter.__base__  # what a command line that is not understood raises
+
+
+def check_command(line: str) -> None:
+    """Parse a command line down to the options of its command, without running it."""
+    command = whole_command()
+    context = command.make_context("cavmarl", [], resilient_parsing=True)
+    words = shlex.split(line.replace("…", ""), comments=True)[1:]
+    while hasattr(command, "get_command") and words and not words[0].startswith("-"):
+        found = command.get_command(context, words[0])
+        assert found is not None, line
+        context = type(context)(found, parent=context, **found.context_settings)
+        command, words = found, words[1:]
+    try:
+        _, left, _ = command.make_parser(context).parse_args(words)
+    except USAGE as error:
+        if "requires an argument" not in str(error):  # as a page may name an option
+            raise
+        left = []
+    assert not left or context.ignore_unknown_options, line
+
+
+@cache
+def whole_command() -> Any:
+    """Return the group of all commands."""
+    return typer.main.get_command(app)
