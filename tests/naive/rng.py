@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tests.naive.digests import mixed
+
 MASK_32 = (1 << 32) - 1
 
 
@@ -43,16 +45,9 @@ MASK_64 = (1 << 64) - 1
 GOLDEN = 0x9E3779B97F4A7C15
 
 
-def _mix(word: int) -> int:
-    """The finaliser of SplitMix64."""
-    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & MASK_64
-    word = (word ^ word >> 27) * 0x94D049BB133111EB & MASK_64
-    return word ^ word >> 31
-
-
 def quick_uniform(key: int, vehicle: int, tick: int, stream: int) -> float:
     """Key, vehicle and (stream, tick) mixed in turn; the upper 53 bits."""
-    word = _mix((key + GOLDEN) & MASK_64)
-    word = _mix(word ^ vehicle * GOLDEN & MASK_64)
-    word = _mix(word ^ ((stream << 32) + tick) * GOLDEN & MASK_64)
+    word = mixed((key + GOLDEN) & MASK_64)
+    word = mixed(word ^ vehicle * GOLDEN & MASK_64)
+    word = mixed(word ^ ((stream << 32) + tick) * GOLDEN & MASK_64)
     return (word >> 11) / 2**53

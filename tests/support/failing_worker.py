@@ -9,7 +9,6 @@ from cavmarl.parallel.processes.worker_loop import serve
 from cavmarl.parallel.team.team import TeamFollower
 from cavmarl.shards.shard_group import ShardGroup
 
-PHASE = "resolve"
 AT = 9  # the call of it that fails
 
 follows = TeamFollower.follow

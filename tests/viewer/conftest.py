@@ -18,6 +18,7 @@ from cavmarl.viewer.vehicle_details import hello_of
 from cavmarl.viewer.viewed_world import first_stage
 from cavmarl.viewer.web_options import WebOptions
 from cavmarl.viewer.web_server import WebServer
+from tests.support.chromium import chromium
 
 
 @dataclass
@@ -63,6 +64,20 @@ def served(env: CavEnv, options: WebOptions, drives: bool = True) -> Iterator[Se
 def _drive(run: ShownRun, over: threading.Event) -> None:
     while not over.is_set():
         over.wait(min(run.turn(), 0.02))
+
+
+@pytest.fixture(scope="module")
+def chromium_browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def browser(chromium_browser: Any) -> Iterator[Any]:
+    """A browser whose pages are closed after the test."""
+    yield chromium_browser
+    for context in chromium_browser.contexts:
+        context.close()
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.live_recording import ShownRecording, recording_stages
 from cavmarl.viewer.show_world import serve_stages
 from cavmarl.viewer.web_options import WebOptions
-from tests.support.chromium import chromium, until
+from tests.support.chromium import until
 from tests.viewer.conftest import Served
 
 Serve = Callable[..., Served]
@@ -26,20 +26,6 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
   return kind === "webgl2" ? null : real.call(this, kind, ...more);
 };
 """
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(autouse=True)
-def closed_pages(browser: Any) -> Iterator[None]:
-    """No page of one test is drawn any more during the next."""
-    yield
-    for context in browser.contexts:
-        context.close()
 
 
 def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[str], set[str]]:
