@@ -154,11 +154,9 @@ def test_without_a_library_kernels_are_compiled_or_refused(
     anew.setattr(Library.__init__, "__defaults__", (copied,))
     function: Any = rough_atan2
     expected = rough_atan2(1.0, 2.0)
-
     again: Any = kernel(function.py_func)
     assert again(1.0, 2.0) == expected
     assert not (tmp_path / "cache").exists(), "it came from the library"
-
     damaged = Path(shutil.copytree(copied, tmp_path / "damaged"))  # the other one is in use
     _flip(damaged / LIBRARY_FILE, 1000)
     anew.setattr(Library.__init__, "__defaults__", (damaged,))
@@ -170,7 +168,6 @@ def test_without_a_library_kernels_are_compiled_or_refused(
     said = capsys.readouterr().err
     assert said.count("a kernel is compiled on this machine, as ") == 1
     assert "is damaged: install cavmarl again" in said
-
     anew.setenv("CAVMARL_KERNELS", "prebuilt")
     machine_code.kernel_source.cache_clear()
     with pytest.raises(KernelError, match=r"no compiled kernels to use, as .* is damaged"):

@@ -217,7 +217,6 @@ def test_a_generated_network_is_read_whole(tmp_path: Path, options: list[str]) -
     path = tmp_path / "made.net.xml"
     command = [str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate"), *options, "-o", str(path)]
     subprocess.run(command, check=True, capture_output=True)
-
     check_everything(path, read_network)
 
 
@@ -227,18 +226,8 @@ def test_a_network_without_roads_is_refused(name: str) -> None:
         read_network(game(name))
 
 
-@pytest.mark.slow  # test_reader.py says the same of a small map
-def test_extents_come_from_roads_and_not_from_stray_nodes(built_map: BuiltMap) -> None:
-    # Monaco has a node 25 km to the south.
-    min_x, min_y, max_x, max_y = network_of(built_map("osm/monaco.osm.gz")).extent_m
-
-    assert max_x - min_x == pytest.approx(2874, abs=15)
-    assert max_y - min_y == pytest.approx(3301, abs=15)
-
-
 def test_elevation_is_kept(built_map: BuiltMap) -> None:
     bridges = network_of(built_map("xodr/Town04.xodr")).points["z"]
     hill = network_of(built_map("net/mcity/mcity.net.xml")).points["z"]
-
     assert (bridges.min(), bridges.max()) == pytest.approx((0.0, 11.0), abs=0.05)
     assert (hill.min(), hill.max()) == pytest.approx((266.0, 279.4), abs=0.05)

@@ -26,7 +26,6 @@ TRIP = '<vType id="t"/><trip id="a" type="t" depart="0" from="{}" to="{}"/>'
 @pytest.fixture(scope="module")
 def trip() -> str:
     """A trip over two edges of the map."""
-
     network = network_of(MAP)
     link = network.links[0]
     ends = (network.lanes["edge"][link[side]] for side in ("from_lane", "to_lane"))
