@@ -15,29 +15,10 @@ import cavmarl
 ROOT = Path(__file__).resolve().parents[1]
 
 LATE = (
-    "numba",
-    "torch",
-    "stable_baselines3",
-    "highway_env",
-    "libsumo",
-    "sumolib",
-    "sumo",
-    "pydantic",
-    "pygame",
-    "imageio",
-    "matplotlib",
-    "jinja2",
-    "typer",
-    "rich",
-    "fastapi",
-    "ray",
-    "psutil",
-    "torchrl",
-    "tensordict",
-    "benchmarl",
-    "pyarrow",
-    "mcap",
-)
+    "numba", "torch", "stable_baselines3", "highway_env", "libsumo", "sumolib", "sumo", "pydantic",
+    "pygame", "imageio", "matplotlib", "jinja2", "typer", "rich", "fastapi", "ray", "psutil",
+    "torchrl", "tensordict", "benchmarl", "pyarrow", "mcap",
+)  # fmt: skip
 
 PROBE = """
 import json, sys, time

@@ -102,15 +102,11 @@ def test_rates_are_agent_steps_a_second_of_steps_alone(monkeypatch: pytest.Monke
 
 def test_ratios_are_ours_over_theirs() -> None:
     medians = {
-        ("lidar", "batched"): 600.0,
-        ("lidar", "highway_env"): 20.0,
-        ("kinematics", "batched"): 1000.0,
-        ("kinematics", "single"): 500.0,
-        ("kinematics", "dicts"): 250.0,
-        ("kinematics", "more"): 800.0,
-        ("kinematics", "highway_env"): 10.0,
-        ("kinematics", "highway_env_raw"): 40.0,
-    }
+        ("lidar", "batched"): 600.0, ("lidar", "highway_env"): 20.0,
+        ("kinematics", "batched"): 1000.0, ("kinematics", "single"): 500.0,
+        ("kinematics", "dicts"): 250.0, ("kinematics", "more"): 800.0,
+        ("kinematics", "highway_env"): 10.0, ("kinematics", "highway_env_raw"): 40.0,
+    }  # fmt: skip
     rows = [Row(*key, 1, 1, 0.5 * rate, rate, 2.0 * rate) for key, rate in medians.items()]
     found = step_speed.compare(500.0, 2, rows)
     assert (found.ratio, found.ratio_kinematics, found.ratio_kinematics_raw) == (30.0, 100.0, 25.0)

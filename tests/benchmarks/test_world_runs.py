@@ -30,17 +30,9 @@ pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 pytest.importorskip("matplotlib", reason="needs the extra 'report'")
 
 FIGURES = {
-    "departed": 100,
-    "waiting": 0,
-    "arrived": 80,
-    "mean_speed_mps": 10.0,
-    "mean_delay_s": 20.0,
-    "queue": 3.0,
-    "contacts": 0,
-    "longest_lock_s": 5.0,
-    "locked_junction": "a",
-    "teleports": 0,
-}
+    "departed": 100, "waiting": 0, "arrived": 80, "mean_speed_mps": 10.0, "mean_delay_s": 20.0,
+    "queue": 3.0, "contacts": 0, "longest_lock_s": 5.0, "locked_junction": "a", "teleports": 0,
+}  # fmt: skip
 SPREAD = {
     "departed": [100, 100, 100],
     "arrived": [78, 80, 82],

@@ -30,12 +30,9 @@ def watched(env: str = "grid4x4", worlds: int = 1, **overrides: Any) -> Simulati
         background=40,
         num_worlds=worlds,
         overrides={
-            "zones.count": 4,
-            "zones.check_invariants": True,
-            "clock.sim_dt_s": 0.1,
-            **overrides,
+            "zones.count": 4, "zones.check_invariants": True, "clock.sim_dt_s": 0.1, **overrides,
         },
-    )
+    )  # fmt: skip
     start(simulation, seed=1)
     return simulation
 

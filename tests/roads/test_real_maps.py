@@ -19,34 +19,18 @@ from tests.support.kept_maps import network_of
 BuiltMap = Callable[[str], Path]
 
 MAPS = [
-    "net/Town10HD.net.xml",
-    "net/bologna_acosta/acosta_buslanes.net.xml",
-    "net/mcity/mcity.net.xml",
-    "osm/berlin_siegessaeule.osm.gz",
-    "osm/laufamholz.osm.xml",
-    "osm/monaco.osm.gz",
-    "xodr/Town01.xodr",
-    "xodr/Town04.xodr",
-    "xodr/Town10HD.xodr",
-    "xodr/fabriksgatan.xodr",
-    "xodr/multi_intersections.xodr",
-    "xodr/newmarket.xodr",
-    "xodr/soderleden_invalid.xodr",
-]
+    "net/Town10HD.net.xml", "net/bologna_acosta/acosta_buslanes.net.xml", "net/mcity/mcity.net.xml",
+    "osm/berlin_siegessaeule.osm.gz", "osm/laufamholz.osm.xml", "osm/monaco.osm.gz",
+    "xodr/Town01.xodr", "xodr/Town04.xodr", "xodr/Town10HD.xodr", "xodr/fabriksgatan.xodr",
+    "xodr/multi_intersections.xodr", "xodr/newmarket.xodr", "xodr/soderleden_invalid.xodr",
+]  # fmt: skip
 
 # Networks that come with SUMO: pedestrians, trams, bicycles, trains, motorways, zipper merges.
 GAMES = [
-    "A10KW/osm.net.xml",
-    "DRT/osm.net.xml",
-    "bs3d/bs.net.xml",
-    "cross/cross.net.xml",
-    "fkk_in/ingolstadt.net.xml.gz",
-    "fokr_bs_demo/fokr_bs.net.xml.gz",
-    "grid6/grid6.net.xml",
-    "highway/highway.net.xml",
-    "hiking/hiking.net.xml",
-    "ramp/ramp.net.xml",
-]
+    "A10KW/osm.net.xml", "DRT/osm.net.xml", "bs3d/bs.net.xml", "cross/cross.net.xml",
+    "fkk_in/ingolstadt.net.xml.gz", "fokr_bs_demo/fokr_bs.net.xml.gz", "grid6/grid6.net.xml",
+    "highway/highway.net.xml", "hiking/hiking.net.xml", "ramp/ramp.net.xml",
+]  # fmt: skip
 NOT_FOR_CARS = ["rail/net.net.xml", "rail_demo/net.net.xml", "racing/spreewaldring.net.xml"]
 
 

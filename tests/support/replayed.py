@@ -23,11 +23,8 @@ QUICK: Mapping[str, Any] = {
     "zones.approach_ticks": 4,
 }
 BUSY: Mapping[str, Any] = {
-    **QUICK,
-    "population.mode": "respawn",
-    "population.agents": 6,
-    "population.background": 110,
-}
+    **QUICK, "population.mode": "respawn", "population.agents": 6, "population.background": 110,
+}  # fmt: skip
 
 
 class Checked:

@@ -129,14 +129,10 @@ def test_a_name_that_means_another_file_is_refused(
 
 
 SECTIONS = {
-    "processing": "fcd-output",
-    "routing": "device.rerouting.output",
-    "unknown": "summary-output",
-    "ssm_device": "device.ssm.file",
-    "taxi_device": "device.taxi.dispatch-algorithm.output",
-    "mesoscopic": "save-state.files",
-    "random_number": "error-log",
-}
+    "processing": "fcd-output", "routing": "device.rerouting.output", "unknown": "summary-output",
+    "ssm_device": "device.ssm.file", "taxi_device": "device.taxi.dispatch-algorithm.output",
+    "mesoscopic": "save-state.files", "random_number": "error-log",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("section", "option"), SECTIONS.items())
