@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from cavmarl.sensors.registry import register_sensor
     from cavmarl.viewer.live_env import show
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "TERMS",
