@@ -10,9 +10,9 @@ from cavmarl.driving.kernels.lanes.lane_choice import (
     MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
     SWAP_ROOM_M,
-    _asked_of_followers,
-    _change_is_safe,
-    _rear_is_inside,
+    asked_of_followers,
+    change_is_safe,
+    rear_is_inside,
     room_for_more,
     wish_on_lane,
 )
@@ -80,9 +80,9 @@ def test_one_changes_lanes_when_its_rear_is_out_of_the_junction(
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"] = driver
     lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
-    assert _rear_is_inside(lane, row) == waits
+    assert rear_is_inside(lane, row) == waits
     row["s"] = 2.6
-    assert not _rear_is_inside(lane, row)
+    assert not rear_is_inside(lane, row)
 
 
 @pytest.mark.parametrize(("length_m", "near_m"), [(16.4, 0.0), (18.5, 2.0), (100.0, 5.0)])
@@ -93,7 +93,7 @@ def test_behind_a_junction_it_stays_in_its_lane_where_long_vehicles_turn_in(
     row["driver"], row["length"], lane["length_m"] = DRIVER_BACKGROUND, 5.0, length_m
     for rear_m, stays in ((near_m - 0.1, True), (near_m + 0.1, False)):
         row["s"] = 2.5 + rear_m
-        assert _rear_is_inside(lane, row) == stays
+        assert rear_is_inside(lane, row) == stays
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_a_steered_one_that_creeps_changes_there_too(
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"], row["length"], lane["length_m"] = driver, 5.0, 20.0
     row["s"], row["speed"] = 2.5 + 3.0, speed
-    assert _rear_is_inside(lane, row) == stays
+    assert rear_is_inside(lane, row) == stays
 
 
 @pytest.mark.parametrize(("far_mps", "asks"), [(25.0, True), (0.0, False)])
@@ -126,7 +126,7 @@ def test_a_change_of_lanes_asks_those_of_every_lane_that_leads_there(
     )
     room = scratch(roads, 3)
     index_lanes(roads.arrays, tables, rows, 3, room)
-    least = _asked_of_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
+    least = asked_of_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
     assert (least < -MAX_BRAKING_NEEDED) == asks
 
 
@@ -145,4 +145,4 @@ def test_no_change_of_lanes_ends_where_a_crawl_cannot_stop(gap_m: float, safe: b
     )
     room = scratch(roads, 2)
     index_lanes(roads.arrays, tables, rows, 2, room)
-    assert _change_is_safe(roads.arrays, tables, rows, 0, left, 0.0, True, room) == safe
+    assert change_is_safe(roads.arrays, tables, rows, 0, left, 0.0, True, room) == safe

@@ -133,7 +133,7 @@ def _blocked_by_foes(
 
 
 @kernel
-def _exit_blocked(
+def exit_blocked(
     roads: RoadArrays, travel: TripTables, row: np.void, link: int, way: int, scratch: Scratch
 ) -> bool:
     """Whether a row could not clear the junction behind the last standing vehicle on its way.
@@ -213,7 +213,7 @@ def may_enter(
     )
     if hold != HOLD_NONE:
         return hold
-    if _exit_blocked(roads, travel, row, link, way, scratch):
+    if exit_blocked(roads, travel, row, link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
@@ -329,7 +329,7 @@ def waits_inside(
     )
     if hold != HOLD_NONE:
         return hold
-    if _exit_blocked(roads, travel, rows[i], link, way, scratch):
+    if exit_blocked(roads, travel, rows[i], link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 

@@ -155,7 +155,7 @@ def _next_beyond(
 
 
 @kernel
-def _asked_of_followers(
+def asked_of_followers(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -191,7 +191,7 @@ def _asked_of_followers(
 
 
 @kernel
-def _change_is_safe(
+def change_is_safe(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -235,14 +235,14 @@ def _change_is_safe(
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
         return False
-    followers = _asked_of_followers(roads, travel, rows, row, target, s, scratch)
+    followers = asked_of_followers(roads, travel, rows, row, target, s, scratch)
     most = MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED
     # What followers gain or lose has no weight (POLITENESS), so what they do now is not asked.
     return mobil_accepts(own_wish, after, 0.0, followers, 0.0, 0.0, mandatory, most)
 
 
 @inlined_kernel
-def _rear_is_inside(lane: np.void, row: np.void) -> bool:
+def rear_is_inside(lane: np.void, row: np.void) -> bool:
     """Whether a vehicle's rear is in the junction or near it, where others turn in beside it.
 
     On lanes so short that two do not fit behind one another, with room to swap, that does not
@@ -276,7 +276,7 @@ def _may_change(
     target = lane["left"] if side > 0 else lane["right"]
     if lane["internal"] or target < 0 or (needed != 0 and needed != side):
         return False
-    if _rear_is_inside(lane, row):
+    if rear_is_inside(lane, row):
         return False
     rest = lane["length_m"] - row["s"] - SIDEWAYS_S * row["speed"]
     if rest < (0.5 * row["length"] if needed == 0 or row["speed"] > CREEP_MPS else 0.0):
@@ -302,7 +302,7 @@ def _may_change(
             queue_m = QUEUED_M * num_ahead(scratch, row["lane"], row["s"], row["id"], travel.view_m)
             if beyond["room"] - row["s"] - queue_m < 2.0 * early:
                 return False
-    if not _change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch):
+    if not change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch):
         return False
     # One that is so slow goes sideways where it is.
     place = beside_s(roads, row["lane"], target, row["s"])
