@@ -1,4 +1,4 @@
-"""Both models of car following, told from the acceleration that a driver takes in the end."""
+"""Twins of IDM and of Krauss's model: the acceleration that a driver finally applies."""
 
 from __future__ import annotations
 

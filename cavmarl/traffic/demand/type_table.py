@@ -7,8 +7,8 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.driver_models import NEAREST_MODEL, model_code, model_names
+from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.vehicle_types import (
     ALL_PERMISSIONS,
     CLASS_DEFAULTS,
@@ -92,7 +92,7 @@ def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | N
     record["desired_max_speed"] = _number(element, "desiredMaxSpeed", default.desired_max_speed)
     record["tau"] = _number(element, "tau", 1.0)
     sigma = _number(element, "sigma", default.sigma)
-    record["sigma"] = sigma if model == MODEL_KRAUSS else 0.0
+    record["sigma"] = sigma if any(k.uses_sigma for k in MODELS if k.code == model) else 0.0
     _number(element, "probability", 1.0)
     decel = float(record["decel"])
     record["emergency_decel"] = _number(

@@ -31,10 +31,11 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import ENTER_REACH_M
 from cavmarl.driving.kernels.junctions.swept_areas import LONG_FORK_M
-from cavmarl.driving.kernels.lanes.adjacent_leaders import askew_beside
+from cavmarl.driving.kernels.lanes.adjacent_leaders import next_askew
 from cavmarl.driving.kernels.lanes.lane_index import ahead_on, behind_by, first_from, last_on
 from cavmarl.driving.kernels.lanes.route_following import next_step
-from cavmarl.driving.kernels.models.following import LINE_MARGIN_M, accel_behind, speed_behind
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import accel_behind, speed_behind
 
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
 LEADER_M = 150.0  # how far ahead a leader is looked for
@@ -282,7 +283,7 @@ def entry_speed(
         ahead = distance + scratch.entries[j]["s"] - half
         safe = min(safe, _safe_behind(kind, scratch.entries[j], ahead))
     for to_left in (True, False):
-        k, apart = askew_beside(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
+        k, apart = next_askew(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
         if k >= 0:
             safe = min(safe, _safe_behind(kind, scratch.entries[k], apart - half))
     # Behind the last vehicle, and with other speeds, it waits until what it wants is safe.
