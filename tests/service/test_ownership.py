@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.requests import DoorBody, TransfersBody
+from cavmarl.service.request_bodies import DoorBody, TransfersBody
 from cavmarl.service.service_records import KEPT_OWNERS, Infrastructure
 from cavmarl.service.session_worlds import SessionWorld
 from tests.support.fleet import Fleet
