@@ -25,7 +25,7 @@ from cavmarl.cli.output import OptionalEnvironment, Seed, Settings, about, parse
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.zones.partition.zone_statistics import imbalance
 
 SETTLE_ROUNDS = 6  # before anything is timed

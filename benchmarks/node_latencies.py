@@ -23,9 +23,9 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.processes import start_python
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.backend_name import NODES, BackendName
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.placement.backend_name import NODES, BackendName
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 
 TURN_STEPS = 50

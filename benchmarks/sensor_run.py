@@ -19,8 +19,8 @@ from cavmarl.config.io import read_yaml
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers, SensorWorkerTimes
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.sensors.registry import type_of
 
 Rig = dict[str, dict[str, Any]]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import validate
-from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
+from cavmarl.parallel.memory.shared_memory import Segment, arrays_in
 from cavmarl.parallel.processes.worker_loop import Job, serve
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
 
 __all__ = ["TrivialJob", "make_jobs"]
 
@@ -44,12 +44,12 @@ class TrivialJob(Job):
         self._tasks[:] = saved[0]
 
 
-def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
+def make_jobs(message: Mapping[str, Any]) -> list[Job]:
     """The jobs of all workers."""
-    config = validate(EnvConfig, recipe["config"], "the environment")
-    layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
-    arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
-    return [TrivialJob(arrays.part(first, last)) for first, last, _ in recipe["parts"]]
+    config = validate(EnvConfig, message["config"], "the environment")
+    layout = layout_of(config, message["capacity"], message["num_worlds"])
+    arrays = StepArrays.of(arrays_in(Segment(message["arrays"], 0).map(), layout))
+    return [TrivialJob(arrays.part(first, last)) for first, last, _ in message["parts"]]
 
 
 if __name__ == "__main__":

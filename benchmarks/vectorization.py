@@ -30,7 +30,7 @@ from cavmarl.core.errors import ConfigError, MissingExtraError, require
 from cavmarl.engine.spaces import flat_observation_space
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.shards.shard import Commands
 
 PROGRAM = "benchmarks.trivial_worker"

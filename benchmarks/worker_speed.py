@@ -27,8 +27,8 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, WorkerError
 from cavmarl.core.machine import describe_hardware
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 
 WARM_STEPS = 20
 PINGS = 2000  # a turn

@@ -32,7 +32,7 @@ LARGE_CLASSES = {
     "cavmarl.parallel.nodes.node_peers.NodePeers",
     "cavmarl.parallel.nodes.node_pool.NodePool",
     "cavmarl.parallel.nodes.node_process.NodeProgram",
-    "cavmarl.parallel.nodes.zone_hosts.ZoneHosts",
+    "cavmarl.parallel.nodes.zone_endpoints.ZoneEndpoints",
     "cavmarl.shards.shard.Shard",
     "cavmarl.traffic.sumo.sumo_child.SumoSimulation",
 }

@@ -36,7 +36,7 @@ from cavmarl.learning.observation_norm import Scales
 from cavmarl.learning.opponents import Opponents
 from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.parallel.local_worlds import kept_elsewhere
+from cavmarl.parallel.worlds.local_worlds import kept_elsewhere
 from cavmarl.policies.loading import driver_keys, policy_files
 from cavmarl.policies.network_files import NetworkConfig
 

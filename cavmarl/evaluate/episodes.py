@@ -24,7 +24,7 @@ from cavmarl.evaluate.run_extras import RunWatch, recording_path
 from cavmarl.evaluate.stuck_trips import StandingWatch
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
 from cavmarl.evaluate.transfer_rows import TransferRecorder
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.policies.loading import load_policy
 from cavmarl.policies.policy import Policy
 from cavmarl.recordings.extra_tables import RecordOptions

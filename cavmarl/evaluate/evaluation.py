@@ -60,7 +60,7 @@ from cavmarl.evaluate.tables import (
 from cavmarl.evaluate.transfer_rows import transfers_of
 from cavmarl.handoff.coordinator.coordinator_setup import journal_path
 from cavmarl.ownership.transfer_summary import TransferSummary
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.policies.loading import load_policy
 from cavmarl.recordings.extra_tables import RecordOptions
 

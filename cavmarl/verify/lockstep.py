@@ -19,7 +19,7 @@ from cavmarl.core import errors
 from cavmarl.core.tracebacks import print_traceback
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.verify.differences import Arrays, DrivenRun, single_arrays, snapshot
 
 

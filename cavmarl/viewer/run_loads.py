@@ -13,7 +13,7 @@ from cavmarl.balance.load_score import load_score
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.probe import Watch
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.viewer.subscribers import Audience
 
 EVERY_S = 2.0

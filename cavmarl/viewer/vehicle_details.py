@@ -19,7 +19,7 @@ from cavmarl.engine.spaces import sensed_observation
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.observed import feature_names
 from cavmarl.sensors.sensed_shapes import Shape, observed_shapes, sampled_shapes

@@ -14,7 +14,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netgenerate
 

@@ -27,7 +27,7 @@ from cavmarl.cosim.followers.follower_messages import (
     payload_of,
     read_payload,
 )
-from cavmarl.parallel.network.framed_socket import FramedSocket
+from cavmarl.cosim.followers.framed_socket import FramedSocket
 from tests.cosim.conftest import hashes, make_env, seated
 from tests.cosim.test_followed_world import reference
 from tests.support.descriptors import without_descriptors

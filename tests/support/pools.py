@@ -21,9 +21,11 @@ MORE = 1000  # numbers that each task adds
 Make = Callable[..., Pool]
 
 
-def program(workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **recipe: object) -> Program:
+def program(
+    workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **message: object
+) -> Program:
     names = tuple(f"part {k}" for k in range(workers))
-    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS, teams=teams)
+    return Program(MODULE, {"workers": workers, **message}, names, (), TASKS, teams=teams)
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
 from cavmarl.learning.actor_critic import load_network
 from cavmarl.learning.checkpoint import read_checkpoint, write_checkpoint
 from cavmarl.learning.run_folder import parse_run
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.policies.loading import load_policy
 from tests.support.training import TRAIN, load_program
 

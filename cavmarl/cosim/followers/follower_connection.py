@@ -33,7 +33,7 @@ from cavmarl.cosim.followers.follower_messages import (
     payload_of,
     read_payload,
 )
-from cavmarl.parallel.network.framed_socket import HEAD_BYTES, FramedSocket, bytes_before_data
+from cavmarl.cosim.followers.framed_socket import HEAD_BYTES, FramedSocket, bytes_before_data
 
 Array = NDArray[Any]
 

@@ -23,7 +23,7 @@ from pydantic import (
 )
 
 from cavmarl.core.errors import FollowerError, require
-from cavmarl.parallel.network.framed_socket import Dialect
+from cavmarl.cosim.followers.framed_socket import Dialect
 
 T = TypeVar("T")
 

@@ -19,7 +19,7 @@ from cavmarl.cosim.followers.follower_messages import (
 from cavmarl.cosim.stack.signal_reading import SPAT
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.step_arrays import Driven
+from cavmarl.parallel.worlds.step_arrays import Driven
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.mounted.frames import SensorFrames
 
