@@ -144,7 +144,7 @@ class NativeTraffic:
         for name in (
             "travel",
             "_travel_of_others",
-            "_slots",
+            "slots",
             "rerouting",
             "calls",
         ):  # kept per world
@@ -156,7 +156,7 @@ class NativeTraffic:
     def goal_edges(self) -> NDArray[np.int32]:
         """EDGE rows (M, G) of each map's goals; a map with fewer goals repeats some."""
         acted = [] if self.scene is None else self.scene.goal_edges
-        found = for_each_map(self.network, lambda number: self._trips_of(number).goals(acted))
+        found = for_each_map(self.network, lambda number: self.trips_of(number).goals(acted))
         most = max(map(len, found))
         return np.array([np.resize(goals, most) for goals in found], dtype=np.int32)
 
@@ -179,7 +179,8 @@ class NativeTraffic:
         plans.setflags(write=False)
         return plans
 
-    def _trips_of(self, number: int) -> MapTrips:
+    def trips_of(self, number: int) -> MapTrips:
+        """Return the trips of one map."""
         return MapTrips(self.network, number, self.traffic)
 
     @cached_property
@@ -254,9 +255,9 @@ class NativeTraffic:
 
     def _with_slots(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
         """Return the table of ways, with room for ways found at run time if vehicles reroute."""
-        if self._slots is None:
+        if self.slots is None:
             return fixed
-        steps = self.zeros(len(fixed) + self._slots.room, dtype=fixed.dtype)
+        steps = self.zeros(len(fixed) + self.slots.room, dtype=fixed.dtype)
         steps[: len(fixed)] = fixed
         return steps
 
@@ -311,7 +312,7 @@ class NativeTraffic:
         )
 
     @cached_property
-    def _slots(self) -> WaySlots | None:
+    def slots(self) -> WaySlots | None:
         """Room for ways found at run time; None if no vehicle reroutes."""
         schedule = self.schedule
         if schedule is None or not self._reroutes:
@@ -336,10 +337,10 @@ class NativeTraffic:
     @cached_property
     def rerouting(self) -> Rerouting | None:
         """The rerouting of vehicles; None if vehicles do not reroute."""
-        if self.schedule is None or self._slots is None:
+        if self.schedule is None or self.slots is None:
             return None
         first_type = len(generated_types())
-        return Rerouting(self.schedule, self.travel, self._slots, first_type, self.dt)
+        return Rerouting(self.schedule, self.travel, self.slots, first_type, self.dt)
 
     @cached_property
     def capacity(self) -> int:
@@ -358,7 +359,7 @@ class NativeTraffic:
         """
         num_goals = self.goal_edges.shape[1]
         parts = for_each_map(
-            self.network, lambda number: self._trips_of(number).drawn(self.plans, num_goals)
+            self.network, lambda number: self.trips_of(number).drawn(self.plans, num_goals)
         )
         return Demand(
             agent_trips=together([part.agent_arrays for part in parts]),
@@ -454,7 +455,7 @@ class NativeTraffic:
         for_each_map(self.network, self._check_room_of)
 
     def _check_room_of(self, number: int) -> None:
-        metres = self._trips_of(number).metres
+        metres = self.trips_of(number).metres
         room = int(metres / (float(self.blank["length"][0]) + JAM_GAP_M))
         wanted = self.population.agents + self.population.background
         if wanted > room:

@@ -36,8 +36,7 @@ def test_equal_workers_take_at_most_what_graham_says(costs: list[float], workers
 
 @settings(deadline=None)
 @given(
-    st.lists(COSTS, min_size=3, max_size=7),
-    st.lists(st.floats(0.0, 0.85), min_size=2, max_size=3),
+    st.lists(COSTS, min_size=3, max_size=7), st.lists(st.floats(0.0, 0.85), min_size=2, max_size=3)
 )
 def test_unequal_workers_take_at_most_twice_the_least(
     costs: list[float], cpus: list[float]
@@ -182,9 +181,7 @@ def test_nothing_moves_within_the_tolerance() -> None:
 
 @settings(deadline=None)
 @given(
-    st.lists(COSTS, min_size=4, max_size=12),
-    st.integers(1, 5),
-    st.randoms(use_true_random=False),
+    st.lists(COSTS, min_size=4, max_size=12), st.integers(1, 5), st.randoms(use_true_random=False)
 )
 def test_rounds_of_constant_loads_are_bounded_help_and_come_to_rest(
     costs: list[float], most: int, draw: random.Random

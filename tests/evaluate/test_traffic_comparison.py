@@ -166,7 +166,7 @@ def test_a_turn_counts_each_vehicle_once_a_step_on_both_sides(still: StillSumo) 
         step=lambda _: moved.append(None),
         vehicles=lambda: [None] * 7,
     )
-    ours, theirs = traffic_speed._our_turn(world, 4), traffic_speed.turn_of_sumo(4)
+    ours, theirs = traffic_speed.our_turn(world, 4), traffic_speed.turn_of_sumo(4)
     assert ours.vehicle_steps == theirs.vehicle_steps == 28
     assert len(moved) == still.steps == 4
 

@@ -22,14 +22,9 @@ from cavmarl.traffic.scenarios.library import load_scenario, scenario_names, sum
 from cavmarl.traffic.scenarios.scene import describe
 
 NAMES = (
-    "failed_u_turn",
-    "intersection_blockage",
-    "merge_conflict",
-    "pedestrian_crossing",
-    "road_closure",
-    "signal_outage",
-    "unprotected_left_turn",
-)
+    "failed_u_turn", "intersection_blockage", "merge_conflict", "pedestrian_crossing",
+    "road_closure", "signal_outage", "unprotected_left_turn",
+)  # fmt: skip
 VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
     *((name, {}) for name in NAMES),
     ("pedestrian_crossing", {"occluded": True}),

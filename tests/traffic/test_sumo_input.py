@@ -26,7 +26,6 @@ TRIP = '<vType id="t"/><trip id="a" type="t" depart="0" from="{}" to="{}"/>'
 @pytest.fixture(scope="module")
 def trip() -> str:
     """A trip over two edges of the map."""
-
     network = network_of(MAP)
     link = network.links[0]
     ends = (network.lanes["edge"][link[side]] for side in ("from_lane", "to_lane"))
@@ -130,14 +129,10 @@ def test_a_name_that_means_another_file_is_refused(
 
 
 SECTIONS = {
-    "processing": "fcd-output",
-    "routing": "device.rerouting.output",
-    "unknown": "summary-output",
-    "ssm_device": "device.ssm.file",
-    "taxi_device": "device.taxi.dispatch-algorithm.output",
-    "mesoscopic": "save-state.files",
-    "random_number": "error-log",
-}
+    "processing": "fcd-output", "routing": "device.rerouting.output", "unknown": "summary-output",
+    "ssm_device": "device.ssm.file", "taxi_device": "device.taxi.dispatch-algorithm.output",
+    "mesoscopic": "save-state.files", "random_number": "error-log",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("section", "option"), SECTIONS.items())

@@ -14,11 +14,7 @@ import psutil
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.core.errors import (
-    ConfigError,
-    DemandError,
-    SumoError,
-)
+from cavmarl.core.errors import ConfigError, DemandError, SumoError
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.traffic.sumo.sumo_input import free_libsumo

@@ -122,14 +122,14 @@ class FollowedWorld:
                     f"ENV --at {self.address}`",
                     is_late=True,
                 )
-            self._admit(left_s)
+            self.admit(left_s)
 
     def reset(self, seed: int | None = None) -> None:
         """Start an episode and send its first snapshot to the followers.
 
         Raises FollowerError: see `step`.
         """
-        self._admit(0.0)
+        self.admit(0.0)
         self.master.reset(seed)
         self._episode += 1
         self._queued.clear()
@@ -149,7 +149,7 @@ class FollowedWorld:
         """
         if self.is_over:
             raise EpisodeError("the episode is over; call FollowedWorld.reset()")
-        self._admit(0.0)
+        self.admit(0.0)
         self._exchange([seat for seat in self._seats if seat.frame < self._frame])
         agents = self.env.agents
         actions = {agent: self._queued[agent] for agent in agents if agent in self._queued}
@@ -192,7 +192,8 @@ class FollowedWorld:
         if not isinstance(self.address, int):
             Path(self.address).unlink(missing_ok=True)
 
-    def _admit(self, within_s: float) -> None:
+    def admit(self, within_s: float) -> None:
+        """Seat followers that have introduced themselves; wait up to `within_s` for the first."""
         for line, hello in self._reception.callers(within_s):
             try:
                 self._seat(line, hello)

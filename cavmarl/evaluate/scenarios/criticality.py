@@ -39,8 +39,8 @@ def least_ttc_s(one: NDArray[np.void], other: NDArray[np.void]) -> float:
     _, here, there = np.intersect1d(one["time_s"], other["time_s"], return_indices=True)
     least = math.inf
     for i, j in zip(here.tolist(), there.tolist(), strict=True):
-        x1, y1, cos1, sin1, length1, width1 = _box(one[i])
-        x2, y2, cos2, sin2, length2, width2 = _box(other[j])
+        x1, y1, cos1, sin1, length1, width1 = box(one[i])
+        x2, y2, cos2, sin2, length2, width2 = box(other[j])
         speed1, speed2 = float(one[i]["speed"]), float(other[j]["speed"])
         ttc = time_to_collision_s(
             x2 - x1, y2 - y1, speed2 * cos2 - speed1 * cos1, speed2 * sin2 - speed1 * sin1,
@@ -70,12 +70,13 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
     near = np.argwhere(dx * dx + dy * dy < reach * reach)
     near = near[np.argsort(apart_s[near[:, 0], near[:, 1]], kind="stable")]
     for i, j in near.tolist():
-        if boxes_overlap(*_box(one[i]), *_box(other[j])):
+        if boxes_overlap(*box(one[i]), *box(other[j])):
             return float(apart_s[i, j])
     return math.inf
 
 
-def _box(body: np.void) -> tuple[float, float, float, float, float, float]:
+def box(body: np.void) -> tuple[float, float, float, float, float, float]:
+    """Return the arguments of `boxes_overlap` for a body: centre, cos, sin and half sizes."""
     return (
         float(body["x"]), float(body["y"]), *cos_sin(float(body["heading"])),
         0.5 * float(body["length"]), 0.5 * float(body["width"]),

@@ -108,7 +108,7 @@ def _measure(job: SumoJob, contacts: bool) -> TrafficRun:
         trips = folder / "trips.xml"
         libsumo = start_sumo(job, folder, f"--tripinfo-output={trips}")
         meter = TrafficMeter(network)
-        reader = _VehicleReader(libsumo, network)
+        reader = VehicleReader(libsumo, network)
         departed = arrived = teleports = 0
         ticks_per_s = round(1.0 / job.dt_s)
         try:
@@ -151,7 +151,7 @@ def _keep_shared(libsumo: Any, job: SumoJob) -> int:
     return sum(map(job.is_shared, entered))
 
 
-class _VehicleReader:
+class VehicleReader:
     """Reads SUMO's vehicles as VEHICLE records.
 
     SUMO reports the middle of the front bumper, and angles in degrees clockwise from north.

@@ -189,7 +189,9 @@ def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
 
 
 @kernel
-def _may_be_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
+def may_entry_be_swept(
+    roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch
+) -> bool:
     """Return whether swept areas lie where a vehicle enters: ahead, or occupied ones behind."""
     to_line = roads.lanes[row["lane"]]["length_m"] - row["s"]
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
@@ -216,7 +218,7 @@ def _may_be_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: 
 
 
 @kernel
-def _is_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
+def is_entry_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
     """Return whether a vehicle enters an area that another one sweeps, ahead or behind it."""
     here = roads.lanes[row["lane"]]
     half = 0.5 * row["length"]
@@ -283,12 +285,12 @@ def propose(
             enter(roads, travel, worlds, w, departure, lane, s, speed, row)
             if _touches_any(rows, num, row):
                 continue
-            if _may_be_swept(roads, travel, row, scratch):
+            if may_entry_be_swept(roads, travel, row, scratch):
                 if not announced:
                     step, step_at = worlds.step[w], worlds.step_at[w]
                     register_links(roads, travel, rows, num, step, step_at, scratch)
                     announced = True
-                if _is_swept(roads, travel, row, scratch):
+                if is_entry_swept(roads, travel, row, scratch):
                     continue
             departures.places[w, n] = q
             departures.num_passing[w] = n + 1

@@ -28,41 +28,15 @@ def refused(demand: Reader, body: str, *words: str, error: type[Exception] = Dem
 @pytest.mark.parametrize(
     "attribute",
     [
-        'length="0"',
-        'length="1e9"',
-        'width="100"',
-        'accel="1e9"',
-        'decel="1e-9"',
-        'tau="1e9"',
-        'minGap="1e9"',
-        'maxSpeed="1e-9"',
-        'maxSpeed="1e9"',
-        'probability="-1"',
-        'length="-1"',
-        'length="nan"',
-        'length="five"',
-        'length="1_0"',
-        'width="0"',
-        'height="-1"',
-        'decel="-1"',
-        'accel="0"',
-        'accel="1e400"',
-        'emergencyDecel="0"',
-        'tau="0"',
-        'sigma="1.5"',
-        'sigma="-0.1"',
-        'maxSpeed="0"',
-        'maxSpeed="inf"',
-        'minGap="-1"',
-        'speedDev="-1"',
-        'speedFactor="-1"',
-        'speedFactor="3"',
-        'speedFactor="unif(0.8,1.2)"',
-        'speedFactor="normc(1)"',
-        'vClass="boat"',
-        'carFollowModel="Foo"',
+        'length="0"', 'length="1e9"', 'width="100"', 'accel="1e9"', 'decel="1e-9"', 'tau="1e9"',
+        'minGap="1e9"', 'maxSpeed="1e-9"', 'maxSpeed="1e9"', 'probability="-1"', 'length="-1"',
+        'length="nan"', 'length="five"', 'length="1_0"', 'width="0"', 'height="-1"', 'decel="-1"',
+        'accel="0"', 'accel="1e400"', 'emergencyDecel="0"', 'tau="0"', 'sigma="1.5"',
+        'sigma="-0.1"', 'maxSpeed="0"', 'maxSpeed="inf"', 'minGap="-1"', 'speedDev="-1"',
+        'speedFactor="-1"', 'speedFactor="3"', 'speedFactor="unif(0.8,1.2)"',
+        'speedFactor="normc(1)"', 'vClass="boat"', 'carFollowModel="Foo"',
     ],
-)
+)  # fmt: skip
 def test_types_that_cannot_exist(demand: Reader, attribute: str) -> None:
     refused(demand, f'<vType id="t" {attribute}/>', "line 2", '<vType id="t">')
 
@@ -70,20 +44,14 @@ def test_types_that_cannot_exist(demand: Reader, attribute: str) -> None:
 @pytest.mark.parametrize(
     "timing",
     [
-        'begin="0" end="10"',
-        'begin="0" end="10" period="2" number="3"',
-        'begin="0" end="10" period="2" probability="0.3"',
-        'begin="5" end="2" period="1"',
-        'begin="-5" end="20" period="7"',
-        'begin="0" end="10" probability="1.2"',
-        'begin="0" end="10" period="0"',
-        'begin="0" end="10" period="exp(0)"',
-        'begin="0" end="10" period="exp(x)"',
-        'begin="0" end="10" vehsPerHour="0"',
-        'begin="0" end="10" number="-1"',
-        'begin="soon" end="10" number="1"',
+        'begin="0" end="10"', 'begin="0" end="10" period="2" number="3"',
+        'begin="0" end="10" period="2" probability="0.3"', 'begin="5" end="2" period="1"',
+        'begin="-5" end="20" period="7"', 'begin="0" end="10" probability="1.2"',
+        'begin="0" end="10" period="0"', 'begin="0" end="10" period="exp(0)"',
+        'begin="0" end="10" period="exp(x)"', 'begin="0" end="10" vehsPerHour="0"',
+        'begin="0" end="10" number="-1"', 'begin="soon" end="10" number="1"',
     ],
-)
+)  # fmt: skip
 def test_flows_that_sumo_refuses(demand: Reader, timing: str) -> None:
     refused(demand, f'{ROUTE}<flow id="f" route="r" {timing}/>', '<flow id="f">')
 

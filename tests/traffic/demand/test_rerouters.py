@@ -132,13 +132,10 @@ def test_what_rerouters_say_is_part_of_the_content(demand: Reader) -> None:
     hashes = {
         demand(rerouter(inside)).content_hash
         for inside in (
-            "",
-            '<closingReroute id="BC"/>',
-            '<closingReroute id="BA"/>',
-            '<destProbReroute id="BC"/>',
-            '<destProbReroute id="BA"/>',
+            "", '<closingReroute id="BC"/>', '<closingReroute id="BA"/>',
+            '<destProbReroute id="BC"/>', '<destProbReroute id="BA"/>',
         )
-    }
+    }  # fmt: skip
     assert len(hashes) == 5
 
 
