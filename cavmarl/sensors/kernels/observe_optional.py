@@ -92,9 +92,9 @@ def observe_optional(
                 controllers = worlds.controllers[w]
                 observe_way(roads, travel, controllers, row, phase, time, tick_s, way, out)
             if conflicts.most > 0:
-                told, tick = objects[w, row["agent"]], worlds.ticks[w]
+                reports, tick = objects[w, row["agent"]], worlds.ticks[w]
                 observe_conflicts(
-                    roads, travel, rows, i, grid, phase, told, tick, tick_s, conflicts, out
+                    roads, travel, rows, i, grid, phase, reports, tick, tick_s, conflicts, out
                 )
             if history.size > 0:
                 entered = has_entered(row, ticks_per_step)

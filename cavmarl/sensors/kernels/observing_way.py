@@ -107,21 +107,21 @@ def observe_way(
     )
     before_m = 0.0
     direction = atan2(sin, cos)
-    told = 0
+    written = 0
     lines = 0
     for _ in range(MOST_LANES):
         end = start + here["length_m"]
         following, way_there, link = next_step_of_plan(roads, travel, lane, way)
-        while told < distances.size and (distances[told] <= end or following < 0):
-            at = sensor.at + PLACE_FEATURES * told
-            distance = min(distances[told], end)
+        while written < distances.size and (distances[written] <= end or following < 0):
+            at = sensor.at + PLACE_FEATURES * written
+            distance = min(distances[written], end)
             x, y, _, cos, sin, _ = lane_pose(
                 roads.points, here["first_point"], here["num_points"], distance - start
             )
             left = (y - row["y"]) * cos_heading - (x - row["x"]) * sin_heading
             turned = atan2(sin, cos)
             out = observation[at : at + PLACE_FEATURES]
-            out[0] = unit(left / distances[told])
+            out[0] = unit(left / distances[written])
             if distance > before_m:
                 curvature = wrap_angle(turned - direction) / (distance - before_m)
                 out[1] = unit(curvature / CURVATURE_SCALE)
@@ -129,7 +129,7 @@ def observe_way(
             out[3] = unit(here["speed_mps"] / SPEED_SCALE)
             direction = turned
             before_m = distance
-            told += 1
+            written += 1
         if link >= 0 and lines < sensor.lines and end <= sensor.range_m:
             out = observation[lines_at + size * lines : lines_at + size * (lines + 1)]
             if _observe_line(
@@ -137,7 +137,7 @@ def observe_way(
             ):
                 lines += 1
         is_beyond = lines == sensor.lines or end > sensor.range_m
-        if following < 0 or (told == distances.size and is_beyond):
+        if following < 0 or (written == distances.size and is_beyond):
             break
         lane, way, start = following, way_there, end
         here = roads.lanes[lane]

@@ -80,7 +80,7 @@ def measure_inertia(
 ) -> None:
     """Write the samples that are due for the owned agents.
 
-    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6), see `measure_motion`.
+    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6) forces and rates.
     """
     for w in range(worlds.ticks.size):
         num = due.num[w]
