@@ -127,19 +127,19 @@ class TopDownRenderer:
         """Draw one picture.
 
         Args:
-          vehicles: VEHICLE rows, in any order.
-          signal_phases: (num_signals,) present PHASE rows; by default no signal is shown.
-          title: text for the upper left corner.
-          clock_s: time for the upper left corner.
-          follow: agents, by index, that the camera follows; it stays still while none of them is in
-              the world. By default it shows `focus`.
-          center: (x, y) in metres that the camera follows, instead of agents.
-          zones: zones of a divided world; vehicles get the colours of their owners. `vehicles` must
-              then be all vehicles of the world, as from `Simulation.vehicles`.
-          ghosts_of: zone whose sensing range and ghosts are outlined.
+            vehicles: VEHICLE rows, in any order.
+            signal_phases: (num_signals,) present PHASE rows; by default no signal is shown.
+            title: text for the upper left corner.
+            clock_s: time for the upper left corner.
+            follow: agents, by index, that the camera follows; it stays still while none of them is
+                in the world. By default it shows `focus`.
+            center: (x, y) in metres that the camera follows, instead of agents.
+            zones: zones of a divided world; vehicles get the colours of their owners. `vehicles`
+                must then be all vehicles of the world, as from `Simulation.vehicles`.
+            ghosts_of: zone whose sensing range and ghosts are outlined.
 
         Returns:
-          a new surface; see `frame` for an array.
+            a new surface; see `frame` for an array.
         """
         self._aim(vehicles, follow, center)
         camera = self._camera
@@ -267,13 +267,13 @@ class WorldView:
     """Renders one world of a simulation from above, into arrays or into a window.
 
     Args:
-      simulation: the worlds.
-      mode: `rgb_array` or `human`.
-      title: title of the picture and of the window.
-      fps: pictures per second of the window.
+        simulation: the worlds.
+        mode: `rgb_array` or `human`.
+        title: title of the picture and of the window.
+        fps: pictures per second of the window.
 
     Raises:
-      MissingExtraError: pygame-ce is not installed.
+        MissingExtraError: pygame-ce is not installed.
     """
 
     def __init__(self, simulation: Simulation, mode: str, title: str, fps: int) -> None:
@@ -289,11 +289,11 @@ class WorldView:
         A divided world is drawn with its zones, and with vehicles in the colours of their owners.
 
         Args:
-          ghosts_of: zone whose sensing range and ghosts are outlined.
-          world: index of the simulation's world.
+            ghosts_of: zone whose sensing range and ghosts are outlined.
+            world: index of the simulation's world.
 
         Raises:
-          ConfigError: the world has no such zone.
+            ConfigError: the world has no such zone.
         """
         simulation = self._simulation
         count = simulation.partition.count

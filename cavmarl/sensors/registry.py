@@ -65,18 +65,18 @@ def register_sensor(
     """Register a sensor that agents observe; `sensors.registered` can then name it.
 
     Args:
-      name: name of the sensor.
-      sense: returns one number per feature for an `AgentView` at the end of the step; if `batched`,
-          an array (n, number of features) for a `BatchView` of n agents. The numbers must not
-          depend on the order of `AgentView.others`; this is checked at the first use.
-      features: meaning of each number; names are unique.
-      reach_m: largest distance of the centres of `AgentView.others`; 0: there are no others.
-      batched: whether `sense` is called once per world, with all its agents, instead of once per
-          agent.
+        name: name of the sensor.
+        sense: returns one number per feature for an `AgentView` at the end of the step; if
+            `batched`, an array (n, number of features) for a `BatchView` of n agents. The numbers
+            must not depend on the order of `AgentView.others`; this is checked at the first use.
+        features: meaning of each number; names are unique.
+        reach_m: largest distance of the centres of `AgentView.others`; 0: there are no others.
+        batched: whether `sense` is called once per world, with all its agents, instead of once per
+            agent.
 
     Raises:
-      ConfigError: the name is taken, `reach_m` is negative or infinite, `features` is empty, or two
-          features have the same name.
+        ConfigError: the name is taken, `reach_m` is negative or infinite, `features` is empty, or
+            two features have the same name.
     """
     if not 0.0 <= reach_m < math.inf:
         raise ConfigError(f"sensor '{name}': reach_m = {reach_m} must be finite and at least 0")

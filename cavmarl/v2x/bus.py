@@ -73,8 +73,8 @@ class Bus:
     clocks, keys and signals. `zeros`: allocates the arrays that outlive a tick.
 
     Attributes:
-      units: UNIT (num_units,), the roadside units.
-      mail: inboxes, counts and packets in flight.
+        units: UNIT (num_units,), the roadside units.
+        mail: inboxes, counts and packets in flight.
     """
 
     def __init__(
@@ -146,11 +146,11 @@ class Bus:
         """Send what is due in the present tick, and receive what arrives in it.
 
         Args:
-          side: side of the zones' rows that holds the committed ones.
+            side: side of the zones' rows that holds the committed ones.
 
         Raises:
-          ConfigError: the channel is external, and no network simulator is connected or its answer
-              is invalid.
+            ConfigError: the channel is external, and no network simulator is connected or its
+                answer is invalid.
         """
         num_worlds = len(self._common.ticks)
         if not self._config.channel.external:
@@ -226,7 +226,7 @@ class Bus:
         """Let agents report events in the next tick.
 
         Args:
-          causes: (W, A) ETSI cause codes; 0: no event.
+            causes: (W, A) ETSI cause codes; 0: no event.
         """
         declared = self.mail.declared[:, : self._num_agents]
         np.copyto(declared, causes, where=causes != 0)

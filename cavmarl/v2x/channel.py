@@ -82,8 +82,8 @@ def chances_among_others(busy: float, hidden: NDArray[np.float64]) -> NDArray[np
     terminal problem", 1975).
 
     Args:
-      busy: share of time in which the receiver hears a station.
-      hidden: (n,) shares of stations that the sender does not hear.
+        busy: share of time in which the receiver hears a station.
+        hidden: (n,) shares of stations that the sender does not hear.
     """
     return exp_all(-2.0 * busy * hidden)
 

@@ -259,12 +259,12 @@ def check_receptions(
     (latency_ticks + 1,) packets in flight, by tick modulo that.
 
     Returns:
-      the receptions sorted by receiver, tick and packet, so that the order of the answer is
-      irrelevant.
+        the receptions sorted by receiver, tick and packet, so that the order of the answer is
+        irrelevant.
 
     Raises:
-      MessageError: a wrong dtype, an unknown packet or receiver, or a delay that is too long or
-          negative.
+        MessageError: a wrong dtype, an unknown packet or receiver, or a delay that is too long or
+            negative.
     """
     if not isinstance(receptions, np.ndarray) or receptions.dtype != RECEPTION:
         raise MessageError("a network simulator must return an array of dtype RECEPTION")

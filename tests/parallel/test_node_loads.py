@@ -56,7 +56,7 @@ def test_loads_of_the_nodes_machines_are_told_to_pages(
     monkeypatch.setattr("cavmarl.viewer.run_loads.EVERY_S", 0.05)
     audience = Audience()
     told: list[Any] = []
-    monkeypatch.setattr(audience, "tell_all", told.append)
+    monkeypatch.setattr(audience, "send_all", told.append)
     loads = RunLoads(nodes, audience)
     loads.look()
     assert not told  # none watches

@@ -108,7 +108,7 @@ class Failing(Delayed):
     [
         (OSError("it is gone"), OSError, "it is gone"),
         (KeyError("a bug"), KeyError, "a bug"),
-        (np.array([(9, 0, 0)], RECEPTION), MessageError, "another tick than those"),
+        (np.array([(9, 0, 0)], RECEPTION), MessageError, "has a tick outside"),
         (np.zeros(3), MessageError, "dtype RECEPTION"),
     ],
 )

@@ -94,10 +94,10 @@ def test_a_vehicle_is_told_as_it_was(path: Path) -> None:
     heard = Heard(path, world=0)
     frame: WorldFrame = Recording(path).at(10, 0, 0)
     row = frame.vehicles[0]
-    found = heard.shown._tell(frame, int(row["id"]), True)
+    found = heard.shown._details(frame, int(row["id"]), True)
     assert found["here"]
     assert dict(found["rows"])["speed"].startswith(f"{row['speed']:.2f} m/s")
-    assert not heard.shown._tell(frame, 10**6, True)["here"]
+    assert not heard.shown._details(frame, 10**6, True)["here"]
 
 
 def test_an_agent_is_told_with_what_it_observed(path: Path) -> None:
@@ -105,20 +105,20 @@ def test_an_agent_is_told_with_what_it_observed(path: Path) -> None:
     tick = recording.ticks(1, 0)[5]
     frame = recording.at(tick, 1, 0)
     row = recording.extra_at("observations", tick, 1)[0]
-    found = heard.shown._tell(frame, int(row["vehicle"]), True)
+    found = heard.shown._details(frame, int(row["vehicle"]), True)
     names = [tuple(told[:2]) for told in found["observation"]]
     assert names == [tuple(name) for name in recording.head.features]
     numbers = [told[2] for told in found["observation"]]
     assert numbers == pytest.approx(row["values"].tolist(), abs=1e-4)
     assert [name for name, _ in found["terms"]] == list(recording.head.terms)
     others = frame.vehicles[frame.vehicles["agent"] < 0]
-    assert "observation" not in heard.shown._tell(frame, int(others["id"][0]), True)
+    assert "observation" not in heard.shown._details(frame, int(others["id"][0]), True)
 
 
 def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) -> None:
     (path / "network.bin").rename(tmp_path / "network.bin")
     try:
-        with pytest.raises(RecordingError, match="without its map"):
+        with pytest.raises(RecordingError, match="has no map"):
             recording_stages(Recording(path))
     finally:
         (tmp_path / "network.bin").rename(path / "network.bin")
@@ -126,5 +126,5 @@ def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) 
     empty.mkdir()
     for name in ("recording.json", "network.bin"):
         (empty / name).write_bytes((path / name).read_bytes())
-    with pytest.raises(RecordingError, match="no frame was committed"):
+    with pytest.raises(RecordingError, match="the recording has no frames"):
         recording_stages(Recording(empty))

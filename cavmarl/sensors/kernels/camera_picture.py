@@ -59,10 +59,10 @@ def make_camera(
     """Create a camera.
 
     Args:
-      mount: (3, 4) axes and position in the vehicle's frame.
-      width: width of the picture in pixels.
-      fov_rad: horizontal field of view, less than pi.
-      range_m: largest visible depth.
+        mount: (3, 4) axes and position in the vehicle's frame.
+        width: width of the picture in pixels.
+        fov_rad: horizontal field of view, less than pi.
+        range_m: largest visible depth.
     """
     focal = 0.5 * width / tangent(0.5 * fov_rad)
     return CameraPose(mount, focal, range_m, np.zeros((5, 4)), np.zeros((4, 3)))

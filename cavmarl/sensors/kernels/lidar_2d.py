@@ -53,12 +53,12 @@ def _ray_to_box(
     is the intersection of two strips, and the ray hits it where it enters the second strip.
 
     Args:
-      x: start of the ray, mirrored to x >= 0.
-      y: start of the ray, mirrored to y >= 0.
-      closing_x: decrease of x per metre along the ray.
-      closing_y: decrease of y per metre along the ray.
-      half_length: half the box's size along x.
-      half_width: half the box's size along y.
+        x: start of the ray, mirrored to x >= 0.
+        y: start of the ray, mirrored to y >= 0.
+        closing_x: decrease of x per metre along the ray.
+        closing_y: decrease of y per metre along the ray.
+        half_length: half the box's size along x.
+        half_width: half the box's size along y.
     """
     # Negative if the ray starts inside the strip; beyond any range if it points away from it.
     enter_x = (x - half_length) / max(closing_x, _PARALLEL)

@@ -63,10 +63,10 @@ def make_fan(
     """Create the rays of a sensor.
 
     Args:
-      mount: (3, 4) axes and position in the vehicle's frame.
-      azimuths_rad: first azimuth, step, and number of columns; at most a full circle.
-      elevations_rad: (E,) elevation of each channel in the sensor's frame.
-      range_m: range along each ray.
+        mount: (3, 4) axes and position in the vehicle's frame.
+        azimuths_rad: first azimuth, step, and number of columns; at most a full circle.
+        elevations_rad: (E,) elevation of each channel in the sensor's frame.
+        range_m: range along each ray.
     """
     first_rad, step_rad, columns = azimuths_rad
     azimuth = (first_rad + step_rad * np.arange(columns))[:, np.newaxis]

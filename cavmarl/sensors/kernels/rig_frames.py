@@ -147,13 +147,13 @@ def sensor_pose(
     """Compute the position and orientation of a sensor in the world.
 
     Args:
-      row: VEHICLE that carries the sensor.
-      mount: pose of the sensor on the vehicle.
-      body: (3, 3), overwritten: rotation from the vehicle's frame to the world's.
-      axes: (3, 3), overwritten: rotation from the sensor's frame to the world's.
+        row: VEHICLE that carries the sensor.
+        mount: pose of the sensor on the vehicle.
+        body: (3, 3), overwritten: rotation from the vehicle's frame to the world's.
+        axes: (3, 3), overwritten: rotation from the sensor's frame to the world's.
 
     Returns:
-      x, y, z in m.
+        x, y, z in m.
     """
     rotation(row["heading"], row["pitch"], 0.0, body)
     for column in range(3):

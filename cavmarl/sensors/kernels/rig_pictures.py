@@ -62,10 +62,10 @@ def make_birds_eye(
     """Create a grid.
 
     Args:
-      mount: (3, 4) axes and position in the vehicle's frame, not tilted.
-      ahead_m: distance from the sensor to the upper edge.
-      left_m: distance from the sensor to the left edge.
-      cell_m: side of a cell.
+        mount: (3, 4) axes and position in the vehicle's frame, not tilted.
+        ahead_m: distance from the sensor to the upper edge.
+        left_m: distance from the sensor to the left edge.
+        cell_m: side of a cell.
     """
     return BirdsEye(
         float(mount[0, 3]),

@@ -47,15 +47,15 @@ def put_first(
     """Move the agents that a worker senses to the front; it owns these rows, the rest are ghosts.
 
     Args:
-      rows: VEHICLE (W, C), agents before the other vehicles.
-      num_agents: (W,) number of agents.
-      lines: (W, A, 2) lines [first, last) of each agent's frame that the worker writes; may be
-          empty.
-      spare: VEHICLE (1,), scratch.
-      num_owned: (W,) overwritten with the number of owned rows.
+        rows: VEHICLE (W, C), agents before the other vehicles.
+        num_agents: (W,) number of agents.
+        lines: (W, A, 2) lines [first, last) of each agent's frame that the worker writes; may be
+            empty.
+        spare: VEHICLE (1,), scratch.
+        num_owned: (W,) overwritten with the number of owned rows.
 
     Returns:
-      the number of owned rows in all worlds.
+        the number of owned rows in all worlds.
     """
     total = 0
     for w in range(num_agents.size):

@@ -80,7 +80,7 @@ def measure_inertia(
 ) -> None:
     """Write the samples that are due for the owned agents.
 
-    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6) forces and rates.
+    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6) force and rate.
     """
     for w in range(worlds.ticks.size):
         num = due.num[w]
@@ -264,17 +264,17 @@ def report_events(
     Earlier reports move towards the first slot; the newest report is the last.
 
     Args:
-      worlds: committed rows.
-      before: POSE (W, A) of the tick before.
-      ticks_per_step: ticks per step; VEHICLE["events"] is cleared at each step.
-      tick_s: seconds per tick.
-      due: the worlds in which reports are due.
-      stream: stream of the sensor's random numbers.
-      dropout: probability that a report is lost.
-      stamp_s: (W, A, S) in s since the reset.
-      lost: (W, A, S) whether each report is lost.
-      fresh: (W, A) number of reports of this step so far.
-      data: (W, A, S, 2) EVENT_* bits, and the id of the vehicle that was hit, or -1.
+        worlds: committed rows.
+        before: POSE (W, A) of the tick before.
+        ticks_per_step: ticks per step; VEHICLE["events"] is cleared at each step.
+        tick_s: seconds per tick.
+        due: the worlds in which reports are due.
+        stream: stream of the sensor's random numbers.
+        dropout: probability that a report is lost.
+        stamp_s: (W, A, S) in s since the reset.
+        lost: (W, A, S) whether each report is lost.
+        fresh: (W, A) number of reports of this step so far.
+        data: (W, A, S, 2) EVENT_* bits, and the id of the vehicle that was hit, or -1.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:

@@ -55,12 +55,12 @@ class MountedSensor(ABC, Generic[C]):
     """One sensor of the rig, on the vehicles of all agents of W worlds.
 
     Attributes:
-      name: name in the rig.
-      config: settings of the sensor.
-      mount: pose on the vehicle.
-      frame: name of the frame of its directions.
-      lines: (W, A, 2) lines [first, last) of each agent's frame that `sense` writes: all, unless
-          other processes write the rest.
+        name: name in the rig.
+        config: settings of the sensor.
+        mount: pose on the vehicle.
+        frame: name of the frame of its directions.
+        lines: (W, A, 2) lines [first, last) of each agent's frame that `sense` writes: all, unless
+            other processes write the rest.
     """
 
     dtype: ClassVar[DTypeLike]

@@ -87,7 +87,7 @@ class Gnss(MountedSensor[GnssConfig]):
     """The position of the antenna, with errors, converted to the earth by the map's projection.
 
     Attributes:
-      geodesy: conversion between map and earth.
+        geodesy: conversion between map and earth.
     """
 
     dtype = np.float64

@@ -50,7 +50,7 @@ class Rig:
     A) int64, the vehicle of each agent's samples; kept from tick to tick.
 
     Attributes:
-      sense: writes the samples that are due.
+        sense: writes the samples that are due.
     """
 
     def __init__(

@@ -107,7 +107,8 @@ def largest_radius_m(types: NDArray[np.void]) -> float:
     """Return half the diagonal of the largest body, in m: an upper bound from centre to corner.
 
     Args:
-      types: VTYPE (num_types,), `TripTables.types`: the types of agents and of all other vehicles.
+        types: VTYPE (num_types,), `TripTables.types`: the types of agents and of all other
+            vehicles.
     """
     return 0.5 * float(hypot_all(types["length"], types["width"]).max())
 

@@ -93,11 +93,11 @@ def vehicle_feature(
     """Return one feature of a vehicle.
 
     Args:
-      name: one of `VEHICLE_FEATURES`.
-      label: the feature's name in the observation.
-      subject: the vehicle; begins the meaning.
-      ranges: values that are mapped to [-1, 1], by feature.
-      clip: whether mapped values are clipped.
+        name: one of `VEHICLE_FEATURES`.
+        label: the feature's name in the observation.
+        subject: the vehicle; begins the meaning.
+        ranges: values that are mapped to [-1, 1], by feature.
+        clip: whether mapped values are clipped.
     """
     meaning, unit = _MEANINGS[name]
     text = f"{subject}: {meaning}"

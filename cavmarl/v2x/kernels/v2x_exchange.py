@@ -329,18 +329,18 @@ def exchange_messages(
     """Send what is due in the present tick of some worlds, and receive what arrives in it.
 
     Args:
-      sending: schedule of the stations.
-      channel: the radio channel.
-      roads: the road arrays.
-      types: VTYPE (num_types,).
-      units: UNIT (num_units,), the roadside units.
-      common: clocks, keys and signals of the worlds.
-      zoned: vehicles of all zones.
-      side: side of the zones' rows that holds the committed ones.
-      first: first world.
-      last: end of the worlds, exclusive.
-      mail: state that outlives the tick; written.
-      scratch: overwritten.
+        sending: schedule of the stations.
+        channel: the radio channel.
+        roads: the road arrays.
+        types: VTYPE (num_types,).
+        units: UNIT (num_units,), the roadside units.
+        common: clocks, keys and signals of the worlds.
+        zoned: vehicles of all zones.
+        side: side of the zones' rows that holds the committed ones.
+        first: first world.
+        last: end of the worlds, exclusive.
+        mail: state that outlives the tick; written.
+        scratch: overwritten.
     """
     for w in range(first, last):
         tick = common.ticks[w]
