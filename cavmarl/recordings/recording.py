@@ -109,7 +109,7 @@ class Recording:
         network = unpack_network(content, info["name"], info["source_sha256"]) if whole else None
         if network is None:
             raise RecordingError(
-                f"{path}: damaged, or not the map named in {HEAD_FILE}; put the file "
+                f"{path}: is damaged, or not the map named in {HEAD_FILE}; put the file "
                 "back, from another recording of the same map if need be"
             )
         return network
@@ -257,7 +257,7 @@ def _parts_of(folder: Path) -> list[Path]:
     for number, path in enumerate(paths):
         if path.stem != f"{number:06d}":
             raise RecordingError(
-                f"{path.with_name(f'{number:06d}.parquet')}: missing, although later parts "
+                f"{path.with_name(f'{number:06d}.parquet')}: is missing, although later parts "
                 "exist; restore it, or remove the later parts to read the earlier ones"
             )
     return paths

@@ -126,7 +126,7 @@ class RecordingHead:
                 raise ValueError("a key is missing")
         except Exception as error:
             raise RecordingError(
-                f"{path}: damaged ({error}); restore it, or record the run again"
+                f"{path}: is damaged ({error}); restore it, or record the run again"
             ) from error
         return head
 
@@ -172,7 +172,7 @@ def read_table(path: Path) -> Any:
         return parquet.read_table(path, page_checksum_verification=True, partitioning=None)
     except FileNotFoundError:
         raise RecordingError(
-            f"{path}: missing, although its part was committed; restore it, or remove the files "
+            f"{path}: is missing, although its part was committed; restore it, or remove the files "
             "with that name and the later ones to read the earlier parts"
         ) from None
     except (OSError, ValueError, KeyError) as error:  # pyarrow's errors are derived from these
@@ -182,7 +182,7 @@ def read_table(path: Path) -> Any:
 def damaged(path: Path, why: str) -> RecordingError:
     """Return the error for a damaged file."""
     return RecordingError(
-        f"{path}: damaged ({why}); restore it, or remove the files with that name and the later "
+        f"{path}: is damaged ({why}); restore it, or remove the files with that name and the later "
         "ones to read the earlier parts"
     )
 

@@ -138,7 +138,7 @@ def test_what_cannot_be_connected_is_refused(make: Make) -> None:
     vec.worlds.connect_network(Delayed())
     vec.step(vec.suggest_actions())
     own = make(**WANTED, zones=2, nodes=2, overrides={"v2x.enabled": True})
-    with pytest.raises(ConfigError, match="v2x.channel.external is off"):
+    with pytest.raises(ConfigError, match="external is off"):
         own.worlds.connect_network(Delayed())
     with pytest.raises(ConfigError, match="use backend='local', or nodes"):
         make_vec("grid4x4", workers=1, overrides=EXTERNAL)

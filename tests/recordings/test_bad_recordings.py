@@ -104,7 +104,7 @@ def gone(name: str) -> Callable[[Path], object]:
         (flipped("world-0/vehicles/000001.parquet", 0.3), ["000001.parquet", "is damaged"]),
         (cut("world-0/events/000001.parquet"), ["events/000001.parquet", "is damaged"]),
         (gone("world-0/vehicles/000002.parquet"), ["000002.parquet", "is missing", "restore it"]),
-        (gone("world-0/frames/000001.parquet"), ["000001.parquet", "missing, although later"]),
+        (gone("world-0/frames/000001.parquet"), ["000001.parquet", "is missing, although later"]),
     ],
 )
 def test_a_spoilt_recording_is_refused(

@@ -157,7 +157,7 @@ def test_a_killed_run_leaves_whole_tables(tmp_path: Path) -> None:
     assert recording.extra("v2x")["tick"].max() <= ticks[-1]
     for part in (path / "world-0" / "observations").glob("0*.parquet"):
         part.write_bytes(part.read_bytes()[:-30])
-    with pytest.raises(RecordingError, match=r"observations/0+\.parquet: damaged"):
+    with pytest.raises(RecordingError, match=r"observations/0+\.parquet: is damaged"):
         Recording.open(path).extra("observations")
 
 
