@@ -105,11 +105,11 @@ def test_the_order_of_an_answer_does_not_matter() -> None:
 @pytest.mark.parametrize(
     ("reception", "words"),
     [
-        ((-4, 0, 0), "another tick than those from 1 to 1"),
-        ((2, 0, 0), "another tick"),
+        ((-4, 0, 0), "has a tick outside 1 to 1"),
+        ((2, 0, 0), "has a tick outside"),
         ((1, 99, 0), "not sent"),
         ((1, -1, 0), "not sent"),
-        ((1, 0, 2), "by no station"),
+        ((1, 0, 2), "by an unknown receiver"),
     ],
 )
 def test_answers_that_cannot_be_are_refused(reception: tuple[int, int, int], words: str) -> None:
