@@ -42,7 +42,7 @@ BODY = SweptBody(HALF_M, 0.5 * WIDTH_M + 0.25)
 TICKS_S = (0.05, 0.1)  # the longer a tick is, the further out a car drives
 SETTLE_M = 20.0  # before the places that count: there it comes at the speed of the bend
 MOST_POSES = 2000
-FORMAT = "steered-3"  # another one when other rows are found for the same map
+FORMAT = "steered-4"  # another one when other rows are found for the same map
 
 
 def load_steered(path: str | Path) -> RoadNetwork:
