@@ -118,7 +118,7 @@ def test_a_seat_is_driven_by_one_page_and_given_back(serve: Serve) -> None:
         watcher = run._seats[0]
         assert run._driving[watcher][1:] == (1.0, 0.5)
         actions: dict[str, Any] = {"car_0": None, "car_1": None}
-        run._take_seats(actions)
+        run._apply_seats(actions)
         assert actions["car_0"].tolist() == [1.0, 0.5]
         assert actions["car_1"] is None
     turns_until(served, lambda: not run._seats)
@@ -225,14 +225,16 @@ def test_a_token_to_watch_gives_no_control(serve: Serve) -> None:
 
 
 def test_other_machines_are_only_served_with_a_token() -> None:
-    with pytest.raises(ServiceError, match=r"--host 0\.0\.0\.0: others can reach it; give a --to"):
+    with pytest.raises(
+        ServiceError, match=r"--host 0\.0\.0\.0: reachable from outside; give a --to"
+    ):
         WebServer(WebOptions(host="0.0.0.0", port=0), [])
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("nonsense", "no JSON"),
+        ("nonsense", "not valid JSON"),
         ("[1]", "a list"),
         ('{"kind": "fly"}', "'fly'"),
         ('{"kind": "watch", "number": -1}', "whole number"),
