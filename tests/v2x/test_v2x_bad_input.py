@@ -34,7 +34,7 @@ from cavmarl.engine.world_setup import load_world
         ({"v2x.inbox.memory_s": 0.0}, r"v2x\.inbox\.memory_s"),
         ({"v2x.roadside.signals": ["A0", "A0"]}, r"name each signal once"),
         ({"v2x.roadside.signals": ["all", "A0"]}, r"'all' stands alone"),
-        ({"v2x.roadside.signals": ["A9"]}, r"no signal 'A9' on the map '.*There are: A0, A1"),
+        ({"v2x.roadside.signals": ["A9"]}, r"no signal 'A9' on the map '.*The map has: A0, A1"),
         ({"v2x.perception.objects": 33}, r"v2x\.perception\.objects = 33"),
         ({"sensors.messages.objects": 9}, r"sensors\.messages\.objects = 9: .*objects = 8 keeps"),
         ({"sensors.messages.range_m": 0.0}, r"sensors\.messages\.range_m"),
