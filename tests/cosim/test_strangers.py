@@ -153,10 +153,10 @@ def test_a_world_without_descriptors_lets_the_oldest_caller_go(address: Path) ->
 @pytest.mark.parametrize(
     ("speak", "match"),
     [
-        (lambda wire: wire.send(Say.HELLO, 0, payload_of(Hello("again", []))), "says HELLO"),
+        (lambda wire: wire.send(Say.HELLO, 0, payload_of(Hello("again", []))), "sent HELLO"),
         (lambda wire: os.write(wire.fileno(), b"garbage " * 20), "begins no frame"),
-        (lambda wire: wire.send(Say.CONTROL, 0, {"frame": "x"}), "no Control"),
-        (lambda wire: wire.send(Say.CONTROL, 0, None), "no Control"),
+        (lambda wire: wire.send(Say.CONTROL, 0, {"frame": "x"}), "not a Control"),
+        (lambda wire: wire.send(Say.CONTROL, 0, None), "not a Control"),
         (lambda wire: wire.send(Say.CONTROL, 0, {"frame": 0, "controls": {}, "more": 1}), "more"),
     ],
     ids=["hello twice", "garbage", "no number", "nothing", "more than is known"],
@@ -182,7 +182,7 @@ def test_a_hello_for_too_many_is_refused(address: Path) -> None:
         world.reset(seed=0)
         hashes(world, 2)
         heard = line.hear(10.0)
-        assert "wants 5000 vehicles" in heard.payload["reason"]
+        assert "requests 5000 vehicles" in heard.payload["reason"]
         line.close()
 
 
@@ -221,12 +221,12 @@ def test_any_payload_is_a_message_or_a_typed_error(payload: object) -> None:
 @pytest.mark.parametrize(
     ("dtype", "shape", "stamps", "words"),
     [
-        ("O", [1], 1, "dtype 'O' is none of"),
-        ("<f4,<f4", [1], 1, "dtype '<f4,<f4' is none of"),
-        ("<f4", [], 1, "no array has the shape"),
-        ("<f4", [-1], 1, "no array has the shape"),
-        ("<f4", [0] + [1 << 40] * 2, 0, "no array has the shape"),
-        ("<f4", [1] * 40, 1, "no array has the shape"),
+        ("O", [1], 1, "dtype 'O': must be one of"),
+        ("<f4,<f4", [1], 1, "dtype '<f4,<f4': must be one of"),
+        ("<f4", [], 1, "invalid shape"),
+        ("<f4", [-1], 1, "invalid shape"),
+        ("<f4", [0] + [1 << 40] * 2, 0, "invalid shape"),
+        ("<f4", [1] * 40, 1, "invalid shape"),
         ("<f4", [2, 3], 1, "2 samples with 1 stamps"),
     ],
 )

@@ -187,7 +187,7 @@ def test_numbers_out_of_range_are_refused(wrong: dict[str, float], says: str) ->
         (("bench", "traffic", str(MAP), "-d", "none.rou.xml"), "none.rou.xml: cannot be read"),
         (
             ("bench", "traffic", str(GAME / "cross" / "cross.net.xml"), "-d", str(ROUTES)),
-            "is the file of another map",
+            "use files that were made for this map",
         ),
         ((*WORDS, "--speed", "--plot", "x.png"), "--plot"),
         ((*WORDS, "--speed", "--after", "0"), "after = 0"),

@@ -67,7 +67,7 @@ def test_flows_that_sumo_refuses(demand: Reader, timing: str) -> None:
         (CAR + CAR, ("occurs twice",)),
         (ROUTE, ("line 2", "ids must be unique")),
         ('<vType id="t"/><vTypeDistribution id="t" vTypes="t"/>', ("unique",)),
-        ('<vehicle id="a" depart="0" route="q"/>', ("unknown route 'q'", "near it: r")),
+        ('<vehicle id="a" depart="0" route="q"/>', ("unknown route 'q'", "similar names: r")),
         ('<vehicle id="a" depart="0" route="r" type="t"/>', ("unknown type 't'",)),
         ('<vehicle id="a" depart="0" route="r" departLane="2"/>', ("departLane='2'", "'AB'")),
         ('<vehicle id="a" depart="0" route="r" departPos="middle"/>',
@@ -82,9 +82,9 @@ def test_flows_that_sumo_refuses(demand: Reader, timing: str) -> None:
         ('<trip id="a" depart="0" from="AB"/>', ("no to",)),
         ('<trip id="a" depart="0" fromTaz="1" toTaz="2"/>', ("duarouter",)),
         ('<vehicle id="a" depart="0"><route edges="AB BC CD"/></vehicle>',
-         ("'CD'", "another map?", "near it: ")),
+         ("'CD'", "made for this map", "similar names: ")),
         ('<vehicle id="a" depart="0"><route edges="1 2 3 AB"/></vehicle>',
-         ("file of another map", "AB")),
+         ("made for this map", "AB")),
         ('<vehicle id="a" depart="0"><route edges=" "/></vehicle>', ("no edges",)),
     ],
 )  # fmt: skip
@@ -130,7 +130,7 @@ def test_the_ignoring_and_the_allowed_drive_everywhere(demand: Reader) -> None:
         ('lane="CB_0" endPos="9" duration="5"', ("off the route",)),
         ('lane="AB_0" endPos="9000" duration="5"', ("friendlyPos",)),
         ('lane="AB_0" startPos="10" endPos="5" duration="5"', ("startPos='10'",)),
-        ('lane="AB_7" duration="5"', ("'AB_7'", "near it: AB_")),
+        ('lane="AB_7" duration="5"', ("'AB_7'", "similar names: AB_")),
         ('busStop="s" duration="5"', ("unknown busStop 's'",)),
         ('duration="5"', ("no lane",)),
         ('lane="AB_0" duration="-5"', ("negative time",)),
@@ -190,7 +190,7 @@ def test_missing_files_and_files_that_hold_themselves(town: RoadNetwork, tmp_pat
         read_demand([], town)
     path = tmp_path / "a.rou.xml"
     path.write_text('<routes><include href="a.rou.xml"/></routes>', encoding="utf-8")
-    with pytest.raises(DemandError, match="hold themselves"):
+    with pytest.raises(DemandError, match="include themselves"):
         read_demand([path], town)
 
 

@@ -73,7 +73,7 @@ def test_closings_are_for_classes(demand: Reader, attrs: str, classes: int) -> N
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        (rerouter("", 'edges="AB BCC"'), ["BCC", "near it: BC"]),
+        (rerouter("", 'edges="AB BCC"'), ["BCC", "similar names: BC"]),
         (rerouter("", ""), ["no edges"]),
         (rerouter("", 'edges="AB" probability="1.5"'), ["probability='1.5'", "at most 1"]),
         (rerouter("", 'edges="AB" probability="-1"'), ["probability='-1'"]),
