@@ -27,7 +27,7 @@ from cavmarl.service.access import Access
 from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
-from cavmarl.service.requests import BeatBody, NodeBody
+from cavmarl.service.request_bodies import BeatBody, NodeBody
 
 CONFIGURATION = "0" * 64
 NODES_AN_IDENTITY = 100  # whose requests are limited together

@@ -82,7 +82,7 @@ def run_worlds(
         progress(done, job.count)
         if seed in rows:
             continue
-        rows[seed] = _run_world(job, seed)
+        rows[seed] = run_world(job, seed)
         with (job.out / ROWS_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(rows[seed]) + "\n")
         _drop_files(job.out, list(rows.values()))
@@ -123,7 +123,8 @@ def _check_settings(job: WorldSeries) -> None:
         )
 
 
-def _run_world(job: WorldSeries, seed: int) -> Row:
+def run_world(job: WorldSeries, seed: int) -> Row:
+    """Draw a world, run it here and in SUMO, and return its row."""
     draw = draw_world(seed, job.without)
     folder = world_folder(job.out, seed)
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was ended

@@ -103,7 +103,7 @@ def measure(
     chosen = [name.strip() for name in models.split(",")]
     if not maps and not worlds:
         raise ConfigError("no map: name some, or draw nets with --worlds")
-    named = _labels(maps or [])
+    named = labels(maps or [])
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     sums = {(model, crowd): Drive() for model in chosen for crowd in crowds}
@@ -139,8 +139,8 @@ def measure(
     )
 
 
-def _labels(maps: Sequence[str]) -> dict[str, str]:
-    """A short name of each map: of a file its own without folders, where no other has the same."""
+def labels(maps: Sequence[str]) -> dict[str, str]:
+    """Return a short name of each map: a file's name without folders, where it is unique."""
     short = {name: map_name(Path(name)) or name for name in maps}
     number = Counter(short.values())
     return {name: label if number[label] == 1 else name for name, label in short.items()}
@@ -177,7 +177,7 @@ def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
     vec = CavVectorEnv(LocalWorlds(world, max(1, min(16, TOGETHER // (5 * agents)))))
     weights = np.array(vec.config.terms.weight_of_each)
     recorder = Recorder(vec.num_envs, vec.num_agents, vec.max_cycles, vec.step_s, weights)
-    watch, ground = _Standing(vec), _SharedGround(vec.network)
+    watch, ground = StandingVehicles(vec), SharedGround(vec.network)
     found = Drive()
     _, infos = vec.reset(seed=seed)
     running = np.ones(vec.num_envs, dtype=np.bool_)
@@ -219,7 +219,7 @@ def _place(vec: CavVectorEnv, what: str, world: int, row: np.void, step: int) ->
     }
 
 
-class _SharedGround:
+class SharedGround:
     """Which collisions are between two roads that a map draws on the same ground."""
 
     def __init__(self, network: RoadNetwork) -> None:
@@ -265,7 +265,7 @@ def _axes(rows: NDArray[np.void], dt: float) -> tuple[NDArray[np.float64], NDArr
     return x, y
 
 
-class _Standing:
+class StandingVehicles:
     """Finds vehicles that have stood for `STANDS_S` without a cause, each once."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
@@ -282,11 +282,12 @@ class _Standing:
             shown = signal_codes(self._vec.network, simulation.signal_phases(world))
             for i in long.tolist():
                 key = (world, int(rows[i]["id"]))
-                if key not in self._told and not self._has_cause(rows, i, shown):
+                if key not in self._told and not self.has_cause(rows, i, shown):
                     self._told.add(key)
                     yield world, rows[i]
 
-    def _has_cause(self, rows: NDArray[np.void], i: int, shown: NDArray[np.uint8]) -> bool:
+    def has_cause(self, rows: NDArray[np.void], i: int, shown: NDArray[np.uint8]) -> bool:
+        """Return whether vehicle `i` has a cause to stand; `shown`: the signal of each link."""
         row = rows[i]
         others = rows[np.arange(len(rows)) != i]
         lane = self._vec.network.lanes[row["lane"]]
@@ -299,10 +300,10 @@ class _Standing:
         near = ahead & (np.hypot(to_x, to_y) < NEAR_AHEAD_M)
         if near.any() or (link >= 0 and not inside and shown[link] not in GREEN):
             return True
-        return link >= 0 and self._gives_way(others, link)
+        return link >= 0 and self.gives_way(others, link)
 
-    def _gives_way(self, others: NDArray[np.void], link: int) -> bool:
-        """Whether there is no room behind a link, or one comes that goes first."""
+    def gives_way(self, others: NDArray[np.void], link: int) -> bool:
+        """Return whether the road behind a link is full, or a vehicle comes that goes first."""
         network = self._vec.network
         lanes, target = network.lanes, network.links[link]
         if ((others["lane"] == target["to_lane"]) & (others["s"] < NEAR_AHEAD_M)).any():

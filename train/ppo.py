@@ -150,6 +150,9 @@ class Collector:
 
     If the critic sees their states, worlds begin anew in the next step: the last state of an
     episode is gone when they do so in the same.
+
+    Attributes:
+        opponents: drive some of the seats; nothing is learnt from these.
     """
 
     def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
@@ -158,8 +161,8 @@ class Collector:
         self.times = PhaseTimes(PHASES)
         self._mask = vec.reset(seed=seed)[1]["mask"]
         self._observations = torch.from_numpy(vec.worlds.arrays.observations)  # worlds write here
-        self._opponents = Opponents(args.opponents, vec, args.opponent_share, args.seed)
-        self._suggest = self._opponents.example(args.imitate)
+        self.opponents = Opponents(args.opponents, vec, args.opponent_share, args.seed)
+        self._suggest = self.opponents.example(args.imitate)
 
     @torch.inference_mode()
     def collect(self, with_suggested: bool) -> Batch:
@@ -167,7 +170,7 @@ class Collector:
         simulated_s = self.vec.simulated_s
         with self.times.rest("transfer"):
             batch = self._empty(with_suggested)
-            self._opponents.begin()
+            self.opponents.begin()
             for t in range(self._args.num_steps):
                 self._step(batch, t)
             self._expect(batch)
@@ -201,11 +204,11 @@ class Collector:
             actions, batch.log_probs[t] = self.network.draw(output)
             batch.values[t], batch.actions[t] = values, actions
             given = self.network.given(actions, batch.observations[t]).cpu().numpy()
-        self._opponents.act(self._observations.numpy(), self._mask, given)
+        self.opponents.act(self._observations.numpy(), self._mask, given)
         _, reward, ended, cut, infos = self.vec.step(given)
         if self._args.end_at_red:
             ended = ended | (infos["terms"][..., RED_LIGHT] > 0.0)
-        ours, self._mask = self._opponents.absent, infos["mask"]
+        ours, self._mask = self.opponents.absent, infos["mask"]
         acted = infos["acted"] & ours
         batch.rewards[t] = torch.from_numpy(reward)
         batch.acted[t] = torch.from_numpy(acted)

@@ -97,18 +97,19 @@ def measure_step_speed(
         theirs = {(sensors, side): highway_env(agents, seen) for sensors, side, seen in THEIRS}
         road_m = max(map(length_m, theirs.values()))
         progress("making our worlds on that road")
-        sides = _our_sides(Path(folder), road_m, agents, worlds)
+        sides = our_sides(Path(folder), road_m, agents, worlds)
         for key, env in theirs.items():
-            sides[key] = (agents, 1, partial(_their_rate, env, agents))
+            sides[key] = (agents, 1, partial(their_rate, env, agents))
         turns = take_turns({key: rate for key, (_, _, rate) in sides.items()}, repeats, progress)
     rows = []
     for (sensors, side), (count, together, _) in sides.items():
         rates = spread(turns[sensors, side])
         rows.append(Row(sensors, side, count, together, rates.low, rates.median, rates.high))
-    return _compare(road_m, repeats, rows)
+    return compare(road_m, repeats, rows)
 
 
-def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
+def compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
+    """Compute the ratios of the median rates."""
     found = {(row.sensors, row.side): row for row in rows}
 
     def ratio(sensors: str, one: str, other: str) -> float:
@@ -127,10 +128,10 @@ def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
     )
 
 
-def _our_sides(
+def our_sides(
     folder: Path, road_m: float, agents: int, worlds: int
 ) -> dict[tuple[str, str], tuple[int, int, Callable[[], float]]]:
-    """Agents, worlds and rate of each of ours, stepped twice before anything is measured."""
+    """Return the agents, worlds and rate of each CAV-MARL row, each stepped twice to warm up."""
     sides: dict[tuple[str, str], tuple[int, int, Callable[[], float]]] = {}
     for sensors, side, times, is_batched in OURS:
         count, together = times * agents, worlds if is_batched else 1
@@ -141,17 +142,17 @@ def _our_sides(
             background=0,
             overrides=overrides(LIDAR if sensors == "lidar" else KINEMATICS, count),
         )
-        _batched_rate(vec, 2)
-        sides[sensors, side] = (count, together, partial(_batched_rate, vec))
+        batched_rate(vec, 2)
+        sides[sensors, side] = (count, together, partial(batched_rate, vec))
     road = straight_road(folder, road_m)
     env = parallel_env(road, agents=agents, background=0, overrides=overrides(KINEMATICS, agents))
-    _dicts_rate(env, 2)
-    sides["kinematics", "dicts"] = (agents, 1, partial(_dicts_rate, env))
+    dicts_rate(env, 2)
+    sides["kinematics", "dicts"] = (agents, 1, partial(dicts_rate, env))
     return sides
 
 
-def _batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
-    """Agent-steps a second from a fresh reset, which is not timed."""
+def batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
+    """Return the agent-steps per second from a fresh reset, which is not timed."""
     vec.reset(seed=0)
     actions = np.full((vec.num_envs, vec.num_agents), np.int64(IDLE))
     decisions = 0
@@ -161,8 +162,8 @@ def _batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
     return decisions / (time.process_time() - began)
 
 
-def _dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
-    """The same through PettingZoo's dicts; agents that have ended are left out from then on."""
+def dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
+    """Return the agent-steps per second through PettingZoo's dicts, without ended agents."""
     env.reset(seed=0)
     actions = dict.fromkeys(env.agents, IDLE)
     decisions = 0
@@ -176,7 +177,8 @@ def _dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
     return decisions / (time.process_time() - began)
 
 
-def _their_rate(env: Any, agents: int) -> float:
+def their_rate(env: Any, agents: int) -> float:
+    """Return the agent-steps per second of highway-env from a fresh reset, which is not timed."""
     env.reset(seed=0)
     actions = (IDLE,) * agents
     began = time.process_time()

@@ -78,9 +78,9 @@ def measure_traffic_speed(
         sumo.submit(load_sumo, job, folder).result()
         sumo.submit(turn_of_sumo, warm).result()
         progress(f"our first {after_s} s")
-        _our_turn(simulation, warm)
+        our_turn(simulation, warm)
         sides: dict[str, Callable[[], Turn]] = {
-            "ours": partial(_our_turn, simulation, steps),
+            "ours": partial(our_turn, simulation, steps),
             "sumo": lambda: sumo.submit(turn_of_sumo, steps).result(),
         }
         turns = take_turns(sides, repeats, progress)
@@ -111,7 +111,8 @@ def _timed(steps: int, step: Callable[[], int]) -> Turn:
     return Turn(vehicle_steps, time.process_time() - began_s, time.perf_counter() - began)
 
 
-def _our_turn(simulation: Simulation, steps: int) -> Turn:
+def our_turn(simulation: Simulation, steps: int) -> Turn:
+    """Time some steps of a world."""
     commands = idle_commands(simulation)
 
     def step() -> int:

@@ -114,7 +114,7 @@ class Shard:
         self.cut(zones, halo)
         # One after the other works in it: what the last one has left is still near in memory.
         self.scratch: Scratch = (
-            _make_scratch(network, capacity, travel.scripts.room)
+            make_shard_scratch(network, capacity, travel.scripts.room)
             if first is None
             else first.scratch
         )
@@ -270,7 +270,7 @@ def _seen(
     )
 
 
-def _make_scratch(network: RoadNetwork, capacity: int, covers: int = 0) -> Scratch:
+def make_shard_scratch(network: RoadNetwork, capacity: int, covers: int = 0) -> Scratch:
     def integers(size: int) -> NDArray[np.int32]:
         return huge_zeros(size, dtype=np.int32)
 

@@ -23,7 +23,8 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.verify.differences import Arrays, DrivenRun, single_arrays, snapshot
 
 
-def _main() -> None:
+def main() -> None:
+    """Run the job that standard input describes."""
     job = json.loads(sys.stdin.readline())
     try:
         for told in _steps(job):
@@ -64,4 +65,4 @@ def _digest(arrays: Arrays) -> str:
 
 
 if __name__ == "__main__":
-    _main()
+    main()

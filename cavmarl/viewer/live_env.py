@@ -40,6 +40,8 @@ class ShownEnv:
 
     Attributes:
         address: of the page.
+        audiences: the pages that watch each world.
+        publishers: of the frames of each world.
         changes: how often pages have asked for something that changes a world.
     """
 
@@ -64,8 +66,8 @@ class ShownEnv:
         hello["may"] += ["reset"] if reset is not None else []
         first = first_stage("world 0", env.network, hello)
         stages = [first, *(first.named(f"world {k}") for k in range(1, count))]
-        self._audiences = [stage.audience for stage in stages]
-        self._publishers = [FramePublisher(stage.audience, stage.encoder) for stage in stages]
+        self.audiences = [stage.audience for stage in stages]
+        self.publishers = [FramePublisher(stage.audience, stage.encoder) for stage in stages]
         with ExitStack() as stack:
             self.address = serve_stages(stack, stages, options, tell)
             self._loads = stack.enter_context(RunLoads(env.worlds, first.audience))
@@ -77,7 +79,7 @@ class ShownEnv:
         """Show the present moment to pages; while they have paused it, wait."""
         self._renew()
         while wait_s := self.turn():
-            self._audiences[0].wait(wait_s)
+            self.audiences[0].wait(wait_s)
         self._clock.tick(time.monotonic(), self._env.step_s)
 
     def turn(self) -> float:
@@ -101,14 +103,14 @@ class ShownEnv:
     @property
     def is_watched(self) -> bool:
         """Whether a page is open."""
-        return any(audience.wishes.watchers for audience in self._audiences)
+        return any(audience.wishes.watchers for audience in self.audiences)
 
     def _renew(self) -> None:
-        for publisher in self._publishers:
+        for publisher in self.publishers:
             publisher.is_new = True
 
     def _heed(self) -> None:
-        for world, audience in enumerate(self._audiences):
+        for world, audience in enumerate(self.audiences):
             for number, request in audience.requests():
                 if not self._clock.heed(request) and self._controlled and self._env.is_ready:
                     self._change(world, audience, number, request)
@@ -123,7 +125,7 @@ class ShownEnv:
         self.changes += 1
 
     def _publish(self) -> None:
-        for world, publisher in enumerate(self._publishers):
+        for world, publisher in enumerate(self.publishers):
             see, tell = partial(self._see, world), partial(self._tell, world)
             publisher.publish(time.monotonic(), self._clock, see, tell)
 
@@ -135,7 +137,7 @@ class ShownEnv:
 
     def refresh(self) -> None:
         """Show the present moment to pages that are open or will be, however lately one was."""
-        for world, publisher in enumerate(self._publishers):
+        for world, publisher in enumerate(self.publishers):
             publisher.keep(self._see(world, ghosts=False), self._clock)
 
     def _repr_html_(self) -> str:

@@ -42,6 +42,7 @@ class ShownRun:
         clock: of its steps.
         publisher: of its frames.
         steps: that it has taken.
+        seats: agents that a page drives, and the number of its watcher.
     """
 
     def __init__(self, env: CavEnv, policy: Policy, stage: Stage, seed: int) -> None:
@@ -50,7 +51,7 @@ class ShownRun:
         self._audience = stage.audience
         self.clock = RunClock()
         self.publisher = FramePublisher(stage.audience, stage.encoder)
-        self._seats: dict[int, int] = {}  # watchers by agent
+        self.seats: dict[int, int] = {}
         self._driving: dict[int, tuple[float, float, float]] = {}  # time, throttle, steering
         self.steps = 0
         self._observations, _ = env.reset(seed=seed)
@@ -96,7 +97,7 @@ class ShownRun:
 
     def _take_seats(self, actions: dict[str, Any]) -> None:
         now = time.monotonic()
-        for agent, watcher in self._seats.items():
+        for agent, watcher in self.seats.items():
             name = self._env.possible_agents[agent]
             said_s, throttle, steering = self._driving.get(watcher, (0.0, 0.0, 0.0))
             if name in actions and now - said_s < HELD_S:
@@ -116,17 +117,17 @@ class ShownRun:
             self._driving[number] = (time.monotonic(), request.throttle, request.steering)
 
     def _give_seat(self, watcher: int, agent: float | None) -> None:
-        self._seats = {one: held for one, held in self._seats.items() if held != watcher}
+        self.seats = {one: held for one, held in self.seats.items() if held != watcher}
         self._driving.pop(watcher, None)
         if agent is None:
             return
         reason = ""
         if agent >= len(self._env.possible_agents):
             reason = "there is no such agent"
-        elif int(agent) in self._seats:
+        elif int(agent) in self.seats:
             reason = "another page drives it"
         else:
-            self._seats[int(agent)] = watcher
+            self.seats[int(agent)] = watcher
         seat = {"kind": "seat", "agent": None if reason else int(agent), "reason": reason}
         self._audience.tell(watcher, seat)
 

@@ -9,14 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl import (
-    ActionError,
-    CapacityError,
-    CavEnv,
-    ConfigError,
-    make_vec,
-    parallel_env,
-)
+from cavmarl import ActionError, CapacityError, CavEnv, ConfigError, make_vec, parallel_env
 from cavmarl.recordings.recording import Recording
 
 ROOM = {"population.insertions": 12}

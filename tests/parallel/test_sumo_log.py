@@ -56,7 +56,7 @@ def test_more_ticks_than_were_logged_are_refused() -> None:
 def test_a_log_that_is_too_long_is_given_up_until_its_restart(most_bytes: int) -> None:
     log = log_of(200, most_bytes)
     assert log.words.nbytes < 100
-    with pytest.raises(SumoError, match=r"more than .* MiB.*sumo\.replay_mib"):
+    with pytest.raises(SumoError, match=r"exceeds .* MiB.*sumo\.replay_mib"):
         log.ticks(1)
     log.begin()
     assert bytes_of(log, 0) == []

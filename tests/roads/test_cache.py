@@ -36,7 +36,6 @@ def test_a_second_load_restores_every_array(
 ) -> None:
     path = crossing()
     reads = count_reads(monkeypatch)
-
     first, second = load_network(path), load_network(path)
     assert len(reads) == 1
     assert first.content_hash == second.content_hash == read_network(path).content_hash
@@ -71,7 +70,6 @@ def test_a_large_map_stays_in_its_file(
 def test_a_changed_source_is_read_again(crossing: Callable[..., Path], cache_folder: Path) -> None:
     before = load_network(crossing())
     after = load_network(crossing(('speed="5"', 'speed="6"')))
-
     assert before.content_hash != after.content_hash
     assert len(list(cache_folder.iterdir())) == 2
 
@@ -84,7 +82,6 @@ def test_a_broken_entry_is_built_again(
     whole = load_network(path)
     (entry,) = cache_folder.iterdir()
     entry.write_bytes(content)
-
     assert load_network(path).content_hash == whole.content_hash
     assert entry.read_bytes() != content
 
@@ -96,7 +93,6 @@ def test_a_truncated_entry_is_built_again(
     whole = load_network(path)
     (entry,) = cache_folder.iterdir()
     entry.write_bytes(entry.read_bytes()[:-500])
-
     assert load_network(path).content_hash == whole.content_hash
 
 
@@ -106,5 +102,4 @@ def test_the_name_is_the_files_and_not_the_caches(
     path = crossing()
     load_network(path)
     renamed = path.rename(path.with_name("other.net.xml"))
-
     assert load_network(renamed).name == "other"

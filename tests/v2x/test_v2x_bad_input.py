@@ -70,13 +70,9 @@ def test_it_is_off_by_default_and_every_effect_of_the_channel_too() -> None:
 
 def test_the_mode_messages_shows_nothing_else_of_others() -> None:
     overrides = {
-        "v2x.enabled": True,
-        "sensors.messages.objects": 3,
-        "sensors.messages.events": 1,
-        "sensors.messages.signal": True,
-        "observation.mode": "messages",
-        "observation.kind": "dict",
-    }
+        "v2x.enabled": True, "sensors.messages.objects": 3, "sensors.messages.events": 1,
+        "sensors.messages.signal": True, "observation.mode": "messages", "observation.kind": "dict",
+    }  # fmt: skip
     env = parallel_env("grid4x4", overrides=overrides)
     observations, _ = env.reset(seed=0)
     assert set(observations[env.agents[0]]) == {"ego", "route", "messages"}

@@ -1,4 +1,4 @@
-"""The bodies of requests: unknown fields, other types and values out of range are refused."""
+"""Bodies of requests. Unknown fields, wrong types and values out of range are refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9:][A-Za-z0-9:.-]{0,
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 Port = Annotated[int, Field(ge=1, le=65535)]
-Whole = Annotated[int, Field(ge=0, lt=1 << 53)]  # JSON has these exactly
+Whole = Annotated[int, Field(ge=0, lt=1 << 53)]  # JSON represents these integers exactly
 Words = Annotated[list[Word], Field(max_length=64)]
 
 
@@ -27,7 +27,7 @@ class _Body(BaseModel):
 
 
 class NodeBody(_Body):
-    """A node registers."""
+    """Registration of a node."""
 
     name: Name
     address: Host
@@ -40,7 +40,7 @@ class NodeBody(_Body):
 
 
 class BeatBody(_Body):
-    """A node is alive. Shares of its resources that are in use, from 0 to 1: 0.85, not 85."""
+    """Heartbeat of a node. Shares of used resources are from 0 to 1: 0.85, not 85."""
 
     incarnation: Annotated[int, Field(ge=1)]
     sequence: Annotated[int, Field(ge=0)]
@@ -52,8 +52,8 @@ class BeatBody(_Body):
         dict[Word, Annotated[float, Field(allow_inf_nan=False)]],
         Field(max_length=32, json_schema_extra=NO_OTHERS),
     ] = {}
-    watched: bool = False  # a page of a session is open: the answer has all nodes' LoadScores
-    # of jobs: how many steps are done, and are to be
+    watched: bool = False  # a page of a session is open; the answer then has all LoadScores
+    # job → steps done, total
     jobs: Annotated[
         dict[Word, Annotated[list[Whole], Field(min_length=2, max_length=2)]],
         Field(max_length=10_000, json_schema_extra=NO_OTHERS),
@@ -61,7 +61,7 @@ class BeatBody(_Body):
 
 
 class ConfigurationBody(_Body):
-    """A world; as the keywords of `cavmarl.make_vec`."""
+    """A world, with the keywords of `cavmarl.make_vec`."""
 
     name: Name | None = None
     environment: Name
@@ -69,14 +69,16 @@ class ConfigurationBody(_Body):
     background: Annotated[int, Field(ge=0, le=100_000)] | None = None
     max_cycles: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
     zones: Annotated[int, Field(ge=1, le=1024)] | None = None
-    nodes: Annotated[int, Field(ge=1, le=64)] | None = None  # that host the zones; None: one
+    nodes: Annotated[int, Field(ge=1, le=64)] | None = (
+        None  # number of nodes that host the zones; None: one
+    )
     num_envs: Annotated[int, Field(ge=1, le=1024)] = 1
     seed: Whole = 0
     overrides: Annotated[dict[str, Any], Field(max_length=256)] = {}
 
 
 class SessionBody(_Body):
-    """A client wants a world."""
+    """A client's request for a world."""
 
     configuration: Sha256
     node: Name | None = None
@@ -85,28 +87,28 @@ class SessionBody(_Body):
 
 
 class ResolveBody(_Body):
-    """A client asks again where its session is."""
+    """A client's question where its session is."""
 
     unreachable: Annotated[list[Name], Field(max_length=16)] = []
     wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
 
 
 class TransfersBody(_Body):
-    """A node tells which vehicles of a session have changed their zone, and which are about to."""
+    """Vehicles of a session that have changed zone, or are prepared to."""
 
-    at: Whole  # commands up to then
+    at: Whole  # number of commands up to the report
     # world, episode, tick, vehicle, source, target, epoch
     transfers: Annotated[
         list[Annotated[list[Whole], Field(min_length=7, max_length=7)]], Field(max_length=2000)
     ] = []
-    # world, vehicle, source, target: the target holds its state, the source owns it still
+    # world, vehicle, source, target; the target has the state, the source still owns it
     prepared: Annotated[
         list[Annotated[list[Whole], Field(min_length=4, max_length=4)]], Field(max_length=2000)
     ] = []
 
 
 class DoorBody(_Body):
-    """A node tells where it awaits those that host zones of a session, and the key for them."""
+    """Address and key at which a node waits for the nodes that host zones of a session."""
 
     host: Host
     port: Port
@@ -114,7 +116,7 @@ class DoorBody(_Body):
 
 
 class JobBody(_Body):
-    """A client wants an evaluation."""
+    """A client's request for an evaluation."""
 
     configuration: Sha256
     policies: Annotated[list[Name], Field(min_length=1, max_length=16)] = ["idm"]
@@ -122,31 +124,31 @@ class JobBody(_Body):
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     node: Name | None = None
     needs: Words = []
-    # so long it may wait for its first node; none: as long as it takes
+    # longest wait for the first node in s; None: no limit
     wait_s: Annotated[float, Field(ge=0.0, le=MAX_WAIT_S)] | None = None
 
 
 class OutcomeBody(_Body):
-    """A node has ended a job."""
+    """The outcome of a job."""
 
     status: Literal["done", "failed"]
     message: Annotated[str, StringConstraints(max_length=2000)] = ""
 
 
 class IdentityBody(_Body):
-    """A new identity; the answer has its secret, once."""
+    """A new identity. The answer has its secret, which is not shown again."""
 
     name: Name
     role: Role
 
 
 class SecretBody(_Body):
-    """A secret, in exchange for tokens."""
+    """A secret in exchange for tokens."""
 
     secret: Annotated[str, StringConstraints(max_length=256)]
 
 
 class RefreshBody(_Body):
-    """A refresh token, in exchange for new ones."""
+    """A refresh token in exchange for new tokens."""
 
     refresh_token: Annotated[str, StringConstraints(max_length=4096)]

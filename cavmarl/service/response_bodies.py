@@ -1,4 +1,4 @@
-"""The answers to requests, as the document of the interface shows them."""
+"""Responses, as the OpenAPI document shows them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from cavmarl.service.requests import ConfigurationBody, Sha256
+from cavmarl.service.request_bodies import ConfigurationBody, Sha256
 from cavmarl.service.service_records import Role
 
 
@@ -15,14 +15,14 @@ class _Answer(BaseModel):
 
 
 class Health(_Answer):
-    """The service is there."""
+    """The service is running."""
 
     status: Literal["ok"]
-    events: int  # in the log
+    events: int  # number of events in the log
 
 
 class PublicKey(_Answer):
-    """A key of Ed25519, as RFC 8037 has it."""
+    """An Ed25519 key as in RFC 8037."""
 
     kid: str
     kty: Literal["OKP"]
@@ -39,10 +39,10 @@ class PublicKeys(_Answer):
 
 
 class Tokens(_Answer):
-    """Send the access token as `Authorization: Bearer TOKEN`."""
+    """Tokens. Send the access token as `Authorization: Bearer TOKEN`."""
 
     access_token: str
-    refresh_token: str  # good once
+    refresh_token: str  # can be used once
     token_type: Literal["Bearer"]
     expires_in: float  # seconds
     role: Role
@@ -50,7 +50,7 @@ class Tokens(_Answer):
 
 
 class Load(_Answer):
-    """Shares in use, from 0 to 1."""
+    """Shares of used resources, from 0 to 1."""
 
     cpu: float
     ram: float
@@ -73,15 +73,15 @@ class NodeStatus(_Answer):
     state: Literal["up", "down", "left"]
     draining: bool
     excluded: list[str]  # resources above their thresholds
-    load: Load | None  # null: no beat yet
+    load: Load | None  # null: no heartbeat yet
     score: float | None
     sessions: int
-    zones_of: list[str]  # sessions whose zones it hosts, one for each part
-    age_s: float  # since it was heard of
+    zones_of: list[str]  # sessions whose zones it hosts, once per part
+    age_s: float  # seconds since the last heartbeat
 
 
 class Excluded(_Answer):
-    """A node that was not chosen, and why."""
+    """A node that was not chosen, and the reason."""
 
     node: str
     reason: str
@@ -96,7 +96,7 @@ class NodeList(_Answer):
 
 
 class Door(_Answer):
-    """Where a node has to call, to host zones of a session."""
+    """The address at which a node must connect to host zones of a session."""
 
     session: str
     host: str
@@ -105,7 +105,7 @@ class Door(_Answer):
 
 
 class JobOrder(_Answer):
-    """What a node has to evaluate."""
+    """An evaluation that a node must run."""
 
     id: str
     configuration: Sha256
@@ -119,7 +119,7 @@ class NodeScore(_Answer):
 
     name: str
     state: str
-    score: float | None  # null: it has told no load
+    score: float | None  # null: the node reports no load
     sessions: int
 
 
@@ -132,11 +132,11 @@ class Duties(_Answer):
     zones_of: list[Door]
     without_door: list[str]
     jobs: list[JobOrder]
-    scores: list[NodeScore]  # of the first hundred nodes by name, if a page is open
+    scores: list[NodeScore]  # the first hundred nodes by name, if a page is open
 
 
 class Configuration(ConfigurationBody):
-    """A configuration that is kept."""
+    """A stored configuration."""
 
     hash: Sha256
     version: int
@@ -144,7 +144,7 @@ class Configuration(ConfigurationBody):
 
 
 class Assignment(_Answer):
-    """Where the worlds of a session are, and what opens them there."""
+    """Where the worlds of a session are, and the token that opens them."""
 
     session: str
     requested: str | None
@@ -152,7 +152,7 @@ class Assignment(_Answer):
     redirected: bool
     reason: str
     score: float
-    excluded: list[Excluded]  # the first of those that were left out
+    excluded: list[Excluded]  # the first nodes that were excluded
     excluded_count: int
     scheme: Literal["http", "https"]
     address: str
@@ -173,7 +173,7 @@ class Job(_Answer):
 
 
 class Session(_Answer):
-    """A session, or a job: then `job` says what it evaluates."""
+    """A session, or a job if `job` is set."""
 
     id: str
     owner: str
@@ -182,7 +182,7 @@ class Session(_Answer):
     job: Job | None
     needs: list[str]
     preferred: str | None
-    wait_s: float | None  # how long a job may wait for its first node
+    wait_s: float | None  # longest wait of a job for its first node
     opened_s: float  # of the wall clock
     state: Literal["queued", "active", "closed", "done", "failed"]
     node: str | None
@@ -193,13 +193,13 @@ class Session(_Answer):
     excluded: list[Excluded]
     excluded_count: int
     saved_number: int
-    results: dict[str, str]  # files, with their hashes
+    results: dict[str, str]  # names of files → hashes
     message: str
     key: str
     zone_nodes: int
     members: list[str]
     told_number: int
-    progress: list[int] | None  # of a job: steps done, and to be; null: its node has told none
+    progress: list[int] | None  # of a job: steps done, total; null: not reported yet
 
 
 class SessionList(_Answer):
@@ -219,7 +219,7 @@ class OwnerOfVehicle(_Answer):
 
 
 class InFlight(_Answer):
-    """A vehicle that is about to change its zone."""
+    """A vehicle whose change of zone is prepared."""
 
     world: int
     vehicle: int
@@ -229,9 +229,9 @@ class InFlight(_Answer):
 
 
 class Ownership(_Answer):
-    """Owners of vehicles that have changed their zone."""
+    """Owners of the vehicles that have changed zone."""
 
-    number: int  # commands up to which it is told
+    number: int  # number of commands up to the last report
     owners: list[OwnerOfVehicle]
     in_flight: list[InFlight]
 
@@ -250,7 +250,7 @@ class EventLine(_Answer):
 
 
 class EventList(_Answer):
-    """Lines of the log, the oldest first."""
+    """Lines of the log, oldest first."""
 
     events: list[EventLine]
 
@@ -271,7 +271,7 @@ class IdentityList(_Answer):
 
 
 class NewIdentity(_Answer):
-    """An identity, and its secret, which is shown this once."""
+    """An identity and its secret, which is not shown again."""
 
     identity: str
     name: str
@@ -280,23 +280,23 @@ class NewIdentity(_Answer):
 
 
 class NewKey(_Answer):
-    """The key that signs from now on."""
+    """The new signing key."""
 
     key: str
 
 
 class ArrayForm(_Answer):
-    """Of an array: `dtype` as numpy writes it, such as `<f4`."""
+    """Form of an array; `dtype` is written as in NumPy, for example `<f4`."""
 
     shape: list[int]
     dtype: str
 
 
 class WorldDescription(_Answer):
-    """The worlds of a session, on their node."""
+    """The worlds of a session on their node."""
 
-    number: int  # commands up to now: the next one has the number after it
-    saved: int  # those that the saved state includes
+    number: int  # number of commands so far; the next command has the next number
+    saved: int  # number of commands that the saved state includes
     agents: list[str]
     num_envs: int
     max_cycles: int
@@ -306,20 +306,20 @@ class WorldDescription(_Answer):
 
 
 class WorldHashes(_Answer):
-    """Digests of the worlds of a session."""
+    """State hashes of the worlds of a session."""
 
     hashes: list[str]
 
 
 class WorldPage(_Answer):
-    """Where the worlds of a session can be watched and controlled, on the machine of their node."""
+    """Address of a page on the node's machine that shows and controls the worlds."""
 
     address: str
-    token: str  # that the page asks for, to control them; without a state to be saved, to watch
-    watch_token: str  # to watch alone
+    token: str  # token to control the worlds; to watch them if they cannot be saved
+    watch_token: str  # token to watch only
 
 
 class WorldTransfers(_Answer):
-    """Changes of owner in divided worlds."""
+    """Ownership transfers of divided worlds."""
 
     transfers: list[dict[str, Any]]
