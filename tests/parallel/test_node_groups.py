@@ -243,15 +243,15 @@ def test_an_interrupted_move_is_undone(
     for each in (whole, vec):
         each.reset(seed=3)
     group, calls = groups_of(vec)[1], [0]
-    become = group.become
+    set_worlds = group.set_worlds
 
     def interrupt(*worlds: Any) -> None:
         calls[0] += 1
         if calls[0] in (1, 4):
             raise KeyboardInterrupt
-        become(*worlds)
+        set_worlds(*worlds)
 
-    monkeypatch.setattr(group, "become", interrupt)
+    monkeypatch.setattr(group, "set_worlds", interrupt)
     for _ in range(20):
         actions = whole.suggest_actions()
         whole.step(actions)

@@ -330,7 +330,7 @@ def test_one_environment_of_pettingzoo() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"nodes": 5, "zones": 4}, "hosted by 1 to 4 nodes"),
+        ({"nodes": 5, "zones": 4}, "needs 1 to 4 nodes"),
         ({"nodes": 0}, "nodes = 0"),
         ({"nodes": 2, "workers": 2}, "leave out workers, or nodes"),
         ({"backend": "nodes:2@here"}, "must be HOST:PORT"),

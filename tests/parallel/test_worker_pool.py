@@ -111,7 +111,7 @@ def test_a_damaged_image_is_refused(make: Make) -> None:
     image = committed_image(pool)
     image[200] ^= 1
     os.kill(pool.pids[0], signal.SIGKILL)
-    with pytest.raises(WorkerFailureError, match="not what it wrote"):
+    with pytest.raises(WorkerFailureError, match="is damaged"):
         pool.run(ADD)
 
 
