@@ -75,8 +75,6 @@ SHARED_CLASS_NAMES = {"Job", "Parameters", "Spread", "Turn", "Within"}
 UNDERSCORED = {"_asdict", "_exit", "_fields", "_foes", "_multiarray_umath", "_replace"}
 UNDERSCORED |= {"_repr_html_"}
 
-MAY_LOOK_INSIDE = ("tests/support/", "tests/parallel/")  # the second one waits to go
-
 # Persons where the field says vehicle, zone, worker. These numbers may only fall.
 PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
 PERSONS_AT_MOST = {"cavmarl": 0, "docs": 2}
@@ -174,7 +172,7 @@ def test_tests_use_no_private_names() -> None:
     found = {
         path: names
         for path, text in sources("tests")
-        if not path.startswith(MAY_LOOK_INSIDE) and (names := private_names(text))
+        if not path.startswith("tests/support/") and (names := private_names(text))
     }
     assert not found, "observe it from outside, or make it public"
     used = "a._b\nself._b\nfrom c import _d\nm.setattr('e._f', 1)\nsetattr(g, '_h', 1)\na.__i__"

@@ -107,13 +107,13 @@ def test_repeatedly_killed_nodes_end_the_run(make: Make) -> None:
     vec = make(backend="nodes:2", overrides={"workers.max_retries": 1}, **WANTED)
     drive(vec, steps=2)
     pool = groups_of(vec)[0].pool
-    tell = pool._send_zones
+    tell = pool.send_zones
 
     def strike_and_tell(*told: Any, **more: Any) -> None:
         tell(*told, **more)
         os.kill(pool.pids[0], signal.SIGKILL)
 
-    pool._send_zones = strike_and_tell  # type: ignore[method-assign]
+    pool.send_zones = strike_and_tell  # type: ignore[method-assign]
     os.kill(pool.pids[0], signal.SIGKILL)
     with pytest.raises(WorkerDeathError, match=r"zones 0"):
         drive(vec, steps=2)
