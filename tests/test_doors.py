@@ -123,7 +123,9 @@ def test_workers_do_without_what_they_cannot_import_and_do_not_need() -> None:
 def test_a_batched_answer_has_a_number_for_each_agent() -> None:
     cavmarl.register_term("one", lambda view: np.zeros(1), batched=True)
     env = cavmarl.parallel_env(ENV, agents=4, overrides={"terms.weights": {"one": 1.0}})
-    with pytest.raises(RegisteredFunctionError, match=r"'one' .* must be 1 finite number\(s\) an"):
+    with pytest.raises(
+        RegisteredFunctionError, match=r"'one' .* must return 1 finite number\(s\) per"
+    ):
         drive(env)
     env.close()
 
@@ -188,7 +190,7 @@ def test_unknown_and_taken_names_are_refused() -> None:
     def nothing(view: Any) -> float:
         return 0.0
 
-    with pytest.raises(ConfigError, match=r"traffic.model = 'IDN': no such driver model"):
+    with pytest.raises(ConfigError, match=r"traffic.model = 'IDN' is not a driver model"):
         cavmarl.parallel_env(ENV, overrides={"traffic.model": "IDN"})
     with pytest.raises(ConfigError, match=r"no such term.*cavmarl.register_term"):
         cavmarl.parallel_env(ENV, overrides={"terms.weights": {"headwind": 1.0}})

@@ -78,6 +78,11 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
         self.action_space = self._env.action_space(EGO)
         self._speed_mps = 0.0
 
+    @property
+    def parallel_env(self) -> CavEnv:
+        """The world behind this view."""
+        return self._env
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:

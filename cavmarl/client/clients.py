@@ -1,4 +1,4 @@
-"""The two clients: one waits, the other awaits; what they say is in the flows."""
+"""The synchronous and the asynchronous client; their protocol is in `service_protocol`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.client.world_protocol import RECOVERY_S, WorldFlows
 from cavmarl.core.errors import ServiceError
 
 T = TypeVar("T")
-TIMEOUT = httpx.Timeout(300.0, connect=5.0)  # a first world may compile its kernels
+TIMEOUT = httpx.Timeout(300.0, connect=5.0)  # the first world may compile kernels
 
 
 def _wanted(node: str | None, needs: Sequence[str], wait_s: float) -> dict[str, Any]:
@@ -41,7 +41,9 @@ def _write(files: dict[str, bytes], folder: str | Path) -> Path:
     path.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
         if Path(name).name != name:
-            raise ServiceError(f"result {name!r}: is no name of a file; the service is not ours")
+            raise ServiceError(
+                f"result {name!r}: is not a file name; the server is not a cavmarl service"
+            )
         (path / name).write_bytes(content)
     return path
 
@@ -56,7 +58,7 @@ def _request(http: httpx.Client | httpx.AsyncClient, ask: Ask) -> httpx.Request:
 
 
 def _event_of(line: str) -> dict[str, Any] | None:
-    """The event of a line of a stream of server-sent events, if it has one."""
+    """Return the event in a line of a stream of server-sent events, or None."""
     if not line.startswith("data: "):
         return None
     found: dict[str, Any] = json.loads(line[len("data: ") :])
@@ -64,13 +66,13 @@ def _event_of(line: str) -> dict[str, Any] | None:
 
 
 class Client:
-    """A client that waits for each answer.
+    """A synchronous client.
 
     Args:
         url: of the service.
-        secret: of an identity, as `cavmarl serve` or `cavmarl grant` has shown it.
-        verify: the file of the authority that has signed the service's certificate; True: any that
-            the system trusts.
+        secret: of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
+        verify: certificate file of the authority that signed the service's certificate; True
+            accepts the authorities that the system trusts.
     """
 
     def __init__(self, url: str, secret: str, *, verify: str | bool = True) -> None:
@@ -87,27 +89,27 @@ class Client:
         recovery_s: float = RECOVERY_S,
         **keys: Any,
     ) -> RemoteWorld:
-        """A world on a node that the service chooses.
+        """Open a world on a node that the service selects.
 
         Args:
-            environment: name of an entry.
-            node: the preferred one.
-            needs: capabilities that a node must have.
-            wait_s: how long to wait for a node.
-            recovery_s: how long to look for another node when one is lost.
-            keys: zones, nodes, agents, background, max_cycles, num_envs, seed, overrides, as in
-                `make_vec`; nodes are those of the service. And name, under which the service
+            environment: name of an environment.
+            node: preferred node.
+            needs: capabilities that the node must have.
+            wait_s: longest wait for a node in s.
+            recovery_s: longest search in s for another node after a loss.
+            keys: zones, nodes, agents, background, max_cycles, num_envs, seed and overrides as in
+                `make_vec`, where nodes are those of the service; and name, under which the service
                 counts versions.
 
         Raises:
-            ServiceError: it was refused; `problem` says why.
+            ServiceError: the request was refused; `problem` names the reason.
         """
         flows = WorldFlows(self.flows, recovery_s)
         self.run(flows.open(environment, keys, _wanted(node, needs, wait_s)))
         return RemoteWorld(self, flows)
 
     def take_up(self, session: str) -> RemoteWorld:
-        """A world that another client of the same identity has opened."""
+        """Return a world that another client of the same identity has opened."""
         flows = WorldFlows(self.flows)
         self.run(flows.take_up(session))
         return RemoteWorld(self, flows)
@@ -123,9 +125,9 @@ class Client:
         wait_s: float | None = None,
         **keys: Any,
     ) -> str:
-        """The id of a new job: an evaluation, as `cavmarl.evaluate.evaluate` makes it.
+        """Submit an evaluation as by `cavmarl.evaluate.evaluate`, and return the id of the job.
 
-        Where no node can take it now it waits, at most `wait_s`; then it has failed.
+        If no node is free, the job waits at most `wait_s` and then fails.
         """
         job = _job(policies, episodes, repeats, node, wait_s)
         return self.run(self.flows.submit(environment, keys, job))
@@ -137,30 +139,33 @@ class Client:
         timeout_s: float = 3600.0,
         told: Told = lambda _: None,
     ) -> dict[str, Any]:
-        """A job that is done; its files go to `folder`. Until then `told` what it is like."""
+        """Wait for a job, and write its files to `folder`.
+
+        Meanwhile `told` is called with the state of the job.
+        """
         found = self.run(self.flows.wait(job, timeout_s, told))
         if folder is not None:
             _write(self.run(self.flows.results(job)), folder)
         return found
 
     def events(self, subject: str) -> list[dict[str, Any]]:
-        """What the log has of a session, a job or a node."""
+        """Return the events of a session, a job or a node."""
         return self.run(self.flows.events(subject))
 
     def get(self, path: str, **params: Any) -> Any:
-        """A document of the service: `/nodes`, `/sessions`, `/events`."""
+        """Return a document of the service: `/nodes`, `/sessions` or `/events`."""
         return self.run(self.flows.get(path, **params))
 
     def post(self, path: str, document: Any = None) -> Any:
-        """What the service answers to a document."""
+        """Send a document to the service and return the answer."""
         return self.run(self.flows.post(path, document))
 
     def delete(self, path: str) -> None:
-        """Take something away."""
+        """Delete a resource of the service."""
         self.run(self.flows.delete(path))
 
     def follow(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Events as they come; ends when the service does."""
+        """Yield events as they happen, until the service ends."""
         url, token = f"{self.flows.url}/v1/events/stream", self.run(self.flows.token())
         ask = Ask("GET", url, params={"after": after}, token=token)
         answer = self._http.send(_request(self._http, ask), stream=True)
@@ -177,7 +182,7 @@ class Client:
             answer.close()
 
     def run(self, flow: Flow[T]) -> T:
-        """Carry a flow out."""
+        """Execute a flow."""
         try:
             step = next(flow)
             while True:
@@ -211,38 +216,38 @@ class Client:
 
 
 class RemoteWorld:
-    """Worlds on a node: arrays in and out, as those of `make_vec`."""
+    """Worlds on a node, with arrays like those of `make_vec`."""
 
     def __init__(self, client: Client, flows: WorldFlows) -> None:
         self._client = client
         self.flows = flows
 
     def reset(self, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in every world."""
+        """Start an episode in every world."""
         return self._client.run(self.flows.reset(seed))
 
     def step(self, actions: Any) -> tuple[Any, ...]:
-        """Let every agent act: observations, rewards, terminations, truncations, infos."""
+        """Step all worlds; return observations, rewards, terminations, truncations and infos."""
         return self._client.run(self.flows.step(actions))
 
     def suggest_actions(self) -> Any:
-        """What the built-in driver would do in each agent's place."""
+        """Return the built-in driver's actions."""
         return self._client.run(self.flows.look("suggestion"))["actions"]
 
     def state_hash(self, world: int = 0) -> str:
-        """Hex digest of one world."""
+        """Return the state hash of one world."""
         return str(self._client.run(self.flows.look("hash"))["hashes"][world])
 
     def page(self) -> dict[str, str]:
-        """A page that shows the worlds, on the machine of their node: its `address`, and tokens.
+        """Open a page of the worlds on the node's machine; return its `address` and tokens.
 
-        `token` is to control them, `watch_token` only to watch.
+        `token` allows control, `watch_token` only watching.
         """
         found: dict[str, str] = self._client.run(self.flows.look("page"))
         return found
 
     def transfers(self) -> list[dict[str, Any]]:
-        """Changes of owner of a divided world, the newest ones."""
+        """Return the most recent ownership transfers of a divided world."""
         found: list[dict[str, Any]] = self._client.run(self.flows.look("transfers"))["transfers"]
         return found
 
@@ -258,7 +263,7 @@ class RemoteWorld:
 
 
 class AsyncClient:
-    """`Client`, with `await`; of a client that is shared by tasks each world is one task's."""
+    """A client with coroutines. Tasks may share it, but each world belongs to one task."""
 
     def __init__(self, url: str, secret: str, *, verify: str | bool = True) -> None:
         self._http = httpx.AsyncClient(timeout=TIMEOUT, verify=_trust(verify))
@@ -274,7 +279,7 @@ class AsyncClient:
         recovery_s: float = RECOVERY_S,
         **keys: Any,
     ) -> AsyncWorld:
-        """As `Client.open`."""
+        """Like `Client.open`."""
         flows = WorldFlows(self.flows, recovery_s)
         await self.run(flows.open(environment, keys, _wanted(node, needs, wait_s)))
         return AsyncWorld(self, flows)
@@ -290,7 +295,7 @@ class AsyncClient:
         wait_s: float | None = None,
         **keys: Any,
     ) -> str:
-        """As `Client.submit`."""
+        """Like `Client.submit`."""
         job = _job(policies, episodes, repeats, node, wait_s)
         return await self.run(self.flows.submit(environment, keys, job))
 
@@ -301,22 +306,22 @@ class AsyncClient:
         timeout_s: float = 3600.0,
         told: Told = lambda _: None,
     ) -> dict[str, Any]:
-        """As `Client.wait`."""
+        """Like `Client.wait`."""
         found = await self.run(self.flows.wait(job, timeout_s, told))
         if folder is not None:
             _write(await self.run(self.flows.results(job)), folder)
         return found
 
     async def events(self, subject: str) -> list[dict[str, Any]]:
-        """As `Client.events`."""
+        """Like `Client.events`."""
         return await self.run(self.flows.events(subject))
 
     async def get(self, path: str, **params: Any) -> Any:
-        """As `Client.get`."""
+        """Like `Client.get`."""
         return await self.run(self.flows.get(path, **params))
 
     async def follow(self, after: int = 0) -> AsyncIterator[dict[str, Any]]:
-        """As `Client.follow`."""
+        """Like `Client.follow`."""
         url, token = f"{self.flows.url}/v1/events/stream", await self.run(self.flows.token())
         ask = Ask("GET", url, params={"after": after}, token=token)
         answer = await self._http.send(_request(self._http, ask), stream=True)
@@ -331,7 +336,7 @@ class AsyncClient:
             await answer.aclose()
 
     async def run(self, flow: Flow[T]) -> T:
-        """Carry a flow out."""
+        """Execute a flow."""
         try:
             step = next(flow)
             while True:
@@ -367,26 +372,26 @@ class AsyncClient:
 
 
 class AsyncWorld:
-    """`RemoteWorld`, with `await`."""
+    """`RemoteWorld` with coroutines."""
 
     def __init__(self, client: AsyncClient, flows: WorldFlows) -> None:
         self._client = client
         self.flows = flows
 
     async def reset(self, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in every world."""
+        """Start an episode in every world."""
         return await self._client.run(self.flows.reset(seed))
 
     async def step(self, actions: Any) -> tuple[Any, ...]:
-        """Let every agent act."""
+        """Step all worlds."""
         return await self._client.run(self.flows.step(actions))
 
     async def suggest_actions(self) -> Any:
-        """What the built-in driver would do in each agent's place."""
+        """Return the built-in driver's actions."""
         return (await self._client.run(self.flows.look("suggestion")))["actions"]
 
     async def state_hash(self, world: int = 0) -> str:
-        """Hex digest of one world."""
+        """Return the state hash of one world."""
         return str((await self._client.run(self.flows.look("hash")))["hashes"][world])
 
     async def close(self) -> None:
@@ -409,4 +414,4 @@ def _trust(verify: str | bool) -> Any:
 
 
 def _unreachable(url: str, error: Exception) -> ServiceError:
-    return ServiceError(f"{url}: cannot be reached ({error}); see that the service runs there")
+    return ServiceError(f"{url}: cannot be reached ({error}); check that the service runs there")

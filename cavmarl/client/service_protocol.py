@@ -1,7 +1,7 @@
-"""Conversations with the service and with nodes, without input or output.
+"""The client's protocol with the service, independent of the HTTP library.
 
-A flow yields what is to be asked and is sent the answer, so that the client that waits and the one
-that awaits have the same code.
+A flow is a generator. It yields requests and receives their answers, so the synchronous and the
+asynchronous client share it.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import httpx
 from cavmarl.core.errors import ServiceError
 
 T = TypeVar("T")
-RENEW_BEFORE_S = 60.0  # a token ends
+RENEW_BEFORE_S = 60.0  # before a token expires, it is renewed
 AGAIN_S = 0.2  # between two attempts
 PAGE = 1000  # events in one answer
-RETRIED_S = 10.0  # for so long is asked again for an answer that was lost
+RETRIED_S = 10.0  # how long a request is repeated after a lost answer
 
 
 class Ask(NamedTuple):
-    """A request; the flow is sent its answer, or thrown `httpx.TransportError`."""
+    """A request. The flow receives its answer, or `httpx.TransportError` is raised in it."""
 
     method: str
     url: str
@@ -31,11 +31,11 @@ class Ask(NamedTuple):
     content: bytes | None = None
     params: Mapping[str, Any] | None = None
     token: str = ""
-    key: str = ""  # by which the service knows the same request again
+    key: str = ""  # key that identifies a repeated request
 
 
 class Rest(NamedTuple):
-    """Wait."""
+    """A pause."""
 
     time_s: float
 
@@ -46,7 +46,7 @@ Told = Callable[[dict[str, Any]], None]
 
 
 class ServiceFlows:
-    """What a service is asked, with a token that is renewed in time."""
+    """Requests to a service, with a token that is renewed in time."""
 
     def __init__(self, url: str, secret: str) -> None:
         self.url = url.rstrip("/")
@@ -64,7 +64,7 @@ class ServiceFlows:
         params: Mapping[str, Any] | None = None,
         key: str = "",
     ) -> Flow[httpx.Response]:
-        """The answer to a request; raises ServiceError where it was refused."""
+        """Return the answer to a request; raise ServiceError if it is refused."""
         for is_second in (False, True):
             if is_second or time.monotonic() > self._until_s:
                 yield from self._renew()
@@ -76,21 +76,21 @@ class ServiceFlows:
         return answer
 
     def token(self) -> Flow[str]:
-        """A token that is good for a while."""
+        """Return a valid token."""
         if time.monotonic() > self._until_s:
             yield from self._renew()
         return self._token
 
     def get(self, path: str, **params: Any) -> Flow[Any]:
-        """A document of the service."""
+        """Return a document of the service."""
         return (yield from self.ask("GET", path, params=params)).json()
 
     def post(self, path: str, json: Any = None) -> Flow[Any]:
-        """What the service answers to a document."""
+        """Send a document and return the answer."""
         return (yield from self.ask("POST", path, json=json)).json()
 
     def post_once(self, path: str, json: Any, within_s: float) -> Flow[Any]:
-        """As `post`; asked again where the answer is lost, and carried out once."""
+        """Like `post`, repeated if the answer is lost; the service executes it once."""
         key, until_s = secrets.token_hex(16), time.monotonic() + within_s
         while True:
             try:
@@ -101,11 +101,11 @@ class ServiceFlows:
                 yield Rest(AGAIN_S)
 
     def delete(self, path: str) -> Flow[None]:
-        """Take something away."""
+        """Delete a resource."""
         yield from self.ask("DELETE", path)
 
     def add_configuration(self, environment: str, keys: Mapping[str, Any]) -> Flow[str]:
-        """The hash of a configuration."""
+        """Store a configuration and return its hash."""
         body = {"environment": environment, **keys}
         found = yield from self.post("/configurations", body)
         return str(found["hash"])
@@ -116,7 +116,7 @@ class ServiceFlows:
         keys: Mapping[str, Any],
         job: Mapping[str, Any],
     ) -> Flow[str]:
-        """The id of a new job."""
+        """Submit a job and return its id."""
         found = yield from self.add_configuration(environment, keys)
         return str(
             (yield from self.post_once("/jobs", {"configuration": found, **job}, RETRIED_S))["id"]
@@ -125,7 +125,7 @@ class ServiceFlows:
     def wait(
         self, job: str, timeout_s: float, told: Told = lambda _: None, poll_s: float = 0.25
     ) -> Flow[dict[str, Any]]:
-        """A job that is over; raises ServiceError if it has failed, or takes longer."""
+        """Return a job when it is done; raise ServiceError if it fails or takes too long."""
         until_s = time.monotonic() + timeout_s
         while True:
             found: dict[str, Any] = yield from self.get(f"/sessions/{job}")
@@ -141,7 +141,7 @@ class ServiceFlows:
             yield Rest(poll_s)
 
     def results(self, job: str) -> Flow[dict[str, bytes]]:
-        """The files that a job has made, by name."""
+        """Return the files of a job by name."""
         found = yield from self.get(f"/sessions/{job}")
         files = {}
         for name in found["results"]:
@@ -150,7 +150,7 @@ class ServiceFlows:
         return files
 
     def events(self, subject: str) -> Flow[list[dict[str, Any]]]:
-        """What the log has of a session, a job or a node."""
+        """Return the events of a session, a job or a node."""
         found: list[dict[str, Any]] = []
         after = 0
         while True:
@@ -169,7 +169,7 @@ class ServiceFlows:
 
 
 def check(answer: httpx.Response) -> None:
-    """Raise what an answer refuses."""
+    """Raise ServiceError if an answer is a refusal."""
     if answer.is_success:
         return
     retry_s = answer.headers.get("retry-after")

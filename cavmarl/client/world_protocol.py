@@ -1,9 +1,12 @@
-"""A world on a node: its commands, and how it goes on when the node is gone.
+"""The client's protocol with a world on a node, including recovery from the loss of the node.
 
-Each command has a number. A node answers a repeated one from memory, and keeps the state of its
-worlds with the service now and then; the client keeps the commands since. When the node is lost,
-the service names another, which loads that state, and the client sends again what came after:
-the same commands give the same bytes. No address of a node is kept beyond its lease.
+Commands are numbered. A node answers a repeated command from memory, and from time to time stores
+the
+state of its worlds with the service. The client keeps the commands since the last stored state. If
+the
+node is lost, the service selects another node, which loads that state, and the client repeats the
+later
+commands. Equal commands give equal bytes. The address of a node is not used after its lease.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class SentCommand(NamedTuple):
-    """A command as it was sent."""
+    """A command as sent."""
 
     word: str  # reset or step
     params: dict[str, Any]
@@ -37,12 +40,12 @@ class SentCommand(NamedTuple):
 
 
 class WorldFlows:
-    """A session and the commands that it has had.
+    """A session and its commands.
 
     Attributes:
-        description: shapes and names, as the node tells them.
-        assignment: what the service has answered last.
-        moves: how often another node has taken it up.
+        description: shapes and names reported by the node.
+        assignment: the last answer of the service.
+        moves: number of times that another node has taken the session.
     """
 
     def __init__(self, service: ServiceFlows, recovery_s: float = RECOVERY_S) -> None:
@@ -51,20 +54,20 @@ class WorldFlows:
         self.moves = 0
         self._service = service
         self._recovery_s = recovery_s
-        self._sent: list[SentCommand] = []  # those after the saved state
-        self._saved = 0  # commands that it includes
-        self._is_pending = False  # whether the last command waits for its answer
+        self._sent: list[SentCommand] = []  # commands after the stored state
+        self._saved = 0  # number of commands that the stored state includes
+        self._is_pending = False  # whether the answer to the last command is missing
         self._url = ""
         self._renew_s = 0.0
 
     @property
     def number(self) -> int:
-        """Commands up to now."""
+        """The number of commands so far."""
         return self._saved + len(self._sent)
 
     @property
     def session(self) -> str:
-        """Its id, by which another client can take it up."""
+        """The id of the session, with which another client can continue it."""
         return str(self.assignment["session"])
 
     def open(
@@ -73,7 +76,7 @@ class WorldFlows:
         keys: Mapping[str, Any],
         wanted: Mapping[str, Any],
     ) -> Flow[None]:
-        """Begin a session."""
+        """Open a session."""
         found = yield from self._service.add_configuration(environment, keys)
         body = {"configuration": found, **wanted}
         answer = yield from self._service.post_once("/sessions", body, self._recovery_s)
@@ -81,18 +84,18 @@ class WorldFlows:
         yield from self._recover(is_known=True)
 
     def take_up(self, session: str) -> Flow[None]:
-        """Go on with a session that another client has begun, where its node is."""
+        """Continue a session of another client on its node."""
         self.assignment = {"session": session, "assigned": ""}
         yield from self._recover(is_known=False, is_foreign=True)
 
     def reset(self, seed: int | None) -> Flow[tuple[Any, Arrays]]:
-        """Begin an episode in every world."""
+        """Start an episode in every world."""
         params = {} if seed is None else {"seed": seed}
         arrays = yield from self._command(SentCommand("reset", params, b""))
         return _join(arrays, "observations"), _infos(arrays)
 
     def step(self, actions: Any) -> Flow[tuple[Any, ...]]:
-        """Let every agent act."""
+        """Step all worlds."""
         form = self.description["action"]
         given = np.asarray(actions)
         if list(given.shape) != form["shape"]:
@@ -103,14 +106,14 @@ class WorldFlows:
         return _join(arrays, "observations"), *parts, _infos(arrays)
 
     def look(self, word: str) -> Flow[Any]:
-        """A question that changes nothing: `hash`, `suggestion`, `transfers`."""
+        """Send a query that changes nothing: `hash`, `suggestion` or `transfers`."""
         answer = yield from self._asked("GET", word, {}, b"")
         if answer.headers["content-type"] == "application/json":
             return answer.json()
         return unpack(answer.content)
 
     def close(self) -> Flow[None]:
-        """End the session; while the service is away, that is asked for again."""
+        """End the session; repeat the request while the service is unreachable."""
         until_s = time.monotonic() + RETRIED_S
         while True:
             try:
@@ -123,7 +126,7 @@ class WorldFlows:
         try:
             yield Ask("DELETE", self._url, token=self.assignment["token"])
         except httpx.TransportError:
-            return  # the node hears of it with its next beat
+            return  # the node learns it with its next heartbeat
 
     def _command(self, sent: SentCommand) -> Flow[Arrays]:
         self._sent.append(sent)
@@ -133,7 +136,7 @@ class WorldFlows:
                 "POST", sent.word, {**sent.params, "number": self.number}, sent.content
             )
         except ServiceError as error:
-            if error.status in (400, 409, 422):  # refused before anything has changed
+            if error.status in (400, 409, 422):  # refused before any change
                 self._sent.pop()
             raise
         finally:
@@ -144,7 +147,7 @@ class WorldFlows:
     def _asked(
         self, method: str, word: str, params: Mapping[str, Any], content: bytes
     ) -> Flow[httpx.Response]:
-        """The answer of the node, of whichever has the session."""
+        """Return the answer of the node that has the session."""
         until_s = time.monotonic() + self._recovery_s
         while True:
             if time.monotonic() > self._renew_s:
@@ -172,7 +175,7 @@ class WorldFlows:
     def _recover(
         self, *, is_known: bool, is_gone: bool = False, is_foreign: bool = False
     ) -> Flow[None]:
-        """Have a node open the session, and send it what it has not had."""
+        """Open the session on a node and repeat the commands that it has not executed."""
         until_s = time.monotonic() + self._recovery_s
         while True:
             try:
@@ -181,7 +184,7 @@ class WorldFlows:
             except (httpx.TransportError, ServiceError) as error:
                 if not _may_pass(error, ("no-node", "too-many"), until_s):
                     raise
-                # Without a node left, the one that was gone is asked for again: it may be back.
+                # Without another node, ask for the lost one again: it may have restarted.
                 is_gone = is_gone and not isinstance(error, ServiceError)
                 yield Rest(0.1)
                 continue
@@ -199,7 +202,7 @@ class WorldFlows:
                 yield Rest(0.1)
 
     def _renew(self) -> Flow[None]:
-        """A new lease; while the service is away, the old one is good until it ends."""
+        """Request a new lease; the old one stays valid if the service is unreachable."""
         before = self.assignment["assigned"]
         try:
             yield from self._resolve(False)
@@ -226,7 +229,7 @@ class WorldFlows:
                 f"session {self.session}: node {self.assignment['assigned']} has command {number}, "
                 f"but {self._saved} were saved: the store was changed; open another session"
             )
-        # One that is pending is asked for anew by what waits for its answer.
+        # A pending command is repeated by the caller that waits for its answer.
         for place in range(number + 1, self.number + (not self._is_pending)):
             sent = self._sent[place - self._saved - 1]
             params = {**sent.params, "number": place, "quiet": 1}
@@ -243,7 +246,7 @@ class WorldFlows:
         self._renew_s = time.monotonic() + 0.6 * answer["lease_s"]
 
     def _trim(self, answer: httpx.Response) -> None:
-        """Forget commands that a saved state includes."""
+        """Forget commands that a stored state includes."""
         saved = int(answer.headers.get(SAVED_HEADER, self._saved))
         if saved > self._saved:
             self._sent = self._sent[saved - self._saved :]
@@ -251,27 +254,27 @@ class WorldFlows:
 
 
 def _may_pass(error: Exception, names: Sequence[str], until_s: float) -> bool:
-    """Whether it is worth trying again."""
+    """Return whether repeating the request can help."""
     if isinstance(error, ServiceError) and error.problem not in names:
         return False
     return time.monotonic() < until_s
 
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Arrays as the bytes of an .npz, without compression."""
+    """Return arrays as the bytes of an uncompressed .npz file."""
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
     return content.getvalue()
 
 
 def unpack(content: bytes) -> Arrays:
-    """The arrays of `pack`."""
+    """Return the arrays that `pack` wrote."""
     with np.load(io.BytesIO(content), allow_pickle=False) as found:
         return dict(found)
 
 
 def flatten(name: str, value: Any) -> Arrays:
-    """An array by its name, or arrays of a dict by theirs."""
+    """Return an array, or the arrays of a dict, by name."""
     if isinstance(value, Mapping):
         return {f"{name}/{key}": one for key, one in value.items()}
     return {name: value}

@@ -29,7 +29,7 @@ from cavmarl.core.errors import (
 
 MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
 
-_PACKAGE = Path(__file__).resolve().parents[1]
+PACKAGE = Path(__file__).resolve().parents[1]
 _SUMO_PREFIX = "sumo:"
 
 
@@ -40,8 +40,8 @@ def places(kind: str) -> list[Path]:
 
 def _ours(kind: str) -> Path:
     """Return the folder in the wheel or, if there is none, in the checkout."""
-    packaged = _PACKAGE / "data" / kind
-    return packaged if packaged.is_dir() else _PACKAGE.parent / kind
+    packaged = PACKAGE / "data" / kind
+    return packaged if packaged.is_dir() else PACKAGE.parent / kind
 
 
 def entries() -> dict[str, Path]:

@@ -1,4 +1,4 @@
-"""How vehicles drive: their record, their types, and the kernels of driver models.
+"""Vehicles and their drivers: the vehicle record, vehicle types, and the kernels of driver models.
 
-Reads `roads`; `shards` runs its kernels in each tick.
+This folder reads `roads`. `shards` runs its kernels in each tick.
 """

@@ -1,7 +1,7 @@
-"""What functions from outside of the package are given of agents' surroundings.
+"""The view of agents' surroundings that registered functions receive.
 
-It is the same however the world is divided: the others are those within a reach that the function
-has named, in the order of their ids, with the fields that zones know of each other's vehicles.
+The view does not depend on the division of the world: it contains the vehicles within the reach
+that the function declares, ordered by id, with the fields that zones share about their vehicles.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from cavmarl.core.errors import RegisteredFunctionError
 from cavmarl.driving.vehicles import GHOST_FIELDS, STATE_FIELDS
 from cavmarl.roads.network import RoadNetwork
 
-ORDER_CHECKS = 32  # of each function, the first with two others or more
+ORDER_CHECKS = 32  # number of checks per function, of views with at least two other vehicles
 _OWN = list(STATE_FIELDS)
 _OTHERS = list(GHOST_FIELDS)
 
 
 @dataclass(frozen=True)
 class AgentView:
-    """An agent's vehicle and the others near it, at the end of a step; all read-only.
+    """An agent's vehicle and the vehicles near it, at the end of a step; read-only.
 
     Attributes:
-        own: the fields of `VEHICLE` (docs/guides/extending.md) of its vehicle.
-        others: (n,) those of the vehicles whose centres are within the reach, by rising id.
+        own: the fields of `VEHICLE` (docs/guides/extending.md) of the agent's vehicle.
+        others: (n,) the same for vehicles whose centres are within the reach, by increasing id.
         network: the roads; `own["lane"]` is a row of `network.lanes`.
-        step_s: seconds a step.
+        step_s: length of a step in s.
     """
 
     own: np.void
@@ -41,17 +41,18 @@ class AgentView:
 
 @dataclass(frozen=True)
 class BatchView:
-    """Some agents' vehicles and the others near each, at the end of a step; all read-only.
+    """The vehicles of several agents and the vehicles near them, at the end of a step; read-only.
 
-    Which agents are in a batch depends on the division: each answer must be of its agent alone.
+    The agents in a batch depend on the division of the world, so the result for an agent must not
+    depend on the other agents.
 
     Attributes:
-        own: (n,) the fields of `VEHICLE` (docs/guides/extending.md) of their vehicles.
-        others: (m,) those of the vehicles near them, agent after agent, each by rising id. One that
-            is near two agents is there twice.
-        agent: (m,) the row of `own` that each of `others` is near.
+        own: (n,) the fields of `VEHICLE` (docs/guides/extending.md) of the agents' vehicles.
+        others: (m,) the same for the vehicles near each agent, agent by agent, by increasing id. A
+            vehicle near two agents occurs twice.
+        agent: (m,) for each of `others`, the row of `own` that the vehicle is near.
         network: the roads; `own["lane"]` are rows of `network.lanes`.
-        step_s: seconds a step.
+        step_s: length of a step in s.
     """
 
     own: NDArray[np.void]
@@ -61,7 +62,7 @@ class BatchView:
     step_s: float
 
     def chosen(self, agents: NDArray[np.int64]) -> BatchView:
-        """The view of these agents, in this order."""
+        """Return the view of these agents, in this order."""
         pairs = [np.flatnonzero(self.agent == agent) for agent in agents.tolist()]
         return replace(
             self,
@@ -71,7 +72,7 @@ class BatchView:
         )
 
     def single(self) -> Iterator[AgentView]:
-        """The view of each agent."""
+        """Return the view of each agent."""
         bounds = np.searchsorted(self.agent, np.arange(len(self.own) + 1))
         for k in range(len(self.own)):
             others = self.others[bounds[k] : bounds[k + 1]]
@@ -79,13 +80,13 @@ class BatchView:
 
 
 def batch_view(
-    rows: NDArray[np.void],  # VEHICLE (n,), own ones and ghosts
+    rows: NDArray[np.void],  # VEHICLE (n,), owned rows and ghosts
     agents: NDArray[np.int64],  # rows of the agents' vehicles
-    reach_m: float,  # how far away the centres of others can be
+    reach_m: float,  # largest distance of the centres of other vehicles
     network: RoadNetwork,
-    step_s: float,  # seconds a step
+    step_s: float,  # length of a step, s
 ) -> BatchView:
-    """The view of these agents."""
+    """Return the view of these agents."""
     by_id = np.argsort(rows["id"])
     x, y = rows["x"][by_id], rows["y"][by_id]
     near = [np.zeros(0, np.int64)]
@@ -103,13 +104,13 @@ def batch_view(
 
 
 class RegisteredFunction:
-    """Calls a function from outside for a batch of agents, and checks what it answers.
+    """A registered function: called for a batch of agents, and its results are checked.
 
     Args:
-        name: of it.
-        function: takes a `BatchView` if it is `batched`, else an `AgentView`.
-        size: numbers of an agent.
-        batched: whether it answers for all agents at once.
+        name: the name of the function.
+        function: takes a `BatchView` if `batched`, else an `AgentView`.
+        size: number of values per agent.
+        batched: whether the function returns the values of all agents at once.
     """
 
     def __init__(self, name: str, function: Callable[[Any], Any], size: int, batched: bool) -> None:
@@ -120,7 +121,12 @@ class RegisteredFunction:
         self._unchecked = ORDER_CHECKS
 
     def __call__(self, view: BatchView) -> NDArray[np.float32]:
-        """Its numbers (n, size)."""
+        """Return the function's values (n, size).
+
+        Raises:
+            RegisteredFunctionError: the values have another shape, are not finite, or depend on
+                the order of other vehicles or on other agents.
+        """
         numbers = self._ask(view)
         if self._unchecked and np.bincount(view.agent, minlength=1).max() > 1:
             self._unchecked -= 1
@@ -141,31 +147,32 @@ class RegisteredFunction:
             answers = np.stack(each) if fits else each[0]
         if not fits or not np.isfinite(answers).all():
             raise RegisteredFunctionError(
-                f"'{self._name}' of vehicles {view.own['id'][:4].tolist()} answers "
-                f"{answers[:4].tolist()}: must be {self._size} finite number(s) an agent"
+                f"registered function '{self._name}' returned {answers[:4].tolist()} for vehicles "
+                f"{view.own['id'][:4].tolist()}; it must return {self._size} finite number(s) per "
+                "agent"
             )
         return answers
 
     def _check_order(self, view: BatchView, numbers: NDArray[np.float32]) -> None:
-        """Ask again with others, and agents, in another order, and for one agent alone."""
+        """Compare the values with those for vehicles and agents in another order, and alone."""
         for order in (np.arange(view.agent.size)[::-1], np.roll(np.arange(view.agent.size), 1)):
             moved = order[np.argsort(view.agent[order], kind="stable")]
             again = self._ask(replace(view, others=view.others[moved]))
-            self._compare(numbers, again, "view.others, which means nothing", "they change places")
+            self._compare(numbers, again, "the order of view.others")
         if self._batched:
             last = np.array([len(view.own) - 1])
             for agents in (np.arange(len(view.own))[::-1], last):
                 again = self._ask(view.chosen(agents))
-                what = "the other agents of the batch, which depend on the division"
-                self._compare(numbers[agents], again, what, "these change")
+                self._compare(numbers[agents], again, "the other agents of the batch")
 
     def _compare(
-        self, numbers: NDArray[np.float32], again: NDArray[np.float32], what: str, when: str
+        self, numbers: NDArray[np.float32], again: NDArray[np.float32], changed: str
     ) -> None:
         wrong = ~np.isclose(numbers, again, rtol=1e-5, atol=1e-6).all(axis=1)
         if wrong.any():
             before, after = numbers[wrong][0].tolist(), again[wrong][0].tolist()
             raise RegisteredFunctionError(
-                f"'{self._name}' depends on the order of {what}: {before} becomes {after} when "
-                f"{when}; take the nearest, the least, the sum or the like of each agent's others"
+                f"registered function '{self._name}' depends on {changed}: it returned {before}, "
+                f"and after a change {after}; use values that are independent of it, such as the "
+                "nearest, the minimum or the sum over each agent's others"
             )

@@ -1,9 +1,9 @@
-"""Where cars that are steered sweep over ways beside theirs: for maps of worlds with agents.
+"""Swept areas of steered cars, for the maps of worlds with agents.
 
 Background vehicles have both bumpers on their paths. A steered car, whose axles are at its bumpers,
-drives its front outside of a bend and its rear inside, and turns in late. So it is driven over each
-link once, and SWEEP rows say where it meets others; drivers in agents' seats read them, and no
-others.
+drives with its front outside and its rear inside of a bend, and turns in late. So a car is driven
+over each link once, and SWEEP rows describe where it meets vehicles on other links. Only the
+built-in drivers of agents' vehicles read these rows.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from cavmarl.roads.sumo_net.sweeps import (
 LENGTH_M, WIDTH_M = 5.0, 2.0
 HALF_M = 0.5 * SIZE_BODIES_M[0]
 BODY = SweptBody(HALF_M, 0.5 * WIDTH_M + 0.25)
-TICKS_S = (0.05, 0.1)  # the longer a tick is, the further out a car drives
-SETTLE_M = 20.0  # before the places that count: there it comes at the speed of the bend
+TICKS_S = (0.05, 0.1)  # the longer a tick, the further out a car drives
+SETTLE_M = 20.0  # additional start distance, so that the car arrives at the speed of the bend
 MOST_POSES = 2000
-FORMAT = "steered-3"  # another one when other rows are found for the same map
+FORMAT = "steered-4"  # change it when the rows of the same map change
 
 
 def load_steered(path: str | Path) -> RoadNetwork:
-    """The network of a map file with SWEEP rows of steered cars, kept between runs, too.
+    """Return the network of a map file with SWEEP rows of steered cars, from a cache on disk.
 
     Raises MapError: see `read_network`.
     """
@@ -54,8 +54,8 @@ def load_steered(path: str | Path) -> RoadNetwork:
 
 
 def with_steered_sweeps(network: RoadNetwork) -> RoadNetwork:
-    """A map with SWEEP rows of steered cars beside those that it has."""
-    # Bytes, for copies of arrays would leave the padding of the records undefined.
+    """Return a map with SWEEP rows of steered cars in addition to its own SWEEP rows."""
+    # Copy bytes: copies of arrays would leave the padding of the records undefined.
     links = np.frombuffer(bytearray(network.links.tobytes()), dtype=network.links.dtype)
     ways = [_way(network, link) for link in range(len(links))]
     movements = Movements(links, network.conflicts, ways)
@@ -63,7 +63,7 @@ def with_steered_sweeps(network: RoadNetwork) -> RoadNetwork:
     own = np.split(network.sweeps, links["first_sweep"][1:]) if len(links) else []
     parts: list[bytes] = []
     for link, (old, rows) in enumerate(zip(own, found, strict=True)):
-        # Behind one that turns round it waits as others do.
+        # Behind a vehicle that makes a U-turn, a steered car waits as other cars do.
         behind = links["from_lane"][old["foe"]] == links["from_lane"][link]
         rows += [(int(k["foe"]), STEERED, *k.item()[2:]) for k in old[behind & (old["own"] == 0)]]
         new = np.zeros(len(rows), SWEEP)
@@ -77,7 +77,7 @@ def with_steered_sweeps(network: RoadNetwork) -> RoadNetwork:
 
 
 def _rows(network: RoadNetwork, movements: Movements) -> list[list[tuple[float, ...]]]:
-    """The rows of each link."""
+    """Return the SWEEP rows of each link."""
     by_junction: dict[int, list[int]] = defaultdict(list)
     for link, way in enumerate(movements.ways):
         if way is not None:
@@ -112,7 +112,7 @@ def _rows(network: RoadNetwork, movements: Movements) -> list[list[tuple[float, 
 
 
 def _way(network: RoadNetwork, link: int) -> LinkPath | None:
-    """A link's path, with some of the lanes at its ends; None where it has none."""
+    """Return a link's path with parts of the lanes at its ends, or None without internal lanes."""
     row = network.links[link]
     if row["first_internal"] < 0:
         return None
@@ -136,7 +136,7 @@ def _way(network: RoadNetwork, link: int) -> LinkPath | None:
 
 
 class _Drive:
-    """A car that is driven over the links of a map."""
+    """Drives a car over the links of a map."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network
@@ -147,7 +147,7 @@ class _Drive:
         self._poses = np.empty((MOST_POSES, 6))
 
     def poses(self, link: int) -> NDArray[np.float64]:
-        """(n, 6) as `poses_on_rails` gives them."""
+        """Return the poses (n, 6) of the car on a link, as `poses_on_rails` does."""
         network, lane = self._network, int(self._network.links["from_lane"][link])
         self._plan["next"][0, lane] = network.links["first_internal"][link]
         self._plan["link"][0, lane] = link

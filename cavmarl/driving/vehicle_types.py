@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
+from cavmarl.core.records.codes import MODEL_IDM
+from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.kernels.models.idm import (
     ACCEL_LIMIT,
     ACCEL_MAX,
@@ -23,50 +24,48 @@ from cavmarl.driving.kernels.models.idm import (
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.roads.network import VEHICLE_CLASSES
 
-# A vehicle of SUMO's class "ignoring" heeds no permission.
+# A vehicle of SUMO's class "ignoring" may use every lane.
 ALL_PERMISSIONS = (1 << 32) - 1
 
 VTYPE = np.dtype(
     [
         ("vclass", np.int32),  # index in VEHICLE_CLASSES
-        ("permissions", np.uint32),  # bits of LANE["permissions"] of which one must be set
+        ("permissions", np.uint32),  # LANE["permissions"] of a usable lane has one of these bits
         ("model", np.int32),  # MODEL_*; written by `set_model`
-        ("as_sumo", np.bool_),  # whether its driver looks ahead and yields as SUMO's drivers do
+        ("as_sumo", np.bool_),  # looks ahead, yields, queues and resolves deadlocks as in SUMO
         ("length", np.float64),  # m
         ("width", np.float64),  # m
         ("height", np.float64),  # m
-        ("accel", np.float64),  # m/s², the most it accelerates
-        ("decel", np.float64),  # m/s², the most it brakes at will, positive
-        ("emergency_decel", np.float64),  # m/s², the most it can brake, at least decel
-        ("tau", np.float64),  # s, the headway its driver wants
+        ("accel", np.float64),  # m/s², largest acceleration
+        ("decel", np.float64),  # m/s², comfortable deceleration, positive
+        ("emergency_decel", np.float64),  # m/s², largest deceleration, at least decel
+        ("tau", np.float64),  # s, desired time gap
         ("min_gap", np.float64),  # m, between bumpers at rest
-        ("max_speed", np.float64),  # m/s, of the machine
-        ("desired_max_speed", np.float64),  # m/s, of the driver, times the speed factor
-        ("sigma", np.float64),  # imperfection of the driver (Krauss), in [0, 1]
-        ("speed_factor", np.float64),  # mean of the desired speed over the limit
-        ("speed_dev", np.float64),  # its standard deviation
-        ("min_speed_factor", np.float64),  # the normal distribution is cut here
+        ("max_speed", np.float64),  # m/s, technical limit of the vehicle
+        ("desired_max_speed", np.float64),  # m/s, limit of the driver, before the speed factor
+        ("sigma", np.float64),  # imperfection of the driver in Krauss's model, in [0, 1]
+        # desired speed divided by the speed limit: mean, standard deviation and range
+        ("speed_factor", np.float64),
+        ("speed_dev", np.float64),
+        ("min_speed_factor", np.float64),
         ("max_speed_factor", np.float64),
-        (
-            "reroute",
-            np.float64,
-        ),  # chance that such a vehicle looks for its way itself; -1: not said
-        ("reroute_period_ms", np.int64),  # how often; 0: once, -1: not said
-        # of types that agents can have, else 0
-        ("wheelbase", np.float64),  # m, twice the way from the centre to each axle
-        ("most_steering", np.float64),  # rad, of the front wheels
-        ("most_accel", np.float64),  # m/s², that a policy can ask for
-        ("most_decel", np.float64),  # m/s², likewise, positive
+        ("reroute", np.float64),  # probability that a vehicle finds its own route; -1: not stated
+        ("reroute_period_ms", np.int64),  # time between two searches; 0: one search, -1: not stated
+        # only for types of agents' vehicles, else 0
+        ("wheelbase", np.float64),  # m, twice the distance from the centre to each axle
+        ("most_steering", np.float64),  # rad, largest angle of the front wheels
+        ("most_accel", np.float64),  # m/s², largest acceleration of a policy
+        ("most_decel", np.float64),  # m/s², largest deceleration of a policy, positive
     ],
     align=True,
 )
 
-# The fields that say what a type is; the others follow from them.
+# The fields that define a type; the other fields are derived from them.
 STATED_FIELDS = [name for name in VTYPE.names or () if name != "as_sumo"]
 
 
 class ClassDefaults(NamedTuple):
-    """The values of a type of which only the class is known, named and measured as in `VTYPE`."""
+    """Default values of a type with a given class; names and units as in `VTYPE`."""
 
     length: float
     width: float
@@ -113,7 +112,7 @@ CLASS_DEFAULTS = {
     "scooter": ClassDefaults(1.2, 0.5, 1.7, 0.5, 1.2, 3.0, 7.0, 25.0 * _KMH, 0.5, 0.1),
 }
 
-# Classes of SUMO whose lanes a road network here does not tell from those of another class.
+# The class of a road network whose permissions apply to each class of SUMO.
 NEAREST_CLASS = {name: name for name in VEHICLE_CLASSES} | {
     "private": "passenger",
     "hov": "passenger",
@@ -130,13 +129,13 @@ NEAREST_CLASS = {name: name for name in VEHICLE_CLASSES} | {
     "scooter": "bicycle",
 }
 
-# Classes of SUMO that drive on no road: their vehicles are left out.
+# Classes of SUMO that do not use roads: their vehicles are skipped.
 NO_ROAD_CLASSES = frozenset(
     "pedestrian wheelchair rail_urban rail rail_electric rail_fast subway ship container cable_car "
     "aircraft drone".split()
 )
 
-# Types that SUMO knows before it has read a file, by their class.
+# Types that SUMO defines itself, with their classes.
 DEFAULT_TYPES = {
     "DEFAULT_VEHTYPE": "passenger",
     "DEFAULT_TAXITYPE": "taxi",
@@ -148,7 +147,7 @@ DEFAULT_TYPES = {
 
 
 class AgentType(NamedTuple):
-    """What sets a type of agents' vehicles apart from the car, named and measured as in `VTYPE`."""
+    """Values in which a type of agents' vehicles differs from the car; as in `VTYPE`."""
 
     vclass: str
     length: float
@@ -168,22 +167,18 @@ AGENT_TYPES = {
     "truck": AgentType("truck", 8.0, 2.5, 3.6, 1.5, 4.0, 6.0, 3.0, 25.0, 4.8, 0.7),
     "bus": AgentType("bus", 12.0, 2.55, 3.2, 1.2, 3.5, 5.5, 3.0, 27.8, 6.0, 0.75),
 }
-# Car-following models of drivers that are SUMO's in everything else, too: how far they look ahead,
-# and how they yield, queue and resolve deadlocks.
-AS_SUMO = frozenset({MODEL_KRAUSS})
-
-CAR_WHEELBASE_M = 5.0  # highway-env's car has its axles at its bumpers
-NO_LIMIT = 1e9  # of what a policy asks of a car, beyond `action`
+CAR_WHEELBASE_M = 5.0  # the axles of highway-env's car are at its bumpers
+NO_LIMIT = 1e9  # the type does not limit a policy; `action` does
 
 
 def set_model(types: NDArray[np.void] | np.void, model: int) -> None:
-    """Let the drivers of VTYPE rows, or of one row, follow by a model, MODEL_*."""
+    """Set the car-following model (MODEL_*) of VTYPE rows or of one row."""
     types["model"] = model
-    types["as_sumo"] = model in AS_SUMO
+    types["as_sumo"] = any(known.as_sumo for known in MODELS if known.code == model)
 
 
 def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void]:
-    """VTYPE (n,) of types of agents' vehicles by name, `car` and those of `AGENT_TYPES`."""
+    """Return VTYPE (n,) of types of agents' vehicles by name: `car` and those of `AGENT_TYPES`."""
     chosen = list(names)
     types = generated_types(model).repeat(len(chosen))
     for record, name in zip(types, chosen, strict=True):
@@ -194,7 +189,7 @@ def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void
             if field != "vclass":
                 record[field] = value
         record["vclass"] = VEHICLE_CLASSES.index(kind.vclass)
-        record["permissions"] |= 1 << int(record["vclass"])  # and what is for cars
+        record["permissions"] |= 1 << int(record["vclass"])  # in addition to the lanes of cars
         record["desired_max_speed"] = kind.max_speed
         record["most_accel"], record["most_decel"] = kind.accel, kind.emergency_decel
     types.setflags(write=False)
@@ -202,9 +197,9 @@ def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void
 
 
 def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
-    """VTYPE (1,): the passenger car of the generator and of agents.
+    """Return VTYPE (1,): the passenger car of the generator and of agents.
 
-    It drives with highway-env's defaults for IDM and has that car's size (5 m × 2 m).
+    It has highway-env's parameters of IDM, and the size of highway-env's car (5 m × 2 m).
     """
     types = np.zeros(1, dtype=VTYPE)
     car = types[0]

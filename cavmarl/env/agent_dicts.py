@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.engine.spaces import named_observation, observation_parts, sensed_observation
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 
 Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 Listed = NDArray[np.intp] | slice

@@ -17,12 +17,12 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import ENDED, NONE_ENDED
-from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.backends import shows_state
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_arrays import StepArrays, SteppedWorlds
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.worlds.journaled_worlds import without_journals
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.step_arrays import StepArrays, SteppedWorlds
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -71,7 +71,7 @@ class WorldCopy:
         if isinstance(worlds, LocalWorlds):
             return worlds.simulation
         if self._copied is None:
-            self._copied = LocalWorlds(unwatched(worlds.world), len(worlds.arrays.mask))
+            self._copied = LocalWorlds(without_journals(worlds.world), len(worlds.arrays.mask))
         return self._copied.simulation
 
     def present(self, worlds: SteppedWorlds) -> Simulation:

@@ -26,7 +26,7 @@ from cavmarl.env.drawn_worlds import RENDER_MODES
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 
 Stepped = tuple[

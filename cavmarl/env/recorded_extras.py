@@ -14,7 +14,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Nack, Record, Step
 from cavmarl.ownership.trace import LOG, TraceEntry, describe
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.sensors.observed import feature_names
 from cavmarl.v2x.kernels.v2x_records import REPORT
 

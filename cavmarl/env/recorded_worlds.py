@@ -18,10 +18,10 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.recorded_extras import RecordedExtras, check_extras
-from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.backends import shows_state
-from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording_writer import RecordingWriter
 

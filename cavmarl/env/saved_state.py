@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.step_session import StepSession
-from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
-from cavmarl.parallel.local_worlds import every_array, kept_elsewhere
+from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
+from cavmarl.parallel.worlds.local_worlds import every_array, kept_elsewhere
 
 _DIGEST_BYTES = 32
 

@@ -20,8 +20,8 @@ from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
 from cavmarl.env.insertions import Insertions
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
-from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.render.topdown import WorldView
 from cavmarl.shards.shard import Commands

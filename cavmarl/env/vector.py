@@ -24,7 +24,7 @@ from cavmarl.env.saved_state import load_session, save_session
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 
 MAX_WORLDS = 65_536

@@ -15,7 +15,7 @@ from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.drawn_worlds import check_rendering
 from cavmarl.env.recorded_worlds import Record, check_recording
 from cavmarl.parallel.backends import find_backend, make_worlds
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 
 
 class WorldArguments(TypedDict, total=False):

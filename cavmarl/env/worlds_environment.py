@@ -15,7 +15,7 @@ from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.recorded_worlds import Record
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_copies import OwnWorlds
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.roads.network import RoadNetwork
 
 

@@ -45,7 +45,8 @@ def compile_into_cache(
     return len(missing)
 
 
-def _compile(call: KernelCall) -> CompiledKernel:
+def compile_call(call: KernelCall) -> CompiledKernel:
+    """Compile a kernel for the argument types of a call."""
     file = kernel_file(call)
     arguments = example_arguments(call.kinds)
     result, code = compile_kernel(_function_of(call), arguments, file.symbol)
@@ -56,7 +57,7 @@ def _compile_and_store(call: KernelCall) -> None:
     file = kernel_file(call)
     with file.locked():
         if file.load() is None:
-            file.save(_compile(call))
+            file.save(compile_call(call))
 
 
 def _function_of(call: KernelCall) -> Any:

@@ -9,7 +9,8 @@ from typing import TypeGuard
 
 _PACKAGE = Path(__file__).parents[1]
 _DECORATORS = {"kernel", "inlined_kernel"}
-_FACTORIES = {"for_each_zone"}  # functions that return a kernel
+# Functions and classes that make kernels, or collect kernels for other kernels.
+_FACTORIES = {"for_each_zone", "acceleration_model", "CarFollowingModel"}
 _CORE = ("core.math", "core.records")  # folders of kernels besides those named `kernels`
 
 
@@ -63,7 +64,7 @@ def _defined(tree: ast.Module) -> Iterator[str]:
 
 
 def _is_made(statement: ast.stmt) -> TypeGuard[ast.Assign]:
-    """Return whether a statement assigns a kernel from a factory."""
+    """Return whether a statement gives a name to the result of a factory."""
     return (
         isinstance(statement, ast.Assign)
         and isinstance(statement.value, ast.Call)

@@ -23,7 +23,7 @@ APART_M = 1000.0  # distance between the lanes of two maps
 WHOLE_M = 1000.0  # maps are moved by multiples of this length
 
 # The arrays to which index fields refer. -1 does not change.
-_POINTERS: dict[str, dict[str, str]] = {
+POINTERS: dict[str, dict[str, str]] = {
     "lanes": {
         "left": "lanes", "right": "lanes", "successor": "lanes", "link": "links",
         "first_link": "links", "first_point": "points", "edge": "edges", "first_into": "into",
@@ -72,14 +72,14 @@ def join(networks: Sequence[RoadNetwork]) -> RoadNetwork:
     names = _names(networks)
     starts = {
         key: list(accumulate((len(getattr(one, key)) for one in networks), initial=0))
-        for key in _POINTERS
+        for key in POINTERS
     }
     moved = [_moved(one, place) for one, place in zip(networks, _places(networks), strict=True)]
     arrays: dict[str, Any] = {
         key: np.concatenate(
             [_pointed(getattr(one, key), key, starts, n) for n, one in enumerate(moved)]
         )
-        for key in _POINTERS
+        for key in POINTERS
     }
     arrays["programs"]["controller"] = _controllers(networks)
     arrays["lanes"]["map"] = np.repeat(np.arange(len(networks)), [len(n.lanes) for n in networks])
@@ -156,7 +156,7 @@ def _pointed(
 ) -> NDArray[Any]:
     """Return an array of one map whose indices refer to the joined arrays."""
     found = array.copy()
-    for field, target in _POINTERS[key].items():
+    for field, target in POINTERS[key].items():
         column = found[field] if field else found
         column[column >= 0] += starts[target][number]
     return found

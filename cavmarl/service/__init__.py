@@ -1,4 +1,5 @@
-"""The coordination service: nodes, sessions, selection, access and events, over HTTP.
+"""The coordination service: nodes, sessions, node selection, access control and events over HTTP.
 
-`server` starts it and `node_host` a node that runs worlds for it; both need the extra `service`.
+`server` starts the service. `node_host` starts a node that runs worlds for it. Both need the extra
+`service`.
 """

@@ -1,8 +1,10 @@
-"""Access: identities and their secrets, tokens and the keys that sign them, limits of rate.
+"""Access control: identities, secrets, tokens and the keys that sign them.
 
-A secret is 256 random bits, shown once; the store has its hash. It is exchanged for a bearer token
-that lives for minutes, and a refresh token that is good for one use. Tokens are signed with
-Ed25519, so that nodes verify the tokens of sessions with public keys alone.
+A secret has 256 random bits. It is shown once, and the store keeps only its hash. A client
+exchanges
+it for a bearer token, which lives for minutes, and a refresh token, which can be used once. Tokens
+are
+signed with Ed25519, so nodes verify the tokens of sessions with public keys alone.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ AUDIENCE = "cavmarl.service"
 ALGORITHM = "EdDSA"
 ACCESS_S = 900.0
 REFRESH_S = 8 * 3600.0
-KEYS_KEPT = 2  # whose tokens are taken: the present one and the one before
+KEYS_KEPT = 2  # keys whose tokens are accepted: the current and the previous one
 MOST_VERIFIED = 10_000
 
 
@@ -39,7 +41,7 @@ class Access:
     def __init__(self, log: EventLog, wall_s: Callable[[], float] = time.time) -> None:
         self._log = log
         self._wall_s = wall_s
-        self._verified: dict[str, tuple[str, int, float]] = {}  # signatures that were checked
+        self._verified: dict[str, tuple[str, int, float]] = {}  # cache of checked signatures
         if not log.state.keys:
             self.rotate_key()
         self._load_keys()
@@ -47,10 +49,10 @@ class Access:
     def add_identity(
         self, name: str, role: Role, actor: str = "service"
     ) -> tuple[IdentityRecord, str]:
-        """A new identity and its secret, which nothing can show again."""
+        """Create an identity and return its secret, which cannot be shown again."""
         there = [one for one in self._log.state.identities.values() if one.name == name]
         if any(not one.revoked for one in there):
-            raise problem("conflict", f"identity '{name}' is there already: give another name")
+            raise problem("conflict", f"identity '{name}' exists already: choose another name")
         number = f"id-{secrets.token_hex(8)}"
         secret = f"cav.{number}.{secrets.token_urlsafe(32)}"
         data, private = {"name": name, "role": role}, {"digest": _digest(secret)}
@@ -58,7 +60,7 @@ class Access:
         return self._log.state.identities[number], secret
 
     def revoke(self, number: str, actor: str) -> None:
-        """Void an identity: its secret and all its tokens."""
+        """Revoke an identity, its secret and all its tokens."""
         identity = self._identity(number)
         others = [
             one
@@ -70,7 +72,7 @@ class Access:
         self._log.record("identity.revoked", number, actor=actor)
 
     def rotate_key(self, actor: str = "service") -> str:
-        """Sign with a new key from now on; its id."""
+        """Create a new signing key and return its id."""
         key = Ed25519PrivateKey.generate()
         pem = key.private_bytes(
             serialization.Encoding.PEM,
@@ -83,7 +85,7 @@ class Access:
         return number
 
     def public_keys(self) -> dict[str, Any]:
-        """The keys that verify tokens, as a JSON Web Key Set."""
+        """Return the keys that verify tokens, as a JSON Web Key Set."""
         keys = []
         for number, key in self._keys.items():
             found = json.loads(OKPAlgorithm.to_jwk(key.public_key()))
@@ -91,26 +93,29 @@ class Access:
         return {"keys": keys}
 
     def exchange(self, secret: str) -> dict[str, Any]:
-        """Tokens for a secret."""
+        """Return tokens for a secret."""
         return self._tokens(self._by_secret(secret))
 
     def refresh(self, refresh_token: str) -> dict[str, Any]:
-        """Tokens for a refresh token that was not used yet."""
+        """Return new tokens for an unused refresh token."""
         claims = self._verify(refresh_token, "refresh")
         identity = self._identity(claims["sub"])
-        if claims["jti"] in identity.used:  # it was stolen, or its answer was
+        if claims["jti"] in identity.used:  # a used token means that it, or its answer, was stolen
             self._log.record("identity.withdrawn", identity.id)
-            raise problem("bad-token", "the refresh token was used before: all tokens are void now")
+            raise problem(
+                "bad-token",
+                "the refresh token was used before; all tokens of the identity are revoked",
+            )
         data = {"token": claims["jti"], "expires_s": claims["exp"]}
         self._log.record("identity.refreshed", identity.id, data, actor=identity.id)
         return self._tokens(identity)
 
     def withdraw(self, identity: IdentityRecord) -> None:
-        """Void all tokens of an identity; its secret stays."""
+        """Revoke all tokens of an identity; its secret stays valid."""
         self._log.record("identity.withdrawn", identity.id, actor=identity.id)
 
     def authenticate(self, token: str) -> IdentityRecord:
-        """The identity that an access token is of; raises the problem `bad-token`."""
+        """Return the identity of an access token; raise the problem `bad-token` if invalid."""
         known = self._verified.get(token)
         if known is None:
             claims = self._verify(token, "access")
@@ -121,11 +126,11 @@ class Access:
         identity = self._identity(number)
         if generation != identity.generation or until_s <= self._wall_s():
             del self._verified[token]
-            raise problem("bad-token", "the token has expired or was revoked: get another")
+            raise problem("bad-token", "the token has expired or was revoked: get another token")
         return identity
 
     def session_token(self, session: SessionRecord, lease_s: float) -> str:
-        """What opens a session on its node, until the lease ends."""
+        """Return a token that opens a session on its node until the lease ends."""
         return self._sign(
             {"sub": session.id, "aud": f"node:{session.node}", "inc": session.incarnation,
              "cfg": session.configuration, "use": "session"},
@@ -148,7 +153,7 @@ class Access:
         identity = self._log.state.identities.get(rest.partition(".")[0])
         known = identity.digest if identity else _digest("")
         if not hmac.compare_digest(known, _digest(secret)) or identity is None or identity.revoked:
-            raise problem("bad-token", "the secret is not that of any identity")
+            raise problem("bad-token", "the secret belongs to no identity")
         return identity
 
     def _sign(self, claims: dict[str, Any], lives_s: float) -> str:
@@ -168,13 +173,13 @@ class Access:
                          "verify_iat": False},
             )  # fmt: skip
         except (jwt.InvalidTokenError, KeyError) as error:
-            raise problem("bad-token", "the token is not one of this service's") from error
+            raise problem("bad-token", "the token was not issued by this service") from error
         if claims["exp"] <= self._wall_s():
             raise problem("bad-token", "the token has expired: get another")
         identity = self._log.state.identities.get(claims["sub"])
         is_void = identity is None or identity.revoked or claims.get("gen") != identity.generation
         if claims.get("use") != use or is_void:
-            raise problem("bad-token", "the token was revoked, or is of another use")
+            raise problem("bad-token", "the token was revoked, or has another purpose")
         return claims
 
     def _identity(self, number: str) -> IdentityRecord:
@@ -194,5 +199,5 @@ class Access:
 
 
 def _digest(secret: str) -> str:
-    """Secrets are random and long: a fast hash cannot be searched."""
+    """Return the hash of a secret; a fast hash is enough, as secrets are long and random."""
     return hashlib.sha256(secret.encode()).hexdigest()

@@ -1,7 +1,6 @@
-"""The HTTP interface: an application of FastAPI around a broker and its access.
+"""The HTTP interface: a FastAPI application around a broker and its access control.
 
-Each route says which roles may use it, and an application with a route that says nothing does not
-start.
+Each route must declare which roles may use it; otherwise the application does not start.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_metrics import ServiceMetrics
 
 MAX_BODY_BYTES = 256 * 1024
-MAX_CONTENT_BYTES = 64 * 1024 * 1024  # of a world's state, or a file of results
+MAX_CONTENT_BYTES = 64 * 1024 * 1024  # maximum size of a saved state or of a file of results
 _CONTENT = re.compile(r"/v1/(sessions/[^/]+/state|jobs/[^/]+/results/[^/]+)")
 MAX_PATH_BYTES = 1024
-NO_TELEMETRY: TelemetryConfig = {  # whatever the surroundings have set up: nothing is exported
+NO_TELEMETRY: TelemetryConfig = {  # do not export telemetry, whatever the environment configures
     "tracing": False,
     "metrics": False,
     "logs": False,
     "auto_configure": False,
 }
-BODY_S = 10.0  # in which a body has to come
+BODY_S = 10.0  # time limit for receiving a body
 HEADERS = {
     b"x-content-type-options": b"nosniff",
     b"cache-control": b"no-store",
@@ -43,7 +42,7 @@ HEADERS = {
 
 
 def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
-    """The application; it sweeps the broker so often."""
+    """Return the application. It also calls the broker's `sweep` at a fixed interval."""
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -75,7 +74,7 @@ def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
 def _check_rules(router: APIRouter) -> None:
     for route in router.routes:
         if isinstance(route, APIRoute) and rule_of(route) is None:
-            raise ServiceError(f"route {route.path}: does not say which roles may use it")
+            raise ServiceError(f"route {route.path}: does not declare which roles may use it")
 
 
 async def _sweep(service: Service, every_s: float) -> None:
@@ -91,12 +90,12 @@ async def _sweep(service: Service, every_s: float) -> None:
 
 
 class GuardedRequests:
-    """Long paths, large and slow bodies are refused, and answers get headers of safety.
+    """Middleware that refuses long paths and large or slow bodies, and adds security headers.
 
     Args:
-        app: what it guards.
-        content_bytes: the most of a state or a result, which is read after its sender is known.
-        body_bytes: the most that any other body has.
+        app: the application to protect.
+        content_bytes: maximum size of a state or a result, which is read after authentication.
+        body_bytes: maximum size of any other body.
     """
 
     def __init__(
@@ -119,7 +118,7 @@ class GuardedRequests:
 
         async def receive_in_time() -> Message:
             nonlocal is_read, left
-            if is_read:  # what comes now is that the caller has gone
+            if is_read:  # the next message says that the client has disconnected
                 return await receive()
             try:
                 async with asyncio.timeout_at(until_s):

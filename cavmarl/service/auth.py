@@ -1,4 +1,4 @@
-"""What each route stands on: which roles may use it, and that its answer is on disk."""
+"""Base parts of routes: roles, rate limits, strict parameters and durable answers."""
 
 from __future__ import annotations
 
@@ -25,24 +25,23 @@ MOST_HELD = 64
 
 @dataclass
 class Service:
-    """What routes work on.
+    """The objects that routes work on.
 
     Attributes:
-        on_broken: called when the store cannot be written: the process has to end.
-        held: requests of each identity that are not answered at once: streams, and waits for a
-            node.
+        on_broken: called when the store cannot be written, after which the process must end.
+        held: number of open streams and waiting requests of each identity.
     """
 
     broker: Broker
     access: Access
     by_identity: RateLimit
-    by_address: RateLimit  # where there is no identity yet
+    by_address: RateLimit  # before the identity is known
     on_broken: Callable[[], None] = lambda: None
     held: Counter[str] = field(default_factory=Counter)
 
     @contextmanager
     def holding(self, identity: IdentityRecord) -> Iterator[None]:
-        """Count a request that is not answered at once; raises the problem `too-many`."""
+        """Count a stream or a waiting request while it is open; raise `too-many` at the limit."""
         if self.held[identity.id] >= MOST_HELD:
             detail = f"{MOST_HELD} requests of yours wait or follow events: end some"
             raise problem("too-many", detail, 5.0)
@@ -62,11 +61,13 @@ async def _given(request: Request) -> Service:
     return service_of(request)
 
 
-TheService = Annotated[Service, Depends(_given)]  # what is not async would go through a thread
+TheService = Annotated[
+    Service, Depends(_given)
+]  # FastAPI would run a function that is not async in a thread
 
 
 class Rule:
-    """Lets the identities of some roles use a route; it gives the route the identity."""
+    """A dependency that admits identities of some roles and passes the identity to the route."""
 
     roles: frozenset[str]
 
@@ -75,7 +76,7 @@ class Rule:
 
 
 class may(Rule, SecurityBase):
-    """A route for identities of some roles, which send a token."""
+    """Return the dependency of a route for some roles, whose identities send a token."""
 
     model = HTTPBearer(bearerFormat="JWT", description="An access token of POST /v1/token")
     scheme_name = "token"
@@ -106,7 +107,7 @@ class may(Rule, SecurityBase):
 
 
 class open_to_all(Rule):
-    """A route without a token: counted by address."""
+    """Admit requests without a token; their rate is limited by client address."""
 
     roles = frozenset(ROLES)
 
@@ -116,7 +117,7 @@ class open_to_all(Rule):
 
 
 class StrictRoute(APIRoute):
-    """A route that refuses parameters which it does not know: a typo is not ignored."""
+    """A route that refuses unknown parameters, so that a typo is not ignored."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handle = super().get_route_handler()
@@ -126,14 +127,16 @@ class StrictRoute(APIRoute):
             for name in request.query_params if request.scope["query_string"] else ():
                 if name not in known:
                     there = ", ".join(sorted(known)) or "none"
-                    raise problem("bad-body", f"query.{name[:64]}: unknown; there are: {there}")
+                    raise problem(
+                        "bad-body", f"query.{name[:64]}: is unknown; known parameters: {there}"
+                    )
             return await handle(request)
 
         return check_and_handle
 
 
 class DurableRoute(StrictRoute):
-    """A route that answers when what it tells of is on disk."""
+    """A route that answers only after all events that its answer refers to are on disk."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handle = super().get_route_handler()
@@ -153,7 +156,7 @@ class DurableRoute(StrictRoute):
 
 
 def rule_of(route: APIRoute) -> Rule | None:
-    """The dependency that says which roles may use a route."""
+    """Return the dependency that declares which roles may use a route."""
     for one in route.dependant.dependencies:
         if isinstance(one.call, Rule):
             return one.call

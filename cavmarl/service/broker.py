@@ -1,7 +1,7 @@
-"""The broker: nodes come and go, sessions and jobs are given to them.
+"""The broker: registers nodes and assigns sessions and jobs to them.
 
-All is decided in one thread, between two events of its log; so requests that come at once see each
-other. Time comes from an injected clock.
+All decisions are made in one thread, between two events of the log, so concurrent requests see each
+other's effects. The clock is injected.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cavmarl.service.node_selection import (
     overloads,
     score_of,
 )
-from cavmarl.service.requests import BeatBody, NodeBody, TransfersBody
+from cavmarl.service.request_bodies import BeatBody, NodeBody, TransfersBody
 from cavmarl.service.service_records import (
     SESSION_OVER,
     IdentityRecord,
@@ -36,27 +36,27 @@ from cavmarl.service.service_records import (
 from cavmarl.service.zone_nodes import ZoneNodes
 
 SHOWN_EXCLUSIONS = 10  # in an event
-MOST_SCORES = 100  # that a node is told for its pages
+MOST_SCORES = 100  # sent to a node for its pages
 
 
 @dataclass(frozen=True)
 class BrokerRules:
-    """Times and numbers of a service."""
+    """Time limits and capacities of a service."""
 
-    beat_s: float = 1.0  # from beat to beat of a node
-    missed_beats: int = 3  # after which a node is down
-    lease_s: float = 30.0  # of a session's token; the client asks anew
-    idle_s: float = 600.0  # an idle session ends
-    keep_s: float = 3600.0  # sessions that are over can be read so long
-    keep_nodes_s: float = 86_400.0  # nodes that are down or have left are known so long
-    max_placements: int = 10  # of a job: so many nodes it may lose
-    max_skew_s: float = 5.0  # between the clocks of a node and of the service
+    beat_s: float = 1.0  # between two heartbeats of a node
+    missed_beats: int = 3  # missed heartbeats after which a node is down
+    lease_s: float = 30.0  # lifetime of a session's token; the client then asks for a new one
+    idle_s: float = 600.0  # after which an idle session ends
+    keep_s: float = 3600.0  # how long ended sessions can be read
+    keep_nodes_s: float = 86_400.0  # how long nodes that are down or have left are kept
+    max_placements: int = 10  # nodes that a job may lose before it fails
+    max_skew_s: float = 5.0  # tolerated difference of the clocks of a node and of the service
     max_nodes: int = 10_000
-    max_sessions: int = 1000  # of one identity, that are not over
+    max_sessions: int = 1000  # open sessions of one identity
 
 
 class Broker:
-    """Nodes, sessions and jobs."""
+    """The nodes, sessions and jobs of a service, and all decisions about them."""
 
     def __init__(
         self,
@@ -68,15 +68,17 @@ class Broker:
         self.rules = rules or BrokerRules()
         self.live: dict[str, LiveNode] = {}
         self.refusals = 0
-        self.waiting = 0  # requests that wait for a node
-        self.took_s: Callable[[float], None] = lambda _: None  # told how long a selection took
+        self.waiting = 0  # maximum number of requests that wait for a node
+        self.took_s: Callable[[float], None] = lambda _: (
+            None
+        )  # called with the duration of each selection
         self._clock_s = clock_s
-        self._touched: dict[str, float] = {}  # session → when it was asked for last
-        # sessions → world, vehicle, source and target of what is about to change its zone
+        self._touched: dict[str, float] = {}  # session → time of its last request
+        # session → world, vehicle, source and target of prepared transfers
         self.prepared: dict[str, list[list[int]]] = {}
         now_s = clock_s()
         self._reports = NodeReports(log, now_s, self.rules.max_skew_s)
-        self._numbers = itertools.count()  # of nodes, in the order of their coming
+        self._numbers = itertools.count()  # order of registration of nodes
         for name in log.state.nodes:
             self.live[name] = LiveNode(next(self._numbers), now_s)
         for session in log.state.sessions.values():
@@ -89,7 +91,7 @@ class Broker:
     # Nodes
 
     def register(self, identity: IdentityRecord, body: NodeBody) -> NodeRecord:
-        """A node comes, or comes back; what an earlier process of it says counts no more."""
+        """Register a node, first or again; reports of its earlier process are ignored."""
         known = self.log.state.nodes.get(body.name)
         owner = known and self.log.state.identities.get(known.identity)
         if owner and owner.id != identity.id and not owner.revoked:
@@ -105,17 +107,20 @@ class Broker:
         return self.log.state.nodes[body.name]
 
     def beat(self, identity: IdentityRecord, name: str, body: BeatBody) -> dict[str, Any]:
-        """A node is alive and so busy; the answer is what it has to do."""
+        """Record a heartbeat with the node's load, and return what the node has to do."""
         node = self.own_node(identity, name)
         live = self.live[name]
         if body.incarnation != node.incarnation:
             raise problem(
-                "superseded", f"node '{name}' is at incarnation {node.incarnation}: end this one"
+                "superseded",
+                f"node '{name}' has incarnation {node.incarnation} now: end this process",
             )
         if node.state == "left":
             raise problem("conflict", f"node '{name}' has left: register it again")
         if body.sequence <= live.beat:
-            raise problem("stale-beat", f"beat {body.sequence} of '{name}' after {live.beat}")
+            raise problem(
+                "stale-beat", f"heartbeat {body.sequence} of '{name}' arrived after {live.beat}"
+            )
         if node.state == "down":
             self.log.record("node.up", name)
         live.heard_s, live.beat = self._clock_s(), body.sequence
@@ -141,7 +146,7 @@ class Broker:
         }  # fmt: skip
 
     def _scores(self) -> list[dict[str, Any]]:
-        """What pages show of the nodes that have not left."""
+        """Return the LoadScores that pages show, of nodes that have not left."""
         nodes = [one for _, one in sorted(self.log.state.nodes.items()) if one.state != "left"]
         return [
             {"name": one.name, "state": "draining" if one.draining else one.state,
@@ -151,13 +156,13 @@ class Broker:
         ]  # fmt: skip
 
     def misreported(self, identity: IdentityRecord, name: str, detail: str) -> None:
-        """Put on record that a node tells what cannot be, such as 85 for 0.85."""
+        """Record that a node reports an impossible value, such as 85 instead of 0.85."""
         node = self.log.state.nodes.get(name)
         if node is not None and node.identity == identity.id:
             self._reports.refuse(name, detail)
 
     def own_node(self, identity: IdentityRecord, name: str) -> NodeRecord:
-        """A node that this identity may speak for."""
+        """Return a node that this identity may act for."""
         node = self.log.state.nodes.get(name)
         if node is None:
             raise problem("not-found", f"there is no node '{name}': register it")
@@ -166,7 +171,7 @@ class Broker:
         return node
 
     def drain(self, identity: IdentityRecord, name: str, is_on: bool = True) -> NodeRecord:
-        """Give a node nothing more; its sessions move when their clients ask."""
+        """Assign nothing more to a node; its sessions move when their clients ask again."""
         node = self.own_node(identity, name)
         if node.draining != is_on:
             kind = "node.drained" if is_on else "node.resumed"
@@ -174,7 +179,7 @@ class Broker:
         return node
 
     def leave(self, identity: IdentityRecord, name: str) -> NodeRecord:
-        """A node ends; what it hosts waits for another."""
+        """Remove a node; its sessions wait for another node."""
         node = self.own_node(identity, name)
         if node.state != "left":
             self.log.record("node.left", name, actor=identity.id)
@@ -182,11 +187,11 @@ class Broker:
         return node
 
     def age_s(self, name: str) -> float:
-        """How long ago a node was heard."""
+        """Return the seconds since the last heartbeat of a node."""
         return self._clock_s() - self.live[name].heard_s
 
     def sweep(self) -> None:
-        """Nodes that have missed their beats are down; idle sessions end."""
+        """Mark nodes that missed their heartbeats as down, and end idle sessions."""
         now_s = self._clock_s()
         for name, node in list(self.log.state.nodes.items()):
             age_s = now_s - self.live[name].heard_s
@@ -225,12 +230,14 @@ class Broker:
         wait_s: float | None = None,
         key: str = "",
     ) -> SessionRecord:
-        """A session, assigned to a node; a job waits for one, `wait_s` at most, if there is none.
+        """Open a session and assign it to a node.
 
-        With the `key` of a request that was carried out, it is the session of that request.
+        A job for which no node is free waits at most `wait_s`. If `key` belongs to an earlier
+        request, return
+        the session of that request.
 
         Raises:
-            NoNodeError: no node can take a session.
+            NoNodeError: no node can accept a session.
         """
         own = [
             one
@@ -268,10 +275,12 @@ class Broker:
     def resolve(
         self, identity: IdentityRecord, number: str, unreachable: Sequence[str] = ()
     ) -> SessionRecord:
-        """Where a session is: on its node, or on another if that is gone, drained or out of reach.
+        """Return a session on its node, or on another node if that one cannot serve it.
+
+        Another node is chosen if the session's node is lost, drained or unreachable for the client.
 
         Raises:
-            NoNodeError: no node can take it.
+            NoNodeError: no node can accept it.
         """
         session = self.session(identity, number)
         if session.state in SESSION_OVER or session.job is not None:
@@ -289,7 +298,7 @@ class Broker:
     def refuse(
         self, identity: IdentityRecord, subject: str, error: NoNodeError, waited_s: float = 0.0
     ) -> None:
-        """Put on record that no node could take what `identity` wants, after it has waited."""
+        """Record that no node could serve the request of `identity` before its deadline."""
         self.refusals += 1
         if waited_s > 0.0:
             told = {"of": "request for a node", "after_s": waited_s}
@@ -299,7 +308,7 @@ class Broker:
         self.log.record("session.refused", subject, data, actor=identity.id, owner=identity.id)
 
     def session(self, identity: IdentityRecord, number: str) -> SessionRecord:
-        """A session that this identity may see: another's is not found."""
+        """Return a session that this identity may see; others are reported as missing."""
         session = self.log.state.sessions.get(number)
         is_own = session is not None and session.owner == identity.id
         if session is None or not (is_own or identity.role in ("viewer", "operator", "admin")):
@@ -307,58 +316,58 @@ class Broker:
         return session
 
     def hosted(self, identity: IdentityRecord, number: str) -> SessionRecord:
-        """A session that a node of this identity hosts now."""
+        """Return a session that a node of this identity hosts now."""
         session = self.log.state.sessions.get(number)
         node = self.log.state.nodes.get(session.node or "") if session else None
         is_own = node is not None and node.identity == identity.id
         if session is None or node is None or not is_own:
-            raise problem("lost", f"session '{number}' is not on a node of yours")
+            raise problem("lost", f"session '{number}' is on no node of this identity")
         if session.incarnation != node.incarnation:
-            raise problem("superseded", f"node '{node.name}' has registered anew since")
+            raise problem("superseded", f"node '{node.name}' has registered again since")
         return session
 
     def close(self, identity: IdentityRecord, number: str) -> SessionRecord:
         """End a session or a job."""
         session = self.session(identity, number)
         if identity.role == "viewer":
-            raise problem("forbidden", "a viewer closes no session")
+            raise problem("forbidden", "viewers cannot close sessions")
         if session.state not in SESSION_OVER:
             self._end(session, "closed", identity.id)
         return session
 
     def save(self, session: SessionRecord, number: int, content: bytes) -> None:
-        """Keep the state of a world; it includes so many commands."""
+        """Store the state of a world after a number of commands."""
         if number < session.saved_number:
-            raise problem("conflict", f"command {session.saved_number} is saved already")
+            raise problem("conflict", f"command {session.saved_number} is stored already")
         before, sha256 = session.saved_blob, self.log.keep(content)
         self._tell(session, "saved", {"number": number, "sha256": sha256, "bytes": len(content)})
         if before != sha256:
             self._drop(before)
 
     def hand_over(self, session: SessionRecord, body: TransfersBody) -> None:
-        """Vehicles of a session have changed their zone; others are about to."""
+        """Record vehicles of a session that have changed zone, and vehicles that are about to."""
         if body.transfers:
             data = {"number": body.at, "transfers": body.transfers}
             self._tell(session, "handed_over", data)
         self.prepared[session.id] = body.prepared
 
     def add_result(self, session: SessionRecord, name: str, content: bytes) -> None:
-        """Keep a file that a job has made."""
+        """Store a file that a job has produced."""
         sha256 = self.log.keep(content)
         self._tell(session, "result", {"name": name, "sha256": sha256, "bytes": len(content)})
 
     def finish(self, session: SessionRecord, status: str, message: str) -> None:
-        """A job is done, or has failed."""
+        """Record that a job is done or has failed."""
         self._end(session, status, session.node or "service", message)
 
     # Within
 
     def _of_key(self, identity: IdentityRecord, data: dict[str, Any]) -> SessionRecord | None:
-        """The session that an identity has opened with a key before."""
+        """Return the session that an identity opened earlier with a request key."""
         for one in self.log.state.sessions.values():
             if one.owner == identity.id and one.key == data["key"]:
                 if any(getattr(one, name) != value for name, value in data.items()):
-                    raise problem("conflict", f"key '{one.key}' was of another request")
+                    raise problem("conflict", f"key '{one.key}' belongs to another request")
                 if one.node is None and one.job is None:
                     return self.resolve(identity, one.id)
                 return one
@@ -419,7 +428,7 @@ class Broker:
             self._drop(sha256)
 
     def _drop(self, sha256: str | None) -> None:
-        """Delete content, unless another session has the same."""
+        """Delete content unless another session refers to it."""
         for one in self.log.state.sessions.values():
             if sha256 == one.saved_blob or sha256 in one.results.values():
                 return

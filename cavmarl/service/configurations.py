@@ -1,7 +1,7 @@
-"""Configurations: immutable, named by the hash of what they say, with versions by name.
+"""Configurations of worlds: immutable, identified by hash, with numbered versions per name.
 
-What comes over the network names entries of this installation. It names no file and no code: keys
-of files have to be as the entry has them.
+A configuration from the network refers to entries of this installation only. It must not name files
+or code: keys with file names must have the same values as in the entry.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from cavmarl.config.registry import agent_entries, entries, load_config
 from cavmarl.core.errors import CavmarlError
 from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
-from cavmarl.service.requests import ConfigurationBody
+from cavmarl.service.request_bodies import ConfigurationBody
 from cavmarl.service.service_records import IdentityRecord
 
-MOST_CONFIGURATIONS = 10_000  # of one identity
-MOST_VEHICLES = 200_000  # in all worlds of a session: more may take more memory than a node has
+MOST_CONFIGURATIONS = 10_000  # configurations of one identity
+MOST_VEHICLES = 200_000  # in all worlds of a session, so that they fit into the memory of a node
 _PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")
 _OF_FILES = (
     "map.source",
@@ -34,7 +34,7 @@ _OF_FILES = (
 def add_configuration(
     log: EventLog, identity: IdentityRecord, body: ConfigurationBody
 ) -> dict[str, Any]:
-    """Check a configuration and keep it; the same again is the same version."""
+    """Check and store a configuration; equal content keeps its version."""
     document = body.model_dump(exclude={"name"})
     _check(document)
     name = body.name or body.environment
@@ -53,7 +53,7 @@ def add_configuration(
 
 
 def read_configuration(log: EventLog, sha256: str) -> dict[str, Any]:
-    """What was kept under a hash; raises the problem `not-found`."""
+    """Return the configuration with a hash; raise the problem `not-found` if there is none."""
     if not any(sha256 in versions for versions in log.state.configurations.values()):
         raise problem("not-found", f"there is no configuration {sha256}: add it first")
     document: dict[str, Any] = json.loads(log.content(sha256))
@@ -61,15 +61,17 @@ def read_configuration(log: EventLog, sha256: str) -> dict[str, Any]:
 
 
 def check_policies(policies: list[str]) -> None:
-    """Refuse what is not the name of a driver: a path would run code."""
+    """Refuse texts that are not names of drivers, as a path could run code."""
     known = agent_entries()
     for policy in policies:
         if policy not in known:
-            raise problem("refused", f"no driver '{policy}': there are {', '.join(known)}")
+            raise problem(
+                "refused", f"there is no driver '{policy}': choose one of {', '.join(known)}"
+            )
 
 
 def world_keywords(document: dict[str, Any]) -> dict[str, Any]:
-    """Keywords of `make_vec` and `evaluate` that name the world."""
+    """Return the keywords of `make_vec` and `evaluate` that describe the world."""
     names = ("agents", "background", "max_cycles")
     zones = document.get("zones")
     divided = {} if zones is None else {"zones.count": zones}
@@ -81,12 +83,12 @@ def _check(document: dict[str, Any]) -> None:
     environment = document["environment"]
     if environment not in entries():
         known = ", ".join(entries())
-        raise problem("refused", f"no environment '{environment}': there are {known}")
+        raise problem("refused", f"there is no environment '{environment}': choose one of {known}")
     for text in _texts(document["overrides"]):
         if not _PLAIN.fullmatch(text):
             raise problem(
                 "refused",
-                f"overrides: {text[:64]!r} could name a file: letters, digits, _, + and - only",
+                f"overrides: {text[:64]!r} could name a file: use only letters, digits, _, + and -",
             )
     try:
         own = asdict(load_config(environment)[0])
@@ -100,16 +102,16 @@ def _check(document: dict[str, Any]) -> None:
     if vehicles > MOST_VEHICLES:
         raise problem(
             "refused", f"{vehicles} vehicles in {document['num_envs']} worlds: at most "
-            f"{MOST_VEHICLES}; ask for less agents, background or num_envs"
+            f"{MOST_VEHICLES}; reduce agents, background or num_envs"
         )  # fmt: skip
     wanted = asdict(config)
     for key in _OF_FILES:
         if _value(own, key) != _value(wanted, key):
-            raise problem("refused", f"{key}: names files, which stay as they are here")
+            raise problem("refused", f"{key}: names files and cannot be overridden")
 
 
 def _texts(value: Any) -> list[str]:
-    """All texts that are values somewhere inside."""
+    """Return all text values of a nested document."""
     if isinstance(value, str):
         return [value]
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Why the service refuses a request: the names that answers carry."""
+"""Names and meanings of the problems with which the service refuses requests."""
 
 from __future__ import annotations
 
@@ -17,29 +17,32 @@ PROBLEM_SCHEMA = {
     },
 }
 
-# name → status, what it means and what to do
+# name → HTTP status, meaning and remedy
 PROBLEMS = {
-    "bad-body": (422, "the body or a parameter has an unknown field, a wrong type or value"),
-    "refused": (422, "cavmarl refuses it; the message has the place and the cure"),
-    "bad-token": (401, "no token, or one that is expired, revoked or forged: get another"),
-    "forbidden": (403, "the role, or the owner, may not do this"),
-    "not-found": (404, "there is nothing of that name, or it is another's"),
-    "wrong-method": (405, "the path does not take this method"),
-    "slow-body": (408, "the body did not come in time: send it at once"),
-    "conflict": (409, "it does not fit the state: the message says which"),
-    "stale-beat": (409, "a beat older than the last one: count beats up"),
-    "superseded": (409, "the node has registered anew since: this process has to end"),
+    "bad-body": (
+        422,
+        "the body or a parameter has an unknown field, a wrong type or a wrong value",
+    ),
+    "refused": (422, "cavmarl refuses the input; the message names the place and the remedy"),
+    "bad-token": (401, "the token is missing, expired, revoked or forged: get another token"),
+    "forbidden": (403, "this identity may not do this"),
+    "not-found": (404, "the name does not exist, or belongs to another identity"),
+    "wrong-method": (405, "the path does not support this method"),
+    "slow-body": (408, "the body was not received in time: send it at once"),
+    "conflict": (409, "the request conflicts with the current state, which the message names"),
+    "stale-beat": (409, "the heartbeat is older than the last one: increase its number"),
+    "superseded": (409, "a newer process of the node has registered: this process must end"),
     "lost": (410, "the session is not on this node: resolve it again"),
-    "too-large": (413, "the body is larger than is taken here"),
-    "too-many": (429, "too many requests, or too many of a kind: wait, see Retry-After"),
-    "broken": (500, "a fault of the service; its log has the traceback"),
-    "paused": (503, "a page holds the session: ask again after Retry-After"),
-    "no-node": (503, "no node can take it now: try again after Retry-After"),
+    "too-large": (413, "the body is larger than the limit"),
+    "too-many": (429, "too many requests: wait for the time in Retry-After"),
+    "broken": (500, "the service has an internal error; its log has the traceback"),
+    "paused": (503, "a page has paused the session: repeat the request after Retry-After"),
+    "no-node": (503, "no node can accept the request now: repeat it after Retry-After"),
 }
 
 
 def problem(name: str, detail: str, retry_s: float | None = None) -> ServiceError:
-    """The error of that name; routes raise it."""
+    """Return the error of a problem; routes raise it."""
     error = ServiceError(detail, PROBLEMS[name][0], name)
     error.retry_s = retry_s
     return error

@@ -1,6 +1,6 @@
-"""The log as the service writes it: events act at once, and are answered when they are on disk.
+"""The event log of the service: events take effect at once and are acknowledged when on disk.
 
-Requests that come together are written together: one transaction, one wait for the disk.
+Events of concurrent requests are written in one transaction, with one wait for the disk.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ SERVICE = "service"
 
 
 class EventLog:
-    """The infrastructure, and the only way to change it.
+    """The service records and the only way to change them.
 
     Args:
-        store: where events are kept; what it has is replayed.
+        store: where events are kept; the events that it holds are replayed.
         wall_s: the wall clock.
 
     Raises:
-        ServiceError: what the store has was changed.
+        ServiceError: the stored events were modified.
     """
 
     def __init__(self, store: EventStore, wall_s: Callable[[], float] = time.time) -> None:
         self.store = store
         self.state = Infrastructure()
-        self.sequence = 0  # of the last event
-        self.changed = asyncio.Condition()  # told of all that was written, and of what `stir` says
+        self.sequence = 0  # sequence number of the last event
+        self.changed = asyncio.Condition()  # called after each write and by `stir`
         self.is_broken = False
         self.wall_s = wall_s
         self._digest = ""
@@ -42,7 +42,7 @@ class EventLog:
         self._gone: list[str] = []
         self._in_flight: dict[str, bytes] = {}  # content that is being written
         self._writing = asyncio.Lock()
-        self.durable = 0  # the last event on disk
+        self.durable = 0  # sequence number of the last event on disk
         for line in store.read_checked():
             self.state.apply(line)
             self.sequence, self._digest = line.sequence, line.digest
@@ -58,7 +58,7 @@ class EventLog:
         owner: str = "",
         private: dict[str, Any] | None = None,
     ) -> LogEvent:
-        """Let something happen. It is on disk when `settle` or `flush` has returned."""
+        """Apply an event. It is on disk after the next `settle` or `flush`."""
         number, now_s = self.sequence + 1, self.wall_s()
         line = LogEvent(number, now_s, kind, actor, subject, owner, data or {}, private or {}, "")
         line = line._replace(digest=digest_of(self._digest, line))
@@ -68,7 +68,7 @@ class EventLog:
         return line
 
     def keep(self, content: bytes) -> str:
-        """Keep content with the events that name it; its hash."""
+        """Store content together with the events that name it, and return its hash."""
         sha256 = hashlib.sha256(content).hexdigest()
         self._blobs[sha256] = content
         if sha256 in self._gone:
@@ -81,19 +81,19 @@ class EventLog:
             self._gone.append(sha256)
 
     def content(self, sha256: str) -> bytes:
-        """What was kept under a hash."""
+        """Return stored content by its hash."""
         kept = self._blobs.get(sha256) or self._in_flight.get(sha256)
         found = kept or self.store.blob(sha256)
         if found is None:
-            raise ServiceError(f"content {sha256[:12]}… is not in the store: it was damaged")
+            raise ServiceError(f"content {sha256[:12]}… is missing: the store is damaged")
         return found
 
     def flush(self) -> None:
-        """Write all that has happened."""
+        """Write all pending events."""
         self._write(*self._take())
 
     def _take(self) -> tuple[list[LogEvent], dict[str, bytes], list[str]]:
-        """What is to be written; in the thread in which it happens."""
+        """Return the events and content to write; call it in the thread that records events."""
         taken = self._lines, self._blobs, self._gone
         self._lines, self._blobs, self._gone, self._in_flight = [], {}, [], taken[1]
         return taken
@@ -104,16 +104,16 @@ class EventLog:
         try:
             self.store.append(lines, blobs, gone)
         except ServiceError:
-            self.is_broken = True  # what acts here is not on disk: only a new start can go on
+            self.is_broken = True  # memory is ahead of the disk: the service must be restarted
             raise
         if lines:
             self.durable = lines[-1].sequence
 
     async def settle(self) -> None:
-        """Wait until all that has happened up to now is on disk.
+        """Wait until all events recorded so far are on disk.
 
         Raises:
-            ServiceError: it cannot be written; the service has to end.
+            ServiceError: they cannot be written; the service must end.
         """
         if not self._lines and not self._blobs and self.durable >= self.sequence:
             return
@@ -125,6 +125,6 @@ class EventLog:
         await self.stir()
 
     async def stir(self) -> None:
-        """Wake what waits for a change."""
+        """Wake everything that waits for a change."""
         async with self.changed:
             self.changed.notify_all()

@@ -1,6 +1,6 @@
-"""The store: an append-only table of events, and the content that they name by its hash.
+"""The event store: an append-only table of events, and content identified by its hash.
 
-SQLite in its write-ahead mode, or PostgreSQL. What `append` has returned from is on disk.
+It uses SQLite with a write-ahead log, or PostgreSQL. When `append` returns, its data are on disk.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from cavmarl.core.errors import ServiceError, require
 from cavmarl.service.service_records import LogEvent
 
 SCHEMA = "cavmarl.service/1"
-_LOCK_KEY = 0x6361766D  # of PostgreSQL's advisory lock
+_LOCK_KEY = 0x6361766D  # key of PostgreSQL's advisory lock
 _PAGE = 1000
 
 _METADATA = MetaData()
@@ -71,26 +71,27 @@ _BLOBS = Table(
 
 
 def digest_of(before: str, line: LogEvent) -> str:
-    """The digest of a line, over that of the line before it."""
+    """Return the digest of a line, which includes the digest of the previous line."""
     content = json.dumps([before, *line[:-1]], sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(content.encode()).hexdigest()
 
 
 class EventStore:
-    """A store that this process alone writes.
+    """A store that only this process writes.
 
     Args:
-        where: a file of SQLite, or the URL of a database.
+        where: an SQLite file, or the URL of a database.
 
     Raises:
-        ServiceError: it cannot be opened, another service has it, or it is one of another version.
+            ServiceError: the store cannot be opened, is in use by another service, or has another
+            version.
     """
 
     def __init__(self, where: str | Path) -> None:
         self.where = str(where)
         self._lock: IO[bytes] | None = None
         self._open = ExitStack()
-        self._guard = threading.Lock()  # of the one connection
+        self._guard = threading.Lock()  # guards the only connection
         self.url = url = _url_of(self.where)
         self.is_embedded = url.get_backend_name() == "sqlite"
         if self.is_embedded:
@@ -108,8 +109,8 @@ class EventStore:
             self.close()
             cause = str(getattr(error, "orig", error)).strip().splitlines()[0]
             raise ServiceError(
-                f"store {url.render_as_string()}: cannot be opened ({cause}); see that its folder "
-                "or server is there and may be written"
+                f"store {url.render_as_string()}: cannot be opened ({cause}); check that its "
+                "folder or server exists and can be written"
             ) from error
         except ServiceError:
             self.close()
@@ -118,10 +119,10 @@ class EventStore:
     def append(
         self, lines: Sequence[LogEvent], blobs: dict[str, bytes], gone: Sequence[str] = ()
     ) -> None:
-        """Write lines and content in one transaction; content that is `gone` is deleted.
+        """Write lines and content, and delete the content `gone`, in one transaction.
 
         Raises:
-            ServiceError: the store cannot be written; none of it has been.
+            ServiceError: the store cannot be written; nothing was changed.
         """
         try:
             with self._guard, self._connection.begin():
@@ -137,7 +138,7 @@ class EventStore:
         except SQLAlchemyError as error:
             raise ServiceError(
                 f"store {self.where}: cannot be written ({getattr(error, 'orig', error)}); nothing "
-                "of it was: make room, and start the service again"
+                "was changed; free disk space and restart the service"
             ) from error
 
     def read(
@@ -146,10 +147,10 @@ class EventStore:
         limit: int | None = None,
         *,
         until: int | None = None,  # the last sequence number
-        owner: str | None = None,  # the owner of their subject, or the caller that caused them
+        owner: str | None = None,  # the owner of the subject, or the identity that caused the event
         subject: str | None = None,
     ) -> Iterator[LogEvent]:
-        """The lines after a sequence number, of all or of some."""
+        """Return the lines after a sequence number, of all subjects or of some."""
         wanted = []
         if until is not None:
             wanted.append(_EVENTS.c.sequence <= until)
@@ -172,30 +173,30 @@ class EventStore:
             left = None if left is None else left - len(rows)
 
     def blob(self, sha256: str) -> bytes | None:
-        """The content with this hash."""
+        """Return the content with this hash."""
         query = select(_BLOBS.c.content).where(_BLOBS.c.sha256 == sha256)
         with self._guard, self._connection.begin():
             found = self._connection.execute(query).scalar()
         return None if found is None else bytes(found)
 
     def read_checked(self) -> Iterator[LogEvent]:
-        """All lines; each has to follow from the one before.
+        """Return all lines after checking the chain of their digests.
 
         Raises:
-            ServiceError: a line was changed, removed or put in.
+            ServiceError: a line was changed, removed or inserted.
         """
         last = ""
         for count, line in enumerate(self.read(), start=1):
             if line.sequence != count or line.digest != digest_of(last, line):
                 raise ServiceError(
-                    f"store {self.where}: event {line.sequence} does not follow from the one "
-                    "before: the log was changed; take a copy from before that"
+                    f"store {self.where}: event {line.sequence} does not follow from the "
+                    "previous one: the log was modified; restore an older copy"
                 )
             last = line.digest
             yield line
 
     def close(self) -> None:
-        """Let another service have it."""
+        """Release the store."""
         self._open.close()
         if self._lock is not None:
             self._lock.close()
@@ -233,20 +234,22 @@ def _url_of(where: str) -> URL:
             return url.set(drivername="postgresql+psycopg")
         url.get_dialect()
     except (ArgumentError, NoSuchModuleError) as error:
-        raise ServiceError(f"store: {error}; give a file, or postgresql://…") from error
+        raise ServiceError(f"store: {error}; give an SQLite file or postgresql://…") from error
     if url.get_backend_name() != "sqlite":
         raise ServiceError(
-            f"store {url.render_as_string()}: only a file of SQLite or postgresql://… is known"
+            f"store {url.render_as_string()}: must be an SQLite file or postgresql://…"
         )
     return url
 
 
 def _lock_file(path: Path) -> IO[bytes]:
-    """A file beside the store that is locked while a process has it."""
+    """Return a file beside the store, locked as long as this process has the store."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         handle = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT, 0o600)
-        os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))  # it holds keys: ours alone
+        os.close(
+            os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        )  # the file holds keys: readable by this user only
     except OSError as error:
         raise ServiceError(f"store {path}: cannot be opened ({error.strerror})") from error
     lock = os.fdopen(handle, "r+b")
@@ -260,20 +263,20 @@ def _lock_file(path: Path) -> IO[bytes]:
 
 def _taken(where: str) -> ServiceError:
     return ServiceError(
-        f"store {where}: another service has it; end that one, or give another --store"
+        f"store {where}: is in use by another service; end that service, or give another --store"
     )
 
 
 def _foreign(where: str, schema: str) -> ServiceError:
     return ServiceError(
-        f"store {where}: has schema {schema}, this version knows {SCHEMA}; give another --store"
+        f"store {where}: has schema {schema}, this version needs {SCHEMA}; give another --store"
     )
 
 
 def _make_durable(connection: Any, _: Any) -> None:
     cursor = connection.cursor()
     cursor.execute("PRAGMA journal_mode=WAL")
-    cursor.execute("PRAGMA synchronous=FULL")  # a commit survives the machine, too
+    cursor.execute("PRAGMA synchronous=FULL")  # a commit survives a crash of the machine
     cursor.close()
 
 

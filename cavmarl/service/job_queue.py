@@ -1,7 +1,8 @@
-"""Jobs that wait for a node, in the order in which they came.
+"""The queue of jobs that wait for a node, in the order of their arrival.
 
-To ask for a node where none is free costs time. So jobs of one kind that cannot be placed are
-asked for once, and failed attempts have a rate, over all jobs and waiting requests.
+Searching for a node takes time. Jobs of the same kind therefore share one search, and failed
+searches
+of all jobs and waiting requests have a rate limit.
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ from cavmarl.service.node_selection import Chosen, NoNodeError
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.service_records import SessionRecord
 
-FAILURES_HZ, FAILURES = 100.0, 50.0  # attempts in vain: a second, and at once
+FAILURES_HZ, FAILURES = 100.0, 50.0  # failed searches: per second, and burst
 
 
 class JobQueue:
-    """The jobs of a log that no node has.
+    """The jobs that are not assigned to a node.
 
     Args:
-        log: of the service.
-        choose: a node for a session, but for some.
-        assign: gives a session to a node.
-        end: ends a session, as `failed`.
-        clock_s: of the attempts.
+        log: the event log of the service.
+        choose: returns a node for a session, excluding some.
+        assign: assigns a session to a node.
+        end: ends a session as `failed`.
+        clock_s: the clock for the rate limit.
     """
 
     def __init__(
@@ -37,19 +38,19 @@ class JobQueue:
     ) -> None:
         self._log, self._choose, self._assign, self._end = log, choose, assign, end
         self._failures = RateLimit(FAILURES_HZ, FAILURES, clock_s)
-        self._next = ""  # the job at which the last pass ended
+        self._next = ""  # the job at which the last pass stopped
 
     def may_try(self) -> bool:
-        """Whether another attempt may be in vain."""
+        """Return whether another search may fail without exceeding the rate limit."""
         return self._failures.has("")
 
     def has_failed(self) -> None:
-        """An attempt was in vain."""
+        """Count a failed search."""
         if self._failures.has(""):
             self._failures.take("")
 
     def place(self) -> None:
-        """Give jobs to nodes that can take them."""
+        """Assign jobs to nodes that can run them."""
         waiting = list(self._log.state.waiting)
         if not waiting or not self.may_try():
             return
@@ -58,7 +59,10 @@ class JobQueue:
         hopeless = set()
         for number in waiting[first:] + waiting[:first]:
             session = self._log.state.sessions[number]
-            kind = (session.owner_name, *session.needs)  # all else is alike for all
+            kind = (
+                session.owner_name,
+                *session.needs,
+            )  # all other properties are the same for every job
             if kind in hopeless:
                 continue
             if not self.may_try():
@@ -71,7 +75,7 @@ class JobQueue:
                 self.has_failed()
 
     def end_hopeless(self, max_placements: int) -> None:
-        """End jobs that no node has taken in time, or that several nodes have not survived."""
+        """End jobs whose waiting time is over, or that have lost several nodes."""
         for number in list(self._log.state.waiting):
             session = self._log.state.sessions[number]
             if session.placements >= max_placements:

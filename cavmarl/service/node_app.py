@@ -1,8 +1,9 @@
-"""The HTTP interface of a node: the worlds of sessions, opened by the tokens of their leases.
+"""The HTTP interface of a node: worlds of sessions, opened with the tokens of their leases.
 
-A token says which session, on which node, at which incarnation of it; the service has signed it,
-and the node asks no one else. The state of a session goes to the service before a command is done,
-never after: so it includes no command whose answer may have been lost.
+A token names the session, its node and the node's incarnation. The service has signed it, so the
+node
+needs no other authority. The node saves a session's state with the service before it executes a
+command, never after it, so a saved state never includes a command whose answer may have been lost.
 """
 
 from __future__ import annotations
@@ -20,20 +21,20 @@ from starlette.types import ASGIApp
 
 from cavmarl.client.world_protocol import SAVED_HEADER
 from cavmarl.core.errors import ServiceError, WorkerError
-from cavmarl.service import responses
+from cavmarl.service import response_bodies
 from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
 from cavmarl.service.auth import StrictRoute
 from cavmarl.service.error_names import problem
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.problem_json import serve_routes
-from cavmarl.service.requests import Whole
+from cavmarl.service.request_bodies import Whole
 from cavmarl.service.route_common import OCTETS, PROBLEM
 from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorld, SessionWorlds
 
 MAX_ACTIONS_BYTES = 16 * 1024 * 1024
-HOLD_S = 5.0  # that a command waits for a page which has paused its session; then it is asked again
-TEND_S = 0.1  # from look to look at what pages ask for
+HOLD_S = 5.0  # how long a command waits for a paused session before the client must ask again
+TEND_S = 0.1  # between two checks for requests of pages
 
 router = APIRouter(
     prefix="/v1/worlds/{session}", route_class=StrictRoute, responses=PROBLEM, tags=["worlds"]
@@ -75,7 +76,7 @@ def _link(request: Request) -> NodeLink:
 
 
 class Lease(SecurityBase):
-    """Lets in what has the token of a session's lease; it gives the session's configuration."""
+    """A dependency that admits the token of a session's lease and returns its configuration."""
 
     model = HTTPBearer(bearerFormat="JWT", description="The `token` of an Assignment")
     scheme_name = "lease"
@@ -92,12 +93,14 @@ class Lease(SecurityBase):
             )  # fmt: skip
         except (jwt.InvalidTokenError, KeyError):
             raise problem(
-                "bad-token", "no token of a lease on this node: resolve the session"
+                "bad-token", "the token of a lease is missing: resolve the session"
             ) from None
         if kind.lower() != "bearer" or claims.get("use") != "session" or claims["sub"] != session:
-            raise problem("bad-token", "the token is not of this session")
+            raise problem("bad-token", "the token belongs to another session")
         if claims["inc"] != link.incarnation:
-            raise problem("lost", "the token is of an earlier process of this node: resolve again")
+            raise problem(
+                "lost", "the token belongs to an earlier process of this node: resolve again"
+            )
         return str(claims["cfg"])
 
 
@@ -105,7 +108,7 @@ Opened = Annotated[str, Depends(Lease())]
 
 
 def make_node_app(link: NodeLink, worlds: SessionWorlds) -> ASGIApp:
-    """The application of a node."""
+    """Return the application of a node."""
     app = FastAPI(
         title="cavmarl node",
         version="1",
@@ -131,8 +134,8 @@ async def open_worlds(
     session: str,
     configuration: Opened,
     save: Annotated[bool, Query(description="Leave their state with the service first")] = False,
-) -> responses.WorldDescription:
-    """Make the worlds of a session, or find them here; they go on from their saved state."""
+) -> response_bodies.WorldDescription:
+    """Create or find the worlds of a session; they continue from their saved state."""
     link, worlds = _link(request), _worlds(request)
     if session not in worlds:
         document = await link.configuration(configuration)
@@ -141,13 +144,13 @@ async def open_worlds(
         try:
             await asyncio.to_thread(worlds.add, session, document, state, number, keys)
         except WorkerError as error:
-            raise problem("lost", f"its zones have no nodes: {error}") from error
+            raise problem("lost", f"its zone nodes are lost: {error}") from error
         finally:
             link.close_key_file(session)
         link.expect(session)
     elif save:
         await _save(link, worlds, session)
-    return responses.WorldDescription(**worlds[session].describe())
+    return response_bodies.WorldDescription(**worlds[session].describe())
 
 
 @router.post("/reset", response_class=Response, responses=ANSWER)
@@ -159,7 +162,7 @@ async def reset(
     seed: Annotated[Whole | None, Query(description="None: the next episodes")] = None,
     quiet: Quiet = False,
 ) -> Response:
-    """Begin an episode in every world."""
+    """Start an episode in every world."""
     return await _command(request, session, "reset", number, seed=seed, is_quiet=quiet)
 
 
@@ -167,7 +170,7 @@ async def reset(
 async def step(
     request: Request, session: str, _: Opened, number: Number, quiet: Quiet = False
 ) -> Response:
-    """Let every agent act."""
+    """Step all worlds with one action per agent."""
     return await _command(request, session, "step", number, seed=None, is_quiet=quiet)
 
 
@@ -184,14 +187,16 @@ async def _command(
     def act() -> bytes:
         return world.command(word, number, seed, content, is_quiet)
 
-    world.is_commanded = True  # what pages change now is neither in this command nor saved
+    world.is_commanded = (
+        True  # a change by a page would be neither in this command nor in the saved state
+    )
     try:
         if number == world.number + 1:
             await _save_before(link, worlds, session)
         answer = await in_turn(worlds, act)
-    except WorkerError as error:  # the nodes of its zones are gone: it begins from what is saved
+    except WorkerError as error:  # the nodes of its zones are lost: restart from the saved state
         await asyncio.to_thread(worlds.close, session)
-        raise problem("lost", f"its zones have no nodes: {error}") from error
+        raise problem("lost", f"its zone nodes are lost: {error}") from error
     finally:
         world.is_commanded = False
     worlds.ended(session, word)
@@ -200,7 +205,7 @@ async def _command(
 
 
 async def _hold(link: NodeLink, worlds: SessionWorlds, world: SessionWorld) -> None:
-    """Wait while pages have paused a session, or until its next step is due."""
+    """Wait while a page has paused the session, or until its next step is due."""
     until_s = time.monotonic() + HOLD_S
     while not link.is_draining and (wait_s := await in_turn(worlds, world.tend)):
         if time.monotonic() > until_s:
@@ -209,7 +214,7 @@ async def _hold(link: NodeLink, worlds: SessionWorlds, world: SessionWorld) -> N
 
 
 async def _save_before(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
-    """Save the state before a command, if it is time, or pages have changed the worlds."""
+    """Save the state before a command if it is due or a page has changed the worlds."""
     world = worlds[session]
     due = world.number - world.saved >= SAVED_EVERY
     if due or world.is_changed or link.is_draining:
@@ -217,12 +222,12 @@ async def _save_before(link: NodeLink, worlds: SessionWorlds, session: str) -> N
     if link.is_draining:
         raise problem("lost", "this node is being drained: resolve the session again")
     if world.is_changed:
-        detail = "what a page has changed is not saved yet: the service is away"
+        detail = "a change by a page is not saved yet, as the service is unreachable"
         raise problem("paused", detail, retry_s=1.0)
 
 
 async def _tend(worlds: SessionWorlds, session: str) -> None:
-    """Heed the pages of a session as long as it is here."""
+    """Serve the pages of a session for as long as this node hosts it."""
     while session in worlds:
         await asyncio.sleep(TEND_S)
         if session in worlds and worlds[session].is_watched:
@@ -230,35 +235,39 @@ async def _tend(worlds: SessionWorlds, session: str) -> None:
 
 
 @router.get("/hash")
-async def get_hashes(request: Request, session: str, _: Opened) -> responses.WorldHashes:
-    """Digests of the worlds."""
+async def get_hashes(request: Request, session: str, _: Opened) -> response_bodies.WorldHashes:
+    """Return the state hashes of the worlds."""
     worlds = _worlds(request)
-    return responses.WorldHashes(hashes=await in_turn(worlds, worlds[session].hashes))
+    return response_bodies.WorldHashes(hashes=await in_turn(worlds, worlds[session].hashes))
 
 
 @router.get("/suggestion", response_class=Response, responses=ANSWER)
 async def get_suggestion(request: Request, session: str, _: Opened) -> Response:
-    """What the built-in driver would do in each agent's place: an .npz with `actions`."""
+    """Return the built-in driver's actions for all agents as an .npz file with `actions`."""
     worlds = _worlds(request)
     return Response(await in_turn(worlds, worlds[session].suggestion), media_type=OCTETS)
 
 
 @router.get("/transfers")
-async def get_transfers(request: Request, session: str, _: Opened) -> responses.WorldTransfers:
-    """The newest changes of owner in divided worlds."""
+async def get_transfers(
+    request: Request, session: str, _: Opened
+) -> response_bodies.WorldTransfers:
+    """Return the most recent ownership transfers of divided worlds."""
     worlds = _worlds(request)
-    return responses.WorldTransfers(transfers=await in_turn(worlds, worlds[session].transfers))
+    return response_bodies.WorldTransfers(
+        transfers=await in_turn(worlds, worlds[session].transfers)
+    )
 
 
 @router.get("/page")
-async def get_page(request: Request, session: str, _: Opened) -> responses.WorldPage:
-    """A page of the viewer that shows the worlds; it is served on the node's machine alone."""
+async def get_page(request: Request, session: str, _: Opened) -> response_bodies.WorldPage:
+    """Serve a viewer page of the worlds on this node's machine, and return its address."""
     worlds = _worlds(request)
     told = await in_turn(worlds, worlds[session].page)
     tended: dict[str, asyncio.Task[None]] = request.app.state.tended
     if session not in tended or tended[session].done():
         tended[session] = asyncio.create_task(_tend(worlds, session))
-    return responses.WorldPage(**told)
+    return response_bodies.WorldPage(**told)
 
 
 @router.delete("", status_code=204)
@@ -282,12 +291,12 @@ async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
         world.is_changed |= was_changed
         if error.status:
             raise
-        return  # the service is away: the client has the commands since the last state
+        return  # the service is unreachable: the client keeps the commands since the last state
     world.saved = number
 
 
 async def in_turn(worlds: SessionWorlds, act: Callable[[], Any]) -> Any:
-    """Do something with worlds, in a thread, when no other does."""
+    """Run a function on the worlds in a thread, one call at a time."""
 
     def wait_and_act() -> Any:
         began_s = time.perf_counter()

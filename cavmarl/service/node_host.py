@@ -28,27 +28,29 @@ from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
 
 MOST_MESSAGE = 2000
-TELL_S = 0.5  # from telling how far a job is to telling it again
-DRAIN_S = 60.0  # after which a node that is drained ends, whatever it has
+TELL_S = 0.5  # between two progress reports of a job
+DRAIN_S = 60.0  # after which a drained node ends even if sessions are left
 
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """Where a node listens and what it offers."""
+    """Where a node listens, and what it offers."""
 
-    service: str  # URL
+    service: str  # its URL
     secret: str
     name: str
     host: str = "127.0.0.1"
-    port: int = 0  # of clients; 0: any that is free
-    simulator_port: int | None = None  # told to clients; None: the same
+    port: int = 0  # for clients; 0 picks a free port
+    simulator_port: int | None = None  # announced to clients; None: the same
     slots: int = 4
     capabilities: tuple[str, ...] = ()
     allowed: tuple[str, ...] = ()
-    is_supposed_idle: bool = False  # tell no load
+    is_supposed_idle: bool = False  # report no load
     certificate: Path | None = None
     key: Path | None = None
-    authority: str | None = None  # file of the authority that has signed the service's certificate
+    authority: str | None = (
+        None  # certificate of the authority that signed the service's certificate
+    )
 
 
 @dataclass
@@ -57,7 +59,7 @@ class _Host:
     worlds: SessionWorlds
     tell: Callable[[str], None]
     jobs: dict[str, asyncio.Task[None]] = field(default_factory=dict)
-    steps: dict[str, tuple[int, int]] = field(default_factory=dict)  # of jobs: done, and to be
+    steps: dict[str, tuple[int, int]] = field(default_factory=dict)  # steps of jobs: done, total
     zones: ZoneProcesses = field(default_factory=ZoneProcesses)
     telling: asyncio.Task[None] | None = None
     failure: ServiceError | None = None
@@ -68,7 +70,8 @@ def host_node(options: NodeOptions, tell: Callable[[str], None]) -> None:
     """Run a node until it is drained or interrupted; SIGTERM drains it.
 
     Raises:
-        ServiceError: the service refuses it, or an address that others reach has no TLS.
+            ServiceError: the service refuses the node, or an address that other machines reach has
+            no TLS.
     """
     check_transport(options.host, options.certificate, options.key)
     asyncio.run(_run(options, tell))
@@ -117,7 +120,7 @@ async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:
 
 
 async def _serve(server: uvicorn.Server, listener: Any) -> None:
-    """Serve without uvicorn's own handlers of signals: this node has its own."""
+    """Run the server without uvicorn's signal handlers, as the node has its own."""
     server.config.load()
     server.lifespan = server.config.lifespan_class(server.config)
     await server._serve([listener])
@@ -128,7 +131,7 @@ def _end(host: _Host) -> None:
 
 
 async def _beat_until_end(host: _Host) -> None:
-    """Beat; ends when the node is drained and empty, or the service wants no more of it."""
+    """Send heartbeats until the node is drained and empty, or the service rejects it."""
     link, loop = host.link, asyncio.get_running_loop()
     pause_s, drained_s = 0.2, float("inf")
     while True:
@@ -170,16 +173,16 @@ def _start_jobs(host: _Host, jobs: list[dict[str, Any]]) -> None:
 
 
 async def _tell_transfers(host: _Host) -> None:
-    """Tell the service which vehicles have changed their zone since it was told last."""
+    """Report to the service which vehicles have changed zone since the last report."""
     for session in host.worlds.divided():
-        with contextlib.suppress(ServiceError):  # the session, or the service, is gone
+        with contextlib.suppress(ServiceError):  # the session or the service has ended
             world = host.worlds[session]
             rows = await in_turn(host.worlds, world.ownership)
             await host.link.tell_transfers(session, world.number, rows)
 
 
 async def _run_job(host: _Host, job: dict[str, Any]) -> None:
-    """Evaluate in a process of its own, and leave the files with the service."""
+    """Run an evaluation in a new process, and upload its files to the service."""
     link, path = host.link, f"/jobs/{job['id']}"
     status, message = "done", ""
     started: list[subprocess.Popen[bytes]] = []
@@ -200,13 +203,13 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
                 await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
         except CavmarlError as error:
             status, message = "failed", str(error)[:MOST_MESSAGE]
-        except asyncio.CancelledError:  # it is closed, or another node's by now
+        except asyncio.CancelledError:  # it is closed, or another node hosts it
             for process in started:
                 process.kill()
             raise
         finally:
             host.steps.pop(job["id"], None)
-    # Where the service is away or the job is another's by now, it runs again elsewhere.
+    # If the service is unreachable or has reassigned the job, the job runs again elsewhere.
     with contextlib.suppress(ServiceError):
         await link.ask("POST", f"{path}/outcome", json={"status": status, "message": message})
 
@@ -214,7 +217,7 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
 def run_evaluation(
     document: dict[str, Any], job: dict[str, Any], folder: Path, tell: Callable[[int, int], None]
 ) -> None:
-    """The work of a job; `tell` how many steps of how many are done, twice a second."""
+    """Run a job; call `tell` twice a second with the steps done and the total."""
     parts = job["repeats"] * len(job["policies"])
     ended, last, told_s = 0, ("", 0), -math.inf
 

@@ -1,4 +1,4 @@
-"""What a node says to the service: it registers, beats, fetches what worlds need, saves them."""
+"""A node's requests to the service: registration, heartbeats, configurations and states."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from cavmarl.service.configurations import world_keywords
 
 NEW_S = 5.0  # for so long a session may be here before a beat's answer names it
 GPU_EVERY = 5  # beats
-JOIN_S = 60.0  # in which the nodes of a session's zones have to come
-MOST_ROWS = 1000  # in one body, which has 256 KiB at most
+JOIN_S = 60.0  # time in which the nodes of a session's zones must connect
+MOST_ROWS = 1000  # transfers in one body, which is limited to 256 KiB
 
 
 class NodeLink:
@@ -32,8 +32,8 @@ class NodeLink:
     Args:
         url: of the service.
         secret: of an identity with the role `node`.
-        body: with which it registers; docs/guides/service.md has its fields.
-        is_supposed_idle: tell no load, so that selection goes by sessions alone.
+        body: body of the registration; docs/guides/service.md lists its fields.
+        is_supposed_idle: report no load, so that nodes are selected by their sessions alone.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class NodeLink:
         self._is_supposed_idle = is_supposed_idle
 
     async def register(self) -> None:
-        """Say that this process is the node."""
+        """Register this process as the node."""
         found = await self.ask("POST", "/nodes", json=self._body)
         self.incarnation = found.json()["incarnation"]
         self.is_draining = found.json()["draining"]
@@ -70,9 +70,9 @@ class NodeLink:
         jobs: Mapping[str, tuple[int, int]],
         is_watched: bool,
     ) -> dict[str, Any]:
-        """Say how busy this machine is, and how far its jobs are; what the node has to do.
+        """Report the load of this machine and the progress of its jobs; return the node's duties.
 
-        With `is_watched` also the LoadScores of all nodes.
+        With `is_watched`, the answer includes the LoadScores of all nodes.
         """
         number = next(self._beats)
         load = {"cpu": 0.0, "ram": 0.0, "gpu": 0.0}
@@ -94,47 +94,47 @@ class NodeLink:
         answer = await self.ask("POST", f"/nodes/{self.name}/beat", json=body)
         told: dict[str, Any] = answer.json()
         self.is_draining = told["draining"]
-        for session in told["without_door"]:  # the service has begun again
+        for session in told["without_door"]:  # the service has restarted
             if session in self._doors:
                 await self._tell_door(session)
         return told
 
     def expect(self, session: str) -> None:
-        """A session has come with its client, before a beat has told of it."""
+        """Note a session whose client arrived before a heartbeat announced it."""
         self._expected[session] = time.monotonic() + NEW_S
 
     def own(self, told: list[str]) -> set[str]:
-        """The sessions that are this node's: those that were told, and new ones."""
+        """Return the ids of this node's sessions: announced ones and newly arrived ones."""
         now_s = time.monotonic()
         self._expected = {one: until for one, until in self._expected.items() if until > now_s}
         return {*told, *self._expected}
 
     async def public_key(self, number: str) -> Any:
-        """A key that verifies tokens; raises KeyError where the service has none of that id."""
+        """Return a key that verifies tokens; raise KeyError if the service has no such key."""
         if number not in self._keys:
             keys = (await self.ask("GET", "/keys")).json()["keys"]
             self._keys = {one["kid"]: jwt.PyJWK(one).key for one in keys}
         return self._keys[number]
 
     async def configuration(self, sha256: str) -> dict[str, Any]:
-        """The document of a configuration."""
+        """Return the document of a configuration."""
         found: dict[str, Any] = (await self.ask("GET", f"/configurations/{sha256}")).json()
         return found
 
     async def saved_state(self, session: str) -> tuple[bytes | None, int]:
-        """The newest state of a session, and how many commands it includes."""
+        """Return the newest state of a session, and the number of commands that it includes."""
         answer = await self.ask("GET", f"/sessions/{session}/state")
         if answer.status_code == 204:
             return None, 0
         return answer.content, int(answer.headers["cavmarl-number"])
 
     async def save_state(self, session: str, number: int, state: bytes) -> None:
-        """Leave a state with the service."""
+        """Store a state with the service."""
         path = f"/sessions/{session}/state"
         await self.ask("PUT", path, content=state, params={"at": number})
 
     async def open_door(self, session: str, document: dict[str, Any]) -> dict[str, Any]:
-        """Have other nodes host the zones of a session; the keywords of `make_vec` for that."""
+        """Ask other nodes to host zones of a session; return keywords of `make_vec` for that."""
         if not document.get("nodes"):
             return {}
         host: str = self._body["address"]
@@ -152,12 +152,12 @@ class NodeLink:
         }
 
     def close_key_file(self, session: str) -> None:
-        """The worlds of a session have read their key."""
+        """Delete the key file of a session after its worlds have read it."""
         if session in self._key_files:
             os.close(self._key_files.pop(session))
 
     def _in_memory(self, session: str, key: str) -> str:
-        """The path of a file with a key, of which nothing is left when this process ends."""
+        """Return the path of a file with a key that vanishes when this process ends."""
         self.close_key_file(session)
         file = self._key_files[session] = os.memfd_create("cavmarl-key", os.MFD_CLOEXEC)
         os.fchmod(file, 0o600)
@@ -168,7 +168,7 @@ class NodeLink:
         await self.ask("PUT", f"/sessions/{session}/door", json=self._doors[session])
 
     async def tell_transfers(self, session: str, number: int, rows: dict[str, list[Any]]) -> None:
-        """Tell which vehicles have changed their zone, and which are prepared to."""
+        """Report vehicles that have changed zone, and vehicles that are prepared to."""
         told, prepared = rows["transfers"], rows["prepared"][-MOST_ROWS:]
         for first in range(0, max(len(told), 1), MOST_ROWS):
             some = told[first : first + MOST_ROWS]
@@ -176,15 +176,15 @@ class NodeLink:
             await self.ask("PUT", f"/sessions/{session}/transfers", json=body)
 
     async def drain(self) -> None:
-        """Ask for nothing more."""
+        """Ask the service to assign nothing more to this node."""
         await self.ask("POST", f"/nodes/{self.name}/drain")
 
     async def leave(self) -> None:
-        """Say that this process ends."""
+        """Announce that this process ends."""
         await self.ask("DELETE", f"/nodes/{self.name}")
 
     async def ask(self, method: str, path: str, **given: Any) -> Any:
-        """The answer to any request; raises ServiceError."""
+        """Send a request and return the answer; raise ServiceError if it is refused."""
         return await self._client.run(self._client.flows.ask(method, path, **given))
 
     async def close(self) -> None:
@@ -195,5 +195,5 @@ class NodeLink:
 
 
 def is_final(error: ServiceError) -> bool:
-    """Whether asking again cannot help."""
+    """Return whether repeating the request cannot help."""
     return error.problem in ("superseded", "forbidden", "bad-token")

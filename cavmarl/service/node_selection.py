@@ -1,9 +1,12 @@
-"""Which node serves a session: reasons against nodes, then eq. (1) and (2) of `balance`.
+"""Selection of a node for a session: exclusions first, then eq. (1) and (2) of `balance`.
 
-Beside a node's load count its slots, its capabilities, the identities that it serves and the age of
-what is known of it. A session that a node was given since its last beat is not in the load that it
-tells: it counts as one slot's share of the processor, so that requests which come at once do not
-all go to the node that was idle a second ago. That share excludes no node.
+Besides the load of a node, its slots, its capabilities, the identities that it serves and the age
+of
+its last heartbeat count. A session assigned since the last heartbeat is not part of the reported
+load.
+It counts as one slot's share of the processor, so that concurrent requests do not all go to the
+node
+that was idle a second ago. That share never excludes a node.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ from cavmarl.service.service_records import NodeRecord, SessionRecord
 
 
 class Exclusion(NamedTuple):
-    """Why a node is not chosen."""
+    """A node that is not chosen, and the reason."""
 
     node: str
     reason: str  # unavailable, stale, draining, capacity, capability, access, cpu, ram, gpu
@@ -37,42 +40,44 @@ class Exclusion(NamedTuple):
 
 @dataclass
 class LiveNode:
-    """What is known of a node beside the log: its last beat.
+    """What is known of a node besides the log: its last heartbeat.
 
     Attributes:
-        number: by which ties are broken: the order of registration.
+        number: order of registration, which breaks ties.
     """
 
     number: int
-    heard_s: float  # when it was heard of last, by the service's clock
-    beat: int = -1  # sequence number of its last beat
-    use: Utilisation | None = None  # None: no beat yet
-    hosted: set[str] = field(default_factory=set)  # ids of sessions that are assigned to it
-    muted: set[str] = field(default_factory=set)  # of these, since its last beat
-    zones_of: list[str] = field(default_factory=list)  # sessions, a time for each part that it has
-    counters: dict[str, float] = field(default_factory=dict)  # that it tells for /metrics
-    jobs: dict[str, list[int]] = field(default_factory=dict)  # steps done, and to be, of its jobs
-    candidate: Candidate | None = None  # as `select` takes it; None: to be made
+    heard_s: float  # time of the last heartbeat by the service's clock
+    beat: int = -1  # sequence number of the last heartbeat
+    use: Utilisation | None = None  # None: no heartbeat yet
+    hosted: set[str] = field(default_factory=set)  # ids of the sessions assigned to the node
+    muted: set[str] = field(default_factory=set)  # sessions assigned since the last heartbeat
+    zones_of: list[str] = field(
+        default_factory=list
+    )  # sessions whose zones it hosts, once per part
+    counters: dict[str, float] = field(default_factory=dict)  # counters for /metrics
+    jobs: dict[str, list[int]] = field(default_factory=dict)  # job → steps done, total
+    candidate: Candidate | None = None  # cached input of `select`
 
     def refresh(self) -> None:
-        """Something has changed that its candidate is made of."""
+        """Discard the cached candidate after a change of its inputs."""
         self.candidate = None
 
 
 class Chosen(NamedTuple):
-    """The node that a session gets."""
+    """The node chosen for a session."""
 
     node: str
-    outcome: str  # why it is this one, as `balance.load_score.Outcome`, or `preferred unknown`
+    outcome: str  # reason, as in `balance.load_score.Outcome`, or `preferred unknown`
     score: float
     exclusions: tuple[Exclusion, ...]
 
 
 class NoNodeError(ServiceError):
-    """No node can take a session now.
+    """No node can accept a session now.
 
     Attributes:
-        exclusions: why each is not chosen.
+        exclusions: the reason for each node.
     """
 
     def __init__(self, exclusions: tuple[Exclusion, ...]) -> None:
@@ -95,14 +100,14 @@ def choose(
     session: SessionRecord,
     *,
     now_s: float,
-    max_age_s: float,  # of a node's last beat
+    max_age_s: float,  # age of a node's last heartbeat
     avoided: Sequence[str] = (),  # nodes that the client cannot reach
     rule: LoadRule = DEFAULT_RULE,
 ) -> Chosen:
-    """The admissible node of the lowest score, or the preferred one if it is about as good.
+    """Return the admissible node with the lowest score, or the preferred one if about as good.
 
     Raises:
-        NoNodeError: all are excluded.
+        NoNodeError: all nodes are excluded.
     """
     exclusions: list[Exclusion] = []
     candidates: list[Candidate] = []
@@ -136,12 +141,12 @@ def choose(
 
 
 def overloads(use: Utilisation, rule: LoadRule = DEFAULT_RULE) -> list[str]:
-    """The resources that are above their thresholds."""
+    """Return the resources above their thresholds."""
     return [one.resource for one in find_rejections([Candidate(0, use)], rule)]
 
 
 def score_of(node: NodeRecord, known: LiveNode, rule: LoadRule = DEFAULT_RULE) -> float | None:
-    """LoadScore of a node as selection sees it; None: it has told no load."""
+    """Return a node's LoadScore for selection, or None if it reports no load."""
     if known.use is None:
         return None
     return load_score(_candidate(node, known, rule).use, rule.weights)
@@ -150,7 +155,7 @@ def score_of(node: NodeRecord, known: LiveNode, rule: LoadRule = DEFAULT_RULE) -
 def _reason_against(
     node: NodeRecord, known: LiveNode, session: SessionRecord, is_old: bool
 ) -> str | None:
-    """The first reason, but for load, why a node cannot take a session."""
+    """Return the first reason other than load why a node cannot accept a session, or None."""
     if node.state != "up":
         return UNAVAILABLE
     if is_old or known.use is None:

@@ -1,4 +1,4 @@
-"""Errors as `application/problem+json` (RFC 9457), each with its cause and its cure."""
+"""Errors as `application/problem+json` (RFC 9457), each with its cause and its remedy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.service.error_names import PROBLEM_TYPE, PROBLEMS
 from cavmarl.service.node_selection import NoNodeError
 
-MOST_EXCLUSIONS = 100  # that an answer names
+MOST_EXCLUSIONS = 100  # maximum number of errors in an answer
 
 _BY_STATUS = {404: "not-found", 405: "wrong-method", 408: "slow-body", 413: "too-large"}
 _BEAT = re.compile(r"/v1/nodes/([^/]+)/beat")
@@ -32,7 +32,7 @@ def answer(
     headers: dict[str, str] | None = None,
     more: dict[str, Any] | None = None,
 ) -> JSONResponse:
-    """A problem as the answer to a request."""
+    """Return a problem as the answer to a request."""
     known, cure = PROBLEMS[name]
     body = {
         "type": f"urn:cavmarl:problem:{name}",
@@ -46,9 +46,9 @@ def answer(
 
 
 def serve_routes(app: FastAPI, routers: Sequence[APIRouter]) -> None:
-    """Add routes to an application; each of their errors is answered as a problem."""
+    """Add routes to an application whose errors are answered as problems."""
     app.state.rejected = Counter()
-    app.state.on_misreport = None  # told of beats that say what cannot be
+    app.state.on_misreport = None  # called with heartbeats that report impossible values
     app.state.routes = [one for router in routers for one in router.routes]
     for router in routers:
         app.include_router(router)
@@ -88,14 +88,14 @@ async def _on_validation(request: Request, error: Exception) -> JSONResponse:
     ]
     detail = "; ".join(places)
     beat = _BEAT.fullmatch(request.scope["path"])
-    identity = getattr(request.state, "identity", None)  # none: it is no JSON
+    identity = getattr(request.state, "identity", None)  # empty: the body is not JSON
     if beat and identity and request.app.state.on_misreport:
         request.app.state.on_misreport(identity, beat[1], detail)
     return _refuse(request, "bad-body", detail)
 
 
 def _percent(found: dict[str, Any]) -> str:
-    """85 for 0.85 is the mistake to name."""
+    """Return a hint if a share looks like a percentage: 85 instead of 0.85."""
     value = found.get("input")
     if found["type"] == "less_than_equal" and isinstance(value, int | float) and value <= 100:
         return f" (percent? send {value / 100:g})"
@@ -112,7 +112,7 @@ async def _on_http(request: Request, error: Exception) -> JSONResponse:
 
 
 def _methods_of(request: Request) -> set[str]:
-    """All methods of a path: the router itself names those of the first route alone."""
+    """Return all methods of a path; the router itself names only those of its first route."""
     methods: set[str] = set()
     for route in request.app.state.routes:
         if route.path_regex.fullmatch(request.scope["path"]):

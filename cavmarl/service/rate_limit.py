@@ -1,4 +1,4 @@
-"""Limits of rate: so many requests a second, after a burst."""
+"""Rate limits: a number of requests per second after a burst."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MOST_BUCKETS = 10_000
 
 
 class RateLimit:
-    """So many requests a second for each caller, after a burst."""
+    """A limit of requests per second for each caller, after a burst."""
 
     def __init__(
         self, rate_hz: float, burst: float, clock_s: Callable[[], float] = time.monotonic
@@ -22,11 +22,11 @@ class RateLimit:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def has(self, caller: str) -> bool:
-        """Whether `take` would count another one."""
+        """Return whether `take` would accept another request."""
         return self._left(caller, self._clock_s()) >= 1.0
 
     def take(self, caller: str) -> None:
-        """Count a request of `caller`; raises the problem `too-many`."""
+        """Count a request of `caller`; raise the problem `too-many` at the limit."""
         now_s = self._clock_s()
         left = self._left(caller, now_s)
         self._buckets.pop(caller, None)
@@ -35,7 +35,9 @@ class RateLimit:
             self._buckets.popitem(last=False)
         if left < 1.0:
             wait_s = (1.0 - left) / self.rate_hz
-            raise problem("too-many", f"more than {self.rate_hz:g} requests a second: wait", wait_s)
+            raise problem(
+                "too-many", f"more than {self.rate_hz:g} requests per second: wait", wait_s
+            )
 
     def _left(self, caller: str, now_s: float) -> float:
         left, then_s = self._buckets.get(caller, (self.burst, now_s))

@@ -1,4 +1,4 @@
-"""How the answers of routes are made of what the broker knows."""
+"""Builders of the responses of routes from the broker's records."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from dataclasses import asdict
 
-from cavmarl.service import responses
+from cavmarl.service import response_bodies
 from cavmarl.service.auth import Service
 from cavmarl.service.broker import Broker
 from cavmarl.service.node_selection import NoNodeError, score_of
@@ -19,18 +19,18 @@ from cavmarl.service.service_records import (
     SessionRecord,
 )
 
-TLS = "tls"  # the capability of nodes whose clients' port has it
+TLS = "tls"  # capability of nodes whose client port has TLS
 KEEP_ALIVE_S = 15.0
 
 
 async def assigned(
     service: Service,
     identity: IdentityRecord,
-    subject: str,  # of the event, if there is no node
+    subject: str,  # name of the event if no node was found
     take: Callable[[], SessionRecord],
     wait_s: float,
-) -> responses.Assignment:
-    """What a client needs to reach its world; it waits for a node until a deadline."""
+) -> response_bodies.Assignment:
+    """Return what a client needs to reach its world; wait for a node until a deadline."""
     broker = service.broker
     try:
         session = take()
@@ -42,14 +42,14 @@ async def assigned(
             session = await _awaited(broker, identity, subject, take, wait_s)
     node = broker.log.state.nodes[session.node or ""]
     lease_s = broker.rules.lease_s
-    return responses.Assignment(
+    return response_bodies.Assignment(
         session=session.id,
         requested=session.preferred,
         assigned=node.name,
         redirected=session.preferred not in (None, node.name),
         reason=session.reason,
         score=session.score,
-        excluded=[responses.Excluded(**one) for one in session.excluded],
+        excluded=[response_bodies.Excluded(**one) for one in session.excluded],
         excluded_count=session.excluded_count,
         scheme="https" if TLS in node.capabilities else "http",
         address=node.address,
@@ -69,7 +69,7 @@ async def _awaited(
     take: Callable[[], SessionRecord],
     wait_s: float,
 ) -> SessionRecord:
-    """A session, when a node can take it; raises NoNodeError at the deadline."""
+    """Return a session as soon as a node can accept it; raise NoNodeError at the deadline."""
     until_s = time.monotonic() + wait_s
     await broker.log.settle()
     broker.waiting += 1
@@ -93,12 +93,12 @@ async def _awaited(
         broker.waiting -= 1
 
 
-def node_answer(service: Service, node: NodeRecord) -> responses.NodeStatus:
-    """A node, with what its last beat said."""
+def node_answer(service: Service, node: NodeRecord) -> response_bodies.NodeStatus:
+    """Return a node with the values of its last heartbeat."""
     live = service.broker.live[node.name]
-    return responses.NodeStatus(
+    return response_bodies.NodeStatus(
         **asdict(node),
-        load=None if live.use is None else responses.Load(**asdict(live.use)),
+        load=None if live.use is None else response_bodies.Load(**asdict(live.use)),
         score=score_of(node, live),
         sessions=len(live.hosted),
         zones_of=list(live.zones_of),
@@ -106,31 +106,31 @@ def node_answer(service: Service, node: NodeRecord) -> responses.NodeStatus:
     )
 
 
-def session_answer(service: Service, session: SessionRecord) -> responses.Session:
-    """A session or a job, without what only its node needs."""
+def session_answer(service: Service, session: SessionRecord) -> response_bodies.Session:
+    """Return a session or a job, without what only its node needs."""
     found = asdict(session)
     del found["saved_blob"], found["owners"]
     live = service.broker.live.get(session.node or "")
     progress = None if live is None else live.jobs.get(session.id)
-    return responses.Session(**found, progress=progress)
+    return response_bodies.Session(**found, progress=progress)
 
 
-def event_answer(line: LogEvent) -> responses.EventLine:
-    """A line of the log, without what is never shown."""
+def event_answer(line: LogEvent) -> response_bodies.EventLine:
+    """Return a line of the log without its private part."""
     found = line._asdict()
     del found["private"]
-    return responses.EventLine(**found)
+    return response_bodies.EventLine(**found)
 
 
 async def event_stream(
     service: Service, identity: IdentityRecord, after: int
 ) -> AsyncIterator[str]:
-    """Server-sent events: those that there are after a number, and then those that come."""
+    """Yield the events after a number, and then new events, as server-sent events."""
     log = service.broker.log
     owner = identity.id if identity.role == "client" else None
     generation = identity.generation
     with service.holding(identity):
-        while identity.generation == generation:  # its tokens are void: it hears no more
+        while identity.generation == generation:  # its tokens were revoked: end the stream
             last = log.durable
             for line in log.store.read(after, until=last, owner=owner) if last > after else ():
                 text = event_answer(line).model_dump_json()

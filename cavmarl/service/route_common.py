@@ -1,4 +1,4 @@
-"""What routes are made of: roles, names in paths, what is documented of all answers."""
+"""Parts shared by routes: roles, names in paths, and documentation of responses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path
 
-from cavmarl.service import requests
+from cavmarl.service import request_bodies
 from cavmarl.service.auth import DurableRoute, may, open_to_all
 from cavmarl.service.error_names import PROBLEM_SCHEMA, PROBLEM_TYPE
 from cavmarl.service.service_records import IdentityRecord
@@ -31,7 +31,7 @@ CONTENT = {  # of a request whose body is no document
 
 
 def make_router(prefix: str, tag: str) -> APIRouter:
-    """A router whose answers leave when what they tell of is on disk."""
+    """Return a router whose answers are sent when the events they refer to are on disk."""
     return APIRouter(prefix=prefix, route_class=DurableRoute, tags=[tag], responses=PROBLEM)
 
 
@@ -45,6 +45,6 @@ Admins = Annotated[IdentityRecord, Depends(may("admin"))]
 Nodes = Annotated[IdentityRecord, Depends(may("node"))]
 Anybody = Annotated[IdentityRecord, Depends(open_to_all())]
 
-NodeName = Annotated[requests.Name, Path()]
+NodeName = Annotated[request_bodies.Name, Path()]
 SessionId = Annotated[str, Path(pattern=r"^s-[0-9a-f]{24}$")]
-FileName = Annotated[requests.Name, Path()]
+FileName = Annotated[request_bodies.Name, Path()]

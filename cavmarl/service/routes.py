@@ -1,4 +1,4 @@
-"""The routes: what each role may ask the service for."""
+"""The routes of the service and the roles that may use them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
-from cavmarl.service import configurations, requests, responses
+from cavmarl.service import configurations, request_bodies, response_bodies
 from cavmarl.service.auth import TheService
 from cavmarl.service.error_names import problem
 from cavmarl.service.ownership_routes import ownership
@@ -41,47 +41,49 @@ open_routes = make_router("/v1", "open")
 nodes = make_router("/v1/nodes", "nodes")
 worlds = make_router("/v1", "sessions")
 records = make_router("/v1", "records")
-ROUTERS = (nodes, worlds, ownership, records, open_routes)  # beats are most of what comes
+ROUTERS = (nodes, worlds, ownership, records, open_routes)  # heartbeats are most of the requests
 
 PAGE = 1000
 IdempotencyKey = Annotated[
     str, Header(alias="Idempotency-Key", pattern=r"^[A-Za-z0-9-]{0,64}$")
-]  # the same request with the same key is carried out once
+]  # a request is carried out once per key
 
 
 @open_routes.get("/health")
-async def health(_: Anybody, service: TheService) -> responses.Health:
-    """Whether the service is there, and how many events it has."""
-    return responses.Health(status="ok", events=service.broker.log.sequence)
+async def health(_: Anybody, service: TheService) -> response_bodies.Health:
+    """Return whether the service is running, and the number of its events."""
+    return response_bodies.Health(status="ok", events=service.broker.log.sequence)
 
 
 @open_routes.get("/keys")
-async def keys(_: Anybody, service: TheService) -> responses.PublicKeys:
-    """The public keys that verify tokens: a JSON Web Key Set."""
-    return responses.PublicKeys(**service.access.public_keys())
+async def keys(_: Anybody, service: TheService) -> response_bodies.PublicKeys:
+    """Return the public keys that verify tokens, as a JSON Web Key Set."""
+    return response_bodies.PublicKeys(**service.access.public_keys())
 
 
 @open_routes.post("/token")
 async def token(
-    _: Anybody, service: TheService, body: requests.SecretBody | requests.RefreshBody
-) -> responses.Tokens:
-    """An access token and a refresh token for a secret, or for a refresh token."""
-    if isinstance(body, requests.SecretBody):
-        return responses.Tokens(**service.access.exchange(body.secret))
-    return responses.Tokens(**service.access.refresh(body.refresh_token))
+    _: Anybody, service: TheService, body: request_bodies.SecretBody | request_bodies.RefreshBody
+) -> response_bodies.Tokens:
+    """Return an access token and a refresh token for a secret or for a refresh token."""
+    if isinstance(body, request_bodies.SecretBody):
+        return response_bodies.Tokens(**service.access.exchange(body.secret))
+    return response_bodies.Tokens(**service.access.refresh(body.refresh_token))
 
 
 @open_routes.delete("/token", status_code=204)
 async def withdraw(identity: Everyone, service: TheService) -> None:
-    """Void all tokens of the caller."""
+    """Revoke all tokens of the caller."""
     service.access.withdraw(identity)
 
 
-@nodes.post("/{name}/beat", response_model=responses.Duties)  # not checked again: it is often
+@nodes.post(
+    "/{name}/beat", response_model=response_bodies.Duties
+)  # not validated again, as heartbeats are frequent
 async def beat(
-    identity: Nodes, service: TheService, name: NodeName, body: requests.BeatBody
+    identity: Nodes, service: TheService, name: NodeName, body: request_bodies.BeatBody
 ) -> JSONResponse:
-    """Say that a node is alive; the answer says what it has to do."""
+    """Record a heartbeat of a node; the answer lists what it has to do."""
     found = service.broker.beat(identity, name, body)
     if service.broker.waiting:
         await service.broker.log.stir()
@@ -89,62 +91,71 @@ async def beat(
 
 
 @nodes.get("")
-async def list_nodes(_: Readers, service: TheService) -> responses.NodeList:
-    """All nodes, with what their last beats said."""
+async def list_nodes(_: Readers, service: TheService) -> response_bodies.NodeList:
+    """Return all nodes with the values of their last heartbeats."""
     known = service.broker.log.state.nodes.values()
-    return responses.NodeList(nodes=[node_answer(service, one) for one in known])
+    return response_bodies.NodeList(nodes=[node_answer(service, one) for one in known])
 
 
 @nodes.post("", status_code=201)
 async def register(
-    identity: Nodes, service: TheService, body: requests.NodeBody
-) -> responses.NodeStatus:
-    """Register a node, or register it anew after it has left, died or begun again."""
+    identity: Nodes, service: TheService, body: request_bodies.NodeBody
+) -> response_bodies.NodeStatus:
+    """Register a node, or register it again after it left, failed or restarted."""
     return node_answer(service, service.broker.register(identity, body))
 
 
 @nodes.post("/{name}/drain")
-async def drain(identity: Drainers, service: TheService, name: NodeName) -> responses.NodeStatus:
-    """Give a node nothing more, and move what it has."""
+async def drain(
+    identity: Drainers, service: TheService, name: NodeName
+) -> response_bodies.NodeStatus:
+    """Assign nothing more to a node, and move its sessions."""
     return node_answer(service, service.broker.drain(identity, name))
 
 
 @nodes.post("/{name}/resume")
-async def resume(identity: Operators, service: TheService, name: NodeName) -> responses.NodeStatus:
-    """Let a drained node take sessions again."""
+async def resume(
+    identity: Operators, service: TheService, name: NodeName
+) -> response_bodies.NodeStatus:
+    """Let a drained node accept sessions again."""
     return node_answer(service, service.broker.drain(identity, name, is_on=False))
 
 
 @nodes.delete("/{name}")
-async def leave(identity: Drainers, service: TheService, name: NodeName) -> responses.NodeStatus:
-    """A node ends."""
+async def leave(
+    identity: Drainers, service: TheService, name: NodeName
+) -> response_bodies.NodeStatus:
+    """Remove a node."""
     return node_answer(service, service.broker.leave(identity, name))
 
 
 @worlds.post("/configurations", status_code=201)
 async def add_configuration(
-    identity: Clients, service: TheService, body: requests.ConfigurationBody
-) -> responses.Configuration:
-    """Check and keep a configuration; another content is another version."""
+    identity: Clients, service: TheService, body: request_bodies.ConfigurationBody
+) -> response_bodies.Configuration:
+    """Check and store a configuration; new content gets a new version."""
     found = configurations.add_configuration(service.broker.log, identity, body)
-    return responses.Configuration(**found)
+    return response_bodies.Configuration(**found)
 
 
 @worlds.get("/configurations/{sha256}")
 async def get_configuration(
-    _: Everyone, service: TheService, sha256: Annotated[requests.Sha256, Path()]
-) -> requests.ConfigurationBody:
-    """A configuration by its hash."""
-    return requests.ConfigurationBody(
+    _: Everyone, service: TheService, sha256: Annotated[request_bodies.Sha256, Path()]
+) -> request_bodies.ConfigurationBody:
+    """Return a configuration by its hash."""
+    return request_bodies.ConfigurationBody(
         **configurations.read_configuration(service.broker.log, sha256)
     )
 
 
 @worlds.post("/sessions", status_code=201)
 async def open_session(
-    identity: Clients, service: TheService, body: requests.SessionBody, key: IdempotencyKey = ""
-) -> responses.Assignment:
-    """Open a session on the node that eq. (1) and (2) choose, or on a preferred one."""
+    identity: Clients,
+    service: TheService,
+    body: request_bodies.SessionBody,
+    key: IdempotencyKey = "",
+) -> response_bodies.Assignment:
+    """Open a session on the node that eq. (1) and (2) choose, or on a preferred node."""
     found = configurations.read_configuration(service.broker.log, body.configuration)
 
     def opened() -> SessionRecord:
@@ -162,9 +173,9 @@ async def open_session(
 
 @worlds.post("/sessions/{number}/resolve")
 async def resolve(
-    identity: Clients, service: TheService, number: SessionId, body: requests.ResolveBody
-) -> responses.Assignment:
-    """Where a session is now, and a new lease of it."""
+    identity: Clients, service: TheService, number: SessionId, body: request_bodies.ResolveBody
+) -> response_bodies.Assignment:
+    """Return where a session is now, with a new lease."""
 
     def resolved() -> SessionRecord:
         return service.broker.resolve(identity, number, body.unreachable)
@@ -173,25 +184,25 @@ async def resolve(
 
 
 @worlds.get("/sessions")
-async def list_sessions(identity: Readers, service: TheService) -> responses.SessionList:
-    """Sessions and jobs: a client's own, or all."""
+async def list_sessions(identity: Readers, service: TheService) -> response_bodies.SessionList:
+    """Return sessions and jobs: a client's own, or all of them."""
     found = service.broker.log.state.sessions.values()
     own = [one for one in found if identity.role != "client" or one.owner == identity.id]
-    return responses.SessionList(sessions=[session_answer(service, one) for one in own])
+    return response_bodies.SessionList(sessions=[session_answer(service, one) for one in own])
 
 
 @worlds.get("/sessions/{number}")
 async def get_session(
     identity: Readers, service: TheService, number: SessionId
-) -> responses.Session:
-    """A session or a job."""
+) -> response_bodies.Session:
+    """Return a session or a job."""
     return session_answer(service, service.broker.session(identity, number))
 
 
 @worlds.delete("/sessions/{number}")
 async def close_session(
     identity: Clients, service: TheService, number: SessionId
-) -> responses.Session:
+) -> response_bodies.Session:
     """End a session or a job."""
     return session_answer(service, service.broker.close(identity, number))
 
@@ -202,7 +213,7 @@ async def close_session(
     responses={**BYTES, 204: {"description": "Nothing was saved yet"}},
 )
 async def get_state(identity: Nodes, service: TheService, number: SessionId) -> Response:
-    """The newest saved state of a session, for the node that hosts it."""
+    """Return the newest saved state of a session to the node that hosts it."""
     session = service.broker.hosted(identity, number)
     if session.saved_blob is None:
         return Response(status_code=204)
@@ -217,20 +228,20 @@ async def put_state(
     service: TheService,
     request: Request,
     number: SessionId,
-    at: Annotated[requests.Whole, Query()],
+    at: Annotated[request_bodies.Whole, Query()],
 ) -> None:
-    """Save the state of a session after so many commands."""
+    """Store the state of a session after a number of commands."""
     content = await request.body()
     service.broker.save(service.broker.hosted(identity, number), at, content)
 
 
 @worlds.post("/jobs", status_code=201)
 async def submit(
-    identity: Clients, service: TheService, body: requests.JobBody, key: IdempotencyKey = ""
-) -> responses.Session:
-    """Have a node evaluate drivers; where none can, the job waits for one."""
+    identity: Clients, service: TheService, body: request_bodies.JobBody, key: IdempotencyKey = ""
+) -> response_bodies.Session:
+    """Evaluate drivers on a node; the job waits if no node is free."""
     if configurations.read_configuration(service.broker.log, body.configuration).get("nodes"):
-        raise problem("refused", "nodes: an evaluation runs on one node; leave it out")
+        raise problem("refused", "nodes: an evaluation runs on one node; remove the key")
     configurations.check_policies(body.policies)
     session = service.broker.open(
         identity,
@@ -246,9 +257,9 @@ async def submit(
 
 @worlds.post("/jobs/{number}/outcome")
 async def finish(
-    identity: Nodes, service: TheService, number: SessionId, body: requests.OutcomeBody
-) -> responses.Session:
-    """A node has ended a job."""
+    identity: Nodes, service: TheService, number: SessionId, body: request_bodies.OutcomeBody
+) -> response_bodies.Session:
+    """Record the outcome of a job."""
     session = service.broker.hosted(identity, number)
     service.broker.finish(session, body.status, body.message)
     return session_answer(service, session)
@@ -258,7 +269,7 @@ async def finish(
 async def put_result(
     identity: Nodes, service: TheService, request: Request, number: SessionId, name: FileName
 ) -> None:
-    """A node leaves a file that a job has made."""
+    """Store a file that a job has produced."""
     content = await request.body()
     service.broker.add_result(service.broker.hosted(identity, number), name, content)
 
@@ -267,10 +278,10 @@ async def put_result(
 async def get_result(
     identity: Readers, service: TheService, number: SessionId, name: FileName
 ) -> Response:
-    """A file that a job has made."""
+    """Return a file that a job has produced."""
     results = service.broker.session(identity, number).results
     if name not in results:
-        raise problem("not-found", f"there is no result '{name}': there are {sorted(results)}")
+        raise problem("not-found", f"there is no result '{name}': choose one of {sorted(results)}")
     content = service.broker.log.content(results[name])
     return Response(content, media_type="application/octet-stream")
 
@@ -279,15 +290,15 @@ async def get_result(
 async def events(
     identity: Readers,
     service: TheService,
-    after: Annotated[requests.Whole, Query()] = 0,
+    after: Annotated[request_bodies.Whole, Query()] = 0,
     limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
     subject: Annotated[str | None, Query(max_length=128)] = None,
-) -> responses.EventList:
-    """Events after a sequence number, of one subject or of all: a client's own, or everybody's."""
+) -> response_bodies.EventList:
+    """Return events after a sequence number: a client's own, or those of all subjects."""
     owner = identity.id if identity.role == "client" else None
     await service.broker.log.settle()
     found = service.broker.log.store.read(after, limit, owner=owner, subject=subject)
-    return responses.EventList(events=list(map(event_answer, found)))
+    return response_bodies.EventList(events=list(map(event_answer, found)))
 
 
 @records.get("/events/stream", response_class=StreamingResponse)
@@ -295,40 +306,42 @@ async def stream(
     identity: Readers,
     service: TheService,
     request: Request,
-    after: Annotated[requests.Whole, Query()] = 0,
+    after: Annotated[request_bodies.Whole, Query()] = 0,
 ) -> StreamingResponse:
-    """Events as they come, as server-sent events; `Last-Event-ID` goes on where one ended."""
+    """Send events as server-sent events; `Last-Event-ID` continues an earlier stream."""
     last = request.headers.get("last-event-id", "")
     after = int(last) if last.isascii() and last.isdigit() and len(last) < 19 else after
-    with service.holding(identity):  # refused here, where it can be told
+    with service.holding(identity):  # refuse it here, while the client still waits for an answer
         lines = event_stream(service, identity, after)
     return StreamingResponse(lines, media_type="text/event-stream")
 
 
 @records.get("/metrics", response_class=PlainTextResponse)
 async def metrics(_: Viewers, request: Request) -> PlainTextResponse:
-    """The service in figures, as Prometheus reads them."""
+    """Return the metrics of the service in the format of Prometheus."""
     return PlainTextResponse(request.app.state.metrics.text(), media_type="text/plain")
 
 
 @records.post("/identities", status_code=201)
 async def add_identity(
-    identity: Admins, service: TheService, body: requests.IdentityBody
-) -> responses.NewIdentity:
-    """A new identity, and its secret, which is shown this once."""
+    identity: Admins, service: TheService, body: request_bodies.IdentityBody
+) -> response_bodies.NewIdentity:
+    """Create an identity and return its secret, which is not shown again."""
     found, secret = service.access.add_identity(body.name, body.role, identity.id)
-    return responses.NewIdentity(identity=found.id, name=found.name, role=found.role, secret=secret)
+    return response_bodies.NewIdentity(
+        identity=found.id, name=found.name, role=found.role, secret=secret
+    )
 
 
 @records.get("/identities")
-async def list_identities(_: Admins, service: TheService) -> responses.IdentityList:
-    """All identities."""
+async def list_identities(_: Admins, service: TheService) -> response_bodies.IdentityList:
+    """Return all identities."""
     known = service.broker.log.state.identities.values()
     shown = [
-        responses.Identity(id=one.id, name=one.name, role=one.role, revoked=one.revoked)
+        response_bodies.Identity(id=one.id, name=one.name, role=one.role, revoked=one.revoked)
         for one in known
     ]
-    return responses.IdentityList(identities=shown)
+    return response_bodies.IdentityList(identities=shown)
 
 
 @records.delete("/identities/{number}", status_code=204)
@@ -337,11 +350,11 @@ async def revoke(
     service: TheService,
     number: Annotated[str, Path(pattern=r"^id-[0-9a-f]{16}$")],
 ) -> None:
-    """Void an identity, its secret and its tokens."""
+    """Revoke an identity, its secret and its tokens."""
     service.access.revoke(number, identity.id)
 
 
 @records.post("/keys", status_code=201)
-async def rotate(identity: Admins, service: TheService) -> responses.NewKey:
-    """Sign tokens with a new key; those of the key before stay valid."""
-    return responses.NewKey(key=service.access.rotate_key(identity.id))
+async def rotate(identity: Admins, service: TheService) -> response_bodies.NewKey:
+    """Sign tokens with a new key; tokens of the previous key stay valid."""
+    return response_bodies.NewKey(key=service.access.rotate_key(identity.id))

@@ -23,20 +23,20 @@ from cavmarl.service.rate_limit import RateLimit
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700
 MAX_HEAD_BYTES = 16 * 1024
-HEAD_S = 10.0  # in which a head has to come
+HEAD_S = 10.0  # time limit for receiving a head
 SERVER_HEADER: list[tuple[str, str]] = [("server", "cavmarl")]
 
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """Where a service listens and what it keeps."""
+    """Where a service listens, and what it stores."""
 
     host: str = "127.0.0.1"
-    port: int = DEFAULT_PORT  # 0: any that is free
+    port: int = DEFAULT_PORT  # 0 picks a free port
     store: str = str(DEFAULT_STORE)
     certificate: Path | None = None
     key: Path | None = None
-    rate_hz: float = 200.0  # requests of one identity
+    rate_hz: float = 200.0  # rate limit of one identity
     rules: BrokerRules = field(default_factory=BrokerRules)
 
 
@@ -44,13 +44,13 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
     """Run a service until it is interrupted.
 
     Args:
-        options: where and what.
-        tell: told lines for the person that has started it; one of them is the first admin's
-            secret, which is shown nowhere else.
+        options: address, store and rules.
+        tell: called with lines to show on the terminal; one of them is the first
+            admin's secret, which is shown nowhere else.
 
     Raises:
-        ServiceError: an address without TLS that others can reach, a port that is taken, a store
-            that cannot be opened or written, or that was changed.
+        ServiceError: the address can be reached by others without TLS, the port is in use, or the
+            store cannot be opened or written or was modified.
     """
     check_transport(options.host, options.certificate, options.key)
     store = EventStore(options.store)
@@ -77,35 +77,37 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
             tell(f"admin secret, shown this once: {admin}")
         server.run(sockets=[listener])
         if log.is_broken:
-            raise ServiceError(f"store {options.store}: could not be written; see the log")
+            raise ServiceError(
+                f"store {options.store}: could not be written; the log has the reason"
+            )
         log.flush()
     finally:
         store.close()
 
 
 def first_admin(log: EventLog, access: Access) -> str | None:
-    """The secret of a first admin; None: there is one."""
+    """Return the secret of the first admin, or None if there is an admin already."""
     if any(one.role == "admin" for one in log.state.identities.values()):
         return None
     return access.add_identity("admin", "admin")[1]
 
 
 def check_transport(host: str, certificate: Path | None, key: Path | None) -> None:
-    """Refuse to send secrets in the clear to other machines."""
+    """Raise ServiceError if secrets would be sent to other machines without encryption."""
     if (certificate is None) != (key is None):
-        raise ServiceError("give both --certificate and --key, or none of them")
+        raise ServiceError("give both --certificate and --key, or neither")
     for path in (certificate, key):
         if path is not None and not path.is_file():
-            raise ServiceError(f"{path}: there is no such file; give the path of a PEM file")
+            raise ServiceError(f"{path}: does not exist; give the path of a PEM file")
     if certificate is None and not is_loopback(host):
         raise ServiceError(
-            f"--host {host}: others can reach it, and without TLS all can read its secrets: give "
-            "--certificate and --key, or 127.0.0.1"
+            f"--host {host}: other machines can reach it, and without TLS its secrets can be read: "
+            "give --certificate and --key, or use 127.0.0.1"
         )
 
 
 def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
-    """As the service and its nodes are served; without an access log, which would name callers."""
+    """Return the server configuration; there is no access log, as it would name callers."""
     return uvicorn.Config(
         app,  # type: ignore[arg-type]
         log_level="warning",
@@ -125,7 +127,7 @@ def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
 
 
 class BoundedHeads(HttpToolsProtocol):
-    """Closes connections whose head is long or slow; the parser itself would take any."""
+    """A protocol that closes connections with long or slow heads, which the parser would accept."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -133,7 +135,7 @@ class BoundedHeads(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
-        if self._late is None:  # the head is there
+        if self._late is None:  # the head is complete
             return
         self._head_bytes += len(data)
         if self._head_bytes > MAX_HEAD_BYTES:

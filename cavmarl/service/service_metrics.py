@@ -1,4 +1,4 @@
-"""The service in figures, as Prometheus reads them: made of what the broker knows when asked."""
+"""Metrics of the service in the format of Prometheus, collected on request."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.service.broker import Broker
 from cavmarl.service.node_selection import score_of
 
 BUCKETS_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.5)
-_TOLD = {  # by nodes, with their beats
+_TOLD = {  # reported by nodes with their heartbeats
     "ticks": "Ticks of worlds.",
     "steps": "Steps of worlds.",
     "wait_s": "Seconds that commands of clients waited for others.",
@@ -22,7 +22,7 @@ _TOLD = {  # by nodes, with their beats
 
 
 class ServiceMetrics(PrometheusCollector):
-    """Figures of a broker, and of requests that were `rejected`, by their problems."""
+    """Metrics of a broker, and counts of requests that were `rejected`, by problem."""
 
     def __init__(self, broker: Broker, rejected: Mapping[str, int]) -> None:
         self._broker, self._rejected = broker, rejected
@@ -33,11 +33,11 @@ class ServiceMetrics(PrometheusCollector):
         self._registry.register(self)
 
     def text(self) -> str:
-        """The page."""
+        """Return the metrics as text."""
         return generate_latest(self._registry).decode()
 
     def collect(self) -> Iterator[Metric]:
-        """Families of figures, for the registry."""
+        """Yield the families of metrics for the registry."""
         broker, state = self._broker, self._broker.log.state
         states = Counter(
             "draining" if node.state == "up" and node.draining else node.state

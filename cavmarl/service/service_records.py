@@ -1,7 +1,8 @@
-"""What the service knows: nodes, sessions, identities, keys and configurations.
+"""The records of the service: nodes, sessions, identities, keys and configurations.
 
-All of it follows from the event log: `Infrastructure.apply` is the one place where it changes, so
-that a replay of the log gives the same again. What nodes tell with each beat is not in it.
+All records follow from the event log: only `Infrastructure.apply` changes them, so replaying the
+log
+gives the same records again. Values of heartbeats are not part of the log.
 """
 
 from __future__ import annotations
@@ -23,28 +24,28 @@ class LogEvent(NamedTuple):
     sequence: int  # from 1
     time_s: float  # of the wall clock
     kind: str
-    actor: str  # id of the identity that caused it; `service`: none did
-    subject: str  # what it is about: a node, a session, an identity, a configuration
-    owner: str  # identity that owns the subject, and may read of it
-    data: dict[str, Any]  # what may be shown
-    private: dict[str, Any]  # hashes of secrets and keys: never shown
-    digest: str  # over this line and the digest of the line before
+    actor: str  # identity that caused the event, or `service`
+    subject: str  # its subject: a node, session, identity or configuration
+    owner: str  # identity that owns the subject and may read the event
+    data: dict[str, Any]  # public data
+    private: dict[str, Any]  # private data: hashes of secrets, keys
+    digest: str  # of this line and the digest of the previous line
 
 
 @dataclass
 class NodeRecord:
-    """A node as it has registered itself."""
+    """A node as registered."""
 
     name: str
-    identity: str  # that registered it, and alone may speak for it
-    incarnation: int  # how often it has registered
+    identity: str  # identity that registered the node and alone may act for it
+    incarnation: int  # number of registrations
     address: str
     client_port: int
     simulator_port: int
-    slots: int  # sessions and jobs that it takes at most
+    slots: int  # maximum number of sessions and jobs
     capabilities: list[str]
     versions: dict[str, str]
-    allowed: list[str]  # names of identities that it serves; none: all
+    allowed: list[str]  # names of the identities that it serves; empty: all
     state: Literal["up", "down", "left"] = "up"
     draining: bool = False
     excluded: list[str] = field(default_factory=list)  # resources above their thresholds
@@ -52,40 +53,42 @@ class NodeRecord:
 
 @dataclass
 class SessionRecord:
-    """A session of a client, or a job: an evaluation that a node runs alone."""
+    """A session of a client, or a job: an evaluation that a node runs without a client."""
 
     id: str
     owner: str
     owner_name: str
     configuration: str  # hash
-    job: dict[str, Any] | None  # policy, episodes, repeats; None: a client steps the world
+    job: dict[str, Any] | None  # policy, episodes, repeats; None: a session of a client
     needs: list[str]  # capabilities
     preferred: str | None  # name of a node
     opened_s: float = 0.0  # by the wall clock
-    wait_s: float | None = None  # so long a job waits for its first node; None: as long as it takes
+    wait_s: float | None = None  # longest wait of a job for its first node in s; None: no limit
     state: SessionState = "queued"
     node: str | None = None
     incarnation: int = 0  # of that node
     placements: int = 0
-    reason: str = ""  # why it is that node
+    reason: str = ""  # why that node was chosen
     score: float = 0.0  # of that node, then
-    excluded: list[dict[str, Any]] = field(default_factory=list)  # some of the others, and why
+    excluded: list[dict[str, Any]] = field(
+        default_factory=list
+    )  # some excluded nodes, with reasons
     excluded_count: int = 0
     saved_number: int = 0  # commands that the saved state includes
     saved_blob: str | None = None
     results: dict[str, str] = field(default_factory=dict)  # name → hash
     message: str = ""
-    key: str = ""  # by which the same request is known again
-    zone_nodes: int = 0  # how many nodes host the zones of its worlds; 0: its node has all
+    key: str = ""  # key that identifies a repeated request
+    zone_nodes: int = 0  # number of nodes that host its zones; 0: its own node hosts all
     members: list[str] = field(default_factory=list)  # these nodes
-    told_number: int = 0  # commands up to which it is told which vehicles have changed their zone
-    # world → its episode, and vehicle → [zone that owns it, epoch], of those that have changed
+    told_number: int = 0  # number of commands up to the last report of transfers
+    # world → episode, and vehicle → [owner, epoch] of vehicles that changed zone
     owners: dict[str, OwnerTable] = field(default_factory=dict)
 
 
 @dataclass
 class OwnerTable:
-    """Owners of the vehicles of one world that have changed their zone, the newest last."""
+    """Owners of the vehicles of one world that have changed zone, newest last."""
 
     episode: int
     zones: dict[int, list[int]] = field(default_factory=dict)
@@ -93,32 +96,34 @@ class OwnerTable:
 
 @dataclass
 class IdentityRecord:
-    """A person, a program or a node that may ask."""
+    """A person, a program or a node with access to the service."""
 
     id: str
     name: str
     role: Role
     digest: str  # of its secret
-    generation: int = 0  # tokens of earlier ones are void
+    generation: int = 0  # tokens of earlier generations are invalid
     revoked: bool = False
     used: dict[str, float] = field(default_factory=dict)  # refresh tokens: id → when they expire
 
 
 @dataclass
 class Infrastructure:
-    """Everything that follows from the log."""
+    """All records that follow from the log."""
 
     nodes: dict[str, NodeRecord] = field(default_factory=dict)
     sessions: dict[str, SessionRecord] = field(default_factory=dict)
     identities: dict[str, IdentityRecord] = field(default_factory=dict)
-    keys: dict[str, str] = field(default_factory=dict)  # id → private key, in order of making
+    keys: dict[str, str] = field(default_factory=dict)  # id → private key, oldest first
     configurations: dict[str, list[str]] = field(default_factory=dict)  # name → hashes, by version
-    # identities → how many configurations they have added
+    # identity → number of configurations added
     configurations_of: dict[str, int] = field(default_factory=dict)
-    waiting: dict[str, None] = field(default_factory=dict)  # jobs that no node has, in their order
+    waiting: dict[str, None] = field(
+        default_factory=dict
+    )  # jobs without a node, in order of arrival
 
     def apply(self, event: LogEvent) -> None:
-        """Change as `event` says; it has been checked before it was written."""
+        """Apply an event that was checked before it was written."""
         topic, _, word = event.kind.partition(".")
         getattr(self, f"_apply_{topic}")(word, event)
 
@@ -134,7 +139,7 @@ class Infrastructure:
             kept = {one: until_s for one, until_s in identity.used.items() if until_s > now_s}
             identity.used = kept | {event.data["token"]: event.data["expires_s"]}
             return
-        identity.generation += 1  # `withdrawn`: its tokens; `revoked`: itself
+        identity.generation += 1  # `withdrawn`: its tokens are invalid; `revoked`: the identity is
         identity.revoked = identity.revoked or word == "revoked"
 
     def _apply_key(self, word: str, event: LogEvent) -> None:
@@ -145,11 +150,11 @@ class Infrastructure:
         self.configurations_of[event.owner] = self.configurations_of.get(event.owner, 0) + 1
 
     def _apply_clock(self, word: str, event: LogEvent) -> None:
-        """A clock's anomaly changes nothing."""
+        """Change nothing for an anomaly of a clock."""
 
     def _apply_node(self, word: str, event: LogEvent) -> None:
         if word == "registered":
-            self._lose(event.subject)  # what an earlier process of it had is gone
+            self._lose(event.subject)  # the sessions of an earlier process of the node are lost
             self.nodes[event.subject] = NodeRecord(event.subject, **event.data)
             return
         if word == "forgotten":
@@ -172,7 +177,7 @@ class Infrastructure:
                 node.excluded = event.data.get("resources", [])
 
     def _lose(self, name: str) -> None:
-        """Sessions of a node that is gone wait for another."""
+        """Let the sessions of a lost node wait for another one."""
         for session in self.sessions.values():
             if session.node == name and session.state == "active":
                 session.node, session.state = None, "queued"
@@ -187,7 +192,7 @@ class Infrastructure:
             if event.data["job"] is not None:
                 self.waiting[event.subject] = None
             return
-        if word in ("refused", "timeout"):  # what comes of it is told beside it
+        if word in ("refused", "timeout"):  # the outcome is recorded beside it
             return
         if word == "forgotten":
             del self.sessions[event.subject]

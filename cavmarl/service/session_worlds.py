@@ -1,4 +1,4 @@
-"""The worlds of a node: commands by their numbers, in one thread at a time."""
+"""The worlds of a node: numbered commands, executed in one thread at a time."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from cavmarl.client.world_protocol import flatten, pack
 from cavmarl.core.errors import CapacityError, ConfigError, MissingExtraError
 from cavmarl.env.vector import make_vec
-from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.error_names import problem
 from cavmarl.viewer.live_env import ShownEnv
@@ -28,16 +28,16 @@ class SessionWorld:
     """The worlds of one session.
 
     Args:
-        document: their configuration.
-        keys: for `make_vec`, beside it.
-        state: what another node has saved; None: they begin.
-        number: commands that it includes.
+        document: configuration of the worlds.
+        keys: further keywords of `make_vec`.
+        state: state that another node saved, or None for new worlds.
+        number: number of commands that the state includes.
 
     Attributes:
-        number: commands up to now.
-        saved: those that the state includes which the service has.
-        is_changed: a page has changed the worlds since.
-        is_commanded: a command is under way: pages have to wait.
+        number: number of commands so far.
+        saved: number of commands that the state stored with the service includes.
+        is_changed: whether a page has changed the worlds since then.
+        is_commanded: whether a command is running, so that pages have to wait.
     """
 
     def __init__(
@@ -50,21 +50,23 @@ class SessionWorld:
             seed=document["seed"],
             **(world_keywords(document) | keys),
         )
-        # Their zones are here or at nodes, never at workers.
+        # Zones run in this process or on nodes, never in workers.
         self._worlds: LocalWorlds | NodeWorlds | NodeGroups = self._vec.worlds  # type: ignore[assignment]
-        self._told = [0] * len(self._worlds.transfers)  # transfers that the service has of each
+        self._told = [0] * len(
+            self._worlds.transfers
+        )  # number of transfers of each world reported to the service
         self._last = b""  # the answer to the last command
         self.is_changed = self.is_commanded = False
         self._page: ShownEnv | None = None  # that shows them
         self._tokens = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
-        # (W,) which worlds a page has begun anew since the last command
+        # (W,) worlds that a page has restarted since the last command
         self._anew = np.zeros(document["num_envs"], dtype=np.bool_)
         if state:
             self._vec.load_state(state[: -len(self._anew)])
             self._anew[:] = np.frombuffer(state[-len(self._anew) :], dtype=np.bool_)
 
     def describe(self) -> dict[str, Any]:
-        """What a client has to know of them."""
+        """Return shapes and names that a client needs."""
         vec = self._vec
         actions: Any = vec.action_space
         seen: Any = vec.observation_space
@@ -81,7 +83,7 @@ class SessionWorld:
         }
 
     def state(self) -> bytes | None:
-        """Their state; None: it is partly elsewhere, in a SUMO or a journal."""
+        """Return the saved state, or None if part of it is in SUMO or in a journal."""
         try:
             found = self._vec.save_state() + self._anew.tobytes() if self.number else b""
         except ConfigError:
@@ -92,11 +94,13 @@ class SessionWorld:
     def command(
         self, word: str, number: int, seed: int | None, content: bytes, is_quiet: bool
     ) -> bytes:
-        """The answer to a command; to the last one again, without doing it again."""
+        """Execute a command and return its answer; a repeated command gets the same answer."""
         if number == self.number and number and self._last:
             return self._last
         if number != self.number + 1:
-            raise problem("conflict", f"command {number} after {self.number}: count them up")
+            raise problem(
+                "conflict", f"command {number} follows {self.number}: increase the number by one"
+            )
         answer = self._reset(seed) if word == "reset" else self._step(content)
         self.number, self._last = number, answer
         if self._page is not None:
@@ -127,17 +131,18 @@ class SessionWorld:
         return pack(flatten("observations", observations) | told | _flat(infos))
 
     def suggestion(self) -> bytes:
-        """What the built-in driver would do."""
+        """Return the built-in driver's actions."""
         return pack({"actions": self._vec.suggest_actions()})
 
     def hashes(self) -> list[str]:
-        """Digest of each world."""
+        """Return the state hash of each world."""
         return [self._vec.state_hash(world) for world in range(self._vec.num_envs)]
 
     def page(self) -> dict[str, str]:
-        """Address of a page that shows them from now on; tokens to control them, and to watch.
+        """Open a page; return its address and the tokens to control and to watch.
 
-        What pages change has to be in the saved state: worlds that cannot be saved are only shown.
+        Changes by pages must be part of the saved state, so worlds that cannot be saved can only be
+        watched.
         """
         token, watch_token = self._tokens
         if self._page is None:
@@ -155,16 +160,16 @@ class SessionWorld:
 
     @property
     def is_watched(self) -> bool:
-        """Whether a page of them is open."""
+        """Return whether a page of the worlds is open."""
         return self._page is not None and self._page.is_watched
 
     def tell_scores(self, rows: list[dict[str, Any]]) -> None:
-        """Let its pages show these rows below those of what runs it."""
+        """Show these LoadScores on the pages, below those of the worlds' own nodes."""
         if self._page is not None:
             self._page.tell_others(rows)
 
     def tend(self) -> float:
-        """Heed their pages, between commands; how long the next command has to wait, in s."""
+        """Serve the pages between commands; return how long the next command must wait, in s."""
         if self._page is None or self.is_commanded:
             return 0.0
         return self._heed_pages(self._page)
@@ -176,20 +181,20 @@ class SessionWorld:
         return wait_s
 
     def _begin_anew(self, world: int) -> None:
-        """Begin the episode of one world anew, as a page wants it; the next answer says so."""
+        """Restart the episode of one world for a page; the next answer reports it."""
         chosen = np.arange(len(self._anew)) == world
         self._vec.reset(options={"reset_mask": chosen})
         self._anew |= chosen
 
     def transfers(self) -> list[dict[str, Any]]:
-        """The newest changes of owner of divided worlds."""
+        """Return the most recent ownership transfers of divided worlds."""
         found = self._worlds.transfers
         return [
             {"world": world, **row._asdict()} for world, log in enumerate(found) for row in log.rows
         ]
 
     def ownership(self) -> dict[str, list[list[int]]]:
-        """Transfers since this was asked last, and those that are prepared: see `TransfersBody`."""
+        """Return transfers since the last call, and prepared ones, as in `TransfersBody`."""
         rows, prepared = [], []
         for world, log in enumerate(self._worlds.transfers):
             known, number = self._told[world], self._num_transfers(world)
@@ -205,17 +210,17 @@ class SessionWorld:
 
     @property
     def num_transfers(self) -> int:
-        """How many vehicles have changed their zone."""
+        """Return the number of transfers."""
         return sum(self._num_transfers(world) for world in range(len(self._told)))
 
     @property
     def is_divided(self) -> bool:
-        """Whether vehicles can change their zone."""
+        """Return whether the worlds have several zones."""
         return bool(self._told)
 
     @property
     def num_ticks(self) -> int:
-        """Ticks of one step of all worlds."""
+        """Return the number of ticks that one step of all worlds takes."""
         return self._vec.num_envs * self._vec.config.clock.ticks_per_step
 
     def _num_transfers(self, world: int) -> int:
@@ -223,7 +228,7 @@ class SessionWorld:
         return counts["switched"] + counts["forced"]
 
     def close(self) -> None:
-        """Let go of their memory and processes."""
+        """Release memory and processes."""
         if self._page is not None:
             self._page.close()
             self._page = None
@@ -231,10 +236,10 @@ class SessionWorld:
 
 
 class SessionWorlds:
-    """The sessions of a node; one command at a time, as kernels use all of a core anyway.
+    """The sessions of a node. Commands run one at a time, as kernels use a whole core.
 
     Args:
-        slots: how many there may be.
+        slots: maximum number of sessions.
     """
 
     def __init__(self, slots: int) -> None:
@@ -260,21 +265,23 @@ class SessionWorlds:
         number: int,
         keys: dict[str, Any],
     ) -> None:
-        """Make the worlds of a session."""
+        """Create the worlds of a session."""
         if len(self._worlds) >= self._slots:
-            raise CapacityError(f"{self._slots} sessions are on this node: resolve it again later")
+            raise CapacityError(
+                f"this node has {self._slots} sessions already: resolve the session again later"
+            )
         with self.lock:
             if session not in self._worlds:
                 self._worlds[session] = SessionWorld(document, state, number, keys)
 
     def ended(self, session: str, word: str) -> None:
-        """A command of a session is done."""
+        """Note that a command of a session is done."""
         if word == "step":
             self.steps += 1
             self.ticks += self[session].num_ticks
 
     def counters(self) -> dict[str, float]:
-        """What a beat tells."""
+        """Return the counters of a heartbeat."""
         present = sum(world.num_transfers for world in list(self._worlds.values()))
         return {
             "ticks": float(self.ticks),
@@ -285,11 +292,14 @@ class SessionWorlds:
 
     @property
     def is_watched(self) -> bool:
-        """Whether a page of any session is open."""
+        """Return whether a page of any session is open."""
         return any(world.is_watched for world in list(self._worlds.values()))
 
     def tell_scores(self, scores: list[dict[str, Any]]) -> None:
-        """Let pages show the LoadScores of the service's nodes; of none: those before stay."""
+        """Show the LoadScores of the service's nodes on pages.
+
+        Without scores, keep the previous ones.
+        """
         if not scores:
             return
         rows = [
@@ -305,11 +315,11 @@ class SessionWorlds:
             world.tell_scores(rows)
 
     def divided(self) -> list[str]:
-        """Sessions whose worlds have zones."""
+        """Return the sessions whose worlds have zones."""
         return [session for session, world in list(self._worlds.items()) if world.is_divided]
 
     def keep_only(self, sessions: set[str]) -> None:
-        """Close those that are another node's now."""
+        """Close sessions that are now hosted by other nodes."""
         for session in [one for one in self._worlds if one not in sessions]:
             self.close(session)
 

@@ -1,8 +1,10 @@
-"""Which nodes host the zones of a session's worlds, where these are over more than one.
+"""Selection of the nodes that host the zones of a session, if there is more than one.
 
-The session's own node leads: it takes the commands, and awaits the others at a door that it tells.
-They are chosen as nodes of sessions are, on as many machines as there are; one that is lost or
-drained is replaced, and the worlds go on from what their buddies have kept (docs/guides/nodes.md).
+The session's own node leads: it receives the commands, and waits for the other nodes at an address
+that it reports. The other nodes are selected like nodes of sessions, on as many machines as
+possible.
+A node that is lost or drained is replaced, and the worlds continue from the states that other nodes
+keep (docs/guides/nodes.md).
 """
 
 from __future__ import annotations
@@ -13,19 +15,19 @@ from typing import Any
 
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.node_selection import Chosen, LiveNode, NoNodeError
-from cavmarl.service.requests import DoorBody
+from cavmarl.service.request_bodies import DoorBody
 from cavmarl.service.service_records import SessionRecord
 
 Choose = Callable[[SessionRecord, Sequence[str]], Chosen]
 
 
 class ZoneNodes:
-    """The members of all sessions.
+    """The zone nodes of all sessions.
 
     Args:
-        log: of the service.
-        live: what is known of nodes.
-        choose: a node for a session, but for some.
+        log: the event log of the service.
+        live: heartbeats of the nodes.
+        choose: returns a node for a session, excluding some.
     """
 
     def __init__(self, log: EventLog, live: Mapping[str, LiveNode], choose: Choose) -> None:
@@ -36,7 +38,7 @@ class ZoneNodes:
                 self._live[name].zones_of.append(session.id)
 
     def gather(self, session: SessionRecord) -> None:
-        """See that as many nodes as are wanted host zones of a session, if so many can."""
+        """Assign the wanted number of nodes to a session, or as many as can host zones."""
         nodes = self._log.state.nodes
         kept = [
             name
@@ -59,22 +61,22 @@ class ZoneNodes:
         )
 
     def sweep(self) -> None:
-        """Replace members that are gone."""
+        """Replace lost zone nodes."""
         for session in list(self._log.state.sessions.values()):
             if session.zone_nodes and session.state == "active":
                 self.gather(session)
 
     def end(self, session: SessionRecord) -> None:
-        """A session is over: its members are free."""
+        """Release the zone nodes of an ended session."""
         self._release(session.members, session.id)
         self._doors.pop(session.id, None)
 
     def open_door(self, session: SessionRecord, door: DoorBody) -> None:
-        """The session's node awaits its members there."""
+        """Record the address at which the session's node waits for the others."""
         self._doors[session.id] = door
 
     def tasks(self, name: str) -> list[dict[str, Any]]:
-        """The doors that a node has to call at, each as often as it is a member."""
+        """Return the addresses to which a node must connect, once per part that it hosts."""
         found = []
         for session in sorted(self._live[name].zones_of):
             door = self._doors.get(session)
@@ -83,13 +85,13 @@ class ZoneNodes:
         return found
 
     def without_door(self, hosted: Sequence[str]) -> list[str]:
-        """Sessions whose node has not told where it awaits the others."""
+        """Return the sessions whose node has not reported its address yet."""
         sessions = self._log.state.sessions
         return [one for one in hosted if sessions[one].zone_nodes and one not in self._doors]
 
     def _another(self, session: SessionRecord, members: Sequence[str]) -> str | None:
         anywhere = replace(session, preferred=None)
-        for avoided in (members, ()):  # one that is a member already rather than none
+        for avoided in (members, ()):  # prefer a node that hosts a part already to no node
             try:
                 return self._choose(anywhere, avoided).node
             except NoNodeError:

@@ -1,4 +1,4 @@
-"""Zones of other nodes' sessions: a process for each part that this node has, at their doors."""
+"""Processes of a node that host zones of other nodes' sessions, one per part."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
-from cavmarl.parallel.nodes.newcomers import ANYONE
+from cavmarl.parallel.nodes.joining_nodes import ANYONE
 from cavmarl.parallel.nodes.node_starters import NODE
 
 Door = tuple[str, int, str]  # host, port, key
@@ -26,7 +26,7 @@ class ZoneProcesses:
         return sum(len(some) for some in self._of.values())
 
     def follow(self, tasks: Sequence[dict[str, Any]]) -> None:
-        """Have as many as `ZoneNodes.tasks` says; one that has ended is started again."""
+        """Run as many processes as `ZoneNodes.tasks` lists; restart a process that has ended."""
         wanted = Counter((one["host"], one["port"], one["key"]) for one in tasks)
         for door in {*self._of, *wanted}:
             alive = [one for one in self._of.get(door, []) if one.poll() is None]
@@ -39,7 +39,7 @@ class ZoneProcesses:
                 del self._of[door]
 
     def end(self) -> None:
-        """End all."""
+        """End all processes."""
         self.follow([])
 
 

@@ -19,8 +19,6 @@ from typing import Any
 
 from cavmarl.core.errors import MessageError
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.transport import (
     Bytes,
     Connection,
@@ -30,6 +28,8 @@ from cavmarl.parallel.network.transport import (
 )
 from cavmarl.parallel.nodes.leases import late_ticks
 from cavmarl.parallel.nodes.node_system import NodeSystem
+from cavmarl.parallel.worlds.journaled_worlds import without_journals
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 ADDRESS = "node"
 ALIVE_S = 25.0  # until a system ends a connection over which no answer comes
@@ -414,7 +414,7 @@ class _System:
         if listener is None or listener.owner.is_ended:
             raise ConnectionRefusedError(f"nothing listens at {place}")
         if secret != listener.secret:
-            raise MessageError(f"what listens at {place} does not know the secret")
+            raise MessageError(f"the process at {place} does not know the secret")
         here, there = (SimulatedSocket(machine, each) for each in (self._process, listener.owner))
         here.other, there.other = there, here
         machine.connections.append((here, there))
@@ -422,9 +422,9 @@ class _System:
         return here
 
     def worlds_of(
-        self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
+        self, message: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
     ) -> LocalWorlds:
         world = self._machine.world
         late = late_ticks(world.config)
-        world = unwatched(world)
+        world = without_journals(world)
         return LocalWorlds(world, num_worlds, in_next_step=in_next_step, late_ticks=late)

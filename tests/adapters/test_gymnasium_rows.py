@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError
-from cavmarl.engine.spaces import flat_observation
+from cavmarl.engine.spaces import flat_observation, observation_parts
 from cavmarl.env.vector import make_vec
 
 MODES = ("closed", "open", "respawn")
@@ -118,7 +118,7 @@ def test_gymnasium_records_the_trips_of_all_rows(mode: str, autoreset: Autoreset
 def test_a_row_may_show_a_dict(autoreset: AutoresetMode) -> None:
     named = make(kind="dict", autoreset_mode=autoreset)
     flat = make(autoreset_mode=autoreset)
-    parts = named.unwrapped._form._parts
+    parts = observation_parts(named.unwrapped.vec.config.sensors)
 
     def flattened(observation: dict[str, Any]) -> NDArray[np.float32]:
         return flat_observation(parts, observation, stack=1)

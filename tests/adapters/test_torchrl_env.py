@@ -29,12 +29,9 @@ CAR = "car"
 def settings(mode: str = "respawn", **overrides: Any) -> dict[str, Any]:
     keys = {"population.mode": mode, "population.budget": BUDGET, **overrides}
     return {
-        "num_envs": WORLDS,
-        "agents": AGENTS,
-        "background": 3,
-        "max_cycles": HORIZON,
+        "num_envs": WORLDS, "agents": AGENTS, "background": 3, "max_cycles": HORIZON,
         "overrides": keys,
-    }
+    }  # fmt: skip
 
 
 def make(mode: str = "respawn", **overrides: Any) -> Any:

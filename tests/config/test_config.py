@@ -152,10 +152,7 @@ def test_a_value_out_of_range_is_told_the_range(tmp_path: Path, text: str, expec
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (
-            "population: {mode: open, agents: 8, budget: 4}",
-            r"budget = 4: must be at least .* 8",
-        ),
+        ("population: {mode: open, agents: 8, budget: 4}", r"budget = 4: must be at least .* 8"),
         ("traffic: {min_trip_m: 500, max_trip_m: 300}", r"max_trip_m = 300\.0: .*above.* 500"),
         ("horizon_s: 0.05", r"horizon_s = 0\.05: must be a number from 0\.1"),
     ],
@@ -175,10 +172,7 @@ def test_an_impossible_combination_is_told_the_cure(
         ),
         ("kinematics: {features: []}", r"kinematics\.features = \(\): must name at least one"),
         ("kinematics: {features: [x, x]}", r"kinematics\.features = .*must name each feature once"),
-        (
-            "kinematics: {features: [on_road]}",
-            r"kinematics\.features = 'on_road': no such feature",
-        ),
+        ("kinematics: {features: [on_road]}", r"kinematics\.features = 'on_road': no such feature"),
         (
             "kinematics: {features_range: {vz: [0, 1]}}",
             r"kinematics\.features_range = 'vz': no such feature",

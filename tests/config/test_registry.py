@@ -53,7 +53,7 @@ def test_an_entry_of_the_working_directory_is_found_and_comes_first(here: Path) 
 def test_a_wheel_carries_its_own_entries(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     packaged = make_entry(here / "site" / "cavmarl" / "data" / "envs" / "packaged")
     make_entry(here / "site" / "envs" / "beside")
-    monkeypatch.setattr(registry, "_PACKAGE", here / "site" / "cavmarl")
+    monkeypatch.setattr(registry, "PACKAGE", here / "site" / "cavmarl")
     assert entries() == {"packaged": packaged}
 
 

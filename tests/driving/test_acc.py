@@ -1,4 +1,4 @@
-"""Adaptive cruise control against SUMO's on a platoon: a leader with a profile, five followers."""
+"""Adaptive cruise control compared with SUMO's: a leader with a speed profile, five followers."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE, set_model
 DT, STEPS, FOLLOWERS = 0.1, 1000, 5
 START_MPS, START_GAP_M, LIMIT_MPS = 20.0, 22.5, 30.0
 SPEED_MPS, GAP_M = 0.2, 0.3  # largest differences of any vehicle in any step
-MEAN_SPEED_MPS, MEAN_GAP_M = 0.02, 0.05  # and their means
+MEAN_SPEED_MPS, MEAN_GAP_M = 0.02, 0.05  # means of these differences
 
-# In a child process: a process holds one libsumo at most.
+# Run in a child process: a process can load libsumo only once.
 RUN = """
 import json, sys
 import libsumo
@@ -81,7 +81,7 @@ def car() -> np.void:
 
 
 def driven(places: np.ndarray, speeds: np.ndarray) -> np.ndarray:
-    """(steps, vehicles, 2) places and speeds of ours, from where SUMO's stand."""
+    """Return (steps, vehicles, 2) positions and speeds, from SUMO's initial state."""
     kind, rows = car(), []
     places, speeds = places.copy(), speeds.copy()
     for lead in profile()[1:]:
@@ -101,7 +101,7 @@ def driven(places: np.ndarray, speeds: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def theirs(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
-    """SUMO's (steps, vehicles, 2)."""
+    """Positions and speeds (steps, vehicles, 2) in SUMO."""
     sumo: Any = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     folder = tmp_path_factory.mktemp("acc")
@@ -125,8 +125,8 @@ def theirs(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     return np.array(json.loads(said.stdout.strip().splitlines()[-1]))
 
 
-def test_a_platoon_drives_as_sumos(theirs: np.ndarray) -> None:
-    """The largest and the mean difference of speeds and of gaps, over 100 s of five followers."""
+def test_a_platoon_with_acc_drives_as_in_sumo(theirs: np.ndarray) -> None:
+    """Compare speeds and gaps of five followers over 100 s, by largest and mean differences."""
     first, rest = theirs[0], theirs[1:]
     ours = driven(first[:, 0], first[:, 1])
     speed_off = np.abs(ours[:, 1:, 1] - rest[:, 1:, 1])
@@ -142,12 +142,12 @@ def test_a_platoon_drives_as_sumos(theirs: np.ndarray) -> None:
     ("room", "front_mps", "expected"),
     [
         (math.inf, 0.0, 0.4 * 5.0),  # a free road: towards the allowed speed
-        (60.0, 20.0, 0.4 * 5.0),  # more than two seconds away: the same
-        (20.1, 20.05, 0.23 * 0.1 + 0.07 * 0.05),  # near the wanted gap
-        (25.0, 21.0, 0.04 * 5.0 + 0.8 * 1.0),  # the gap is to be closed
-        (17.0, 19.0, -0.8 * 3.0 - 0.23 * 1.0),  # too near
+        (60.0, 20.0, 0.4 * 5.0),  # more than two seconds away: the leader is ignored
+        (20.1, 20.05, 0.23 * 0.1 + 0.07 * 0.05),  # close to the desired gap
+        (25.0, 21.0, 0.04 * 5.0 + 0.8 * 1.0),  # the gap is too large
+        (17.0, 19.0, -0.8 * 3.0 - 0.23 * 1.0),  # the gap is too small
     ],
 )
-def test_the_four_modes(room: float, front_mps: float, expected: float) -> None:
+def test_acc_has_four_modes(room: float, front_mps: float, expected: float) -> None:
     asked = acc_acceleration(20.0, 25.0, room, front_mps, 4.5, 1.0, 2.6, 4.5)
     assert asked == pytest.approx(expected, abs=1e-9)

@@ -1,4 +1,4 @@
-"""`population.types`: cars, trucks and buses, each with dynamics of its own."""
+"""`population.types`: cars, trucks and buses, each with its own dynamics."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def sizes(vec: Any) -> dict[int, tuple[float, float]]:
     return {int(row["agent"]): (row["length"], row["width"]) for row in rows if row["agent"] >= 0}
 
 
-def test_agents_have_the_types_in_turn_also_those_that_follow() -> None:
+def test_types_are_assigned_in_turn_to_agents_and_their_successors() -> None:
     vec = make()
     vec.reset(seed=0)
     wanted = {"car": (5.0, 2.0)} | {
@@ -36,7 +36,7 @@ def test_agents_have_the_types_in_turn_also_those_that_follow() -> None:
     }
     rng = np.random.default_rng(0)
     followed = 0
-    for _ in range(120):  # whoever steers so leaves the road, and another one takes the seat
+    for _ in range(120):  # these vehicles leave the road and are replaced
         actions = rng.uniform(-1.0, 1.0, (1, 6, 2)).astype(np.float32)
         _, _, terminated, _, _ = vec.step(actions)
         followed += int(terminated.sum())
@@ -45,7 +45,7 @@ def test_agents_have_the_types_in_turn_also_those_that_follow() -> None:
     assert followed > 6
 
 
-def test_they_know_their_own_size() -> None:
+def test_ego_observations_contain_the_size() -> None:
     vec = make()
     observations, _ = vec.reset(seed=0)
     assert np.allclose(observations[0, :3, 13], [5.0 / 20.0, 8.0 / 20.0, 12.0 / 20.0])
@@ -54,7 +54,7 @@ def test_they_know_their_own_size() -> None:
     assert np.allclose(observations[0, :3, 17], [1.0, 0.15, 0.12])
 
 
-def test_each_accelerates_brakes_and_turns_as_its_type_can() -> None:
+def test_accelerating_braking_and_turning_are_limited_by_the_type() -> None:
     overrides = {"action.steering_rad": 1.2, "action.acceleration_mps2": 5.0}
     vec = make("highway", overrides=overrides, zones=1)
     vec.reset(seed=1)
@@ -78,8 +78,8 @@ def test_each_accelerates_brakes_and_turns_as_its_type_can() -> None:
             assert row["steering"] == pytest.approx(most, abs=1e-6)
 
 
-def test_a_turning_circle_is_that_of_the_wheelbase() -> None:
-    """At a given angle of the wheels a bus turns as slowly as a wheelbase of 6 m says."""
+def test_the_turning_circle_follows_from_the_wheelbase() -> None:
+    """For a given steering angle, the yaw rate of a bus follows from its wheelbase of 6 m."""
     vec = make("highway", types=["bus"])
     vec.reset(seed=1)
     action = np.zeros((1, 6, 2), dtype=np.float32)
@@ -92,7 +92,7 @@ def test_a_turning_circle_is_that_of_the_wheelbase() -> None:
             assert row["yaw_rate"] == pytest.approx(row["speed"] * np.sin(slip) / 3.0, rel=0.02)
 
 
-def test_krauss_keeps_to_a_limit_though_what_it_does_holds_for_several_ticks() -> None:
+def test_krauss_keeps_the_limit_if_a_decision_holds_for_several_ticks() -> None:
     vec = make("highway", types=["car"], overrides={"traffic.model": "Krauss"})
     assert vec.config.clock.ticks_per_step > 1
     vec.reset(seed=2)
@@ -116,6 +116,6 @@ def test_zones_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("types", [[], ["lorry"], "bus"])
-def test_types_that_there_are_not_are_refused(types: Any) -> None:
+def test_unknown_types_are_refused(types: Any) -> None:
     with pytest.raises(ConfigError, match=r"population\.types"):
         make(types=types)

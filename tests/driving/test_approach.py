@@ -20,7 +20,7 @@ CROWDS = {"merge": 30, "grid4x4": 40, "ring": 20, "blocks": 60}
 
 @pytest.fixture(params=CROWDS, scope="module")
 def world(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Simulation:
-    """Traffic, some seconds after its start; the blocks are streets with signs, and short."""
+    """Traffic some seconds after its start, on short streets with signs."""
     env = request.param
     if env == "blocks":
         env = netgenerate(
@@ -44,15 +44,15 @@ def listed(simulation: Simulation, rows: NDArray[np.void]) -> Scratch:
 
 
 def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
-    """(id, dist, speed, half) of a link, by id."""
+    """Return (id, dist, speed, half) of the vehicles at a link, by id."""
     found = room.approach[room.link_start[link] : room.link_end[link]]
     assert (found["link"] == link).all()
     return sorted((int(e["id"]), float(e["dist"]), e["speed"], e["half"]) for e in found)
 
 
 @pytest.mark.parametrize("stand", [False, True])
-def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation, stand: bool) -> None:
-    """Of vehicles that are kept where they are, too."""
+def test_every_link_lists_the_vehicles_on_it_and_before_it(world: Simulation, stand: bool) -> None:
+    """Vehicles that cannot move are listed as well."""
     travel, roads = world.travel, world.network
     for step in range(0, 12, 2):
         for _ in range(step):
@@ -73,7 +73,7 @@ def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation, stand: b
                 assert mine == pytest.approx(other)
 
 
-def test_each_junction_knows_the_largest_of_those_that_are_listed_there(world: Simulation) -> None:
+def test_each_junction_has_the_largest_size_of_its_listed_vehicles(world: Simulation) -> None:
     rows, links = world.vehicles(), world.network.links
     rows["length"], rows["length"][::2] = 7.5, 12.0
     room = listed(world, rows)

@@ -24,7 +24,7 @@ def contacts(rows: NDArray[np.void], cell_m: float = 10.0) -> list[int]:
 @given(crowds(), st.sampled_from([4.0, 25.0]))
 def test_contacts_equal_twin(rows: NDArray[np.void], cell_m: float) -> None:
     hits = contacts(rows, cell_m)
-    # Boxes that touch without sharing area are at the mercy of rounding.
+    # For boxes that touch without a common area, rounding decides.
     if naive.find_contacts(rows, 1e-6) == naive.find_contacts(rows, -1e-6):
         assert hits == naive.find_contacts(rows)
 
@@ -40,7 +40,7 @@ def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: objec
 @pytest.mark.parametrize(
     ("heading", "reach_m"), [(0.0, 2.0), (0.3, 2.69), (-0.3, 2.69), (7.0, 3.396)]
 )
-def test_side_by_side_they_touch_up_to_half_their_widths_and_what_one_is_turned(
+def test_vehicles_side_by_side_touch_by_their_widths_and_angle(
     heading: float, reach_m: float
 ) -> None:
     for apart_m, touch in ((reach_m - 0.02, [1, 0]), (reach_m + 0.02, [-1, -1])):
@@ -50,14 +50,14 @@ def test_side_by_side_they_touch_up_to_half_their_widths_and_what_one_is_turned(
             assert contacts(rows) == touch
 
 
-def test_a_bridge_is_no_crash() -> None:
+def test_vehicles_on_and_under_a_bridge_do_not_touch() -> None:
     places = [(0.0, 0.0, 0.0), (1.0, 0.0, math.pi / 2)]
     assert contacts(vehicles(places, z=[0.0, 5.0])) == [-1, -1]
     assert contacts(vehicles(places, z=[0.0, 1.5])) == [-1, -1]
     assert contacts(vehicles(places, z=[0.0, 1.4])) == [1, 0]
 
 
-def test_the_smallest_id_is_named() -> None:
+def test_the_smallest_id_is_written() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (-4.0, 0.0, 0.0)], id=[5, 3, 8])
     assert contacts(rows) == [3, 5, 5]
 

@@ -1,4 +1,4 @@
-"""Who has to change lanes is let in by those who follow on the lane that it changes to."""
+"""Followers on the target lane brake for a vehicle that has to change lanes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from cavmarl.driving.vehicles import VEHICLE
 from tests.support.traffic import network, scratch, travel
 
 NAME = "grid4x4"
-FREE = 2.0  # m/s², as somebody drives whom nothing has softened
+FREE = 2.0  # m/s², acceleration without cooperative braking
 
 
 def crossing() -> tuple[int, int, list[int]]:
-    """A lane, the one to its left, and those that lead over a junction to that."""
+    """Find a lane, its left neighbour, and the lanes that lead over a junction to that one."""
     roads = network(NAME)
     for lane, row in enumerate(roads.lanes):
         left = int(row["left"])
@@ -28,7 +28,7 @@ def crossing() -> tuple[int, int, list[int]]:
 
 
 def merged(rows: NDArray[np.void]) -> Scratch:
-    """What is asked of everybody when row 0 has called for room."""
+    """Return the accelerations of all rows after cooperative braking for row 0."""
     roads, ways = network(NAME), travel(NAME)
     room = scratch(roads, len(rows))
     room.accel[: len(rows)] = FREE
@@ -38,7 +38,7 @@ def merged(rows: NDArray[np.void]) -> Scratch:
 
 
 def rows_on(places: list[tuple[int, float]], speed: float = 10.0) -> NDArray[np.void]:
-    """Cars on lanes, the first with its blinker to the left."""
+    """Put cars on lanes; the blinker of the first one is set to the left."""
     rows = np.zeros(len(places), VEHICLE)
     rows["id"], rows["side_lane"] = np.arange(len(places)), -1
     rows["lane"], rows["s"] = zip(*places, strict=True)
@@ -48,13 +48,13 @@ def rows_on(places: list[tuple[int, float]], speed: float = 10.0) -> NDArray[np.
 
 
 @pytest.mark.parametrize("id_", [0, 1])
-def test_followers_on_all_lanes_that_lead_there_make_room(id_: int) -> None:
+def test_followers_on_all_incoming_lanes_brake(id_: int) -> None:
     lane, _, before = crossing()
     rows = rows_on([(lane, 6.0), (before[id_], 1.0), (before[1 - id_], 2.0)])
     assert (merged(rows).accel[1:3] < FREE).all()
 
 
-def test_who_follows_on_the_lane_itself_is_the_only_one_to_make_room() -> None:
+def test_a_follower_on_the_lane_itself_is_the_only_one_that_brakes() -> None:
     lane, left, before = crossing()
     rows = rows_on([(lane, 20.0), (left, 8.0), (before[0], 1.0)])
     accel = merged(rows).accel
@@ -62,7 +62,7 @@ def test_who_follows_on_the_lane_itself_is_the_only_one_to_make_room() -> None:
     assert accel[2] == FREE
 
 
-def test_the_first_on_a_lane_makes_room_for_those_behind_it() -> None:
+def test_the_first_vehicle_on_a_lane_brakes_also_for_vehicles_behind_it() -> None:
     lane, _, before = crossing()
     length = float(network(NAME).lanes["length_m"][before[0]])
     rows = rows_on([(lane, 12.0), (before[0], 0.0), (before[0], length - 1.0)])
@@ -71,7 +71,7 @@ def test_the_first_on_a_lane_makes_room_for_those_behind_it() -> None:
     assert accel[1] == FREE
 
 
-def test_nobody_makes_room_for_one_who_is_far_away() -> None:
+def test_no_follower_brakes_for_a_distant_vehicle() -> None:
     lane, left, _ = crossing()
     rows = rows_on([(lane, 75.0), (left, 10.0)])
     assert merged(rows).accel[1] == FREE

@@ -1,4 +1,4 @@
-"""A car that was steered a little over a red line is not told by the built-in driver to go."""
+"""The built-in driver does not go at red if the car was steered a little over the line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OVER_M = 1.5
 
 
 def test_a_car_that_creeps_over_a_red_line_waits_for_green() -> None:
-    """All creep before lines where they are to stand, until the front is well beyond."""
+    """All cars creep where they should stand at lines, until their fronts are well beyond."""
     vec = cavmarl.make_vec(
         "grid4x4",
         agents=12,
@@ -43,4 +43,4 @@ def test_a_car_that_creeps_over_a_red_line_waits_for_green() -> None:
         vec.close()
     assert crept > 0
     assert red == 0
-    assert arrived > 12, "they go on at green"
+    assert arrived > 12, "the cars go on at green"

@@ -1,4 +1,4 @@
-"""Equal roads: circles of vehicles that wait for one another, and how they are broken."""
+"""Deadlocks on equal roads: cycles of vehicles that wait for one another, and their resolution."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ TICKS = 2000
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The map of a crossing, by SUMO's type of the node."""
+    """The map of a crossing, by SUMO's type of its node."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
 class Queue(NamedTuple):
-    """One that stands at the line of each of some arms, and gives way."""
+    """A vehicle on each of some arms that stands at its line and yields."""
 
     network: RoadNetwork
     links: list[int]
@@ -93,33 +93,35 @@ def queue(crossing: Callable[[str], Path]) -> Callable[..., Queue]:
     [
         ("WSEN", AHEAD, True),
         ("WS", AHEAD, False),
-        ("WSE", AHEAD, False),  # the one from the east gives way to none
+        ("WSE", AHEAD, False),  # the vehicle from the east yields to none
         ("WE", LEFT, False),
-        ("WSE", LEFT, True),  # from the east to the left, that is before the one from the west
+        ("WSE", LEFT, True),  # a left turn from the east yields to the vehicle from the west
     ],
 )
-def test_a_circle_leads_back_to_the_own_lane(
+def test_a_deadlock_leads_back_to_the_own_lane(
     queue: Callable[..., Queue], arms: str, goals: dict[str, str], circle: bool
 ) -> None:
     assert queue(arms, goals).is_circle() == circle
 
 
 @pytest.mark.parametrize(("goals", "share"), [(AHEAD, 0.25), (LEFT, 0.75)])
-def test_in_a_circle_one_lets_the_others_go_in_some_ticks_and_all_agree_when(
+def test_in_a_deadlock_a_vehicle_yields_in_ticks_that_all_drivers_know(
     queue: Callable[..., Queue], goals: dict[str, str], share: float
 ) -> None:
     here = queue("WSEN", goals)
     drawn = [here.yields(tick) for tick in range(TICKS)]
     assert np.mean(drawn) == pytest.approx(share, abs=0.03)
     assert [here.yields(tick, asking=3) for tick in range(TICKS)] == drawn
-    assert [here.yields(tick, i=1) for tick in range(TICKS)] != drawn, "each by itself"
+    assert [here.yields(tick, i=1) for tick in range(TICKS)] != drawn, (
+        "each vehicle draws its own numbers"
+    )
 
 
 @pytest.mark.parametrize(
     "fields",
     [{"hold": HOLD_NONE}, {"speed": 1.0}, {"wait_s": 0.0}],
 )
-def test_one_that_does_not_wait_lets_none_go(
+def test_a_vehicle_that_does_not_wait_does_not_yield_in_a_deadlock(
     queue: Callable[..., Queue], fields: dict[str, Any]
 ) -> None:
     here = queue("WSEN", AHEAD, **fields)
@@ -135,7 +137,7 @@ def test_one_that_does_not_wait_lets_none_go(
         ("priority", DRIVER_BACKGROUND, MODEL_KRAUSS, False),
     ],
 )
-def test_circles_are_for_sumo_s_drivers_on_equal_roads(
+def test_only_drivers_as_in_sumo_resolve_deadlocks_on_equal_roads(
     crossing: Callable[[str], Path], kind: str, driver: int, model: int, breaks: bool
 ) -> None:
     network = read_network(crossing(kind))

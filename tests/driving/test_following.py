@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
+    MODELS,
     accel_behind,
     before_line,
     behind,
@@ -16,6 +17,7 @@ from cavmarl.driving.kernels.models.following import (
     speed_behind,
     wish,
 )
+from cavmarl.driving.kernels.models.registered_models import FIRST_REGISTERED
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE, generated_types, set_model
 from tests.naive import following as naive
 
@@ -27,18 +29,25 @@ DECELS = st.floats(1.0, 9.0)
 SHARES = st.floats(0.0, 1.0, exclude_max=True)
 
 
-def krauss(sigma: float = 0.5) -> np.void:
-    """SUMO's passenger car."""
+def passenger_car(model: int, sigma: float = 0.0) -> np.void:
+    """SUMO's passenger car with a model, MODEL_*."""
     car = np.zeros(1, VTYPE)[0]
     for field, value in CLASS_DEFAULTS["passenger"]._asdict().items():
         if field in (VTYPE.names or ()):
             car[field] = value
-    set_model(car, MODEL_KRAUSS)
+    set_model(car, model)
     car["tau"], car["sigma"] = 1.0, sigma
     return car
 
 
-KINDS = {"IDM": IDM, "Krauss": krauss(0.0)}
+# A car for each model of the package.
+KINDS = {model.name: passenger_car(model.code) for model in MODELS} | {"IDM": IDM}
+
+
+def test_each_model_has_a_code_of_its_own() -> None:
+    codes = {model.code for model in MODELS}
+    assert len(codes) == len(MODELS)
+    assert max(codes) < FIRST_REGISTERED
 
 
 def constraint_of(kind: np.void, speed: float, leaders: list[tuple[float, float, float]]) -> float:
@@ -52,7 +61,7 @@ LEADERS = st.lists(st.tuples(GAPS, SPEEDS, DECELS), max_size=3)
 
 
 @given(SPEEDS, st.floats(1.0, 40.0), LEADERS)
-def test_idms_response_equals_twin(
+def test_idm_response_equals_twin(
     speed: float, allowed: float, leaders: list[tuple[float, float, float]]
 ) -> None:
     constraint = constraint_of(IDM, speed, leaders)
@@ -68,39 +77,39 @@ def test_krauss_response_equals_twin(
     share: float,
     sigma: float,
 ) -> None:
-    kind = krauss(sigma)
+    kind = passenger_car(MODEL_KRAUSS, sigma)
     constraint = constraint_of(kind, speed, leaders)
     twin = naive.krauss_response(kind, speed, allowed, leaders, share, DT)
     assert response(kind, speed, allowed, constraint, share, DT) == pytest.approx(twin, abs=1e-6)
 
 
 @given(SPEEDS, LEADERS, SHARES)
-def test_krauss_never_brakes_below_a_stand(
+def test_krauss_never_brakes_to_a_negative_speed(
     speed: float, leaders: list[tuple[float, float, float]], share: float
 ) -> None:
-    kind = krauss()
+    kind = passenger_car(MODEL_KRAUSS, 0.5)
     accel = response(kind, speed, 30.0, constraint_of(kind, speed, leaders), share, DT)
     assert speed + accel * DT >= -1e-9
     assert accel >= -kind["emergency_decel"]
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ["IDM", "Krauss"])
 @given(speed=SPEEDS, gap=GAPS, more=st.floats(0.1, 50.0), front=SPEEDS)
 def test_a_nearer_leader_constrains_no_less(
     name: str, speed: float, gap: float, more: float, front: float
 ) -> None:
     kind = KINDS[name]
     near, far = (behind(kind, speed, at, front, kind["decel"]) for at in (gap, gap + more))
-    # IDM's desired gap may be negative behind one that speeds away: its square still constrains.
+    # IDM's desired gap may be negative behind a leader that drives away: its square still counts.
     desired = kind["tau"] * speed + speed * (speed - front) / 7.8
     if kind["model"] == MODEL_KRAUSS or desired > -kind["min_gap"]:
         assert near >= far
     assert far >= no_constraint(kind)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ["IDM", "Krauss"])
 @given(gap=st.floats(-5.0, 150.0), front=SPEEDS, front_decel=DECELS)
-def test_at_the_speed_of_a_gap_a_driver_wants_just_that_gap(
+def test_speed_behind_is_the_speed_at_which_a_gap_is_wanted(
     name: str, gap: float, front: float, front_decel: float
 ) -> None:
     kind = KINDS[name]
@@ -117,7 +126,7 @@ def test_at_the_speed_of_a_gap_a_driver_wants_just_that_gap(
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_wish_behind_one_leader_is_that_of_its_constraint(name: str) -> None:
+def test_accel_behind_is_the_wish_for_the_constraint_of_the_leader(name: str) -> None:
     kind = KINDS[name]
     constraint = behind(kind, 12.0, 20.0, 9.0, 4.0)
     assert accel_behind(kind, 12.0, 15.0, 20.0, 9.0, 4.0) == wish(kind, 12.0, 15.0, constraint)
@@ -127,9 +136,7 @@ def test_a_wish_behind_one_leader_is_that_of_its_constraint(name: str) -> None:
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("dt", [0.05, 0.1, 0.2])
 @pytest.mark.parametrize("speed", [5.0, 14.0, 25.0])
-def test_a_driver_stops_with_its_front_just_before_a_line(
-    name: str, dt: float, speed: float
-) -> None:
+def test_a_driver_stops_just_before_a_line(name: str, dt: float, speed: float) -> None:
     kind = KINDS[name]
     gap, hardest, desired = 90.0, 0.0, speed
     for _ in range(round(60.0 / dt)):
@@ -139,11 +146,11 @@ def test_a_driver_stops_with_its_front_just_before_a_line(
         gap -= speed * dt
     assert speed < 0.1
     assert 0.0 < gap < 2.0 * LINE_MARGIN_M
-    assert hardest < 1.25 * kind["decel"], "it can be foreseen"
+    assert hardest < 1.25 * kind["decel"], "the line is visible early enough"
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_follower_comes_to_stand_behind_who_brakes_hard(name: str) -> None:
+def test_a_follower_stops_behind_a_leader_that_brakes_hard(name: str) -> None:
     kind = KINDS[name]
     speed = front_speed = 14.0
     gap = 25.0
@@ -160,11 +167,11 @@ def test_a_follower_comes_to_stand_behind_who_brakes_hard(name: str) -> None:
 
 
 @given(allowed=SPEEDS, further=st.floats(-40.0, 40.0), gap=st.floats(-2.0, 2.4), share=SHARES)
-def test_who_stands_close_behind_a_standing_leader_stays_whatever_lies_ahead(
+def test_close_behind_a_standing_leader_a_driver_waits_whatever_is_ahead(
     allowed: float, further: float, gap: float, share: float
 ) -> None:
-    # `drivers` looks no further then.
-    car = krauss()
+    # Therefore `drivers` does not look further ahead.
+    car = passenger_car(MODEL_KRAUSS, 0.5)
     constraint = behind(car, 0.0, gap, 0.0, 4.5)
     assert constraint == 0.0
     for whole in (constraint, max(constraint, further)):

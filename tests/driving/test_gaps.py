@@ -1,4 +1,4 @@
-"""Which gaps a driver accepts at a junction, by its limits in seconds."""
+"""Gap acceptance at junctions: the limits of accepted gaps in seconds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_OFF_BLINKING,
 )
 from cavmarl.driving.kernels.junctions.approach import APPROACH
-from cavmarl.driving.kernels.junctions.gaps import STUCK_S, foe_blocks, ignores
+from cavmarl.driving.kernels.junctions.gaps import STUCK_S, hold_for_foe, may_ignore
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
@@ -33,7 +33,7 @@ from tests.support.traffic import on_lane, travel
 
 __all__ = ["crossing"]
 
-SPEED_MPS = 10.0  # of both, all along: it is the limit
+SPEED_MPS = 10.0  # of both vehicles; it is also the speed limit
 HALF_M = 2.5
 FROM_WEST, FROM_SOUTH = 0, 1  # LINK rows
 
@@ -49,7 +49,7 @@ def network(crossing: Callable[..., Path]) -> RoadNetwork:
 
 @pytest.fixture
 def blocks(network: RoadNetwork) -> Blocks:
-    """Whether a car from the west blocks one from the south, which gives way to it (HOLD_*)."""
+    """Whether a car from the west blocks a car from the south, which yields to it (HOLD_*)."""
     link = network.links[FROM_SOUTH]
     first = int(link["first_conflict"])
     conflicts = network.conflicts[first : first + int(link["num_conflicts"])]
@@ -66,11 +66,12 @@ def blocks(network: RoadNetwork) -> Blocks:
         travel: TripTables = CARS,
         **foe_fields: float,
     ) -> int:
-        """By how long and how far they are before what they share.
+        """Return whether the foe blocks, for times and distances to the shared area.
 
-        `own_s`: until the own front enters the shared area or is at its `line`, or the own rear is
-        `out` of the junction, as `end` says. `foe_m`: of the other one's front to its line;
-        negative: of its rear to the end of the shared area. `own`, `foe_fields`: of their records.
+        `own_s` is the time until the own front enters the shared area (`end` = "enter") or reaches
+        its line ("line"), or the own rear leaves the junction ("out"). `foe_m` is the distance of
+        the foe's front to its line or, if negative, of its rear to the end of the shared area.
+        `own` and `foe_fields` are fields of the records.
         """
         foe, asked = np.zeros(1, APPROACH), np.array([shared])
         foe["link"], foe["row"], foe["half"] = FROM_WEST, 1, HALF_M
@@ -79,13 +80,13 @@ def blocks(network: RoadNetwork) -> Blocks:
         foe["dist"] = -shared["foe_leave_m"] - HALF_M - foe_m if inside else foe_m + HALF_M
         ahead = {"enter": shared["enter_m"] - HALF_M, "line": -HALF_M}
         ahead["out"] = link["length_m"] + HALF_M
-        row["wait_s"] = wait_s  # of both
+        row["wait_s"] = wait_s  # of both vehicles
         rows = np.concatenate([row, row])
         for k, fields in enumerate((own or {}, foe_fields)):
             for name, value in fields.items():
                 rows[k][name] = value
         foe["speed"] = rows[1]["speed"]
-        return foe_blocks(
+        return hold_for_foe(
             network.arrays, travel, rows, rows[0], FROM_SOUTH,
             own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, asked[0], foe[0], True,
             np.zeros(1, np.int32),
@@ -95,28 +96,28 @@ def blocks(network: RoadNetwork) -> Blocks:
 
 
 @pytest.mark.parametrize(("driver", "behind_s"), [(DRIVER_BACKGROUND, 0.0), (DRIVER_AGENT, 0.5)])
-def test_one_that_comes_enters_where_another_is_just_out(
+def test_a_moving_vehicle_enters_an_area_that_has_just_been_cleared(
     blocks: Blocks, driver: int, behind_s: float
 ) -> None:
-    # Its rear leaves the shared area in 0.6 s.
+    # The foe's rear leaves the shared area in 0.6 s.
     assert blocks(0.55 + behind_s, "enter", -6.0, driver=driver)
     assert not blocks(0.65 + behind_s, "enter", -6.0, driver=driver)
 
 
 @pytest.mark.parametrize(("accel", "waits"), [(0.0, False), (-1.7, False), (-1.9, True)])
-def test_one_that_brakes_on_the_junction_does_not_speed_up(
+def test_a_foe_that_brakes_on_the_junction_is_not_assumed_to_accelerate(
     blocks: Blocks, accel: float, waits: bool
 ) -> None:
-    """Its rear has 6 m to go: 0.6 s, or 1 s at the 6 m/s to which it has slowed down."""
+    """The foe clears the area in 6 m: in 0.6 s, or in 1 s at the 6 m/s of a foe that brakes."""
     blocked = blocks(0.93, "enter", -6.0, own={"speed": SPEED_MPS}, speed=6.0, accel=accel)
     assert blocked == (HOLD_YIELD if waits else HOLD_NONE)
 
 
 @pytest.mark.parametrize(("accel", "waits"), [(-2.9, False), (-3.1, True)])
-def test_one_that_brakes_to_a_stop_on_the_junction_is_waited_for_from_afar(
+def test_a_foe_that_stops_on_the_junction_blocks_distant_vehicles(
     blocks: Blocks, accel: float, waits: bool
 ) -> None:
-    """Its rear has 6 m to go; it stops within 6.2 m, or 5.8."""
+    """The foe clears the area in 6 m; it stops within 6.2 m or within 5.8 m."""
     blocked = blocks(9.0, "enter", -6.0, own={"speed": SPEED_MPS}, speed=6.0, accel=accel)
     assert blocked == (HOLD_YIELD if waits else HOLD_NONE)
 
@@ -125,10 +126,10 @@ def test_one_that_brakes_to_a_stop_on_the_junction_is_waited_for_from_afar(
     ("out_s", "hold", "waits"),
     [(0.6, HOLD_YIELD, True), (0.4, HOLD_YIELD, False), (0.6, HOLD_NONE, False)],
 )
-def test_one_that_stands_sets_off_half_a_second_before_another_is_out(
+def test_a_standing_vehicle_starts_half_a_second_before_the_area_is_clear(
     blocks: Blocks, out_s: float, hold: int, waits: bool
 ) -> None:
-    # It needs over a second to where the other one is. One that has set off goes on.
+    # It needs over a second to the area. A vehicle that has started goes on.
     own = {"speed": 0.0, "hold": hold, "stopped_at": FROM_SOUTH}
     assert blocks(0.2, "line", -out_s * SPEED_MPS, 2.0, own) == (HOLD_YIELD if waits else HOLD_NONE)
 
@@ -136,77 +137,86 @@ def test_one_that_stands_sets_off_half_a_second_before_another_is_out(
 @pytest.mark.parametrize(
     ("speed", "wait_s", "foe_hold", "hold"),
     [
-        (SPEED_MPS, 0.0, HOLD_NONE, HOLD_NONE),  # it will have left
-        (SPEED_MPS, 0.0, HOLD_EXIT_BLOCKED, HOLD_EXIT_BLOCKED),  # another one keeps it there
-        (0.0, 2.9, HOLD_NONE, HOLD_YIELD),  # it may go on at once
+        (SPEED_MPS, 0.0, HOLD_NONE, HOLD_NONE),  # the foe will have left
+        (
+            SPEED_MPS,
+            0.0,
+            HOLD_EXIT_BLOCKED,
+            HOLD_EXIT_BLOCKED,
+        ),  # another vehicle keeps the foe there
+        (0.0, 2.9, HOLD_NONE, HOLD_YIELD),  # the foe may go on at once
         (0.0, 3.1, HOLD_NONE, HOLD_EXIT_BLOCKED),
     ],
 )
-def test_one_that_stays_on_the_junction_keeps_others_before_it(
+def test_a_foe_that_stays_on_the_junction_blocks_others(
     blocks: Blocks, speed: float, wait_s: float, foe_hold: int, hold: int
 ) -> None:
     assert blocks(9.0, "enter", -3.0, speed=speed, wait_s=wait_s, hold=foe_hold) == hold
-    assert blocks(9.0, "enter", -40.0, speed=0.0, wait_s=9.0) == HOLD_NONE, "it stands before it"
+    assert blocks(9.0, "enter", -40.0, speed=0.0, wait_s=9.0) == HOLD_NONE, (
+        "the foe stands before the area"
+    )
 
 
-def test_one_on_a_path_that_keeps_apart_counts_before_its_line_only(
+def test_a_foe_on_a_separate_path_counts_only_before_its_line(
     blocks: Blocks, network: RoadNetwork
 ) -> None:
     assert blocks(0.2, "enter", -6.0)
     assert blocks(0.2, "line", 20.0)
     assert not blocks(0.2, "enter", -6.0, near=False)
-    assert blocks(0.2, "line", 20.0, near=False), "the map says that it gives way"
+    assert blocks(0.2, "line", 20.0, near=False), (
+        "before its line, the right of way of the map counts"
+    )
 
 
-def test_one_that_comes_is_let_over_the_whole_junction(
+def test_an_approaching_foe_is_given_the_whole_junction(
     blocks: Blocks, network: RoadNetwork
 ) -> None:
-    # Its front has 20 m to its line, and its rear 5 m more to the end of its way over.
+    # The front has 20 m to its line; the rear leaves the junction 5 m later.
     over_s = (25.0 + float(network.links["length_m"][FROM_WEST])) / SPEED_MPS
     assert blocks(over_s - 0.05, "line", 20.0)
     assert not blocks(over_s + 0.05, "line", 20.0)
 
 
 @pytest.mark.parametrize(("driver", "ahead_s"), [(DRIVER_BACKGROUND, 1.0), (DRIVER_AGENT, 3.0)])
-def test_before_one_that_comes_to_its_line_it_is_over_one_second_earlier_or_if_steered_three(
+def test_the_time_gap_is_one_second_or_three_if_steered(
     blocks: Blocks, driver: int, ahead_s: float
 ) -> None:
-    # Its front reaches its line in 5 s.
+    # The foe's front reaches its line in 5 s.
     assert blocks(5.05 - ahead_s, "out", 50.0, driver=driver)
     assert not blocks(4.95 - ahead_s, "out", 50.0, driver=driver)
 
 
 @pytest.mark.parametrize(("to_go_m", "waits"), [(52.4, False), (60.0, True), (0.0, True)])
-def test_one_whose_trip_ends_before_its_line_is_not_waited_for(
+def test_a_foe_whose_trip_ends_before_its_line_is_ignored(
     blocks: Blocks, to_go_m: float, waits: bool
 ) -> None:
-    """Its centre has 52.5 m to its line; 0 says a row that knows no end of its way."""
+    """The foe's centre is 52.5 m before its line; `to_go` of 0 means an unknown end of the trip."""
     assert bool(blocks(4.5, "out", 50.0, to_go=to_go_m)) == waits
 
 
-def test_one_that_speeds_up_comes_earlier(blocks: Blocks) -> None:
-    # From 4 m/s with 2 m/s² it has 10 m/s, the limit, after 3 s and 21 m, and 50 m after 5.9 s.
+def test_a_foe_that_accelerates_arrives_earlier(blocks: Blocks) -> None:
+    # From 4 m/s with 2 m/s², the foe reaches the limit of 10 m/s after 21 m, and 50 m in 5.9 s.
     assert blocks(4.95, "out", 50.0, speed=4.0, accel=2.0)
     assert not blocks(4.85, "out", 50.0, speed=4.0, accel=2.0)
-    assert not blocks(4.95, "out", 50.0, speed=4.0), "at the speed that it has it takes 12.5 s"
+    assert not blocks(4.95, "out", 50.0, speed=4.0), "at its present speed, the foe needs 12.5 s"
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 90.0, 180.0, 900.0])
-def test_one_that_crosses_does_not_count_on_others_to_brake_however_long_it_has_waited(
+def test_a_crossing_driver_never_expects_foes_to_brake(
     blocks: Blocks, network: RoadNetwork, wait_s: float
 ) -> None:
     over_s = (float(network.links["length_m"][FROM_SOUTH]) + 2.0 * HALF_M) / SPEED_MPS
-    assert over_s == 1.5, "its front is at its line"
-    # Out in 1.5 s, with 1.0 s more.
+    assert over_s == 1.5, "the front is at its line"
+    # The junction is clear after 1.5 s, and the time gap is 1.0 s.
     assert blocks(over_s, "out", 24.8, wait_s)
     assert not blocks(over_s, "out", 25.2, wait_s)
 
 
 @pytest.mark.parametrize("accel", [1.2, 2.5, 5.0])
-def test_one_that_speeds_up_slowly_needs_a_longer_gap(
+def test_a_vehicle_that_accelerates_slowly_needs_a_longer_gap(
     blocks: Blocks, network: RoadNetwork, accel: float
 ) -> None:
-    """Out of the junction from a stand, with 2.5 m/s² at most, and 1 s more."""
+    """From a standstill, with at most 2.5 m/s², and a time gap of 1 s."""
     types = CARS.types.copy()
     types["accel"] = accel
     length_m = float(network.links["length_m"][FROM_SOUTH])
@@ -217,8 +227,8 @@ def test_one_that_speeds_up_slowly_needs_a_longer_gap(
     assert not asked((out_s + 1.05) * SPEED_MPS)
 
 
-def test_one_that_stands_before_its_line_counts_as_one_at_it(blocks: Blocks) -> None:
-    """With 1.8 m/s² it needs 1.05 s for a metre, and without that it would be out too late."""
+def test_a_vehicle_that_stands_before_its_line_counts_as_being_at_it(blocks: Blocks) -> None:
+    """With 1.8 m/s², the metre before the line takes 1.05 s, which would be too long."""
     own = {"speed": 0.0}
     at_line = next(m for m in np.arange(1.0, 99.0, 0.1) if not blocks(0.0, "line", m, own=own))
     before = next(m for m in np.arange(1.0, 99.0, 0.1) if not blocks(0.1, "line", m, own=own))
@@ -228,9 +238,9 @@ def test_one_that_stands_before_its_line_counts_as_one_at_it(blocks: Blocks) -> 
 
 
 def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float) -> Any:
-    """Of one that comes into the same lane: the least way to its line, and the own one over, in m.
+    """Return the smallest accepted distance of a merging foe to its line, and the own path, in m.
 
-    The other one has 5 m/s, its front 2.5 m to its line, and drives no faster.
+    The own vehicle has 5 m/s, which is its limit, and its front is 2.5 m before its line.
     """
     own = np.repeat(np.arange(len(network.links)), network.links["num_conflicts"])
     shared = next(k for k in np.flatnonzero(network.conflicts["merging"])
@@ -242,11 +252,13 @@ def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float
     foe["link"], foe["row"], foe["half"], foe["speed"] = conflict["foe"], 1, HALF_M, foe_mps
     length_m = float(rows["length"][0])
     over_m = 5.0 + 0.5 * length_m + float(network.links["length_m"][link])
-    assert conflict["enter_m"] > network.links["wait_m"][link] - 1.0, "it is asked about inside"
+    assert conflict["enter_m"] > network.links["wait_m"][link] - 1.0, (
+        "the area is beyond the waiting position"
+    )
 
     def waits(front_m: float) -> int:
         foe["dist"] = front_m + HALF_M
-        return foe_blocks(network.arrays, CARS, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
+        return hold_for_foe(network.arrays, CARS, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
                           True, np.zeros(1, np.int32))  # fmt: skip
 
     return next(m for m in np.arange(1.0, 400.0, 0.1) if not waits(m)), over_m
@@ -259,10 +271,10 @@ def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float
         (DRIVER_BACKGROUND, 10.0, 1.0),
         (DRIVER_AGENT, 4.0, 1.5),
         (DRIVER_AGENT, 10.0, 1.5),
-        (DRIVER_AGENT, 30.0, 2.3),  # (30 - 5)² / (2 · 4.5 · 30): the way to brake behind it
+        (DRIVER_AGENT, 30.0, 2.3),  # (30 - 5)² / (2 · 4.5 · 30): time to brake behind it
     ],
 )
-def test_before_one_that_comes_into_the_same_lane_it_goes_a_little_earlier(
+def test_a_vehicle_merges_before_a_foe_that_can_brake(
     network: RoadNetwork, driver: int, foe_mps: float, ahead_s: float
 ) -> None:
     least_m, over_m = least_ahead(network, driver, 0.0, foe_mps)
@@ -270,17 +282,17 @@ def test_before_one_that_comes_into_the_same_lane_it_goes_a_little_earlier(
 
 
 @pytest.mark.parametrize(("wait_s", "brakes_m"), [(15.0, 100.0), (20.0, 75.0)])
-def test_one_that_has_stood_goes_before_a_faster_one_that_need_hardly_brake(
+def test_a_driver_that_has_waited_merges_before_a_foe_that_brakes_gently(
     network: RoadNetwork, wait_s: float, brakes_m: float
 ) -> None:
-    # From 10 to 5 m/s with 4.5 m/s² times the share of 180 s that it has waited: it begins when the
-    # other one is 1 m before its line, in 0.3 s.
+    # The foe brakes from 10 to 5 m/s with 4.5 m/s², times the waiting time divided by 180 s. It
+    # begins when the own vehicle is 1 m before its line, in 0.3 s.
     least_m, _ = least_ahead(network, DRIVER_BACKGROUND, wait_s, 10.0)
     assert least_m == pytest.approx(brakes_m + 0.3 * 10.0, abs=0.1)
 
 
 def waiting_pair(**fields: Any) -> Any:
-    """One that asks, and its foe at link 1: both stand and give way."""
+    """Return a vehicle and its foe at link 1: both stand and yield."""
     return vehicles([(0.0, 0.0, 0.0)] * 2, hold=HOLD_YIELD, stopped_at=[-1, 1], **fields)
 
 
@@ -288,39 +300,41 @@ def waiting_pair(**fields: Any) -> Any:
     ("own_wait_s", "foe_wait_s", "own_id", "speed", "goes"),
     [
         (0.6, 0.2, 5, 0.0, True),
-        (0.4, 0.2, 5, 0.0, False),  # it has not stood for half a second
+        (0.4, 0.2, 5, 0.0, False),  # it has stood for less than half a second
         (0.6, 0.7, 0, 0.0, False),
         (0.6, 0.6, 0, 0.0, True),
         (0.6, 0.6, 5, 0.0, False),
         (0.6, 0.2, 5, 1.0, False),  # it moves
     ],
 )
-def test_at_an_all_way_stop_the_one_goes_that_has_stood_longer(
+def test_at_an_all_way_stop_the_longest_waiting_vehicle_goes_first(
     own_wait_s: float, foe_wait_s: float, own_id: int, speed: float, goes: bool
 ) -> None:
     waits = [own_wait_s, foe_wait_s]
     row, foe = waiting_pair(id=[own_id, 3], wait_s=waits, speed=[speed, 0.0])
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
+    assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, False), (-1, True)])
-def test_at_an_all_way_stop_one_that_has_not_stood_yet_is_not_waited_for(
+def test_at_an_all_way_stop_a_foe_that_has_not_stopped_is_ignored(
     stopped_at: int, goes: bool
 ) -> None:
     row, foe = vehicles(
         [(0.0, 0.0, 0.0)] * 2, speed=[0.0, 8.0], wait_s=[0.6, 0.0], stopped_at=[0, stopped_at]
     )
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
-    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, STOP, STOP, STUCK_S), (
+    assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
+    assert not may_ignore(row, foe, 0, 1, SIGNAL_NONE, STOP, STOP, STUCK_S), (
         "a stop sign of a side road"
     )
 
 
-def test_equals_that_wait_do_not_stop_one_another() -> None:
+def test_waiting_vehicles_on_equal_roads_do_not_block_each_other() -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[3.1, 9.0], speed=0.0)
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S)
+    assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S)
     row["wait_s"] = 2.9
-    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S), "first the longer one"
+    assert not may_ignore(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S), (
+        "the foe has waited longer"
+    )
 
 
 @pytest.mark.parametrize(
@@ -332,10 +346,10 @@ def test_equals_that_wait_do_not_stop_one_another() -> None:
     ],
 )
 @pytest.mark.parametrize(("later_s", "goes"), [(-1.0, False), (1.0, True)])
-def test_a_road_comes_first_while_it_waits_itself_but_not_for_ever(
+def test_a_waiting_road_keeps_its_right_of_way_for_a_limited_time(
     blocks: Blocks, model: int, driver: int, most_s: float, later_s: float, goes: bool
 ) -> None:
-    """Of drivers as SUMO has them as long as there, of others not so long."""
+    """Drivers as in SUMO wait as long as there, other drivers wait less."""
     cars = CARS._replace(types=generated_types(model))
     own = {"wait_s": most_s + later_s, "hold": HOLD_YIELD, "stopped_at": -1, "driver": driver}
     foe = {"speed": 0.0, "wait_s": 9.0, "hold": HOLD_YIELD, "stopped_at": FROM_WEST}
@@ -347,16 +361,16 @@ def test_a_road_comes_first_while_it_waits_itself_but_not_for_ever(
     ("own_wait_s", "foe_hold", "goes"),
     [(9.0, HOLD_YIELD, True), (1.0, HOLD_YIELD, False), (9.0, HOLD_NONE, False)],
 )
-def test_where_signals_blink_of_two_that_give_way_the_one_goes_that_has_stood_longer(
+def test_at_blinking_signals_the_longest_waiting_vehicle_goes_first(
     own_wait_s: float, foe_hold: int, goes: bool
 ) -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[own_wait_s, 2.0], speed=0.0)
-    foe["hold"] = foe_hold  # HOLD_NONE: it is about to go
-    assert ignores(row, foe, 0, 1, SIGNAL_OFF_BLINKING, MINOR, MINOR, STUCK_S) == goes
+    foe["hold"] = foe_hold  # HOLD_NONE: the foe is about to go
+    assert may_ignore(row, foe, 0, 1, SIGNAL_OFF_BLINKING, MINOR, MINOR, STUCK_S) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, True), (2, False)])
-def test_an_agent_that_stands_at_its_stop_line_gives_way(stopped_at: int, goes: bool) -> None:
+def test_an_agent_that_stands_at_its_stop_line_yields(stopped_at: int, goes: bool) -> None:
     row, foe = vehicles(
         [(0.0, 0.0, 0.0)] * 2,
         id=[5, 3],
@@ -365,4 +379,4 @@ def test_an_agent_that_stands_at_its_stop_line_gives_way(stopped_at: int, goes: 
         driver=[DRIVER_BACKGROUND, DRIVER_AGENT],
         stopped_at=[-1, stopped_at],
     )
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, STOP, STUCK_S) == goes
+    assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, STOP, STUCK_S) == goes

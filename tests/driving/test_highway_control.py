@@ -17,13 +17,13 @@ from tests.support.builders import angles
 def test_steering_control_equals_twin(
     speed: float, d: float, heading_error: float, length: float
 ) -> None:
-    # Facing backwards, rounding decides which way round to turn.
+    # If the car faces backwards, rounding decides the direction of the turn.
     approach = math.asin(max(-1.0, min(1.0, -d / 0.6 / not_zero(speed))))
     approach = max(-math.pi / 4, min(math.pi / 4, approach))
     assume(abs(abs(heading_error + approach) - math.pi) > 1e-9)
     steering = control.steering_control(speed, d, heading_error, length)
     twin = naive.steering_control(speed, d, heading_error, length)
-    # The twin's asin has an infinite slope at its ends: half the digits are lost there.
+    # The twin's asin loses half of the digits where its slope is infinite.
     assert steering == pytest.approx(twin, abs=1e-7)
     assert abs(steering) <= control.MAX_STEERING_RAD
 
@@ -35,7 +35,7 @@ def test_speed_control_is_proportional(speed: float, target_speed: float) -> Non
 
 
 @pytest.mark.parametrize("speed", [3.0, 15.0, 30.0])
-def test_a_car_finds_the_centre_of_its_lane(speed: float) -> None:
+def test_a_car_converges_to_the_centre_of_its_lane(speed: float) -> None:
     y, heading = 3.0, 0.2
     for _ in range(200):
         steering = control.steering_control(speed, y, -heading, 5.0)

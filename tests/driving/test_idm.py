@@ -13,7 +13,7 @@ DEFAULTS = (idm.ACCEL_MAX, idm.DECEL_COMFORT, idm.JAM_DISTANCE_M, idm.TIME_HEADW
 
 
 def acceleration(speed: float, target_speed: float, *leader: float) -> float:
-    """Behind one leader."""
+    """Return the acceleration behind one leader."""
     _, _, accel_max, *_ = leader
     return idm.idm_free(speed, target_speed, accel_max) - idm.idm_interaction(speed, *leader)
 
@@ -38,7 +38,7 @@ def test_acceleration_equals_twin(
     assert acceleration(*state) == pytest.approx(twin, rel=1e-12, abs=1e-9)
 
 
-def test_rests_at_its_target_speed_and_at_its_jam_distance() -> None:
+def test_the_acceleration_is_zero_at_target_speed_and_at_jam_distance() -> None:
     assert idm.idm_free(25.0, 25.0, idm.ACCEL_MAX) == 0.0
     jam = acceleration(0.0, 25.0, idm.JAM_DISTANCE_M, 0.0, *DEFAULTS)
     assert jam == pytest.approx(0.0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""Vehicles lose no time at a junction: one that waits sets off in time, others do not brake."""
+"""Flow at junctions: waiting vehicles start in time, and other vehicles do not brake."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Make = Callable[[str], Scene]
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The map of a crossing, by SUMO's type of the node."""
+    """The map of a crossing, by SUMO's type of its node."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
@@ -27,7 +27,7 @@ def scene(crossing: Callable[[str], Path]) -> Make:
 
 
 @pytest.mark.parametrize(("speed", "left_m", "straight_m"), [(0.0, 1.0, 3.0), (8.0, 10.0, 20.0)])
-def test_no_car_brakes_for_a_left_turn_that_goes_to_its_place_inside(
+def test_no_car_brakes_for_a_left_turn_that_drives_to_its_waiting_position(
     scene: Make, speed: float, left_m: float, straight_m: float
 ) -> None:
     here = scene("traffic_light")
@@ -42,13 +42,13 @@ def test_no_car_brakes_for_a_left_turn_that_goes_to_its_place_inside(
                 hardest = min(hardest, float(car["accel"]))
             elif here.simulation.network.lanes[car["lane"]]["internal"]:
                 waited = waited or car["speed"] < 0.1
-    assert waited, "the left turn gives way inside"
+    assert waited, "the left turn waits inside the junction"
     assert hardest > -0.5
 
 
-def test_at_an_all_way_stop_no_car_sets_off_too_early_and_brakes_inside(scene: Make) -> None:
+def test_at_an_all_way_stop_no_car_starts_too_early_and_brakes_inside(scene: Make) -> None:
     here = scene("allway_stop")
-    ways = {"W": "N", "S": "W", "E": "S", "N": "E"}  # left turns, each across the next
+    ways = {"W": "N", "S": "W", "E": "S", "N": "E"}  # left turns that cross one another
     for k, (arm, goal) in enumerate(ways.items()):
         here.put(arm, f"{arm}_in_0", 30.0 + 8.0 * k, f"{goal}_out", speed=10.0)
     hardest: dict[str, float] = defaultdict(float)
@@ -65,10 +65,10 @@ def test_at_an_all_way_stop_no_car_sets_off_too_early_and_brakes_inside(scene: M
     assert min(hardest.values()) > -1.0
     times = sorted(out.values())
     gaps = [later - time for time, later in pairwise(times)]
-    assert max(gaps) < 3.5, "SUMO's follow 2.8 s apart"
+    assert max(gaps) < 3.5, "in SUMO, cars follow at 2.8 s"
 
 
-def test_one_that_stands_at_a_stop_sign_goes_in_the_next_tick(scene: Make) -> None:
+def test_a_car_that_has_stopped_at_a_stop_sign_goes_in_the_next_tick(scene: Make) -> None:
     here = scene("priority_stop")
     here.put("side", "S_in_0", 30.0, "N_out", speed=10.0)
     stood = max(float(here["side"]["wait_s"]) for _ in here.run(8.0))

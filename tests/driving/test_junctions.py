@@ -1,4 +1,4 @@
-"""Right of way, acted out: a few cars put by hand on the arms of a crossing, and who goes first."""
+"""Right of way in simulation: which of a few cars on the arms of a crossing goes first."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.kernels.junctions.junctions import _exit_blocked
+from cavmarl.driving.kernels.junctions.junctions import exit_blocked
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.roads.network import RoadNetwork
@@ -24,7 +24,7 @@ from tests.support.traffic import on_lane, scratch, travel
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The map of a crossing, by SUMO's type of the node."""
+    """The map of a crossing, by SUMO's type of its node."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
@@ -36,23 +36,23 @@ def scene(crossing: Callable[[str], Path]) -> Callable[[str], Scene]:
 Make = Callable[[str], Scene]
 
 
-def test_alone_on_the_main_road_one_drives_through(scene: Make) -> None:
+def test_a_single_car_on_the_main_road_drives_through(scene: Make) -> None:
     here = scene("priority")
     here.put("main", "W_in_0", 60.0, "E_out", speed=14.0)
     lowest = min(float(here["main"]["speed"]) for _ in here.run(8.0))
     assert lowest > 12.0
 
 
-def test_the_side_road_gives_way_to_the_main_road(scene: Make) -> None:
+def test_the_side_road_yields_to_the_main_road(scene: Make) -> None:
     here = scene("priority")
     here.put("side", "S_in_0", 25.0, "N_out", speed=10.0)
     here.put("main", "W_in_0", 45.0, "E_out", speed=14.0)
     times = here.entries(12.0)
     assert times["main"] < times["side"]
-    assert times["main"] < 4.5, "who has the right of way need not brake"
+    assert times["main"] < 4.5, "the car with the right of way need not brake"
 
 
-def test_the_side_road_goes_first_where_the_gap_is_large(scene: Make) -> None:
+def test_the_side_road_goes_first_if_the_gap_is_large(scene: Make) -> None:
     here = scene("priority")
     here.put("side", "S_in_0", 5.0, "N_out", speed=5.0)
     here.put("main", "W_in_0", 135.0, "E_out", speed=12.0)
@@ -71,9 +71,7 @@ def test_the_side_road_waits_for_a_whole_column_and_then_goes(scene: Make) -> No
 
 
 @pytest.mark.parametrize("waited_s", [0.0, 170.0])
-def test_one_that_crosses_waits_for_one_that_comes_however_long_it_has_waited(
-    scene: Make, waited_s: float
-) -> None:
+def test_a_crossing_car_yields_however_long_it_has_waited(scene: Make, waited_s: float) -> None:
     here = scene("priority")
     here.put("side", "S_in_0", 1.0, "N_out", wait_s=waited_s)
     here.put("main", "W_in_0", 60.0, "E_out", speed=11.0)  # at its line in 5.5 s
@@ -82,15 +80,15 @@ def test_one_that_crosses_waits_for_one_that_comes_however_long_it_has_waited(
     assert times["main"] < times["side"]
 
 
-def test_patience_does_not_run_into_who_cannot_brake_any_more(scene: Make) -> None:
+def test_an_impatient_driver_does_not_enter_before_a_foe_that_cannot_brake(scene: Make) -> None:
     here = scene("priority")
     here.put("side", "S_in_0", 1.0, "N_out", wait_s=10_000.0)
     here.put("main", "W_in_0", 12.0, "E_out", speed=13.0)
-    times = here.entries(10.0)  # nobody touches
+    times = here.entries(10.0)  # fails if cars touch
     assert times["main"] < times["side"]
 
 
-def test_a_left_turn_gives_way_to_who_comes_straight(scene: Make) -> None:
+def test_a_left_turn_yields_to_oncoming_traffic(scene: Make) -> None:
     here = scene("priority")
     here.put("left", "W_in_0", 20.0, "N_out", speed=10.0)
     here.put("straight", "E_in_0", 30.0, "W_out", speed=13.0)
@@ -98,15 +96,15 @@ def test_a_left_turn_gives_way_to_who_comes_straight(scene: Make) -> None:
     assert times["straight"] < times["left"]
 
 
-def test_right_comes_before_left_between_equals(scene: Make) -> None:
+def test_right_comes_before_left_on_equal_roads(scene: Make) -> None:
     here = scene("right_before_left")
     here.put("west", "W_in_0", 30.0, "E_out", speed=10.0)
     here.put("south", "S_in_0", 30.0, "N_out", speed=10.0)
     times = here.entries(15.0)
-    assert times["south"] < times["west"], "who comes from the right goes first"
+    assert times["south"] < times["west"], "the car from the right goes first"
 
 
-def test_four_at_once_between_equals_get_through(scene: Make) -> None:
+def test_four_cars_at_once_on_equal_roads_get_through(scene: Make) -> None:
     here = scene("right_before_left")
     ways = {"W": "E", "E": "W", "S": "N", "N": "S"}
     for arm, goal in ways.items():
@@ -114,7 +112,7 @@ def test_four_at_once_between_equals_get_through(scene: Make) -> None:
     assert here.entries(40.0).keys() == set(ways)
 
 
-def test_a_stop_sign_makes_one_stand_even_if_nobody_comes(scene: Make) -> None:
+def test_a_car_stops_at_a_stop_sign_without_other_traffic(scene: Make) -> None:
     here = scene("priority_stop")
     here.put("side", "S_in_0", 40.0, "N_out", speed=12.0)
     slowest = np.inf
@@ -124,12 +122,14 @@ def test_a_stop_sign_makes_one_stand_even_if_nobody_comes(scene: Make) -> None:
         if lane == "S_in_0":
             slowest = min(slowest, float(here["side"]["speed"]))
             stood = max(stood, float(here["side"]["wait_s"]))
-    assert slowest < 0.1, "it stands, as SUMO counts it"
+    assert slowest < 0.1, "the car stands by SUMO's definition"
     assert stood >= 0.1
-    assert here.simulation.network.lane_ids[here["side"]["lane"]] != "S_in_0", "then it goes on"
+    assert here.simulation.network.lane_ids[here["side"]["lane"]] != "S_in_0", (
+        "then the car goes on"
+    )
 
 
-def test_an_all_way_stop_lets_one_after_the_other_through(scene: Make) -> None:
+def test_an_all_way_stop_lets_cars_through_one_by_one(scene: Make) -> None:
     here = scene("allway_stop")
     ways = {"W": "E", "E": "W", "S": "N", "N": "S"}
     for k, (arm, goal) in enumerate(ways.items()):
@@ -145,18 +145,18 @@ def test_an_all_way_stop_lets_one_after_the_other_through(scene: Make) -> None:
             else:
                 passed.add(arm)
     assert passed == set(ways)
-    assert max(slowest.values()) < 0.1, "everybody stood"
+    assert max(slowest.values()) < 0.1, "every car stopped"
 
 
 def shown(here: Scene, link: int) -> str:
-    """The letter that a link's signal shows."""
+    """Return the state of a link's signal."""
     network = here.simulation.network
     row = network.links[link]
     phase = network.phases[here.simulation.signal_phases()[row["signal"]]]
     return "rugGysoOY"[network.phase_states[phase["first_state"] + row["signal_index"]]]
 
 
-def test_at_red_one_stops_before_the_line_and_goes_at_green(scene: Make) -> None:
+def test_a_car_stops_at_red_before_the_line_and_goes_at_green(scene: Make) -> None:
     here = scene("traffic_light")
     network = here.simulation.network
     for arm, goal in (("W", "E_out"), ("S", "N_out")):
@@ -177,20 +177,20 @@ def test_at_red_one_stops_before_the_line_and_goes_at_green(scene: Make) -> None
                     assert 0.0 < front < 3.0
             elif arm not in crossed:
                 crossed[arm] = shown(here, links[arm])
-    assert stood, "one of them met red"
+    assert stood, "one of the cars stopped at red"
     assert set(crossed) == {"W", "S"}
     assert set(crossed.values()) <= set("gG")
 
 
 @pytest.mark.parametrize(("to_line_m", "goes"), [(8.0, True), (60.0, False)])
-def test_at_yellow_one_goes_on_only_if_stopping_would_be_hard(
+def test_a_car_goes_on_at_yellow_only_if_a_stop_would_be_hard(
     scene: Make, to_line_m: float, goes: bool
 ) -> None:
     here = scene("traffic_light")
     network = here.simulation.network
     here.put("probe", "W_in_0", 140.0, "E_out")
     link = int(here.simulation.plans[here["probe"]["goal"], here["probe"]["lane"]]["link"])
-    # On to the first tick of yellow, then put the car where it is to decide.
+    # Step to the first tick of yellow, then put the car where it has to decide.
     here.clear()
     for _ in here.run(200.0):
         if shown(here, link) == "y":
@@ -208,11 +208,11 @@ def test_at_yellow_one_goes_on_only_if_stopping_would_be_hard(
         assert here["car"]["speed"] < 1.0
 
 
-def test_nobody_enters_where_there_is_no_room_beyond(scene: Make) -> None:
+def test_no_car_enters_without_room_beyond_the_junction(scene: Make) -> None:
     here = scene("priority")
     network = here.simulation.network
     length = float(network.lanes[network.lane_ids.index("E_out_0")]["length_m"])
-    # A car that stands for ever right behind the junction: its way ends there.
+    # A car stands for ever right behind the junction, because its route ends there.
     here.put("block", "E_out_0", length - 9.0, "E_out", agent=0)
     here.simulation.vehicles()["driver"] = DRIVER_AGENT
     here.put("next", "W_in_0", 40.0, "E_out", speed=12.0)
@@ -222,13 +222,13 @@ def test_nobody_enters_where_there_is_no_room_beyond(scene: Make) -> None:
     for _ in here.run(25.0):
         vehicles = here.simulation.vehicles()
         vehicles["speed"][vehicles["id"] == here.names.index("block")] = 0.0
-        assert lanes[here["next"]["lane"]] == "W_in_0", "it keeps the junction free"
+        assert lanes[here["next"]["lane"]] == "W_in_0", "the car keeps the junction clear"
         crossing = vehicles[vehicles["id"] == here.names.index("cross")]
         seen_cross |= bool(len(crossing) and lanes[crossing[0]["lane"]] == "N_out_0")
-    assert seen_cross, "so that others can cross"
+    assert seen_cross, "others can cross"
 
 
-def test_a_left_turn_waits_inside_for_who_comes_and_goes_when_they_are_through(scene: Make) -> None:
+def test_a_left_turn_waits_inside_until_oncoming_traffic_has_passed(scene: Make) -> None:
     here = scene("traffic_light")
     network = here.simulation.network
     here.put("probe", "W_in_0", 140.0, "N_out")
@@ -261,15 +261,15 @@ def test_a_left_turn_waits_inside_for_who_comes_and_goes_when_they_are_through(s
                 through_at = time
         if left_at < np.inf:
             break
-    assert waited > 1.0, "it stands on the junction, not before it"
+    assert waited > 1.0, "the car waits on the junction, not before it"
     assert through_at < left_at < through_at + 8.0
 
 
-def test_who_still_moves_on_the_junction_will_need_room_beyond_it(scene: Make) -> None:
+def test_moving_cars_on_the_junction_need_room_beyond_it(scene: Make) -> None:
     here = scene("priority")
     network = here.simulation.network
     length = float(network.lanes[network.lane_ids.index("E_out_0")]["length_m"])
-    # Room for one car behind the one that stands for ever.
+    # There is room for one car behind the car that stands for ever.
     here.put("block", "E_out_0", length - 16.0, "E_out", agent=0)
     here.simulation.vehicles()["driver"] = DRIVER_AGENT
     here.put("first", "W_in_0", 15.0, "E_out", speed=10.0)
@@ -279,13 +279,13 @@ def test_who_still_moves_on_the_junction_will_need_room_beyond_it(scene: Make) -
         vehicles = here.simulation.vehicles()
         vehicles["speed"][vehicles["id"] == here.names.index("block")] = 0.0
         assert lanes[here["second"]["lane"]] == "W_in_0"
-    assert lanes[here["first"]["lane"]] == "E_out_0", "for the first one there was room"
+    assert lanes[here["first"]["lane"]] == "E_out_0", "there was room for the first car"
 
 
-def test_a_vehicle_inside_goes_before_one_that_cannot_come_which_ends_a_ring(
+def test_a_vehicle_inside_goes_before_a_blocked_foe_and_ends_a_deadlock(
     crossing: Callable[..., Path],
 ) -> None:
-    """The left turn stands in the way of one that stands in the way of one that it lets pass."""
+    """The left turn yields to a car that is blocked by a car that the left turn blocks."""
     here = Scene(crossing("priority", side_lanes=2))
     network = here.simulation.network
     ends = {"left": ("W_in_0", "N_out_1"), "cross": ("N_in_0", "S_out_0")}
@@ -301,7 +301,7 @@ def test_a_vehicle_inside_goes_before_one_that_cannot_come_which_ends_a_ring(
     conflicts = network.conflicts[left["first_conflict"] :][: left["num_conflicts"]]
     (shared,) = conflicts[conflicts["foe"] == link["cross"]]
     wait_m = float(left["wait_m"])
-    assert shared["enter_m"] < wait_m - 1.0 < shared["leave_m"], "it waits in the shared area"
+    assert shared["enter_m"] < wait_m - 1.0 < shared["leave_m"], "the car waits in the shared area"
     fronts = {"left": wait_m - 1.0, "cross": float(shared["foe_enter_m"]) - 1.0}
     for name, row in (("left", left), ("cross", cross)):
         lane = network.lanes[row["first_internal"]]
@@ -319,7 +319,7 @@ def test_a_vehicle_inside_goes_before_one_that_cannot_come_which_ends_a_ring(
     assert through["left"] < 10.0
 
 
-def test_a_vehicle_at_the_very_start_of_the_junction_is_not_driven_into(scene: Make) -> None:
+def test_no_car_hits_a_vehicle_at_the_very_start_of_the_junction(scene: Make) -> None:
     here = scene("priority")
     network = here.simulation.network
     link = next(
@@ -337,11 +337,11 @@ def test_a_vehicle_at_the_very_start_of_the_junction_is_not_driven_into(scene: M
     for _ in here.run(6.0):
         vehicles = here.simulation.vehicles()
         left = vehicles["id"] == here.names.index("left")
-        vehicles["speed"][left] = vehicles["s"][left] = 0.0  # it stands there for ever
+        vehicles["speed"][left] = vehicles["s"][left] = 0.0  # the car stands there for ever
     assert here["straight"]["speed"] < 1.0
 
 
-def test_links_from_one_lane_share_their_way_up_to_the_fork(
+def test_links_from_one_lane_share_their_path_up_to_the_fork(
     crossing: Callable[[str], Path],
 ) -> None:
     network = read_network(crossing("priority"))
@@ -355,13 +355,13 @@ def test_links_from_one_lane_share_their_way_up_to_the_fork(
             others = np.concatenate([paths[k][:, 1:] for k in links if k != link])
             s, xy = paths[link][:, 0], paths[link][:, 1:]
             apart = np.hypot(*(xy[:, None] - others[None]).transpose(2, 0, 1)).min(axis=1)
-            assert (apart[s < fork - 0.6] < 2.7).all(), "as near as two cars side by side"
+            assert (apart[s < fork - 0.6] < 2.7).all(), "closer than two cars side by side"
             beyond = apart[s > fork + 0.6]
             assert beyond[0] > 2.5
 
 
 def path_of(network: RoadNetwork, link: int) -> NDArray[np.float64]:
-    """(n, 3) s, x and y of a link's way over its junction, every 0.1 m."""
+    """Return s, x and y (n, 3) of a link's path over its junction, every 0.1 m."""
     rows, lane = [], int(network.links[link]["first_internal"])
     while network.lanes[lane]["internal"]:
         here = network.lanes[lane]
@@ -373,7 +373,7 @@ def path_of(network: RoadNetwork, link: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("kind", ["priority", "right_before_left", "traffic_light"])
-def test_who_stands_at_a_stop_line_is_touched_by_nobody_who_drives_over(
+def test_vehicles_that_cross_touch_no_vehicle_at_a_stop_line(
     crossing: Callable[[str], Path], kind: str
 ) -> None:
     network = read_network(crossing(kind))
@@ -397,21 +397,21 @@ def test_who_stands_at_a_stop_line_is_touched_by_nobody_who_drives_over(
 
 
 @pytest.mark.parametrize(("pace", "brakes"), [(9.0, False), (3.0, True)])
-def test_who_gives_way_follows_a_faster_one_into_the_same_lane_and_waits_for_a_slower_one(
+def test_a_yielding_driver_follows_a_faster_foe_and_waits_for_a_slower_one(
     scene: Make, pace: float, brakes: bool
 ) -> None:
     here = scene("priority")
     here.put("main", "W_in_0", -3.0, "E_out", speed=pace)
     here.put("side", "N_in_0", 8.0, "E_out", speed=6.0)
     slowest = min(float(here["side"]["speed"]) for _ in here.run(3.0))
-    assert (slowest < 5.0) == brakes, "it slows down a little to follow, more to wait"
+    assert (slowest < 5.0) == brakes, "the car slows down more to wait than to follow"
 
 
 @pytest.mark.parametrize(("place_m", "blocked"), [(74.0, True), (76.0, False)])
-def test_nobody_counts_who_stands_farther_beyond_the_junction_than_is_looked(
+def test_vehicles_that_stand_far_beyond_the_junction_do_not_count(
     place_m: float, blocked: bool
 ) -> None:
-    # A slow queue fills the way up to the one that stands: there is no room, wherever that is.
+    # A slow queue fills the road up to the standing car, so there is no room anywhere.
     roads, ways = network_of("merge"), travel("merge")
     link = next(
         k
@@ -428,11 +428,11 @@ def test_nobody_counts_who_stands_farther_beyond_the_junction_than_is_looked(
     room = scratch(roads, len(rows))
     index_lanes(roads.arrays, ways, rows, len(rows), room)
     way = int(before[0]["way"])
-    assert _exit_blocked(roads.arrays, ways, rows[-1], link, way, room) == blocked
+    assert exit_blocked(roads.arrays, ways, rows[-1], link, way, room) == blocked
 
 
 def _beyond(roads: RoadNetwork, lane: int) -> int:
-    """The first lane from here on that is not part of a junction."""
+    """Return the first lane from here on that is not part of a junction."""
     while roads.lanes["internal"][lane]:
         lane = int(roads.lanes["successor"][lane])
     return lane

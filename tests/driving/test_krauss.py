@@ -40,15 +40,15 @@ def test_imperfection_equals_twin(
 
 @pytest.mark.parametrize(
     ("speed", "left"),
-    # Half of sigma, half of 2.6 m/s², in 0.1 s; below 2.6 m/s in proportion to the speed.
+    # 0.5 · 0.5 · 2.6 m/s² · 0.1 s; below 2.6 m/s proportional to the speed.
     [(10.0, 9.935), (2.6, 2.535), (1.0, 0.975), (0.0, 0.0)],
 )
-def test_imperfection_takes_less_from_who_is_slow(speed: float, left: float) -> None:
+def test_imperfection_is_smaller_at_low_speed(speed: float, left: float) -> None:
     assert dawdle(speed, 2.6, 0.5, 0.5, 0.1) == pytest.approx(left)
 
 
 @given(st.floats(0.0, 100.0), SPEEDS, DECELS, DECELS, TIMES)
-def test_who_brakes_after_the_reaction_does_not_touch_who_brakes_harder(
+def test_a_follower_at_the_safe_speed_never_touches_its_leader(
     gap: float, front_speed: float, decel: float, front_decel: float, reaction_s: float
 ) -> None:
     speed = safe_speed(gap, front_speed, decel, front_decel, reaction_s)
@@ -60,7 +60,7 @@ def test_who_brakes_after_the_reaction_does_not_touch_who_brakes_harder(
         mine = speed * min(time, reaction_s) + speed * braked - 0.5 * decel * braked**2
         front = min(time, front_speed / hardest)
         other = front_speed * front - 0.5 * hardest * front**2
-        # Who may brake harder than its leader can be nearer in between than at the end.
+        # A driver that brakes harder than its leader may be closer before the end than at the end.
         if decel <= front_decel or time >= stop_s:
             assert mine <= gap + other + 1e-6
 
@@ -73,7 +73,7 @@ CASES = [
     )
 ]
 
-# In a child process: a process holds one libsumo at most.
+# Run in a child process: a process can load libsumo only once.
 ASK = """
 import json, sys
 import libsumo
@@ -99,21 +99,22 @@ print(json.dumps(answers))
 
 
 def ours(case: dict[str, float]) -> tuple[float, float]:
-    """The safe speeds behind the leader and before a line, with SUMO's way to a stand.
+    """Return the safe speeds behind the leader and before a line, for SUMO's discrete motion.
 
-    SUMO moves by whole steps with the new speed: whoever brakes to a stand is half a step's way
-    less far than in continuous time. So the reaction is half a step shorter, and the leader's way.
+    SUMO moves with the new speed for a whole step, so a vehicle that brakes to a stop drives less
+    far, by half a step, than in continuous time. Therefore the reaction time and the leader's
+    distance are half a step shorter.
     """
     gap = case["gap"] - 0.5 * DT * case["front"]
     follow = safe_speed(gap, case["front"], case["decel"], case["front_decel"], TAU - 0.5 * DT)
-    # Before a line SUMO's drivers react within a step.
+    # Before a line, SUMO's drivers react within one step.
     stop = safe_speed(case["gap"], 0.0, case["decel"], case["decel"], DT - 0.5 * DT)
     return follow, stop
 
 
 @pytest.fixture(scope="module")
 def answers() -> list[tuple[dict[str, float], dict[str, float]]]:
-    """The cases and SUMO's answers. Its own speed is such that no other bound of SUMO's holds."""
+    """The cases and SUMO's results; the own speed is such that no other limit of SUMO applies."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     pytest.importorskip("sumo", reason="needs the extra 'sumo'")
     cases = []
@@ -130,13 +131,13 @@ def answers() -> list[tuple[dict[str, float], dict[str, float]]]:
     return list(zip(cases, lines, strict=True))
 
 
-def test_the_safe_speed_is_sumos(
+def test_the_safe_speed_equals_sumos(
     answers: list[tuple[dict[str, float], dict[str, float]]],
 ) -> None:
     for case, theirs in answers:
-        # SUMO joins the ways of whole numbers of steps by straight lines: over a parabola they err
-        # by at most decel · dt² / 8 for each of the two cars, in metres of gap, which is so much
-        # speed as the way to a stand is steep a step before. And it takes 1 mm off every gap.
+        # SUMO interpolates braking distances linearly between whole numbers of steps. The error is
+        # at most decel · dt² / 8 in metres of gap for each of both cars; divided by the slope of
+        # the braking distance, it is an error of speed. SUMO also subtracts 1 mm from every gap.
         decel = case["decel"]
         error = decel * DT * DT / 8.0 + 1e-3
         follow, stop = ours(case)
@@ -146,12 +147,11 @@ def test_the_safe_speed_is_sumos(
         assert theirs["stop"] == pytest.approx(stop, abs=error / steep), case
 
 
-def test_the_gap_that_is_just_safe_is_sumos(
+def test_the_safe_gap_equals_sumos(
     answers: list[tuple[dict[str, float], dict[str, float]]],
 ) -> None:
     for case, theirs in answers:
-        # Here the errors of the two parabolas are in metres themselves. SUMO answers no negative
-        # gap.
+        # Here the errors of both interpolations are in metres. SUMO returns no negative gap.
         hardest = max(case["decel"], case["front_decel"])
         error = (case["decel"] + hardest) * DT * DT / 8.0
         if theirs["secure"] > 0.0:

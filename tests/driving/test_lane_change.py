@@ -28,7 +28,7 @@ def test_a_mandatory_change_needs_no_gain_but_safety() -> None:
     assert not mobil_accepts(1.0, -1.5, 0.0, -2.1, 0.0, 0.0, True)
 
 
-def test_how_hard_a_change_may_make_one_brake_can_be_said() -> None:
+def test_the_largest_imposed_braking_is_a_parameter() -> None:
     assert mobil_accepts(1.0, -3.9, 0.0, -3.9, 0.0, 0.0, True, 4.0)
     assert not mobil_accepts(1.0, -4.1, 0.0, -3.9, 0.0, 0.0, True, 4.0)
     assert not mobil_accepts(1.0, -3.9, 0.0, -4.1, 0.0, 0.0, True, 4.0)

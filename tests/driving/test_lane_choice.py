@@ -1,4 +1,4 @@
-"""What the needs of a way ask of a steered vehicle's place on its lane."""
+"""Lane changes that a route needs, or that make a vehicle faster, and where they are possible."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from cavmarl.driving.kernels.lanes.lane_choice import (
     MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
     SWAP_ROOM_M,
-    _asked_of_followers,
-    _change_is_safe,
-    _rear_is_inside,
-    room_for_more,
+    change_is_safe,
+    imposed_on_followers,
+    rear_is_inside,
+    room_for_further_changes,
     wish_on_lane,
 )
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
@@ -30,21 +30,21 @@ from tests.support.traffic import network, on_lane, scratch, travel
         (1, 100.0, 0.0),
         (2, 100.0, 5.0 + SWAP_ROOM_M),
         (3, 100.0, 2.0 * (5.0 + SWAP_ROOM_M)),
-        (3, 40.0, 0.25 * 40.0 - MERGE_ROOM_M),  # at most that share of a lane, with the first
+        (3, 40.0, 0.25 * 40.0 - MERGE_ROOM_M),  # limited to a share of the lane
         (3, 4.0, 0.0),
     ],
 )
-def test_each_further_change_of_lanes_has_room_of_its_own(
+def test_each_further_lane_change_has_its_own_room(
     changes: int, length_m: float, room_m: float
 ) -> None:
     lane, step = np.zeros(1, LANE)[0], np.zeros(1, PLAN)[0]
     lane["length_m"], step["changes"] = length_m, changes
-    assert room_for_more(lane, blank_vehicle()[0], step) == pytest.approx(room_m)
+    assert room_for_further_changes(lane, blank_vehicle()[0], step) == pytest.approx(room_m)
 
 
 @pytest.mark.parametrize(("view_m", "minds"), [(100.0, True), (60.0, False)])
-def test_a_leader_beyond_the_view_is_none(view_m: float, minds: bool) -> None:
-    """Whether it is known depends on the zones."""
+def test_a_leader_beyond_the_view_does_not_count(view_m: float, minds: bool) -> None:
+    """Whether such a leader is known depends on the zones."""
     roads = network("merge")
     tables = travel("merge")._replace(view_m=view_m)
     lane = int(roads.lanes["length_m"].argmax())
@@ -73,48 +73,46 @@ def test_a_leader_beyond_the_view_is_none(view_m: float, minds: bool) -> None:
         (DRIVER_AGENT, 13.1, True),
     ],
 )
-def test_one_changes_lanes_when_its_rear_is_out_of_the_junction(
+def test_a_vehicle_changes_lanes_when_its_rear_is_out_of_the_junction(
     driver: int, length_m: float, waits: bool
 ) -> None:
-    """Where two cars do not fit behind one another it changes where it waits."""
+    """On lanes too short for two cars, it changes where it waits."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"] = driver
     lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
-    assert _rear_is_inside(lane, row) == waits
+    assert rear_is_inside(lane, row) == waits
     row["s"] = 2.6
-    assert not _rear_is_inside(lane, row)
+    assert not rear_is_inside(lane, row)
 
 
 @pytest.mark.parametrize(("length_m", "near_m"), [(16.4, 0.0), (18.5, 2.0), (100.0, 5.0)])
-def test_behind_a_junction_it_stays_in_its_lane_where_long_vehicles_turn_in(
+def test_a_vehicle_keeps_its_lane_where_long_vehicles_turn_in(
     length_m: float, near_m: float
 ) -> None:
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"], row["length"], lane["length_m"] = DRIVER_BACKGROUND, 5.0, length_m
     for rear_m, stays in ((near_m - 0.1, True), (near_m + 0.1, False)):
         row["s"] = 2.5 + rear_m
-        assert _rear_is_inside(lane, row) == stays
+        assert rear_is_inside(lane, row) == stays
 
 
 @pytest.mark.parametrize(
     ("driver", "speed", "stays"),
     [(DRIVER_AGENT, 1.1, True), (DRIVER_AGENT, 0.9, False), (DRIVER_BACKGROUND, 0.9, True)],
 )
-def test_a_steered_one_that_creeps_changes_there_too(
-    driver: int, speed: float, stays: bool
-) -> None:
-    """Where it waits to change, on a lane of 20 m, is no further from the junction."""
+def test_a_slow_steered_vehicle_changes_lanes_there(driver: int, speed: float, stays: bool) -> None:
+    """On a lane of 20 m, the place where it waits to change is that close to the junction."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"], row["length"], lane["length_m"] = driver, 5.0, 20.0
     row["s"], row["speed"] = 2.5 + 3.0, speed
-    assert _rear_is_inside(lane, row) == stays
+    assert rear_is_inside(lane, row) == stays
 
 
 @pytest.mark.parametrize(("far_mps", "asks"), [(25.0, True), (0.0, False)])
-def test_a_change_of_lanes_asks_those_of_every_lane_that_leads_there(
+def test_a_lane_change_considers_followers_on_every_incoming_lane(
     far_mps: float, asks: bool
 ) -> None:
-    """One that stands near, before another line, does not hide one that comes fast."""
+    """A near vehicle that stands before another line does not hide a fast one."""
     roads, tables = network("grid4x4"), travel("grid4x4")
     lane = int(roads.lanes["num_into"].argmax())
     first = int(roads.lanes["first_into"][lane])
@@ -126,13 +124,13 @@ def test_a_change_of_lanes_asks_those_of_every_lane_that_leads_there(
     )
     room = scratch(roads, 3)
     index_lanes(roads.arrays, tables, rows, 3, room)
-    least = _asked_of_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
+    least = imposed_on_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
     assert (least < -MAX_BRAKING_NEEDED) == asks
 
 
 @pytest.mark.parametrize(("gap_m", "safe"), [(1.2, False), (2.0, True)])
-def test_no_change_of_lanes_ends_where_a_crawl_cannot_stop(gap_m: float, safe: bool) -> None:
-    """Krauss's driver asks for its speed in a reaction time, whatever the gap: -3.5 m/s² here."""
+def test_no_lane_change_ends_too_close_to_a_leader_at_low_speed(gap_m: float, safe: bool) -> None:
+    """Krauss's model brakes to its speed within a reaction time, whatever the gap: -3.5 m/s²."""
     roads, types = network("merge"), generated_types().copy()
     set_model(types, MODEL_KRAUSS)
     types["tau"] = 1.0
@@ -145,4 +143,4 @@ def test_no_change_of_lanes_ends_where_a_crawl_cannot_stop(gap_m: float, safe: b
     )
     room = scratch(roads, 2)
     index_lanes(roads.arrays, tables, rows, 2, room)
-    assert _change_is_safe(roads.arrays, tables, rows, 0, left, 0.0, True, room) == safe
+    assert change_is_safe(roads.arrays, tables, rows, 0, left, 0.0, True, room) == safe

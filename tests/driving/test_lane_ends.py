@@ -1,4 +1,4 @@
-"""What the end of a lane asks of a steered vehicle, and what is still over a line."""
+"""Constraints of lane ends on steered vehicles, and bodies that are still over a line."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.lanes.adjacent_leaders import behind_askew
 from cavmarl.driving.kernels.lanes.lane_ends import (
     LONGEST_HALF_M,
-    _behind_turning,
     behind_over_line,
-    misses_change,
+    behind_turning,
+    misses_last_change,
 )
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.models.following import no_constraint
@@ -38,10 +38,10 @@ def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_t
     roads, plans, tables = world.network, world.plans, world.travel
     way = goal * len(roads.lanes)
     assert plans["change"][goal, right] == 1
-    assert plans["link"][goal, right] >= 0, "its lane goes on, too"
-    assert [misses_change(roads.arrays, tables, lane, way) for lane in (right, left)] == [1, 0]
+    assert plans["link"][goal, right] >= 0, "its lane continues as well"
+    assert [misses_last_change(roads.arrays, tables, lane, way) for lane in (right, left)] == [1, 0]
     inside = int(roads.links["first_internal"][plans["link"][goal, right]])
-    assert not misses_change(roads.arrays, tables, inside, way)
+    assert not misses_last_change(roads.arrays, tables, inside, way)
 
     rows = world.vehicles(0)  # side by side before the end
     end = float(roads.lanes["length_m"][right])
@@ -53,7 +53,7 @@ def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_t
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.5])
-def test_a_steered_car_minds_the_end_of_its_lane_until_its_front_is_over_the_other_one(
+def test_a_steered_car_stops_at_its_lane_end_until_its_front_has_left(
     tmp_path: Path, speed: float
 ) -> None:
     world, right, _, goal = before_dead_end(tmp_path, length_m=200.0)
@@ -61,7 +61,7 @@ def test_a_steered_car_minds_the_end_of_its_lane_until_its_front_is_over_the_oth
     end = float(world.network.lanes["length_m"][right])
     width_m = float(world.network.lanes["width_m"][right])
     found = []
-    for share in (0.2, 0.3):  # of the lane's width to the left
+    for share in (0.2, 0.3):  # offset to the left, in lane widths
         put(world, rows[0], right, end - 2.6, speed, goal)
         put(world, rows[1], right, 20.0, 0.0, goal)
         rows[0]["d"] = share * width_m
@@ -70,8 +70,8 @@ def test_a_steered_car_minds_the_end_of_its_lane_until_its_front_is_over_the_oth
     assert found[1] > 0.0
 
 
-def test_a_steered_car_creeps_into_the_other_lane_near_the_end_of_its_own(tmp_path: Path) -> None:
-    """Faster, it would be too late for the change, brake, and begin anew."""
+def test_a_steered_car_changes_lanes_slowly_near_the_end_of_its_lane(tmp_path: Path) -> None:
+    """At a higher speed it would be too late for the change, brake, and start again."""
     world, right, _, goal = before_dead_end(tmp_path, length_m=200.0)
     rows = world.vehicles(0)
     end = float(world.network.lanes["length_m"][right])
@@ -84,7 +84,7 @@ def test_a_steered_car_creeps_into_the_other_lane_near_the_end_of_its_own(tmp_pa
 
 
 @pytest.mark.parametrize("over_m", [0.5, -0.5])
-def test_a_rear_over_the_line_is_a_leader_behind_a_short_first_lane(over_m: float) -> None:
+def test_a_rear_before_the_line_beyond_a_short_lane_is_a_leader(over_m: float) -> None:
     roads, tables = network("grid4x4"), travel("grid4x4")
     inside = np.where(roads.lanes["internal"], roads.lanes["length_m"], np.inf)
     first = int(inside.argmin())
@@ -107,7 +107,7 @@ def test_a_rear_over_the_line_is_a_leader_behind_a_short_first_lane(over_m: floa
 
 
 @pytest.mark.parametrize("over_m", [0.5, -0.5])
-def test_one_that_stops_at_a_line_minds_a_rear_over_it(over_m: float) -> None:
+def test_a_vehicle_that_stops_at_a_line_stays_behind_a_rear_over_it(over_m: float) -> None:
     roads, tables = network("grid4x4"), travel("grid4x4")
     inside = np.where(roads.lanes["internal"], roads.lanes["length_m"], np.inf)
     first = int(inside.argmin())
@@ -122,7 +122,7 @@ def test_one_that_stops_at_a_line_minds_a_rear_over_it(over_m: float) -> None:
     room, step = scratch(roads, 2), np.zeros(2, PLAN)
     step["next"], step["link"] = (first, -1), (link, -1)
     index_lanes(roads.arrays, tables, rows, 2, room)
-    room.link_start[:] = room.link_end[:] = 0  # nothing is asked of the junction
+    room.link_start[:] = room.link_end[:] = 0  # no vehicle is on the junction
     signal, index = roads.links["signal"][link], roads.links["signal_index"][link]
     letters = roads.phase_states[roads.phases["first_state"] + index]
     phase = np.full(len(roads.signals), int((letters == SIGNAL_RED).argmax()), np.int32)
@@ -142,7 +142,7 @@ def test_one_that_stops_at_a_line_minds_a_rear_over_it(over_m: float) -> None:
 def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
     length_m: float, over_m: float, minds: bool
 ) -> None:
-    """`over_m`: of its front, beyond its line; its rear swings out over the lane that ends."""
+    """`over_m`: distance of the front beyond its line; the rear swings out over the ending lane."""
     roads, tables = network("merge"), travel("merge")
     lanes = roads.lanes.copy()
     leads = (lanes["num_links"] > 0) & (lanes["left"] >= 0)
@@ -157,7 +157,7 @@ def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
     room.approach["half"][0] = 0.5 * length_m
     room.approach["dist"][0] = 0.5 * length_m - over_m
     kind = generated_types()[0]
-    found = _behind_turning(roads.arrays._replace(lanes=lanes), kind, row, lane, 20.0, room)
+    found = behind_turning(roads.arrays._replace(lanes=lanes), kind, row, lane, 20.0, room)
     assert (found > no_constraint(kind)) == minds
 
 
@@ -165,7 +165,7 @@ def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
 def test_a_car_that_sticks_out_beyond_the_border_of_a_lane_is_a_leader(
     askew: float, hidden: bool
 ) -> None:
-    """`hidden`: behind it on its lane another one stands straight."""
+    """`hidden`: another car stands straight behind it on its lane."""
     roads, tables = network("merge"), travel("merge")
     lane = roads.lane_ids.index("weave_1")
     before = int(roads.arrays.into[roads.lanes["first_into"][lane]])

@@ -35,7 +35,7 @@ def indexed(name: str, rows: NDArray[np.void]) -> Scratch:
 
 
 def looked_for(roads: RoadNetwork, rows: NDArray[np.void]) -> list[tuple[int, int, float]]:
-    """Row, lane and place to search from: each one's own lane, and its neighbours."""
+    """Row, lane and position of each search: the lane of each vehicle, and its neighbours."""
     asked = []
     for i, row in enumerate(rows):
         here = roads.lanes[row["lane"]]
@@ -46,7 +46,7 @@ def looked_for(roads: RoadNetwork, rows: NDArray[np.void]) -> list[tuple[int, in
 
 
 @given(maps_with_crowds)
-def test_the_index_lists_everybody_on_every_lane_he_covers(
+def test_the_index_lists_each_vehicle_on_every_lane_that_it_covers(
     case: tuple[str, NDArray[np.void]],
 ) -> None:
     name, rows = case
@@ -72,14 +72,14 @@ def nearest_behind(
     reach_m: float,
     view_m: float,
 ) -> tuple[int, float]:
-    """The nearest of all followers; at equal distances the one with the smallest id."""
+    """Return the nearest of all followers; at equal distances, the one with the smallest id."""
     asked = range(max(1, int(roads.lanes[lane]["num_into"])))
     found = [behind_by(roads.arrays, room, lane, s, own_id, n, reach_m, view_m) for n in asked]
     return min(found, key=lambda one: (one[1], room.entries[one[0]]["id"]))
 
 
 def seen(room: Scratch, k: int) -> tuple[int, float]:
-    """Row and place of an entry, as the twin answers."""
+    """Return row and position of an entry, as the twin does."""
     return (int(room.entries[k]["row"]), float(room.entries[k]["s"])) if k >= 0 else (-1, np.inf)
 
 
@@ -130,7 +130,7 @@ def test_the_order_of_rows_does_not_matter(
         assert one == other
 
 
-def test_nobody_sees_further_than_the_view() -> None:
+def test_no_search_exceeds_the_view() -> None:
     roads = network("ring")
     lane = int(np.argmax(roads.lanes["length_m"]))
     view_m = 40.0
@@ -147,7 +147,7 @@ def test_nobody_sees_further_than_the_view() -> None:
         assert (last_on(room, lane, 9, 15.0, view_m) >= 0) == sees
 
 
-def test_of_two_at_one_place_the_larger_id_leads() -> None:
+def test_at_one_place_the_vehicle_with_the_larger_id_leads() -> None:
     roads = network("ring")
     rows = np.zeros(2, VEHICLE)
     rows["id"], rows["side_lane"], rows["s"] = [7, 3], -1, 10.0
@@ -158,7 +158,7 @@ def test_of_two_at_one_place_the_larger_id_leads() -> None:
     assert (seen(room, k)[0], distance) == (1, 0.0)
 
 
-def test_who_stands_far_behind_a_border_is_passed_over() -> None:
+def test_a_vehicle_that_stands_far_behind_a_border_is_skipped() -> None:
     roads = network("grid4x4")
     lane = int(np.flatnonzero(roads.lanes["internal"])[0])
     link = roads.links[roads.lanes["link"][lane]]
@@ -179,7 +179,7 @@ def test_who_stands_far_behind_a_border_is_passed_over() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_places_on_neighbour_lanes_equal_twin_and_lie_beside(name: str) -> None:
+def test_places_on_neighbour_lanes_equal_twin_and_are_close(name: str) -> None:
     roads = network(name)
     asked = 0
     for lane in np.flatnonzero(~roads.lanes["internal"]).tolist():
@@ -199,7 +199,7 @@ def test_places_on_neighbour_lanes_equal_twin_and_lie_beside(name: str) -> None:
                     )
                 )
                 other_x, other_y = place(roads, beside, there)
-                # No place of the neighbour lane is much nearer than the one it is mapped to.
+                # No point of the neighbour lane is much closer than the mapped one.
                 assert np.hypot(x - other_x, y - other_y) < nearest + 1.0
                 asked += 1
     assert asked > 0

@@ -1,4 +1,4 @@
-"""A vehicle before a junction, and one that turns into its lane."""
+"""A vehicle before a junction, and a vehicle that turns into its lane."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scene]:
 
 
 @pytest.mark.parametrize(("merging", "front_m"), [(True, 3.0), (False, 3.0), (True, -3.0)])
-def test_one_that_is_fast_brakes_early_behind_one_that_turns_into_its_lane(
+def test_a_fast_vehicle_brakes_early_for_a_vehicle_that_turns_into_its_lane(
     merging: bool, front_m: float
 ) -> None:
-    # By the shared area alone it would brake when no braking is enough any more.
+    # If only the shared area counted, it would brake too late.
     roads, kind = network("intersection"), generated_types()[0]
     own = np.repeat(np.arange(len(roads.links)), roads.links["num_conflicts"])
     picked = int(np.flatnonzero(roads.conflicts["merging"] == merging)[0])
@@ -45,10 +45,10 @@ def test_one_that_is_fast_brakes_early_behind_one_that_turns_into_its_lane(
 
 
 @pytest.mark.parametrize(("speed", "minds"), [(13.9, True), (4.9, False)])
-def test_a_fast_background_driver_slows_down_for_one_that_turns_in_ahead(
+def test_a_fast_background_driver_slows_down_for_a_merging_vehicle(
     scene: Callable[[str], Scene], speed: float, minds: bool
 ) -> None:
-    """It will be out of the shared area before the other one comes, but much slower than that."""
+    """The merging vehicle clears the shared area in time, but it is much slower."""
     accels = []
     for others in (False, True):
         here = scene("priority")

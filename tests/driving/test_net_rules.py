@@ -1,4 +1,4 @@
-"""Rules of background drivers on small nets: yellow, minor lines, lane changes at a stand."""
+"""Rules of background drivers on small nets: yellow, minor roads, lane changes at a standstill."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from cavmarl.core.records.codes import EVENT_ARRIVED, HOLD_NONE, HOLD_SIGNAL, MODEL_KRAUSS
 from cavmarl.driving.kernels.junctions.gaps import is_minor
-from cavmarl.driving.kernels.junctions.junctions import may_enter
+from cavmarl.driving.kernels.junctions.junctions import hold_at_line
 from cavmarl.driving.kernels.motion.motion import move_background
 from cavmarl.driving.vehicle_types import set_model
 from cavmarl.engine.simulation import Simulation
@@ -30,7 +30,7 @@ ALONE = """<routes>
 </routes>"""
 
 
-def test_krauss_stops_for_yellow_where_its_brakes_are_enough() -> None:
+def test_krauss_stops_for_yellow_if_its_deceleration_suffices() -> None:
     roads = entry_network("grid4x4")
     link = int(np.flatnonzero(roads.links["signal"] >= 0)[0])
     yellow = SIGNAL_STATES.index("y")
@@ -51,19 +51,19 @@ def test_krauss_stops_for_yellow_where_its_brakes_are_enough() -> None:
         front_m = 10.0**2 / (2.0 * needs)
         row = on_lane(roads, lane, length_m - front_m - back_m - 2.5, speed=10.0, length=5.0)
         distance = length_m - float(row["s"][0])
-        held = may_enter(arrays, tables, row, 0, link, distance, 0, phase, room)
+        held = hold_at_line(arrays, tables, row, 0, link, distance, 0, phase, room)
         assert held == holds
 
 
 def only(path: Path, routes: Path) -> Simulation:
-    """A world with the one vehicle of a file."""
+    """Return a world with the only vehicle of a file."""
     world = make(path, [routes], overrides=CLOCK)
     start(world, 1)
     return world
 
 
 @pytest.mark.parametrize(("junctions", "slows"), [("priority", False), ("right_before_left", True)])
-def test_who_gives_way_can_stop_until_it_sees_the_others(
+def test_a_yielding_driver_can_stop_until_it_sees_its_foes(
     tmp_path: Path, junctions: str, slows: bool
 ) -> None:
     path = netgenerate(tmp_path / "net.net.xml", *GRID, "-j", junctions)
@@ -81,11 +81,11 @@ def test_who_gives_way_can_stop_until_it_sees_the_others(
     limit = float(network.lanes["speed_mps"].max())
     assert minor == slows or junctions == "priority"
     assert (slowest < 0.75 * limit) == minor
-    assert slowest > 1.0, "nobody comes: it need not stand"
+    assert slowest > 1.0, "there is no foe, so it need not stop"
 
 
-def test_a_left_turn_comes_ready_to_stop_to_its_place_inside(tmp_path: Path) -> None:
-    """As SUMO's: slowest 4.5 m before the place, where it sees that none comes."""
+def test_a_left_turn_approaches_its_waiting_position_ready_to_stop(tmp_path: Path) -> None:
+    """As in SUMO: it is slowest 4.5 m before the position, where it sees that there is no foe."""
     path = netgenerate(tmp_path / "net.net.xml", *GRID, "-j", "traffic_light")
     network = read_network(path)
     links = network.links
@@ -118,7 +118,7 @@ def is_minor_to(network: RoadNetwork, before: str, after: str) -> bool:
 
 
 @pytest.mark.parametrize(("speed", "sideways_mps"), [(0.0, 0.5), (1.0, 0.5), (10.0, 1.4)])
-def test_a_lane_change_goes_on_at_a_stand(speed: float, sideways_mps: float) -> None:
+def test_a_lane_change_continues_at_a_standstill(speed: float, sideways_mps: float) -> None:
     tables, roads = travel("grid4x4"), entry_network("grid4x4")
     row = on_lane(roads, 0, 10.0, speed=speed, d=1.0)
     move_background(roads.arrays, tables, row[0], tables.steps[0], 0.0, 0, 0.1)
@@ -126,7 +126,7 @@ def test_a_lane_change_goes_on_at_a_stand(speed: float, sideways_mps: float) -> 
 
 
 @pytest.mark.parametrize("length", [5.0, 12.0])
-def test_a_background_trip_ends_with_the_front_before_what_turns_over_the_lane(
+def test_a_background_trip_ends_with_the_front_before_swept_areas(
     length: float,
 ) -> None:
     tables, roads = travel("grid4x4"), entry_network("grid4x4")

@@ -1,4 +1,4 @@
-"""Rows that follow scripts: where they go, what drivers see of them, and when their cues come."""
+"""Rows that follow scripts: their motion, their entries in the indices, and their cues."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.motion.scripted_rows import follow_script, note_cues, stand_at
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.roads.routing import PLAN, make_plans
-from cavmarl.shards.shard import _make_scratch
+from cavmarl.shards.shard import make_shard_scratch
 from cavmarl.traffic.scenarios.motions import Await, Move, Pose, Ride, Wait, arc, path_of
 from cavmarl.traffic.scenarios.movement_scripts import (
     BODIES,
@@ -38,7 +38,7 @@ WALK_MPS = 1.25
 
 
 def crossing() -> Actor:
-    """Over the road, 40 m from the start of a lane."""
+    """Cross the road 40 m from the start of a lane."""
     right, left = STREETS.kerbs_m(LANE, 40.0)
     ends = np.array(
         [STREETS.point(LANE, 40.0, -right - 1.4), STREETS.point(LANE, 40.0, left + 1.4)]
@@ -50,7 +50,7 @@ def crossing() -> Actor:
 def scripted(
     *actors: Actor, goals: dict[int, int] | None = None
 ) -> tuple[TripTables, NDArray[np.void]]:
-    """What kernels take, and VEHICLE (n,) of the actors in their first places."""
+    """Return the arguments of kernels, and VEHICLE (n,) of the actors in their first positions."""
     scripts, firsts = compile_scripts(ROADS, actors, [Cue(0.0, 0.0, 5.0)], goals or {}, DT)
     base = travel("grid4x4")
     types = np.concatenate([base.types, actor_types()])
@@ -85,7 +85,7 @@ def test_an_actor_waits_for_its_cue_and_then_walks() -> None:
     assert row["wait_s"] == pytest.approx(30 * DT)
     places = follow(tables, row, True, 60)
     way_m = math.dist(start, places[-1])
-    # 2.5 m/s² up to its speed, then steady.
+    # It accelerates with 2.5 m/s² to its speed, then the speed is constant.
     ramp_s = WALK_MPS / 2.5
     assert way_m == pytest.approx(WALK_MPS * (60 * DT - 0.5 * ramp_s), abs=0.1)
     assert row["speed"] == WALK_MPS
@@ -97,7 +97,7 @@ def test_an_actor_waits_for_its_cue_and_then_walks() -> None:
 
 
 def covered(row: np.void, at: tuple[float, float]) -> dict[int, tuple[float, float]]:
-    """The twin of `Shadows`: by lane, from where to where a fine grid over a body is on it."""
+    """Twin of `Shadows`: for each lane, the range that a fine grid of points of a body covers."""
     found: dict[int, list[float]] = {}
     cos, sin = math.cos(row["heading"]), math.sin(row["heading"])
     lanes, room_m = ROADS.lanes, 3.0 + row["length"]
@@ -117,8 +117,8 @@ def covered(row: np.void, at: tuple[float, float]) -> dict[int, tuple[float, flo
 def entries(
     tables: TripTables, rows: NDArray[np.void]
 ) -> dict[int, list[tuple[int, float, float]]]:
-    """(id, start, end) on each lane, as the index has them."""
-    room = _make_scratch(ROADS, len(rows), tables.scripts.room)
+    """Return (id, start, end) of the entries of each lane in the index."""
+    room = make_shard_scratch(ROADS, len(rows), tables.scripts.room)
     index_lanes(ROADS.arrays, tables, rows, len(rows), room)
     return {
         lane: [
@@ -133,7 +133,7 @@ def entries(
 def test_drivers_see_a_body_on_every_lane_that_it_covers_or_soon_will() -> None:
     tables, rows = scripted(crossing())
     row = rows[0]
-    assert entries(tables, rows) == {}  # beside the road, waiting
+    assert entries(tables, rows) == {}  # it waits beside the road
     soon = round(FORESIGHT_S / DT)
     for ticks in (2, 20, 40, 40, 60):
         follow(tables, row, True, ticks)
@@ -152,14 +152,14 @@ def test_drivers_see_a_body_on_every_lane_that_it_covers_or_soon_will() -> None:
                 assert (start, end) == pytest.approx(expected[lane], abs=0.15)
 
 
-def test_an_entry_stands_among_those_of_others() -> None:
-    """Drivers before it have it for a leader, by its place and not by its id."""
+def test_scripted_entries_are_sorted_among_others() -> None:
+    """It is the leader of drivers behind it, by its position and not by its id."""
     tables, rows = scripted(crossing())
     follow(tables, rows[0], True, 60)
     cars = [on_lane(ROADS, LANE, s, tables, id=k) for k, s in enumerate((30.0, 50.0))]
-    everybody = np.concatenate([rows, *cars])
-    everybody["driver"][1:] = DRIVER_BACKGROUND
-    found = entries(tables, everybody)[LANE]
+    every_row = np.concatenate([rows, *cars])
+    every_row["driver"][1:] = DRIVER_BACKGROUND
+    found = entries(tables, every_row)[LANE]
     assert [vehicle for vehicle, *_ in found] == [0, 10, 1]
 
 
@@ -175,10 +175,10 @@ def riding() -> Actor:
     return Actor("car", [ride], STREETS.edge(path[-1]))
 
 
-def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
-    """The twin is a background car in the same place, with a way over the same link.
+def test_a_scripted_vehicle_registers_at_junctions_like_a_driver() -> None:
+    """The twin is a background car at the same position, with a route over the same link.
 
-    Its trip ends on the lane behind that, as the ride's does not.
+    Unlike the script, its trip ends on the lane behind that link.
     """
     actor = riding()
     ride = actor.acts[0]
@@ -203,7 +203,7 @@ def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
 
 
 def announced(tables: TripTables, rows: NDArray[np.void]) -> list[tuple[int, float]]:
-    room = _make_scratch(ROADS, 1, tables.scripts.room)
+    room = make_shard_scratch(ROADS, 1, tables.scripts.room)
     step, step_at = np.zeros(1, PLAN), np.zeros(1, np.int64)
     register_links(ROADS.arrays, tables, rows, 1, step, step_at, room)
     return [
@@ -224,7 +224,7 @@ def test_cues_come_at_their_time_or_when_an_agent_is_near() -> None:
         note_cues(cues, rows, num, np.array([tick]), came)
         return [int(tick) for tick in came[0]]
 
-    assert told(3) == [-1, -1]  # others than agents do not count
+    assert told(3) == [-1, -1]  # only agents count
     rows["driver"][1, 0, 0] = DRIVER_AGENT
     rows["x"][1, 0, 0] = 5.1
     assert told(6) == [-1, -1]

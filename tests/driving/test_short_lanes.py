@@ -9,7 +9,7 @@ import pytest
 from cavmarl.evaluate.traffic.native_side import idle_commands, make_world
 from tests.support.netgenerate import netconvert
 
-JUNCTION_M = 8.0  # of an edge is taken by those at its ends
+JUNCTION_M = 8.0  # length of an edge that the junctions at its ends take
 NODES = """<nodes><node id="w" x="-100" y="0"/><node id="u" x="0" y="100"/>
 <node id="j" x="0" y="0" type="unregulated"/><node id="k" x="{x}" y="0" type="unregulated"/>
 <node id="n" x="{x}" y="100"/><node id="e" x="{east}" y="0"/></nodes>"""
@@ -27,8 +27,8 @@ DEMAND = """<routes><vType id="car" sigma="0"/>
 
 
 @pytest.mark.parametrize("length_m", [9.0, 11.0, 13.4, 14.4, 14.6, 15.9, 16.1, 20.0])
-def test_it_changes_once_the_lane_beside_it_is_free(tmp_path: Path, length_m: float) -> None:
-    """On lanes of 13 to 16 m it stood with its rear in the junction for ever."""
+def test_on_a_short_lane_a_vehicle_changes_when_it_can(tmp_path: Path, length_m: float) -> None:
+    """On lanes of 13 to 16 m, the vehicle may wait with its rear in the junction."""
     x = length_m + JUNCTION_M
     files = {"nod": NODES.format(x=x, east=x + 100.0), "edg": EDGES, "con": CONNECTIONS}
     for end, text in files.items():
@@ -45,5 +45,5 @@ def test_it_changes_once_the_lane_beside_it_is_free(tmp_path: Path, length_m: fl
         for row in world.vehicles():
             if row["lane"] == lane:
                 stood = max(stood, float(row["wait_s"]))
-    assert stood > 5.0, "the lane beside it was not free at once"
+    assert stood > 5.0, "the adjacent lane was not free at once"
     assert len(world.vehicles()) == 0, "both have arrived"

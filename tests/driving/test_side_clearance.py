@@ -1,4 +1,4 @@
-"""A vehicle that changes lanes at a crawl, beside one that stands askew."""
+"""A slow vehicle that changes lanes beside a vehicle that stands askew."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.lanes.side_clearance import (
     STAYS_ASIDE,
     has_side_clearance,
-    stays_aside,
+    has_to_stay_aside,
 )
 from cavmarl.driving.kernels.motion.motion import move_background
 from cavmarl.roads.routing import PLAN
@@ -22,7 +22,7 @@ LEFT, RIGHT = 1, -1
 
 
 def lanes() -> list[int]:
-    """Three lanes beside one another, from the right."""
+    """Three adjacent lanes, from right to left."""
     roads = network("merge")
     return [roads.lane_ids.index(f"weave_{k}") for k in range(3)]
 
@@ -31,10 +31,10 @@ def lanes() -> list[int]:
     ("beyond", "askew_rad", "speed", "room"),
     [(1, 0.3, 0.0, False), (1, 0.0, 0.0, True), (1, 0.3, 1.0, True), (0, 0.3, 0.0, True)],
 )
-def test_a_corner_over_the_lane_beside_leaves_no_room(
+def test_a_corner_over_the_adjacent_lane_leaves_no_room(
     beyond: int, askew_rad: float, speed: float, room: bool
 ) -> None:
-    """A bus stands on the lane beyond the one to which a car changes, or on the car's own."""
+    """A bus stands on the lane beyond the target lane of a car, or on the car's own lane."""
     roads, tables = network("merge"), travel("merge")
     right, middle, left = lanes()
     own = on_lane(roads, right, 40.0, tables, id=0, length=5.0, width=1.8)
@@ -58,10 +58,10 @@ def test_a_corner_over_the_lane_beside_leaves_no_room(
         (0.0, 0.0, False),
     ],
 )
-def test_one_that_stands_aside_of_its_lane_goes_on_until_it_would_touch(
+def test_a_vehicle_between_lanes_moves_until_it_would_touch(
     d: float, speed: float, stays: bool
 ) -> None:
-    """It comes from the right; the bus on the left lane has a corner over the middle one."""
+    """It comes from the right; a corner of the bus on the left lane is over the middle lane."""
     roads, tables = network("merge"), travel("merge")
     _, middle, left = lanes()
     own = on_lane(roads, middle, 40.0, tables, id=0, length=5.0, width=1.8, d=d, speed=speed,
@@ -72,7 +72,7 @@ def test_one_that_stands_aside_of_its_lane_goes_on_until_it_would_touch(
     rows["side_lane"] = -1
     index, step = scratch(roads, 2), np.zeros(2, PLAN)
     index_lanes(roads.arrays, tables, rows, 2, index)
-    assert stays_aside(roads.arrays, rows, rows[0], index) == stays
+    assert has_to_stay_aside(roads.arrays, rows, rows[0], index) == stays
     register_links(roads.arrays, tables, rows, 2, step, np.zeros(2, np.int64), index)
     phase = np.zeros(len(roads.signals), np.int32)
     decide(roads.arrays, tables, rows, 2, DRIVER_BACKGROUND, 0, 0.1, phase, step, index)

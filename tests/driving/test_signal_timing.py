@@ -1,4 +1,4 @@
-"""The broadcast time to a signal's change, against the signals as they then switch."""
+"""The broadcast time to the next change of a signal, compared with the actual change."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ DT = 0.5
 def watch(
     roads: RoadNetwork, seconds: float, busy: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(ticks, links with a signal): the letter that is on, and the time to its change as told.
+    """Return (ticks, links with a signal): the state, and the predicted time to its change.
 
-    Each detector is under a vehicle in a share `busy` of the ticks.
+    Each detector is occupied in a share `busy` of the ticks.
     """
     random = np.random.default_rng(1)
     links = [k for k, link in enumerate(roads.links) if link["signal"] >= 0]
@@ -52,7 +52,7 @@ def watch(
 
 
 def true_times(shown: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The time until each letter did change; nan where it had not by the end."""
+    """Return the actual time until each state changed; nan if it did not change by the end."""
     found = np.full_like(shown, np.nan)
     for k in range(shown.shape[1]):
         changes = np.flatnonzero(np.diff(shown[:, k])) + 1
@@ -62,7 +62,7 @@ def true_times(shown: NDArray[np.float64]) -> NDArray[np.float64]:
     return found
 
 
-def test_fixed_time_signals_change_when_they_say() -> None:
+def test_fixed_time_signals_change_at_the_predicted_time() -> None:
     roads = network("grid4x4")
     shown, told = watch(roads, 3 * float(roads.programs["cycle_s"].max()), busy=0.0)
     true = true_times(shown)
@@ -71,7 +71,7 @@ def test_fixed_time_signals_change_when_they_say() -> None:
     assert told[known] == pytest.approx(true[known])
 
 
-def test_actuated_signals_change_no_sooner_than_they_say(tmp_path: Path) -> None:
+def test_actuated_signals_change_no_earlier_than_predicted(tmp_path: Path) -> None:
     sumo = pytest.importorskip("sumo", reason="needs the extra: sumo")
     path = tmp_path / "crossing.net.xml"
     options = ["--grid", "--grid.number", "1", "--grid.attach-length", "100", "--output", str(path)]
@@ -82,5 +82,5 @@ def test_actuated_signals_change_no_sooner_than_they_say(tmp_path: Path) -> None
     true = true_times(shown)
     known = np.isfinite(true)
     assert (told[known] <= true[known] + 1e-9).all()
-    assert (told[known] < true[known] - 5.0).any()  # greens were prolonged
+    assert (told[known] < true[known] - 5.0).any()  # greens were extended
     assert (told[known] > 3.0).any()

@@ -1,4 +1,4 @@
-"""Steered cars in bends: where they sweep, which drivers mind it, and that fewer of them touch."""
+"""Swept areas of steered cars in bends, and the drivers that wait for them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def rows_of(network: RoadNetwork, link: int) -> np.ndarray:
     return network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
 
 
-def test_rows_of_other_vehicles_stay_as_they_are(path: Path, network: RoadNetwork) -> None:
+def test_rows_of_background_vehicles_stay_unchanged(path: Path, network: RoadNetwork) -> None:
     plain = read_network(path)
     for link in range(len(plain.links)):
         found, before = rows_of(network, link), rows_of(plain, link)
@@ -54,7 +54,7 @@ def test_rows_of_other_vehicles_stay_as_they_are(path: Path, network: RoadNetwor
     assert again.sweeps.tobytes() == network.sweeps.tobytes()
 
 
-def test_each_area_of_two_steered_cars_is_known_from_both_sides(network: RoadNetwork) -> None:
+def test_each_area_of_two_steered_cars_has_a_row_on_both_links(network: RoadNetwork) -> None:
     own = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
     rows = {
         (int(link), *(row[name].item() for name in network.sweeps.dtype.names or ()))
@@ -73,7 +73,7 @@ def test_maps_of_worlds_without_agents_have_no_such_rows(path: Path, agents: int
 
 
 def side_by_side(network: RoadNetwork) -> tuple[int, np.void]:
-    """A link on which two steered cars would touch, and two background cars not; and its row."""
+    """A link, and its SWEEP row, on which only steered cars would touch, not background cars."""
     for link in range(len(network.links)):
         rows = rows_of(network, link)
         cars = set(rows["foe"][(rows["own"] == CAR) & (rows["other"] == CAR)])
@@ -91,7 +91,7 @@ def side_by_side(network: RoadNetwork) -> tuple[int, np.void]:
         (DRIVER_BACKGROUND, DRIVER_BACKGROUND, False),
     ],
 )
-def test_a_driver_in_an_agents_seat_waits_before_an_area_that_another_is_in(
+def test_a_driver_in_an_agents_seat_waits_before_an_occupied_area(
     network: RoadNetwork, asks: int, other: int, waits: bool
 ) -> None:
     link, sweep = side_by_side(network)
@@ -114,7 +114,7 @@ def test_a_driver_in_an_agents_seat_waits_before_an_area_that_another_is_in(
 
 
 @pytest.mark.parametrize(("driver", "back"), [(DRIVER_AGENT, True), (DRIVER_BACKGROUND, False)])
-def test_a_steered_car_waits_before_its_line_where_others_will_sweep(
+def test_a_steered_car_waits_before_its_line_where_foes_will_sweep(
     network: RoadNetwork, driver: int, back: bool
 ) -> None:
     own = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
@@ -136,7 +136,7 @@ def test_a_steered_car_waits_before_its_line_where_others_will_sweep(
     ("askew", "driver", "minds"),
     [(0.6, DRIVER_AGENT, True), (0.0, DRIVER_AGENT, False), (0.6, DRIVER_BACKGROUND, False)],
 )
-def test_one_that_crawls_askew_on_a_lane_beside_is_a_leader(
+def test_a_slow_car_askew_on_an_adjacent_lane_is_a_leader(
     askew: float, driver: int, minds: bool
 ) -> None:
     roads, tables = network_of("merge"), travel("merge")
@@ -162,7 +162,7 @@ def test_a_map_without_junctions_has_no_rows() -> None:
 def stop_for_a_fast_one(
     network: RoadNetwork, link: int, sweep: np.void, place: float, front_m: float, speed: float
 ) -> float:
-    """Where a car at `place` of a link stops for one so far before the line of the other link."""
+    """Return where a car at `place` of a link stops for a foe at a distance before its line."""
     lanes = [int(network.links[k]["from_lane"]) for k in (link, int(sweep["foe"]))]
     rows = np.concatenate([on_lane(network, lane, 30.0, id=k) for k, lane in enumerate(lanes)])
     rows["driver"], rows["hold"] = DRIVER_AGENT, HOLD_NONE
@@ -176,10 +176,10 @@ def stop_for_a_fast_one(
 
 
 @pytest.mark.parametrize(("beyond_m", "goes_on"), [(0.5, True), (-0.5, False)])
-def test_one_that_is_in_the_way_of_a_fast_one_does_not_stop_for_it(
+def test_a_car_in_the_path_of_a_fast_foe_does_not_stop_for_it(
     network: RoadNetwork, beyond_m: float, goes_on: bool
 ) -> None:
-    # It has the right of way: the fast one has to brake for it anyway.
+    # The car has the right of way: the fast foe has to brake for it anyway.
     found = None
     for link, row in enumerate(network.links):
         own = network.conflicts[row["first_conflict"] :][: row["num_conflicts"]]
@@ -191,7 +191,7 @@ def test_one_that_is_in_the_way_of_a_fast_one_does_not_stop_for_it(
                 steered = sweep["own"] == sweep["other"] == STEERED
                 if yields and steered and 0.0 < conflict["enter_m"] + 1.0 < sweep["enter_m"]:
                     found = link, sweep, conflict
-    assert found is not None, "no steered car sweeps beyond the area that it has the right of"
+    assert found is not None, "no link pair has a sweep beyond the area of the right of way"
     link, sweep, conflict = found
     place = float(conflict["enter_m"]) + beyond_m
     stop = stop_for_a_fast_one(network, link, sweep, place, front_m=20.0, speed=15.0)
@@ -199,10 +199,10 @@ def test_one_that_is_in_the_way_of_a_fast_one_does_not_stop_for_it(
 
 
 @pytest.mark.parametrize(("place", "goes_on"), [(1.0, True), (-1.0, False)])
-def test_one_that_was_let_in_does_not_stop_where_a_fast_one_drives(
+def test_a_yielding_car_does_not_stop_in_the_path_of_a_fast_foe(
     network: RoadNetwork, place: float, goes_on: bool
 ) -> None:
-    # It turns before one that has the right of way, and would stop behind that one's front.
+    # The car turns before a foe with the right of way, and would stop in the foe's path.
     found = None
     for link, row in enumerate(network.links):
         own = network.conflicts[row["first_conflict"] :][: row["num_conflicts"]]
@@ -212,7 +212,7 @@ def test_one_that_was_let_in_does_not_stop_where_a_fast_one_drives(
                 over = conflict["enter_m"] < sweep["enter_m"] < conflict["leave_m"] + 5.0
                 if steered and over and sweep["enter_m"] > 5.0:
                     found = link, sweep
-    assert found is not None, "no steered car gives way and sweeps beyond the middle"
+    assert found is not None, "no link pair has a sweep of a car that yields beyond the middle"
     link, sweep = found
     stop = stop_for_a_fast_one(network, link, sweep, place, front_m=60.0, speed=25.0)
     assert (stop == np.inf) == goes_on

@@ -20,7 +20,7 @@ speeds = st.lists(st.floats(0.0, 40.0), min_size=2, max_size=9, unique=True).map
 
 
 @given(speeds, st.floats(-5.0, 50.0))
-def test_the_nearest_speed_is_the_nearest(targets: list[float], speed: float) -> None:
+def test_nearest_speed_finds_the_nearest_target_speed(targets: list[float], speed: float) -> None:
     array = np.array(targets)
     assert nearest_speed(array, speed) == min(
         range(len(targets)), key=lambda k: (abs(targets[k] - speed), k)
@@ -42,7 +42,7 @@ def test_faster_and_slower_go_one_step_and_stay_in_the_list(
 
 
 @pytest.mark.parametrize("name", ["ring", "merge", "grid4x4"])
-def test_a_lane_change_asks_for_the_neighbour_if_there_is_one(name: str) -> None:
+def test_a_lane_change_selects_the_neighbour_lane_if_there_is_one(name: str) -> None:
     roads = network(name)
     targets = np.array([0.0, 10.0])
     for lane, here in enumerate(roads.lanes):
@@ -114,13 +114,13 @@ def test_the_controller_brings_a_car_to_the_middle_and_keeps_it_there(
 @pytest.mark.parametrize(
     ("speed", "d", "askew", "straightens"),
     [
-        (0.3, -0.5, 0.6, True),  # its front would be over the far side
-        (0.3, -0.5, 0.4, False),  # it has room to come to the middle
+        (0.3, -0.5, 0.6, True),  # the front would be beyond the far side of the lane
+        (0.3, -0.5, 0.4, False),  # it has room to reach the middle
         (0.3, -1.5, 0.5, False),
-        (8.0, -0.5, 0.6, True),  # this fast it comes back anyway
+        (8.0, -0.5, 0.6, True),  # at this speed it returns anyway
     ],
 )
-def test_a_car_that_crawls_to_a_lane_keeps_its_front_on_it(
+def test_a_slow_car_that_changes_lanes_keeps_its_front_on_the_lane(
     speed: float, d: float, askew: float, straightens: bool
 ) -> None:
     roads = network("merge")
@@ -132,10 +132,10 @@ def test_a_car_that_crawls_to_a_lane_keeps_its_front_on_it(
 
 
 @pytest.mark.parametrize(("place", "as_fast"), [(5.0, True), (50.0, False)])
-def test_behind_a_junction_a_crawling_car_steers_no_harder_than_one_that_turns(
+def test_behind_a_junction_a_slow_car_steers_as_at_turning_speed(
     place: float, as_fast: bool
 ) -> None:
-    # It has cut the corner, and would swing out over the other road.
+    # The car has cut the corner, and would swing out over the other road.
     roads = network("merge")
     lane = roads.lane_ids.index("main_in_0")
     row = on_lane(roads, lane, place, speed=1.0, d=-0.2)

@@ -1,4 +1,4 @@
-"""Announcements of vehicles that come, and vehicles that are not waited for."""
+"""Registration of approaching vehicles, and registered vehicles that can be ignored."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.support.traffic import on_lane, scratch, travel_by
 
 
 @pytest.mark.parametrize(("speed", "expected"), [(0.0, 30.0), (5.0, 70.0), (20.0, 150.0)])
-def test_vehicles_announce_themselves_by_time(speed: float, expected: float) -> None:
+def test_vehicles_register_by_travel_time(speed: float, expected: float) -> None:
     assert registration_distance_m(speed) == expected
 
 
@@ -47,7 +47,7 @@ def test_vehicles_announce_themselves_by_time(speed: float, expected: float) -> 
         (HOLD_NONE, 3.1, 0.6, False),
     ],
 )
-def test_who_stands_and_does_not_want_to_go_is_let_stand(
+def test_a_vehicle_that_stands_without_a_reason_is_ignored(
     hold: int, wait_s: float, speed: float, expected: bool
 ) -> None:
     (row,) = vehicles([(0.0, 0.0, 0.0)], hold=hold, wait_s=wait_s, speed=speed)
@@ -56,12 +56,12 @@ def test_who_stands_and_does_not_want_to_go_is_let_stand(
 
 @pytest.mark.parametrize("turn", ["s", "r"])
 @pytest.mark.parametrize(("more_m", "hold"), [(-0.1, HOLD_EXIT_BLOCKED), (0.2, HOLD_YIELD)])
-def test_one_that_gives_way_behind_one_that_stands_is_let_stand(
+def test_a_yielding_vehicle_behind_a_standing_leader_is_ignored(
     tmp_path: Path, more_m: float, hold: int, turn: str
 ) -> None:
-    """At the line of a side road, with a little less or more room than it keeps anyway.
+    """At the line of a side road, with slightly less or more room than the driver keeps anyway.
 
-    Its leader goes on as itself will, or turns off.
+    Its leader takes the same link as the vehicle, or another one.
     """
     roads = read_network(build_crossing(tmp_path, "priority"))
     ways = [

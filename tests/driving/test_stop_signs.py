@@ -1,4 +1,4 @@
-"""Stop signs and agents: in an agent's seat, too, the built-in driver stands and then goes on."""
+"""Stop signs and agents: the built-in driver in an agent's seat stops and then goes on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ARRIVAL = TERMS.index("arrival")
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A grid of three roads by three, by SUMO's type of all its junctions."""
+    """A grid of three by three roads, by SUMO's type of its junctions."""
     folder = tmp_path_factory.mktemp("stops")
     options = ("--grid", "--grid.number=3", "--grid.length=80", "--default-junction-type")
     return {
@@ -34,7 +34,7 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def drive(
     path: Path, agents: int, steps: int, zones: int = 1, background: int = 0
 ) -> tuple[int, float, list[str]]:
-    """The built-in driver in all seats: (arrivals, longest wait at a stop sign in s, hashes)."""
+    """Run the built-in driver: (arrivals, longest wait at a stop sign in s, hashes)."""
     arrivals, longest, hashes = 0, 0.0, []
     settings = {"horizon_s": 400, "population.mode": "closed"}
     vec = cavmarl.make_vec(
@@ -61,10 +61,10 @@ def drive(
 def test_the_built_in_driver_passes_stop_signs(maps: dict[str, Path], kind: str) -> None:
     arrivals, longest, _ = drive(maps[kind], agents=1, steps=1500)
     assert arrivals >= 1
-    assert 0.5 <= longest < 1.5, "alone it stands, and goes on at once"
+    assert 0.5 <= longest < 1.5, "without other traffic, it stops and goes on at once"
 
 
-def test_agents_and_others_let_each_other_through_at_stop_signs(maps: dict[str, Path]) -> None:
+def test_agents_and_background_vehicles_pass_stop_signs_in_turn(maps: dict[str, Path]) -> None:
     arrivals, _, hashes = drive(maps["allway_stop"], agents=6, steps=1200, background=10)
     assert arrivals >= 6
     assert hashes == drive(maps["allway_stop"], 6, 1200, zones=4, background=10)[2]
@@ -79,10 +79,10 @@ def test_without_stop_signs_no_stop_is_noted(maps: dict[str, Path]) -> None:
     [(False, 6.5, 1.0, True), (False, 6.5, 0.1, False), (False, 8.0, 1.0, False),
      (True, 3.0, 1.0, True), (True, 8.0, 1.0, False)],
 )  # fmt: skip
-def test_one_that_waits_some_metres_before_a_stop_sign_has_stood_there(
+def test_a_vehicle_that_waits_before_a_stop_sign_has_stopped_there(
     maps: dict[str, Path], stub: bool, to_line_m: float, wait_s: float, notes: bool
 ) -> None:
-    # It leaves room for those that sweep over its line; the lane before the sign may be a stub.
+    # It leaves room for vehicles that sweep over its line; the lane before the sign may be short.
     roads = read_network(maps["allway_stop"])
     link = next(
         k
@@ -105,7 +105,7 @@ def test_one_that_waits_some_metres_before_a_stop_sign_has_stood_there(
     assert row["stopped_at"][0] == (link if notes else -1)
     row["wait_s"] = 0.0
     note_stop(arrays, steps, row[0], np.zeros(0, np.int32))
-    assert row["stopped_at"][0] == (link if notes else -1), "it goes on, and has stood"
+    assert row["stopped_at"][0] == (link if notes else -1), "it goes on, and its stop is recorded"
     row["lane"] = int(roads.links["first_internal"][link])
     note_stop(arrays, steps, row[0], np.zeros(0, np.int32))
     assert row["stopped_at"][0] == -1

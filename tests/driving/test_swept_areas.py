@@ -1,4 +1,4 @@
-"""Long vehicles in bends: where they sweep, who waits there, and that nothing touches them."""
+"""Swept areas of long vehicles in bends, and the vehicles that wait for them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.core.records.codes import (
     MODEL_KRAUSS,
 )
 from cavmarl.core.records.rows import STEERED
-from cavmarl.driving.kernels.drivers import _at_line, decide
+from cavmarl.driving.kernels.drivers import decide, decide_at_line
 from cavmarl.driving.kernels.junctions.approach import APPROACH
 from cavmarl.driving.kernels.junctions.swept_areas import (
     behind_fork,
@@ -61,7 +61,7 @@ def network(path: Path) -> RoadNetwork:
 
 
 def bus_over_a_line(network: RoadNetwork) -> tuple[int, np.void]:
-    """A link on which a bus sweeps over cars that wait at the line of another, and its row."""
+    """A link, and its SWEEP row, on which a bus sweeps over cars at the line of another link."""
     for link, row in enumerate(network.links):
         for sweep in network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]:
             over = sweep["own"] == BUS and sweep["other"] == CAR and sweep["foe_enter_m"] < -1.5
@@ -70,7 +70,7 @@ def bus_over_a_line(network: RoadNetwork) -> tuple[int, np.void]:
     raise AssertionError("no bus sweeps over a line")
 
 
-def test_each_sweep_is_known_from_both_sides(network: RoadNetwork) -> None:
+def test_each_sweep_has_a_row_on_both_links(network: RoadNetwork) -> None:
     own = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
     rows = {
         (int(link), *(row[name].item() for name in network.sweeps.dtype.names or ()))
@@ -81,7 +81,7 @@ def test_each_sweep_is_known_from_both_sides(network: RoadNetwork) -> None:
         assert (foe, link, other, size, foe_enter, foe_leave, enter, leave) in rows
 
 
-def test_each_link_says_the_least_size_that_sweeps_over_its_cars(network: RoadNetwork) -> None:
+def test_each_link_has_the_smallest_size_that_sweeps_over_its_cars(network: RoadNetwork) -> None:
     found = set()
     for row in network.links:
         sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
@@ -98,7 +98,7 @@ def test_stop_lines_are_clear_of_cars_but_not_of_buses(network: RoadNetwork) -> 
 
 
 class Meeting:
-    """A bus before a link and a car before the line that it sweeps."""
+    """A bus before a link, and a car before the line over which the bus sweeps."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
@@ -110,7 +110,7 @@ class Meeting:
         )  # fmt: skip
 
     def _announced(self, asks: int, places: tuple[float, float]) -> Scratch:
-        """The other one, announced; `places`: of both fronts beyond their lines."""
+        """Register the other vehicle; `places`: both fronts, in m beyond their lines."""
         room = scratch(self.network, 2)
         other = 1 - asks
         links = (self.link, int(self.sweep["foe"]))
@@ -124,7 +124,7 @@ class Meeting:
         return room
 
     def stop(self, asks: int, places: tuple[float, float], room_m: float = -np.inf) -> float:
-        """Where the front of one has to stop."""
+        """Return where the front of a vehicle has to stop."""
         room, roads = self._announced(asks, places), self.network.arrays
         link = (self.link, int(self.sweep["foe"]))[asks]
         return float(
@@ -132,7 +132,7 @@ class Meeting:
         )
 
     def car_is_swept(self, places: tuple[float, float]) -> bool:
-        """Whether the car may not enter at its place."""
+        """Return whether the bus would sweep over the car if the car entered at its place."""
         room, roads, link = self._announced(1, places), self.network.arrays, self.sweep["foe"]
         return bool(foe_would_sweep_over(roads, self.rows[1], link, places[1], room))
 
@@ -142,7 +142,7 @@ def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(
 ) -> None:
     meeting = Meeting(network)
     assert meeting.stop(0, (-2.0, -1.0)) == 0.0
-    meeting.rows["speed"][1] = 3.0  # it goes: up to where it is in the way
+    meeting.rows["speed"][1] = 3.0  # the bus goes, so the car stops where it would be in its path
     assert meeting.stop(0, (-2.0, -1.0)) == meeting.sweep["enter_m"]
     assert meeting.stop(0, (-2.0, 30.0)) == np.inf
 
@@ -150,30 +150,30 @@ def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(
 def test_a_car_that_has_to_stop_anyway_leaves_room_for_a_bus(network: RoadNetwork) -> None:
     meeting = Meeting(network)
     enter_m = meeting.sweep["foe_enter_m"]
-    meeting.rows["hold"][0] = HOLD_SIGNAL  # it waits for its green
+    meeting.rows["hold"][0] = HOLD_SIGNAL  # the bus waits for green
     red, inside = room_m(HOLD_SIGNAL, HOLD_NONE), room_m(HOLD_NONE, HOLD_YIELD)
     assert meeting.stop(1, (-20.0, -12.0), red) == enter_m
     assert meeting.stop(1, (-40.0, -12.0), red) == np.inf
-    assert meeting.stop(1, (-40.0, -12.0), inside) == enter_m, "it cannot go back later"
-    meeting.rows["speed"][0] = 15.0  # as far away it comes soon
+    assert meeting.stop(1, (-40.0, -12.0), inside) == enter_m, "the car cannot go back later"
+    meeting.rows["speed"][0] = 15.0  # from the same distance, it arrives soon
     assert meeting.stop(1, (-40.0, -12.0), red) == enter_m
     meeting.rows["speed"][0] = 0.0
-    assert meeting.stop(1, (-2.0, -12.0)) == np.inf, "it drives on where nothing stops it"
+    assert meeting.stop(1, (-2.0, -12.0)) == np.inf, "the car drives on if nothing else stops it"
 
 
 @pytest.mark.parametrize(("over_m", "goes"), [(0.0, False), (1e-9, False), (0.1, True)])
-def test_one_that_stands_right_before_the_area_is_not_in_it(
+def test_a_vehicle_that_stands_right_before_the_area_is_outside(
     network: RoadNetwork, over_m: float, goes: bool
 ) -> None:
-    """However its place was rounded; the other one is in the area."""
+    """The other vehicle is in the area; rounding does not matter."""
     meeting = Meeting(network)
     enter_m, car_m = (float(meeting.sweep[name]) for name in ("enter_m", "foe_enter_m"))
     stop_m = meeting.stop(0, (enter_m + over_m, car_m + 0.5))
     assert (stop_m == np.inf) == goes
 
 
-def test_long_vehicles_wait_inside_before_what_others_sweep(network: RoadNetwork) -> None:
-    """The place that a bus waits at lies before every area that begins between there and there."""
+def test_long_vehicles_wait_inside_before_swept_areas(network: RoadNetwork) -> None:
+    """A bus waits before every area that begins close to the waiting position of the map."""
     earlier = 0
     for link in np.flatnonzero(network.links["wait_m"] < np.inf).tolist():
         row = network.links[link]
@@ -187,10 +187,10 @@ def test_long_vehicles_wait_inside_before_what_others_sweep(network: RoadNetwork
     assert earlier > 0
 
 
-def test_one_that_stops_for_a_bus_still_comes_ready_to_stop_to_its_place_inside(
+def test_a_car_that_stops_for_a_bus_is_ready_to_stop_inside(
     network: RoadNetwork,
 ) -> None:
-    """The bus sweeps beyond that place, and may be gone when the car is there."""
+    """The bus sweeps beyond that position, and may have left when the car arrives."""
     links, sweeps, conflicts = network.links, network.sweeps.copy(), network.conflicts.copy()
     owner = np.repeat(np.arange(len(links)), links["num_sweeps"])
     picked = (sweeps["own"] == CAR) & (sweeps["other"] == BUS)
@@ -220,7 +220,7 @@ def test_one_that_stops_for_a_bus_still_comes_ready_to_stop_to_its_place_inside(
         entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, 1, 0.5 * BUS_M
         entry["dist"] = 0.5 * BUS_M - float(sweep["foe_enter_m"]) - 1.0
         entry["speed"] = 2.0
-        found, hold, _ = _at_line(
+        found, hold, _ = decide_at_line(
             roads, travel, rows, 0, types[0], link, front_m + 0.5 * CAR_M, 0, phase, 0.1, room,
         )  # fmt: skip
         assert hold == HOLD_NONE
@@ -230,20 +230,20 @@ def test_one_that_stops_for_a_bus_still_comes_ready_to_stop_to_its_place_inside(
     assert held(bus=True) >= held(bus=False)
 
 
-def test_of_two_before_it_the_one_further_along_goes_first(network: RoadNetwork) -> None:
+def test_before_an_area_the_vehicle_further_along_goes_first(network: RoadNetwork) -> None:
     meeting = Meeting(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     places = (bus_enter_m - 1.0, enter_m - 1.0)
     assert meeting.stop(1, places) == enter_m
     assert meeting.stop(0, places) == np.inf
-    meeting.rows["speed"][1] = 15.0  # it cannot stop any more
+    meeting.rows["speed"][1] = 15.0  # it can no longer stop
     assert meeting.stop(0, (bus_enter_m - 9.0, enter_m - 6.0)) == bus_enter_m
 
 
-def test_of_two_that_are_late_to_stop_the_one_that_brakes_less_waits(
+def test_if_both_are_late_the_vehicle_that_brakes_less_waits(
     network: RoadNetwork,
 ) -> None:
-    """Neither stops in time if both try, or if one changes its mind as it comes near."""
+    """Neither would stop in time if both tried, or if one changed its decision."""
     meeting = Meeting(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     meeting.rows["speed"] = 4.0, 12.0
@@ -253,27 +253,27 @@ def test_of_two_that_are_late_to_stop_the_one_that_brakes_less_waits(
         assert meeting.stop(0, places) == (np.inf if car_waits else bus_enter_m)
 
 
-def test_one_that_stands_before_the_area_without_a_reason_of_its_own_is_not_waited_for(
+def test_a_foe_that_stands_before_the_area_without_a_reason_is_ignored(
     network: RoadNetwork,
 ) -> None:
-    """A leader keeps it, which may wait for the one that asks: none of the three would go."""
+    """Its leader may wait for the own vehicle, so otherwise none of the three would go."""
     meeting = Meeting(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     meeting.rows["wait_s"][0] = 4.0
     assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == np.inf
-    assert meeting.stop(1, (bus_enter_m + 1.0, enter_m - 1.0)) == enter_m, "it is in the area"
+    assert meeting.stop(1, (bus_enter_m + 1.0, enter_m - 1.0)) == enter_m, "the bus is in the area"
     meeting.rows["speed"][0] = 1.0
-    assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == enter_m, "it drives on"
+    assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == enter_m, "the bus drives on"
 
 
 @pytest.mark.parametrize(
     ("front_m", "bus_m", "brakes"),
     [(-2.0, 1.0, True), (-2.0, 80.0, False), (0.5, 40.0, False)],
 )
-def test_one_that_has_left_the_junction_waits_before_an_area_that_begins_behind_it(
+def test_a_vehicle_behind_the_junction_waits_before_an_area_there(
     network: RoadNetwork, front_m: float, bus_m: float, brakes: bool
 ) -> None:
-    """`front_m`, `bus_m`: how far the car's front and the bus's are in the area."""
+    """`front_m`, `bus_m`: how far the fronts of the car and of the bus are in the area."""
     meeting = Meeting(network)
     link, bus_link = int(meeting.sweep["foe"]), meeting.link
     row, sweeps = network.links[link], network.sweeps.copy()
@@ -309,7 +309,7 @@ def test_one_that_has_left_the_junction_waits_before_an_area_that_begins_behind_
 
 
 @pytest.mark.parametrize(("bus_m", "brakes"), [(1.0, True), (40.0, False)])
-def test_one_whose_trip_ends_on_a_lane_waits_where_others_turn_over_its_end(
+def test_a_vehicle_at_its_goal_waits_for_vehicles_that_sweep_over_the_lane_end(
     network: RoadNetwork, bus_m: float, brakes: bool
 ) -> None:
     meeting = Meeting(network)
@@ -337,7 +337,7 @@ def test_one_whose_trip_ends_on_a_lane_waits_where_others_turn_over_its_end(
     assert (room.accel[0] < -1.0) == brakes
 
 
-def test_no_car_enters_where_a_bus_sweeps_that_is_there_or_cannot_stop(
+def test_no_car_enters_the_road_where_a_bus_sweeps(
     network: RoadNetwork,
 ) -> None:
     meeting = Meeting(network)
@@ -345,16 +345,16 @@ def test_no_car_enters_where_a_bus_sweeps_that_is_there_or_cannot_stop(
     at_line, far = -0.5, float(meeting.sweep["foe_enter_m"]) - 1.0
     assert meeting.car_is_swept((enter_m + 1.0, at_line))
     assert not meeting.car_is_swept((leave_m + BUS_M + 1.0, at_line)), "the bus has passed"
-    assert not meeting.car_is_swept((enter_m + 1.0, far)), "it enters before the area"
+    assert not meeting.car_is_swept((enter_m + 1.0, far)), "the car enters before the area"
     assert not meeting.car_is_swept((enter_m - 5.0, at_line)), "the bus stands"
     meeting.rows["speed"][0] = 6.0
-    assert meeting.car_is_swept((enter_m - 5.0, at_line)), "it would have to brake hard"
+    assert meeting.car_is_swept((enter_m - 5.0, at_line)), "the bus would have to brake hard"
     assert not meeting.car_is_swept((enter_m - 15.0, at_line))
     meeting.rows["speed"] = 6.0, 4.0
-    assert meeting.car_is_swept((enter_m + 1.0, far)), "it could not stop before the area"
+    assert meeting.car_is_swept((enter_m + 1.0, far)), "the car could not stop before the area"
 
 
-def test_nothing_touches_buses_that_turn(path: Path, tmp_path: Path) -> None:
+def test_no_vehicle_touches_a_turning_bus(path: Path, tmp_path: Path) -> None:
     routes = tmp_path / "crowd.rou.xml"
     routes.write_text(CROWD, encoding="utf-8")
     world = make(path, [routes], overrides={"horizon_s": 200.0, **CLOCK})
@@ -369,10 +369,10 @@ def test_nothing_touches_buses_that_turn(path: Path, tmp_path: Path) -> None:
     assert stats.arrived > 40
 
 
-def test_a_rear_over_the_end_of_a_lane_counts_for_one_that_has_to_leave_the_lane(
+def test_a_rear_over_a_lane_end_counts_for_a_vehicle_that_has_to_change(
     network: RoadNetwork,
 ) -> None:
-    """Whichever way a bus has gone: its rear stands on the lane, where a follower must stop."""
+    """The rear of a bus is on the lane, so a follower must stop there, whatever the bus's route."""
     link = int(np.flatnonzero(network.links["num_sweeps"] > 0)[0])
     lane = int(network.links[link]["from_lane"])
     length_m = float(network.lanes[lane]["length_m"])

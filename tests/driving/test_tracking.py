@@ -1,4 +1,4 @@
-"""Where on the lanes a steered vehicle is: moved about by hand on maps that are easy to picture."""
+"""Tracking of steered vehicles that are moved by hand on simple maps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRIDS: dict[str, LaneGrid] = {}
 def find(
     name: str, row: NDArray[np.void], table: NDArray[np.void] | None = None
 ) -> tuple[str, float, float, int]:
-    """(lane, s, d, events) after `locate`."""
+    """Return (lane, s, d, events) after `locate`."""
     roads = network(name)
     grid = GRIDS.setdefault(name, lane_grid(roads))
     events = locate(roads.arrays, plans(name) if table is None else table, grid, row[0])
@@ -32,7 +32,7 @@ def find(
 
 
 def shift(row: NDArray[np.void], forward: float, left: float) -> None:
-    """Move a vehicle in its own frame; its lane context stays the old one."""
+    """Move a vehicle in its own frame, and keep its old lane."""
     cos, sin = math.cos(row[0]["heading"]), math.sin(row[0]["heading"])
     row["x"] += forward * cos - left * sin
     row["y"] += forward * sin + left * cos
@@ -43,7 +43,7 @@ def lane_of(roads: RoadNetwork, name: str) -> int:
 
 
 @given(st.sampled_from(NAMES), st.data())
-def test_a_vehicle_put_on_a_lane_is_found_there(name: str, data: st.DataObject) -> None:
+def test_a_vehicle_on_a_lane_is_located_there(name: str, data: st.DataObject) -> None:
     roads = network(name)
     outside = np.flatnonzero(~roads.lanes["internal"])
     lane = int(data.draw(st.sampled_from(outside.tolist())))
@@ -51,17 +51,17 @@ def test_a_vehicle_put_on_a_lane_is_found_there(name: str, data: st.DataObject) 
     s = data.draw(st.floats(0.5, float(here["length_m"]) - 0.5))
     d = data.draw(st.floats(-0.45, 0.45)) * float(here["width_m"])
     row = on_lane(roads, lane, s, d=d)
-    row["s"] += data.draw(st.floats(-3.0, 3.0))  # it is searched for from where it was
+    row["s"] += data.draw(st.floats(-3.0, 3.0))  # the search starts at the old position
     row["d"] = 0.0
     found, found_s, found_d, events = find(name, row)
-    # In a bend the nearest point of a corner may be another one, but not by much.
+    # In a bend, the nearest point may be another one close by.
     assert found == roads.lane_ids[lane]
     assert found_s == pytest.approx(s, abs=1.0)
     assert found_d == pytest.approx(d, abs=0.3)
     assert events == 0
 
 
-def test_beyond_half_a_lane_the_neighbour_takes_over() -> None:
+def test_beyond_half_a_lane_the_vehicle_is_on_the_neighbour_lane() -> None:
     roads = network("merge")
     right, left = lane_of(roads, "main_in_0"), lane_of(roads, "main_in_1")
     half = 0.5 * float(roads.lanes[right]["width_m"])
@@ -79,8 +79,8 @@ def test_beyond_half_a_lane_the_neighbour_takes_over() -> None:
 
 
 @pytest.mark.parametrize(("apart_m", "expected"), [(0.01, 0), (0.9, 0), (1.5, EVENT_OFF_ROAD)])
-def test_what_lies_between_neighbours_is_road(apart_m: float, expected: int) -> None:
-    """Where lanes bend, and by rounding, there is a seam between them; an island is wider."""
+def test_a_seam_between_neighbour_lanes_is_road(apart_m: float, expected: int) -> None:
+    """Bends and rounding leave a seam between lanes; an island is wider than a seam."""
     roads = network("merge")
     right, left = (roads.lanes[lane_of(roads, f"main_in_{k}")] for k in (0, 1))
     points = roads.points.copy()
@@ -94,7 +94,7 @@ def test_what_lies_between_neighbours_is_road(apart_m: float, expected: int) -> 
     assert locate(arrays, plans("merge"), grid, row[0]) == expected
 
 
-def test_past_its_end_a_lane_is_followed_by_the_planned_one() -> None:
+def test_beyond_the_end_of_a_lane_the_planned_lane_follows() -> None:
     roads = network("grid4x4")
     junction_ways = set()
     lane = lane_of(roads, "A1B1_0")
@@ -144,14 +144,14 @@ def test_on_the_lanes_of_the_other_direction_is_the_wrong_way() -> None:
     shift(row, 0.0, 3.2)
     found, _, _, events = find("grid4x4", row)
     assert events == EVENT_WRONG_WAY
-    # Turned round it drives there rightly.
+    # In the opposite direction it is on the correct side.
     row["heading"] += math.pi
     found, _, _, events = find("grid4x4", row)
     assert events == 0
     assert found.startswith("B1A1")
 
 
-def test_who_is_on_no_lane_of_its_direction_says_how_far_from_its_last_one_it_is() -> None:
+def test_a_vehicle_on_no_lane_has_the_distance_to_its_last_lane() -> None:
     roads = network("grid4x4")
     row = on_lane(roads, lane_of(roads, "A1B1_0"), 2.0)
     row["heading"] += math.pi
@@ -162,7 +162,7 @@ def test_who_is_on_no_lane_of_its_direction_says_how_far_from_its_last_one_it_is
     assert events & EVENT_WRONG_WAY
 
 
-def test_who_cuts_across_is_found_on_the_other_road() -> None:
+def test_a_vehicle_that_crosses_to_another_road_is_located_there() -> None:
     roads = network("grid4x4")
     row = on_lane(roads, lane_of(roads, "A1B1_0"), 40.0)
     target = on_lane(roads, lane_of(roads, "B1B2_0"), 30.0)

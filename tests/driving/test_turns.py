@@ -1,4 +1,4 @@
-"""Turns and bends for cars that are steered: taken within the road, or kept out of trips."""
+"""Turns and bends of steered cars: they stay on the road, and trips avoid too tight turns."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ def test_a_car_can_take_each_corner_of_a_grid() -> None:
     roads = network("grid4x4")
     links = with_tight_turns(roads, STEERING_RAD).links
     assert links["direction"].tolist() == roads.links["direction"].tolist()
-    blunt = with_tight_turns(roads, 0.3).links  # with wheels that turn so little it can not
+    blunt = with_tight_turns(roads, 0.3).links  # impossible with this steering angle
     assert (blunt["direction"] != roads.links["direction"]).any()
 
 
-def test_turns_that_are_too_tight_are_sharp_ones_and_no_trip_has_one(tmp_path: Path) -> None:
+def test_too_tight_turns_are_sharp_and_in_no_trip(tmp_path: Path) -> None:
     path = netgenerate(tmp_path / "random.net.xml", *RANDOM)
     world = make_simulation(path, mode="respawn", agents=4, background=0)
     roads = world.network
@@ -69,8 +69,8 @@ def test_turns_that_are_too_tight_are_sharp_ones_and_no_trip_has_one(tmp_path: P
             lane = int(plan[lane]["next"])
 
 
-def test_a_corner_is_tight_if_the_car_leaves_its_road_as_it_steers_there(tmp_path: Path) -> None:
-    # By the aim of a link that leads straight on the car would stay on its road.
+def test_a_turn_is_too_tight_if_a_steered_car_leaves_its_road(tmp_path: Path) -> None:
+    # With the aim distance of a straight link, the car would stay on its road.
     for kind, text in CORNER.items():
         (tmp_path / f"m.{kind}.xml").write_text(text)
     roads = read_network(netconvert(tmp_path, "m"))
@@ -92,8 +92,8 @@ def test_turning_in_a_junction_is_not_the_wrong_way() -> None:
         lane = int(link["first_internal"])
         length = float(roads.lanes["length_m"][lane])
         for s, end, sign, expected in (
-            (0.9 * length, 0, 1.0, 0),  # still as it came
-            (0.1 * length, 1, 1.0, 0),  # already as it goes
+            (0.9 * length, 0, 1.0, 0),  # in the direction of the incoming road
+            (0.1 * length, 1, 1.0, 0),  # in the direction of the outgoing road
             (0.5 * length, 0, -1.0, EVENT_WRONG_WAY),
         ):
             row = blank_vehicle()[0]
@@ -121,8 +121,8 @@ def test_a_corner_between_two_lanes_is_a_bend(tmp_path: Path) -> None:
     assert bend_speed(roads.arrays, first, first, -20.0) == math.inf
 
 
-def test_alone_on_two_lanes_an_agent_stays_on_its_own(tmp_path: Path) -> None:
-    """Bends, lines and limits ahead are the same on either lane."""
+def test_a_single_agent_on_two_lanes_keeps_its_lane(tmp_path: Path) -> None:
+    """Bends, lines and limits ahead are the same on both lanes."""
     path = netgenerate(tmp_path / "random.net.xml", *RANDOM, "-L", "2", "-j", "traffic_light")
     world = make_simulation(path, mode="respawn", agents=1, background=0)
     start(world, 2)
@@ -143,7 +143,7 @@ def test_alone_on_two_lanes_an_agent_stays_on_its_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))]
 )
-def test_alone_on_a_random_map_agents_stay_on_their_side(tmp_path: Path, seed: int) -> None:
+def test_agents_on_a_random_map_stay_on_their_side(tmp_path: Path, seed: int) -> None:
     options = ["--rand", "--rand.iterations", "40", "--seed", str(seed)]
     path = netgenerate(tmp_path / "random.net.xml", *options)
     world = make_simulation(path, mode="respawn", agents=2, background=0, num_worlds=4)
@@ -155,8 +155,8 @@ def test_alone_on_a_random_map_agents_stay_on_their_side(tmp_path: Path, seed: i
         drive(world)
 
 
-def test_all_ways_into_one_lane_are_foes(tmp_path: Path) -> None:
-    """Where a node has very many arms, netconvert names some that merge no foes."""
+def test_all_links_into_one_lane_are_foes(tmp_path: Path) -> None:
+    """For nodes with very many arms, netconvert does not list all merging links as foes."""
     arms = ["--spider", "--spider.arm-number", "13", "--spider.circle-number", "1"]
     roads = read_network(netgenerate(tmp_path / "spider.net.xml", *arms))
     pairs = 0
@@ -171,13 +171,13 @@ def test_all_ways_into_one_lane_are_foes(tmp_path: Path) -> None:
     assert pairs > 100
 
 
-def test_a_steered_car_does_not_overtake_onto_a_way_with_a_turn_that_it_cannot_take(
+def test_a_steered_car_does_not_overtake_towards_a_turn_that_is_too_tight(
     tmp_path: Path,
 ) -> None:
     world, right, left, goal = before_dead_end(tmp_path, length_m=30.0)
     plans = world.plans
     assert plans["turnarounds"][goal, [right, left]].tolist() == [1, 0]
-    assert plans["change"][goal, right] == 0, "its way goes on from the right lane"
+    assert plans["change"][goal, right] == 0, "the route continues from the right lane"
 
     def wants(lane: int) -> int:
         rows = world.vehicles(0)
@@ -186,4 +186,4 @@ def test_a_steered_car_does_not_overtake_onto_a_way_with_a_turn_that_it_cannot_t
         return int(suggested(world)[0, int(rows["agent"][0]), 1] * 1000.0)
 
     assert wants(left) == 0
-    assert wants(right) > 0, "the other way round it overtakes"
+    assert wants(right) > 0, "from the other lane, it overtakes"

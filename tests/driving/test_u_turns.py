@@ -1,4 +1,4 @@
-"""U-turns on roads of two lanes: what meets them, and where others wait."""
+"""U-turns on roads with two lanes: conflicts, and where other vehicles wait."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from cavmarl.core.records.rows import SWEPT_BEYOND_M
 from cavmarl.driving.kernels.drivers import decide
 from cavmarl.driving.kernels.junctions.approach import register_links
 from cavmarl.driving.kernels.junctions.swept_areas import stop_before_foe_sweep
-from cavmarl.driving.kernels.lanes.lane_choice import _change_is_safe
-from cavmarl.driving.kernels.lanes.lane_ends import behind_beside
+from cavmarl.driving.kernels.lanes.lane_choice import change_is_safe
+from cavmarl.driving.kernels.lanes.lane_ends import constraint_of_side_lane
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.models.following import no_constraint
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.roads.sumo_net.reader import read_network
-from cavmarl.traffic.kernels.admission import _is_swept, _may_be_swept
+from cavmarl.traffic.kernels.admission import is_entry_swept, may_entry_be_swept
 from tests.support.netgenerate import netgenerate
 from tests.support.traffic import on_lane, scratch, travel_by
 
@@ -36,7 +36,7 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> RoadNetwork:
 
 
 def beside(network: RoadNetwork) -> tuple[int, int]:
-    """A link that leads straight on, and a U-turn from the lane beside."""
+    """Find a straight link, and a U-turn from the adjacent lane."""
     for link, row in enumerate(network.links):
         lane = network.lanes[row["from_lane"]]
         if row["direction"] == STRAIGHT and lane["left"] >= 0:
@@ -52,10 +52,10 @@ def sweeps_of(network: RoadNetwork, link: int) -> NDArray[np.void]:
     return network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
 
 
-def test_a_u_turn_does_not_conflict_with_the_lane_beside_it(
+def test_a_u_turn_does_not_conflict_with_the_adjacent_lane(
     network: RoadNetwork,
 ) -> None:
-    """Its rear is still on its own lane, which leads straight to the junction."""
+    """The rear is still on its own lane, which is straight up to the junction."""
     link, turn = beside(network)
     row = network.links[link]
     foes = network.conflicts["foe"][row["first_conflict"] :][: row["num_conflicts"]]
@@ -64,10 +64,10 @@ def test_a_u_turn_does_not_conflict_with_the_lane_beside_it(
 
 
 @pytest.mark.parametrize(("size", "reaches"), [(0, False), (BUS, True)])
-def test_only_a_long_vehicle_that_turns_round_minds_those_that_have_left_beside_it(
+def test_only_long_vehicles_wait_in_a_u_turn_for_vehicles_beside_them(
     network: RoadNetwork, size: int, reaches: bool
 ) -> None:
-    """They drive back along its flank, on the lane that it comes to."""
+    """A long vehicle drives back beside them, on the adjacent target lane."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
         sweeps = sweeps_of(network, turn)
@@ -78,8 +78,8 @@ def test_only_a_long_vehicle_that_turns_round_minds_those_that_have_left_beside_
     assert (min(beyond_m) > 2.0) == reaches
 
 
-def test_a_bus_that_turns_round_reaches_far_over_the_lane_beside(network: RoadNetwork) -> None:
-    """Over one whose rear is 5 m behind the junction, and no further than others announce it."""
+def test_a_bus_in_a_u_turn_reaches_far_over_the_adjacent_lane(network: RoadNetwork) -> None:
+    """Up to a vehicle whose rear is 5 m behind the junction, which is still registered."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
         sweeps = sweeps_of(network, turn)
@@ -91,10 +91,10 @@ def test_a_bus_that_turns_round_reaches_far_over_the_lane_beside(network: RoadNe
 
 
 @pytest.mark.parametrize(("bus_m", "brakes"), [(6.0, True), (40.0, False)])
-def test_one_that_leaves_a_lane_minds_those_at_its_end_while_its_body_covers_it(
+def test_a_vehicle_waits_for_a_lane_end_while_its_body_covers_the_lane(
     network: RoadNetwork, bus_m: float, brakes: bool
 ) -> None:
-    """A car between two lanes, and a bus that sweeps over the end of the one that it leaves."""
+    """A car between two lanes, and a bus that sweeps over the end of the lane that it leaves."""
     link, turn = beside(network)
     row, sweeps = network.links[link], sweeps_of(network, link)
     picked = (sweeps["foe"] == turn) & (sweeps["own"] == 0) & (sweeps["other"] == BUS)
@@ -113,12 +113,12 @@ def test_one_that_leaves_a_lane_minds_those_at_its_end_while_its_body_covers_it(
     bus["row"], bus["id"], bus["half"] = 1, 1, 0.5 * BUS_M
     bus["dist"], bus["speed"] = 0.5 * BUS_M - bus_m, 2.0
     kind = generated_types()[0]
-    found = behind_beside(network.arrays, travel, rows, 0, kind, 100.0, 0.1, room)
+    found = constraint_of_side_lane(network.arrays, travel, rows, 0, kind, 100.0, 0.1, room)
     assert (found > no_constraint(kind)) == brakes
 
 
 @pytest.mark.parametrize(("foe_m", "waits"), [(-20.0, False), (2.0, True)])
-def test_a_bus_leaves_room_for_a_u_turn_ahead_of_it_and_not_behind_it(
+def test_a_bus_leaves_room_for_a_u_turn_ahead_but_not_behind(
     network: RoadNetwork, foe_m: float, waits: bool
 ) -> None:
     _, turn = beside(network)
@@ -141,23 +141,23 @@ def test_a_bus_leaves_room_for_a_u_turn_ahead_of_it_and_not_behind_it(
     assert stop == (sweep["enter_m"] if waits else np.inf)
 
 
-def test_a_rear_that_comes_back_reaches_those_behind_it_before_it_has_left_its_lane(
+def test_a_rear_that_moves_back_reaches_followers_on_its_lane(
     network: RoadNetwork,
 ) -> None:
-    """A car does not: its way is hardly shorter than itself."""
+    """A car's rear does not, because its chord is hardly shorter than its path."""
     _, turn = beside(network)
     sweeps = sweeps_of(network, turn)
     behind = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == 0)]
     (bus,) = behind[behind["other"] == BUS]
     assert not (behind["other"] == 0).any()
-    assert 0.0 < bus["foe_enter_m"] < BUS_M - 3.0, "its rear is still before the line"
-    assert bus["enter_m"] < bus["foe_enter_m"] - BUS_M + 1.0, "up to where its rear was"
+    assert 0.0 < bus["foe_enter_m"] < BUS_M - 3.0, "the rear is still before the line"
+    assert bus["enter_m"] < bus["foe_enter_m"] - BUS_M + 1.0, (
+        "up to the previous position of the rear"
+    )
 
 
 @pytest.mark.parametrize("turns", [True, False])
-def test_one_follows_a_bus_that_turns_round_from_further_back(
-    network: RoadNetwork, turns: bool
-) -> None:
+def test_the_gap_to_a_bus_in_a_u_turn_is_larger(network: RoadNetwork, turns: bool) -> None:
     link, turn = beside(network)
     taken = turn if turns else link
     lane = int(network.links["from_lane"][taken])
@@ -167,7 +167,7 @@ def test_one_follows_a_bus_that_turns_round_from_further_back(
     kind = generated_types()[0]
 
     def stands_m(length: float) -> float:
-        """How far behind its leader it does not speed up from rest, to a quarter of a metre."""
+        """Return the gap, to 0.25 m, below which it does not start from rest."""
         for gap_m in np.arange(0.25, 9.0, 0.25):
             rear_m = length_m - 1.0 - length
             places = [(rear_m - gap_m - 2.5, 5.0), (rear_m + 0.5 * length, length)]
@@ -189,10 +189,10 @@ def test_one_follows_a_bus_that_turns_round_from_further_back(
 
 
 @pytest.mark.parametrize(("bus_m", "swept"), [(6.0, True), (40.0, False), (None, False)])
-def test_nothing_enters_at_the_start_of_a_lane_where_a_bus_turns_round_beside_it(
+def test_no_vehicle_enters_beside_a_bus_in_a_u_turn(
     network: RoadNetwork, bus_m: float | None, swept: bool
 ) -> None:
-    """`bus_m`: of its front beyond its line; it reaches over the start of the lane beside it."""
+    """`bus_m`: distance of the front beyond its line; the bus covers the adjacent lane's start."""
     links, sweeps = network.links, network.sweeps
     owner = np.repeat(np.arange(len(links)), links["num_sweeps"])
     reaches = (sweeps["own"] == 0) & (sweeps["other"] == BUS)
@@ -212,14 +212,14 @@ def test_nothing_enters_at_the_start_of_a_lane_where_a_bus_turns_round_beside_it
     if bus_m is not None:
         room.link_end[turn] = 1
         room.approach["half"][0], room.approach["dist"][0] = 0.5 * BUS_M, 0.5 * BUS_M - bus_m
-    assert bus_m is None or _may_be_swept(network.arrays, travel, row, room)
-    assert _is_swept(network.arrays, travel, row, room) == swept
+    assert bus_m is None or may_entry_be_swept(network.arrays, travel, row, room)
+    assert is_entry_swept(network.arrays, travel, row, room) == swept
     row["s"] = 30.0
-    assert not _is_swept(network.arrays, travel, row, room), "it enters further on"
+    assert not is_entry_swept(network.arrays, travel, row, room), "the vehicle enters further on"
 
 
 def dead_end(network: RoadNetwork) -> tuple[int, int]:
-    """A U-turn, and the lane beside the one behind it, into which no link leads."""
+    """Find a U-turn, and a lane without incoming links beside its target lane."""
     for turn in np.flatnonzero(network.links["direction"] == U_TURN).tolist():
         right = int(network.lanes["right"][network.links["to_lane"][turn]])
         if right >= 0 and network.lanes["num_into"][right] == 0:
@@ -228,7 +228,7 @@ def dead_end(network: RoadNetwork) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize(("s", "listed"), [(3.0, True), (30.0, False)])
-def test_one_that_has_entered_where_no_link_leads_is_listed_on_the_one_beside(
+def test_a_vehicle_on_a_lane_without_a_link_is_listed_at_the_adjacent_one(
     network: RoadNetwork, s: float, listed: bool
 ) -> None:
     turn, lane = dead_end(network)
@@ -245,10 +245,10 @@ def test_one_that_has_entered_where_no_link_leads_is_listed_on_the_one_beside(
 
 
 @pytest.mark.parametrize("size", [0, BUS])
-def test_a_bus_that_turns_round_at_a_dead_end_minds_those_that_have_entered_beside_it(
+def test_a_bus_in_a_u_turn_waits_for_vehicles_that_have_entered_beside_it(
     network: RoadNetwork, size: int
 ) -> None:
-    """And they enter only where no bus turns: the area is known from both sides."""
+    """Vehicles enter only where no bus turns: both links have a row for the area."""
     turn, lane = dead_end(network)
     length_m = float(network.links["length_m"][turn])
     sweeps = sweeps_of(network, turn)
@@ -298,7 +298,7 @@ def test_a_bus_that_leaves_room_far_before_a_stop_sign_stands_at_it(
 
 
 @pytest.mark.parametrize(("turned_rad", "nearer"), [(1.6, True), (-1.6, True), (0.5, False)])
-def test_a_leader_that_has_turned_is_half_its_width_nearer(
+def test_a_leader_around_a_corner_is_half_its_width_closer(
     network: RoadNetwork, turned_rad: float, nearer: bool
 ) -> None:
     link, _ = beside(network)
@@ -316,7 +316,7 @@ def test_a_leader_that_has_turned_is_half_its_width_nearer(
         rows["heading"][1] += turned
         room, step = scratch(network, 2), np.zeros(2, PLAN)
         index_lanes(network.arrays, travel, rows, 2, room)
-        room.link_start[:] = room.link_end[:] = 0  # nothing is asked of the junction
+        room.link_start[:] = room.link_end[:] = 0  # no vehicle is on the junction
         step[0] = plan[lane]
         decide(network.arrays, travel, rows, 2, DRIVER_BACKGROUND, 0, 0.1,
                np.zeros(0, np.int32), step, room)  # fmt: skip
@@ -328,10 +328,10 @@ def test_a_leader_that_has_turned_is_half_its_width_nearer(
 
 
 @pytest.mark.parametrize(("rest_m", "announced"), [(6.0, True), (20.0, False)])
-def test_one_that_changes_lanes_before_the_line_is_seen_on_both(
+def test_a_vehicle_that_changes_lanes_at_the_line_is_listed_on_both(
     network: RoadNetwork, rest_m: float, announced: bool
 ) -> None:
-    """Else a bus that turns round from the lane that it has left sweeps over it."""
+    """Otherwise a bus in a U-turn from the lane that the vehicle has left would sweep over it."""
     link, turn = beside(network)
     lane, left = (int(network.links["from_lane"][k]) for k in (link, turn))
     plan = np.zeros(len(network.lanes), PLAN)
@@ -349,10 +349,10 @@ def test_one_that_changes_lanes_before_the_line_is_seen_on_both(
 @pytest.mark.parametrize(("gap_m", "over_m", "safe"), [
     (1.5, -8.0, True), (1.5, 1.0, False), (1.5, 4.0, False), (3.0, 1.0, True), (3.0, 4.0, True),
 ])  # fmt: skip
-def test_no_lane_change_ends_close_behind_one_whose_front_is_over_the_line(
+def test_no_lane_change_ends_close_behind_a_vehicle_over_the_line(
     network: RoadNetwork, gap_m: float, over_m: float, safe: bool
 ) -> None:
-    """Where that one turns round its body sticks out behind the place of its rear."""
+    """In a U-turn, its body extends further back than its rear position on the path."""
     link, turn = beside(network)
     lane, left = (int(network.links["from_lane"][k]) for k in (link, turn))
     plan = np.zeros(len(network.lanes), PLAN)
@@ -372,4 +372,4 @@ def test_no_lane_change_ends_close_behind_one_whose_front_is_over_the_line(
     room = scratch(network, 2)
     index_lanes(network.arrays, travel, rows, 2, room)
     register_links(network.arrays, travel, rows, 2, np.zeros(2, PLAN), np.zeros(2, np.int64), room)
-    assert _change_is_safe(network.arrays, travel, rows, 1, left, 0.0, True, room) == safe
+    assert change_is_safe(network.arrays, travel, rows, 1, left, 0.0, True, room) == safe

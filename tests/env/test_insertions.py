@@ -9,14 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl import (
-    ActionError,
-    CapacityError,
-    CavEnv,
-    ConfigError,
-    make_vec,
-    parallel_env,
-)
+from cavmarl import ActionError, CapacityError, CavEnv, ConfigError, make_vec, parallel_env
 from cavmarl.recordings.recording import Recording
 
 ROOM = {"population.insertions": 12}
@@ -222,7 +215,7 @@ def test_what_cannot_be_put_there_is_refused_with_its_cure() -> None:
         vec.insert_vehicle(lane, 10.0, world=0)
         vec.reset()
         vec.insert_vehicle(lane, 10.0, world=1)
-    with pytest.raises(ConfigError, match=r"population\.insertions = 3: .*of one map"):
+    with pytest.raises(ConfigError, match=r"population\.insertions = 3: .*needs a single map"):
         parallel_env("cities", overrides={"population.insertions": 3})
 
 

@@ -1,4 +1,4 @@
-"""Both models of car following, told from the acceleration that a driver takes in the end."""
+"""Twins of IDM and of Krauss's model: the acceleration that a driver finally applies."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import numpy as np
 from tests.naive import idm, krauss
 
 CAR_M = 5.0  # IDM measures between the centres of two such cars
-MARGIN_M = 1.0  # kept before lines
 
 
 def idm_response(

@@ -269,7 +269,7 @@ def test_choices_cannot_be_corrected(tmp_path: Path) -> None:
 def test_a_shield_compares_throttles() -> None:
     vec = small_vec(action__kind="discrete")
     observations, infos = vec.reset(seed=0)
-    with pytest.raises(PolicyError, match=r"action\.kind = discrete: this driver gives throttle"):
+    with pytest.raises(PolicyError, match=r"action\.kind = discrete: this driver needs throttle"):
         load_policy("shielded:idm", vec).act_batch(observations, infos["mask"])
 
 

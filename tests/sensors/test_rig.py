@@ -14,7 +14,7 @@ from cavmarl.config.rig import GnssConfig
 from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 from cavmarl.verify.equivalence import verify_zones
 from tests.support.replayed import BUSY

@@ -113,8 +113,7 @@ def test_a_node_with_a_little_less_load_is_not_stampeded(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize(
-    ("busy", "reason"),
-    [({"cpu": 0.851}, "cpu"), ({"ram": 0.901}, "ram"), ({"gpu": 0.951}, "gpu")],
+    ("busy", "reason"), [({"cpu": 0.851}, "cpu"), ({"ram": 0.901}, "ram"), ({"gpu": 0.951}, "gpu")]
 )
 def test_one_overloaded_resource_excludes_a_node(
     fleet: Fleet, busy: dict[str, float], reason: str
@@ -228,7 +227,7 @@ def test_a_job_waits_for_a_node_and_is_run_again_when_that_is_lost(fleet: Fleet)
     assert job.state == "queued"
     fleet.join("b")
     assert job.node == "b"
-    with pytest.raises(ServiceError, match="not on a node"):
+    with pytest.raises(ServiceError, match="on no node of this identity"):
         fleet.broker.hosted(fleet.identity("strangers", "node"), job.id)
     fleet.broker.finish(fleet.broker.hosted(fleet.nodes, job.id), "done", "")
     assert (job.state, fleet.beat("b")["jobs"]) == ("done", [])
@@ -403,7 +402,7 @@ def test_requests_of_one_caller_have_a_rate(fleet: Fleet) -> None:
     limit = RateLimit(2.0, 3.0, lambda: fleet.now_s)
     for _ in range(3):
         limit.take("ada")
-    with pytest.raises(ServiceError, match="2 requests a second") as refused:
+    with pytest.raises(ServiceError, match="2 requests per second") as refused:
         limit.take("ada")
     assert (refused.value.problem, refused.value.retry_s) == ("too-many", 0.5)
     limit.take("bob")

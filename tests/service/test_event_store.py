@@ -66,7 +66,7 @@ def history(where: str | Path) -> tuple[list[str], EventLog]:
 
 def test_postgresql_keeps_what_sqlite_keeps(empty_postgresql: str, tmp_path: Path) -> None:
     kinds, log = history(empty_postgresql)
-    with pytest.raises(ServiceError, match="another service has it"):
+    with pytest.raises(ServiceError, match="is in use by another service"):
         EventStore(empty_postgresql)
     log.store.close()
     expected, other = history(tmp_path / "store.sqlite")
@@ -76,7 +76,7 @@ def test_postgresql_keeps_what_sqlite_keeps(empty_postgresql: str, tmp_path: Pat
 
 def test_a_store_is_one_service_s(tmp_path: Path) -> None:
     store = EventStore(tmp_path / "store.sqlite")
-    with pytest.raises(ServiceError, match="another service has it"):
+    with pytest.raises(ServiceError, match="is in use by another service"):
         EventStore(tmp_path / "store.sqlite")
     store.close()
     EventStore(tmp_path / "store.sqlite").close()
@@ -86,7 +86,7 @@ def test_a_store_of_another_version_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     EventStore(path).close()
     damage(path, "UPDATE about SET schema = 'cavmarl.service/9'")
-    with pytest.raises(ServiceError, match="this version knows"):
+    with pytest.raises(ServiceError, match="this version needs"):
         EventStore(path)
 
 
@@ -123,7 +123,7 @@ def test_a_changed_log_is_noticed(tmp_path: Path, change: str) -> None:
     history(path)[1].store.close()
     damage(path, change)
     store = EventStore(path)
-    with pytest.raises(ServiceError, match="does not follow from the one before"):
+    with pytest.raises(ServiceError, match="does not follow from the previous one"):
         EventLog(store)
     store.close()
 
@@ -186,7 +186,8 @@ def test_nothing_is_acknowledged_that_could_not_be_written(tmp_path: Path) -> No
     fleet = Fleet(tmp_path / "store.sqlite")
     fleet.log.flush()
     before = fleet.log.durable
-    fleet.log.store._connection.close()
+    full = "BEGIN SELECT RAISE(FAIL, 'the disk is full'); END"
+    damage(tmp_path / "store.sqlite", f"CREATE TRIGGER full BEFORE INSERT ON events {full}")
     fleet.register("a")
     with pytest.raises(ServiceError, match="cannot be written"):
         fleet.log.flush()

@@ -23,7 +23,7 @@ from cavmarl.service.app import make_app
 from cavmarl.service.auth import Service, open_to_all, rule_of
 from cavmarl.service.configurations import add_configuration
 from cavmarl.service.rate_limit import RateLimit
-from cavmarl.service.requests import ConfigurationBody
+from cavmarl.service.request_bodies import ConfigurationBody
 from cavmarl.service.routes import ROUTERS
 from tests.support.fleet import Fleet
 

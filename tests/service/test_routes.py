@@ -152,7 +152,7 @@ def test_the_page_has_the_routes_and_the_problems() -> None:
         ("/configurations", {"environment": "merge", "agent": 3}, 422, "bad-body", "agent"),
         ("/configurations", {"environment": "merge", "agents": "3"}, 422, "bad-body", "integer"),
         ("/configurations", {"environment": "../etc"}, 422, "bad-body", "pattern"),
-        ("/configurations", {"environment": "mergf"}, 422, "refused", "there are"),
+        ("/configurations", {"environment": "mergf"}, 422, "refused", "choose one of"),
         (
             "/configurations",
             {"environment": "merge", "overrides": {"sensors.lidar.ray": 3}},

@@ -10,7 +10,7 @@ from cavmarl.service.access import Access
 from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
-from cavmarl.service.requests import BeatBody, NodeBody
+from cavmarl.service.request_bodies import BeatBody, NodeBody
 from cavmarl.service.service_records import IdentityRecord, Role
 
 CONFIGURATION = "0" * 64

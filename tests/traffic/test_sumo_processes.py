@@ -14,11 +14,7 @@ import psutil
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.core.errors import (
-    ConfigError,
-    DemandError,
-    SumoError,
-)
+from cavmarl.core.errors import ConfigError, DemandError, SumoError
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.traffic.sumo.sumo_input import free_libsumo
@@ -211,7 +207,7 @@ def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     with (
-        pytest.raises(ConfigError, match=r"names .*none\.rou\.xml, which is not there"),
+        pytest.raises(ConfigError, match=r"names .*none\.rou\.xml, which does not exist"),
         coupled("grid4x4", [path]),
     ):
         pass

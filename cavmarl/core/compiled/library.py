@@ -32,7 +32,8 @@ _LEAF_1_ECX = {
 _LEAF_7_EBX = {"BMI1": 3, "AVX2": 5, "BMI2": 8}
 _EXTENDED_ECX = {"LAHF": 0, "LZCNT": 5}
 _SAVED = {"XMM state": 1, "YMM state": 2}  # state that the system saves, from `xgetbv`
-_LEVEL_WORDS = (_LEAF_1_ECX, _LEAF_7_EBX, _EXTENDED_ECX, _SAVED)
+# Required bits of each word that `LEVEL_SYMBOL` writes.
+LEVEL_WORDS = (_LEAF_1_ECX, _LEAF_7_EBX, _EXTENDED_ECX, _SAVED)
 
 
 class Entry(NamedTuple):
@@ -135,11 +136,11 @@ def missing_features(library: ctypes.CDLL, processor: str) -> list[str]:
     """Return the features of x86-64-v3 that this processor lacks; empty for other targets."""
     if processor != "x86-64-v3":
         return []
-    words = (ctypes.c_uint64 * len(_LEVEL_WORDS))()
+    words = (ctypes.c_uint64 * len(LEVEL_WORDS))()
     getattr(library, LEVEL_SYMBOL)(words)
     return [
         name
-        for word, bits in zip(words, _LEVEL_WORDS, strict=True)
+        for word, bits in zip(words, LEVEL_WORDS, strict=True)
         for name, bit in bits.items()
         if not word >> bit & 1
     ]

@@ -121,7 +121,7 @@ def _compiled(
         with file.locked():  # another process may be compiling it
             kernel = file.load()
             if kernel is None:
-                _explain(reason)
+                explain(reason)
                 kernel = _compile(file, function, arguments)
                 file.save(kernel)
     address = _load_object(kernel)
@@ -140,7 +140,7 @@ def _compile(
 
 
 @cache
-def _explain(reason: str) -> None:
+def explain(reason: str) -> None:
     """Report once why a kernel is compiled although the wheel has compiled kernels."""
     if kernel_source().choice == "auto" and Library.is_there():
         print(

@@ -12,12 +12,12 @@ from functools import cache
 from pathlib import Path
 
 # Imports of one file of kernels by another; a test checks that imports have no other form.
-_IMPORT = re.compile(rb"^from cavmarl\.([\w.]+) import ", re.MULTILINE)
+IMPORT_LINE = re.compile(rb"^from cavmarl\.([\w.]+) import ", re.MULTILINE)
 _PACKAGE = Path(__file__).parents[2]
 _COMPILED = "core.compiled"
 # Files of that folder that affect the code of all kernels; the other files only call it.
-_SHARED = tuple(f"{_COMPILED}.{name}" for name in ("arguments", "compiler", "entry_point"))
-_PARTS = (*_SHARED, f"{_COMPILED}.prefetch", f"{_COMPILED}.run_calls")
+COMPILER_FILES = tuple(f"{_COMPILED}.{name}" for name in ("arguments", "compiler", "entry_point"))
+_PARTS = (*COMPILER_FILES, f"{_COMPILED}.prefetch", f"{_COMPILED}.run_calls")
 
 
 @cache
@@ -50,12 +50,12 @@ def module_digest(module: str) -> str:
     name = module.removeprefix("cavmarl.")
     if name not in sources:
         return sources_digest()
-    found, to_read = set(_SHARED), [name]
+    found, to_read = set(COMPILER_FILES), [name]
     while to_read:
         name = to_read.pop()
         if name not in found:
             found.add(name)
-            imported = [other.decode() for other in _IMPORT.findall(sources[name])]
+            imported = [other.decode() for other in IMPORT_LINE.findall(sources[name])]
             to_read += [
                 other for other in imported if other in _PARTS or not other.startswith(_COMPILED)
             ]

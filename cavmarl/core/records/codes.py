@@ -11,7 +11,7 @@ DRIVER_SCRIPTED = 2  # moves by its script: pedestrians, vehicles of scenarios
 CLASS_PEDESTRIAN = 9
 DRIVER_SUMO = 3  # moved by SUMO, mirrored here
 
-# VTYPE["model"]: how a background driver follows its leader; see driving/driver_models.py
+# VTYPE["model"]: the car-following models, a file each in driving/kernels/models
 MODEL_KRAUSS = 0
 MODEL_IDM = 1
 MODEL_ACC = 2

@@ -1,11 +1,11 @@
-"""Compiled loops of the drivers: what each vehicle decides in a tick, and how it moves.
+"""Compiled loops of the drivers: the decision of each vehicle in a tick, and its motion.
 
-Open `drivers` first: `decide` goes through the vehicles of one world, and calls the folders in this
-order. The index of lanes (`lanes.lane_index`) and the lists of junctions (`junctions.approach`) are
-built once a tick, before any driver decides.
+Open `drivers` first: `decide` iterates over the vehicles of one world and calls the folders in this
+order. The index of lanes (`lanes.lane_index`) and the lists of approaching vehicles
+(`junctions.approach`) are built once per tick, before any driver decides.
 
-1. `junctions`: which line or foe stops a driver ahead,
-2. `models`: how hard a driver accelerates behind all that stands ahead,
-3. `lanes`: whether it changes lanes,
-4. `motion`: how the decision, or an agent's action, moves the vehicle; and contacts afterwards.
+1. `junctions`: the stop lines and foes at which a driver has to stop.
+2. `models`: the acceleration behind leaders and before stop lines.
+3. `lanes`: lane changes.
+4. `motion`: the motion that follows from the decision or from an agent's action, then contacts.
 """

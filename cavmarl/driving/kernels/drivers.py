@@ -1,9 +1,9 @@
-"""Background drivers: what each wants to do in this tick, from the committed state alone.
+"""Drivers: the acceleration and the lane change of each vehicle, from the committed state alone.
 
-Car following is IDM or Krauss's model, as the vehicle's type says, lane changing MOBIL; this file
-finds what they are applied to: the leader across lane and junction borders, the lower speed limit
-ahead, the stop line of a signal or of a right of way, the end of a lane, the vehicle that wants to
-merge, the lane that the route needs.
+Accelerations follow the car-following model of the vehicle's type, lane changes follow MOBIL. This
+file finds the inputs of these models: the leader, also across lane and junction borders, the next
+lower speed limit, the stop line of a signal or of a right of way, the end of a lane, a vehicle that
+wants to merge, and the lane that the route needs.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from cavmarl.driving.kernels.junctions.junctions import (
     before_waiting,
     behind_merging,
     constraint_inside,
-    has_crept,
-    may_enter,
-    waits_inside,
+    has_crept_over_red,
+    hold_at_line,
+    hold_inside,
 )
 from cavmarl.driving.kernels.junctions.swept_areas import (
     before_foe_sweep,
@@ -51,7 +51,7 @@ from cavmarl.driving.kernels.lanes.adjacent_leaders import (
     behind_adjacent_leader,
     behind_askew,
     behind_entry,
-    swings_back_m,
+    rear_swing_m,
 )
 from cavmarl.driving.kernels.lanes.cooperative_braking import COOPERATIVE_DECEL, brake_for_merging
 from cavmarl.driving.kernels.lanes.lane_choice import (
@@ -59,52 +59,51 @@ from cavmarl.driving.kernels.lanes.lane_choice import (
     MERGE_ROOM_M,
     SIDEWAYS_S,
     choose_lane,
+    considers_lane_change,
     needed_change,
-    room_for_more,
-    thinks_of_lanes,
+    room_for_further_changes,
     wish_on_lane,
 )
 from cavmarl.driving.kernels.lanes.lane_ends import (
-    behind_beside,
     behind_over_line,
+    constraint_of_side_lane,
+    constraint_over_lane_end,
     lane_end,
-    misses_change,
-    over_end,
+    misses_last_change,
 )
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M, last_on
 from cavmarl.driving.kernels.lanes.route_following import next_step, next_step_from
-from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE, stays_aside
-from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
-    before_line,
-    no_constraint,
-    response,
-    wish,
-)
+from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE, has_to_stay_aside
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import before_line, no_constraint, response, wish
 from cavmarl.driving.kernels.motion.ordered_stops import distance_to_stop
 from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed, speed_before_limit
 
-SEE_LINE_M = 12.0  # at rest: swept areas begin up to 10.5 m before a line
-CLOSER_M = 0.9  # than `LINE_MARGIN_M` a driver that resolves deadlocks stands before its line
-NEAR_M = 8.0  # to a leader so near the corner between matters,
-ASKEW_RAD = 0.7  # if it turns by so much: the gap is half a width less
-NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
-FALL_IN_M = 100.0  # before the place where a lane change must be made
-# `MERGE_ROOM_M` of a steered vehicle on its way into the other lane: its front comes to 0.2 m
-# before the end, nearer than to a line.
+SEE_LINE_M = 12.0  # for a standing vehicle: swept areas begin up to 10.5 m before a line
+CLOSER_M = 0.9  # a driver that resolves deadlocks stops this much closer than `LINE_MARGIN_M`
+# Around a corner, if the gap to the leader is below `NEAR_M` and the headings differ by more than
+# `ASKEW_RAD`, half the leader's width is subtracted from the gap.
+NEAR_M = 8.0
+ASKEW_RAD = 0.7
+NEXT_LINE_M = 5.0  # plus the braking distance: a vehicle with a leader looks this far for a line
+# At this distance before the place where a lane change must be made, a driver adapts to the leader
+# on the other lane.
+FALL_IN_M = 100.0
+# `MERGE_ROOM_M` of a steered vehicle during a lane change: it stops with its front 0.2 m before the
+# end of the lane, closer than before a line.
 CHANGING_ROOM_M = -0.8
-MISSED_ROOM_M = 1.5  # more, where its lane goes on to a turn that it cannot take
-ACROSS_SHARE = 0.25  # of its lane's width to the side, from which its front is over the other lane,
-CREEPS_MPS = 0.8 * CREEP_MPS  # and how fast it gets there, near the end of its own
-KEPT_MPS = 0.1  # a leader that leaves less keeps one where it is
-ROW_LINES = 3  # of a VEHICLE row that drivers ask for
-FAST_MPS = 5.0  # a slower background driver need not slow down for one that turns in ahead
-RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
+MISSED_ROOM_M = 1.5  # additional room if the lane leads to a turn that the vehicle cannot take
+ACROSS_SHARE = 0.25  # lateral offset in lane widths from which the front covers the other lane
+CREEPS_MPS = 0.8 * CREEP_MPS  # speed of a lane change near the end of the lane
+KEPT_MPS = 0.1  # a vehicle is blocked by its leader if the leader allows a lower speed
+ROW_LINES = 3  # cache lines of a VEHICLE row that drivers read
+FAST_MPS = 5.0  # below this speed, a background driver ignores vehicles that merge ahead of it
+RETURN_MPS = 5.0  # speed of a lost vehicle that searches for its lane
 
 
 @inlined_kernel
 def look_ahead_m(kind: np.void, speed: float) -> float:
-    """How far ahead of its centre a driver looks, in m: IDM reacts earlier and more softly."""
+    """Return how far ahead of its centre a driver looks, in m."""
     if kind["as_sumo"]:
         way = 45.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
     else:
@@ -114,9 +113,10 @@ def look_ahead_m(kind: np.void, speed: float) -> float:
 
 @inlined_kernel
 def see_line_m(kind: np.void, speed: float) -> float:
-    """How far before its front a driver asks whether it may pass a line, in m.
+    """Return the distance in m, from the front, at which a driver reacts to a line.
 
-    IDM asks as soon as it sees the line; Krauss's driver when it may soon have to brake.
+    A driver as in SUMO reacts when it may soon have to brake, other drivers as soon as they see the
+    line.
     """
     if kind["as_sumo"]:
         braking = 0.6 * speed * speed / kind["decel"]
@@ -126,13 +126,13 @@ def see_line_m(kind: np.void, speed: float) -> float:
 
 @kernel
 def _is_askew(row: np.void, leader: np.void) -> bool:
-    """Whether a leader around a corner stands so that its flank is nearer than its rear."""
+    """Return whether the side of a leader around a corner is nearer than its rear."""
     askew: bool = abs(wrap_angle(leader["heading"] - row["heading"])) > ASKEW_RAD
     return askew
 
 
 @kernel
-def _at_line(
+def decide_at_line(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -145,19 +145,20 @@ def _at_line(
     dt: float,
     scratch: Scratch,
 ) -> tuple[float, int, float]:
-    """What the lane's end, `distance` m ahead of row i, asks.
+    """Evaluate the stop line of `link` for row i; the end of the lane is `distance` m ahead.
 
     Returns:
-        The constraint; why it holds there (HOLD_*); how far ahead it stops in m, inf if it goes on.
+        The constraint; the reason to stop (HOLD_*); the distance in m at which the vehicle stops,
+        infinite if it does not stop.
     """
     row = rows[i]
     speed = row["speed"]
     front = distance - 0.5 * row["length"]
     to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
-    if to_line <= 0.0 and has_crept(roads, row, link, -to_line, phase):
+    if to_line <= 0.0 and has_crept_over_red(roads, row, link, -to_line, phase):
         return before_line(kind, speed, 0.0, dt), HOLD_SIGNAL, 0.0
     if to_line <= 0.0:
-        # Its front is over the line: it does not wait there any more.
+        # The front has passed the line, so the vehicle does not wait there.
         constraint, hold, waits = constraint_inside(
             roads, travel, rows, i, link, -distance, way, phase, dt, scratch
         )
@@ -166,10 +167,10 @@ def _at_line(
     merging = no_constraint(kind)
     if row["driver"] == DRIVER_AGENT or speed > FAST_MPS:
         merging = behind_merging(roads, kind, row, link, distance, scratch)
-    hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    hold = hold_at_line(roads, travel, rows, i, link, distance, way, phase, scratch)
     waits = HOLD_NONE
     if hold == HOLD_NONE:
-        waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
+        waits = hold_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
     stop = math.inf
     if roads.links[link]["num_sweeps"] > 0:
         room = room_m(hold, waits)
@@ -202,11 +203,15 @@ def _road_ahead(
     dt: float,
     scratch: Scratch,
 ) -> tuple[float, float, int, int]:
-    """Walk the way of entry k: (constraint, allowed speed, why it holds, link near its line).
+    """Follow the route of the vehicle of entry k and collect its constraints.
 
-    `step` is its own one. A vehicle that stands close behind its leader, too far from the line to
-    look at it, need not: nothing that lies further ahead could make it stay more. Before the end of
-    a lane that its way does not follow it stops `merge_room_m` early.
+    `step` is the PLAN of the vehicle's lane. A vehicle that stands close behind its leader does not
+    look further ahead if the stop line is far: no other constraint could be stronger. Before the
+    end of a lane that the route does not follow, the vehicle stops `merge_room_m` m early.
+
+    Returns:
+        The binding constraint; the allowed speed in m/s; the reason to stop (HOLD_*); the LINK
+        whose line is near, or -1.
     """
     own = scratch.entries[k]
     i = own["row"]
@@ -231,7 +236,7 @@ def _road_ahead(
         allowed = min(allowed, bend_speed(roads, lane, lane, -row["s"]))
     constraint = no_constraint(kind)
     hold = HOLD_NONE
-    kept = no_constraint(kind)  # by a leader
+    kept = no_constraint(kind)  # constraint of the leader
     link_ahead = -1
     if here["internal"]:
         place = here["link_offset_m"] + row["s"]
@@ -248,12 +253,12 @@ def _road_ahead(
         constraint = before_foe_sweep_beyond_junction(roads, rows, i, kind, dt, scratch)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)
-    # Behind a leader on its own lane a driver minds the next line only where it could not stop
-    # any more once the leader has passed it.
+    # A driver with a leader on its own lane considers the next line only if it could otherwise not
+    # stop there after the leader has passed the line.
     if k + 1 < scratch.lane_end[lane] and (scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m):
         leader = scratch.entries[k + 1]
         gap = leader["s"] - row["s"] - half - leader["half"]
-        gap -= swings_back_m(roads, travel, rows, leader)
+        gap -= rear_swing_m(roads, travel, rows, leader)
         kept = behind_entry(kind, speed, gap, leader)
         constraint = max(constraint, kept)
         look = min(look, half + NEXT_LINE_M + speed + 0.5 * speed * speed / kind["decel"])
@@ -265,15 +270,17 @@ def _road_ahead(
             lane, way, link = next_step_from(roads, step, before, way)
         else:
             lane, way, link = next_step(roads, travel, before, way)
-        if lane < 0 or (steered and misses_change(roads, travel, before, before_way)):
+        if lane < 0 or (steered and misses_last_change(roads, travel, before, before_way)):
             end = lane_end(roads, travel, row, kind, before, before_way, distance, merge_room_m, dt)
-            over = over_end(roads, rows, i, kind, before, distance, distance < see, dt, scratch)
+            over = constraint_over_lane_end(
+                roads, rows, i, kind, before, distance, distance < see, dt, scratch
+            )
             constraint = max(constraint, end, over)
             break
         stops = False
         if link >= 0 and distance < see:
             fork = behind_fork(roads, kind, row, before, link, distance, scratch)
-            at_line, found, to_stop = _at_line(
+            at_line, found, to_stop = decide_at_line(
                 roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
             )
             stops = to_stop < math.inf
@@ -295,7 +302,7 @@ def _road_ahead(
             gap = distance + leader["s"] - half - leader["half"]
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
                 gap -= 0.5 * rows[leader["row"]]["width"]
-            gap -= swings_back_m(roads, travel, rows, leader)
+            gap -= rear_swing_m(roads, travel, rows, leader)
             kept = max(kept, behind_entry(kind, speed, gap, leader))
             constraint = max(constraint, kept)
         elif stops:
@@ -309,7 +316,7 @@ def _road_ahead(
         distance += ahead["length_m"]
     if hold == HOLD_YIELD and speed < KEPT_MPS and -kept < KEPT_MPS:
         if kind["as_sumo"] and not here["internal"]:
-            hold = HOLD_EXIT_BLOCKED  # whatever it gives way to: it will not come
+            hold = HOLD_EXIT_BLOCKED  # the leader blocks it, so others need not yield to it
     return constraint, allowed, hold, link_ahead
 
 
@@ -317,7 +324,7 @@ def _road_ahead(
 def _prefetch_first(
     roads: RoadArrays, rows: NDArray[np.void], i: int, step: NDArray[np.void], scratch: Scratch
 ) -> None:
-    """What row i asks about first: itself, and where it goes next."""
+    """Prefetch the data that the decision of row i reads first: its row, next link and lane."""
     for line in range(ROW_LINES):
         prefetch(rows, i, line)
     link, ahead = step[i]["link"], step[i]["next"]
@@ -330,7 +337,7 @@ def _prefetch_first(
 
 @inlined_kernel
 def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> None:
-    """What it asks about then: foes on the junction, and the lane behind it."""
+    """Prefetch the data that the decision reads next: foes on the junction, the lane behind it."""
     link = step["link"]
     if link < 0 or link >= roads.links.shape[0]:  # a scripted vehicle has no step
         return
@@ -346,18 +353,18 @@ def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> Non
 def decide(
     roads: RoadArrays,
     travel: TripTables,
-    rows: NDArray[np.void],  # VEHICLE (C,), the committed state; not written
-    num: int,  # rows to decide for, the first of `rows`; all rows stand in the indices
-    driver: int,  # DRIVER_* whose rows are decided for
+    rows: NDArray[np.void],  # VEHICLE (C,), the committed state; read-only
+    num: int,  # number of rows to decide for, the first of `rows`; the indices contain all rows
+    driver: int,  # only for rows with this DRIVER_*
     tick: int,  # of the committed state
-    dt: float,  # seconds that a decision holds: a tick, or an agent's step
-    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
-    step: NDArray[np.void],  # PLAN (C,) of each row the step of its lane
+    dt: float,  # s for which a decision is valid: a tick, or an agent's step
+    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
+    step: NDArray[np.void],  # (C,) the PLAN of each row's lane
     # with the lane and link indices of this tick; accel (m/s²), lane_change, blinker, hold and
     # link_ahead are written
     scratch: Scratch,
 ) -> None:
-    """Decide acceleration and lane change of all vehicles of one kind of driver in one world."""
+    """Decide acceleration and lane change of all vehicles of one world with one kind of driver."""
     total = scratch.lane_start[roads.lanes.shape[0]]
     for k in range(total):
         if k + SOON < total:
@@ -374,9 +381,9 @@ def decide(
         speed = row["speed"]
         further_m = 0.0
         if driver == DRIVER_AGENT and step[i]["changes"] > 1:
-            further_m = room_for_more(roads.lanes[row["lane"]], row, step[i])
+            further_m = room_for_further_changes(roads.lanes[row["lane"]], row, step[i])
         room_m = MERGE_ROOM_M + further_m
-        if driver == DRIVER_AGENT and misses_change(roads, travel, row["lane"], row["way"]):
+        if driver == DRIVER_AGENT and misses_last_change(roads, travel, row["lane"], row["way"]):
             room_m += MISSED_ROOM_M
         constraint, allowed, hold, link_ahead = _road_ahead(
             roads, travel, rows, k, step[i], phase, room_m, dt, scratch
@@ -390,18 +397,18 @@ def decide(
             constraint = max(constraint, askew)
         if row["side_lane"] >= 0:
             see = min(see_line_m(kind, speed), travel.see_m)
-            aside = behind_beside(roads, travel, rows, i, kind, see, dt, scratch)
+            aside = constraint_of_side_lane(roads, travel, rows, i, kind, see, dt, scratch)
             constraint = max(constraint, aside)
         needed = needed_change(roads, travel, row, step[i])
         change = 0
-        if thinks_of_lanes(row, needed, tick, dt):
+        if considers_lane_change(row, needed, tick, dt):
             own_wish = wish(kind, speed, allowed, constraint)
             if driver == DRIVER_AGENT:
                 own_wish = wish_on_lane(roads, travel, row, k, scratch)
             change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
         if change != 0 and driver == DRIVER_AGENT:
-            # A steered vehicle on its way into a neighbour lane still minds its own lane, to the
-            # very end, and already the leader in the other one. Standing, it could not steer.
+            # During a lane change, a steered vehicle reacts to the leaders on both lanes. It may
+            # drive to the very end of its own lane, because it cannot steer while it stands.
             lane = roads.lanes[row["lane"]]
             room_m = CHANGING_ROOM_M + further_m
             if change * row["d"] > ACROSS_SHARE * lane["width_m"]:
@@ -413,7 +420,7 @@ def decide(
             aside = behind_adjacent_leader(roads, travel, kind, row, target, scratch)
             constraint = max(constraint, askew, aside)
             if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * CREEP_MPS:
-                # Faster, it would be too late for the change, and brake.
+                # At a higher speed the lane would end before the change is complete.
                 allowed = min(allowed, CREEPS_MPS)
         share = 0.0
         if kind["sigma"] > 0.0:
@@ -424,7 +431,7 @@ def decide(
             target = lane["left"] if needed > 0 else lane["right"]
             room = step[i]["room"] - row["s"]
             if target >= 0 and room < FALL_IN_M:
-                # Fall in behind its future leader on the other lane.
+                # Adapt to the future leader on the other lane.
                 fall_in = wish(
                     kind,
                     speed,
@@ -432,7 +439,7 @@ def decide(
                     behind_adjacent_leader(roads, travel, kind, row, target, scratch),
                 )
                 accel = min(accel, max(fall_in, -COOPERATIVE_DECEL))
-        if driver == DRIVER_BACKGROUND and stays_aside(roads, rows, row, scratch):
+        if driver == DRIVER_BACKGROUND and has_to_stay_aside(roads, rows, row, scratch):
             change = STAYS_ASIDE
         scratch.accel[i] = accel
         scratch.lane_change[i] = change

@@ -200,7 +200,7 @@ def _shared_m(path: LinkPath, other: LinkPath) -> float:
     return float(path.s[parted[0]]) if parted.size else float(path.s[-1]) + FORK_BEYOND_M
 
 
-LINE_MARGIN_M = 1.0  # drivers stop this far before a line, see kernels.following
+LINE_MARGIN_M = 1.0  # as in `car_following_model`: drivers stop at this distance before a line
 STEP_M = 0.5
 MOST_M = 8.0
 BODY_M = 5.0

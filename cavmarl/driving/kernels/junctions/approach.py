@@ -1,6 +1,6 @@
-"""Approaches to links: every vehicle announces itself to the link it is on and to the next.
+"""Approaches: each vehicle registers at the link that it is on and at the links that it takes next.
 
-The lists lie together in memory and carry what the right of way asks of a foe.
+The lists are contiguous in memory and hold the values of a foe that decide the right of way.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from cavmarl.driving.kernels.lanes.route_following import (
 )
 
 MAX_LINKS_AHEAD = 2
-STANDS_BEFORE_M = 15.0  # the centre of one that waits before the end of a lane to leave it
-LEAST_M = 1e-9  # beyond the line is one on the junction: at 0 are those at the end of a lane
-BLOCK = 64  # rows that are still near in memory when they are looked at again
+STANDS_BEFORE_M = 15.0  # distance of a vehicle's centre to the lane end while it waits to change
+LEAST_M = 1e-9  # smallest distance beyond the line of a vehicle on the junction; 0: at the line
+BLOCK = 64  # number of rows that stay in the cache between both loops
 
 APPROACH = np.dtype(
     [
@@ -52,22 +52,21 @@ def register_links(
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,), of which `num` live
     num: int,  # live rows
-    # PLAN (C,) of each row the step of its lane; written where it is another one
-    step: NDArray[np.void],
-    step_at: NDArray[np.int64],  # (C,) which one that is, see `Worlds`; written
+    step: NDArray[np.void],  # (C,) the PLAN of each row's lane; updated
+    step_at: NDArray[np.int64],  # (C,) positions of `step` in the table, see `Worlds`; updated
     scratch: Scratch,  # the lists by link, approach and largest are written
 ) -> None:
-    """List for every link the vehicles that are on it or will reach it, into `scratch.approach`.
+    """Write, for each link, the vehicles that are on it or approach it to `scratch.approach`.
 
-    Only links with conflicts list those that approach.
+    Approaching vehicles are listed only for links with conflicts.
     """
     pairs = 0
     scratch.largest[:] = 0
     for first in range(0, num, BLOCK):
         last = min(first + BLOCK, num)
-        # One look for all that follows: in a city the steps lie far apart, each is a cache miss,
-        # and a loop that does nothing else has many of them under way at once. And most rows are
-        # where they were a tick before, with the same vehicle on the same lane.
+        # Read the steps in a loop of their own: in a city each step is a cache miss, and a loop
+        # that does nothing else overlaps many of these misses. For most rows the step is still that
+        # of the previous tick.
         for i in range(first, last):
             if i + SOON < num:
                 prefetch(roads.lanes, rows[i + SOON]["lane"], 0)
@@ -82,11 +81,11 @@ def register_links(
             prefetch(roads.links, step[i]["link"], 1)
         for i in range(first, last):
             if rows[i]["driver"] == DRIVER_SCRIPTED:
-                pairs = _announce_claims(roads, travel, rows[i], i, pairs, scratch)
+                pairs = _register_claims(roads, travel, rows[i], i, pairs, scratch)
                 continue
             if is_lost(rows[i]):
                 continue
-            pairs = _announce(roads, travel, rows[i], i, step[i], pairs, scratch)
+            pairs = _register_row(roads, travel, rows[i], i, step[i], pairs, scratch)
     end = scratch.link_end
     forget(scratch.links)
     for k in range(pairs):
@@ -99,7 +98,7 @@ def register_links(
 
 
 @inlined_kernel
-def _note(
+def _append(
     roads: RoadArrays,
     scratch: Scratch,
     pairs: int,
@@ -123,23 +122,23 @@ def _note(
 
 
 @kernel
-def _announce_claims(
+def _register_claims(
     roads: RoadArrays, travel: TripTables, row: np.void, i: int, pairs: int, scratch: Scratch
 ) -> int:
-    """`_announce` for a row that follows a script, which says where it will be."""
+    """Register a row that follows a script, at the links of its script."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_claim"], frame["first_claim"] + frame["num_claims"]):
         claim = travel.scripts.claims[c]
-        pairs = _note(roads, scratch, pairs, claim["link"], row, i, claim["dist"])
+        pairs = _append(roads, scratch, pairs, claim["link"], row, i, claim["dist"])
     return pairs
 
 
 @inlined_kernel
 def _link_into(roads: RoadArrays, row: np.void) -> int:
-    """The link by which a vehicle has come to its lane, or -1.
+    """Return the link by which a vehicle came to its lane, or -1.
 
-    For one that has entered the road there, or has changed lanes, the first that leads there, or
-    beside it.
+    If the vehicle entered the road on that lane or has changed lanes, the result is the first link
+    that leads to the lane or to an adjacent lane.
     """
     link = int(row["link"])
     if link >= 0 and roads.links[link]["to_lane"] == row["lane"]:
@@ -152,7 +151,7 @@ def _link_into(roads: RoadArrays, row: np.void) -> int:
 
 
 @inlined_kernel
-def _announce(
+def _register_row(
     roads: RoadArrays,
     travel: TripTables,
     row: np.void,
@@ -161,34 +160,34 @@ def _announce(
     pairs: int,
     scratch: Scratch,
 ) -> int:
-    """Append row i's entries; returns the new number of pairs. `step` is its own one."""
+    """Append the entries of row i, whose PLAN is `step`, and return the new number of pairs."""
     lane = row["lane"]
     here = roads.lanes[lane]
     s = row["s"]
     if here["internal"]:
         driven_m = max(here["link_offset_m"] + s, LEAST_M)
-        pairs = _note(roads, scratch, pairs, here["link"], row, i, -driven_m)
+        pairs = _append(roads, scratch, pairs, here["link"], row, i, -driven_m)
     elif s - 0.5 * row["length"] < SWEPT_BEYOND_M:
-        # Its centre has left the junction, its rear has not, or not the fork before it, or where
-        # others wait for it.
+        # The centre has left the junction, but the rear has not left the junction, the fork, or a
+        # swept area.
         link = _link_into(roads, row)
         if link >= 0:
             left = roads.links[link]
             minded = max(left["length_m"], left["fork_m"], left["swept_m"])
             if left["length_m"] + s - 0.5 * row["length"] < minded:
-                pairs = _note(roads, scratch, pairs, link, row, i, -(left["length_m"] + s))
+                pairs = _append(roads, scratch, pairs, link, row, i, -(left["length_m"] + s))
     side = row["side_lane"]
     if side >= 0 and not here["internal"] and roads.lanes[side]["num_links"] > 0:
-        # Its body still covers the lane beside, or covers it already: it is in the way of both.
+        # The body also covers the adjacent lane, so it blocks that lane as well.
         to_end = roads.lanes[side]["length_m"] - beside_s(roads, lane, side, s)
         if to_end < STANDS_BEFORE_M:
             link = roads.lanes[side]["first_link"]
-            pairs = _note(roads, scratch, pairs, link, row, i, max(to_end, 0.0))
+            pairs = _append(roads, scratch, pairs, link, row, i, max(to_end, 0.0))
     reach = registration_distance_m(row["speed"])
     distance = here["length_m"] - s
     way = row["way"]
     found = 0
-    far = not can_be_ignored(row)  # it may be minded by those that turn into its lane
+    far = not can_be_ignored(row)  # vehicles that turn into its lane may have to yield to it
     while distance < reach or (far and distance < MERGES_M and roads.lanes[lane]["merges"]):
         before, before_way = lane, way
         if lane == row["lane"] and way == row["way"]:
@@ -196,16 +195,18 @@ def _announce(
         else:
             lane, way, link = next_step(roads, travel, lane, way)
         if lane < 0:
-            # It has to change lanes before the end, in the way of vehicles that turn beside it, or
-            # its way ends there.
+            # The vehicle has to change lanes before the end, and blocks vehicles that turn from
+            # there, or its route ends there.
             last = roads.lanes[before]
             ends = travel.steps[before_way + before]["change"] == 0
             if (ends or distance < STANDS_BEFORE_M) and found == 0 and last["num_links"] > 0:
-                pairs = _note(roads, scratch, pairs, last["first_link"], row, i, max(distance, 0.0))
+                pairs = _append(
+                    roads, scratch, pairs, last["first_link"], row, i, max(distance, 0.0)
+                )
             break
         if link >= 0:
             if roads.links[link]["num_conflicts"] + roads.links[link]["num_sweeps"] > 0:
-                pairs = _note(roads, scratch, pairs, link, row, i, max(distance, 0.0))
+                pairs = _append(roads, scratch, pairs, link, row, i, max(distance, 0.0))
             found += 1
             far &= roads.links[link]["state"] == STATE_MAJOR and not here["internal"]
             if found == MAX_LINKS_AHEAD:

@@ -1,7 +1,7 @@
 """Deadlocks of vehicles that yield to one another where no road has the right of way.
 
-On equal roads each vehicle yields to the one on its right, so a full circle of vehicles waits for
-ever. As in SUMO, some vehicles of such a circle let the others go, by chance in each tick.
+On equal roads each vehicle yields to the vehicle on its right, so a full cycle of vehicles waits
+for ever. As in SUMO, vehicles of such a cycle let the others go in random ticks.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS, can_be_ignored
 
 DEADLOCK_LINKS = 8  # the longest chain of yielding links that is searched
-STRAIGHT_SHARE = 0.25  # of the ticks in which a deadlocked vehicle lets the others go,
-TURNING_SHARE = 0.75  # and that share if it turns
+# Share of the ticks in which a deadlocked vehicle lets the others go.
+STRAIGHT_SHARE = 0.25
+TURNING_SHARE = 0.75
 STRAIGHT = ord("s")
 STATE_EQUAL = ord("=")
 
@@ -34,7 +35,7 @@ def on_equal_road(roads: RoadArrays, link: int) -> bool:
 
 @inlined_kernel
 def drives_as_sumo(travel: TripTables, row: np.void) -> bool:
-    """Return whether a vehicle is driven as SUMO drives it: in the background, by such a model."""
+    """Return whether a vehicle is a background vehicle whose driver behaves as in SUMO."""
     if row["driver"] != DRIVER_BACKGROUND:
         return False
     as_sumo: bool = travel.types[row["vtype"]]["as_sumo"]
@@ -45,7 +46,7 @@ def drives_as_sumo(travel: TripTables, row: np.void) -> bool:
 def resolves_deadlocks(roads: RoadArrays, travel: TripTables, row: np.void, link: int) -> bool:
     """Return whether the driver of a vehicle resolves deadlocks at `link`, which it takes next.
 
-    Drivers that SUMO has do so, before a junction without any right of way.
+    Drivers as in SUMO do so before a junction of equal roads.
     """
     breaks: bool = on_equal_road(roads, link) and drives_as_sumo(travel, row)
     return breaks
@@ -55,9 +56,10 @@ def resolves_deadlocks(roads: RoadArrays, travel: TripTables, row: np.void, link
 def _first_foe(
     roads: RoadArrays, rows: NDArray[np.void], link: int, lane: int, scratch: Scratch
 ) -> int:
-    """The link of the one, of all that `link` gives way to, that is nearest to its line, or -1.
+    """Return the link of the nearest foe that has the right of way over `link`, or -1.
 
-    `link` itself where it gives way to any from `lane`.
+    The nearest foe is the one with the smallest distance to its stop line. If a foe comes from
+    `lane`, the result is `link` itself.
     """
     nearest, nearest_m, nearest_id = -1, math.inf, 0
     first = roads.links[link]["first_conflict"]
@@ -98,10 +100,10 @@ def yields_in_deadlock(
     rows: NDArray[np.void],
     row: np.void,  # VEHICLE
     link: int,  # that it takes next
-    asking: np.void,  # VEHICLE that asks: itself, or one that gives way to it
+    asking: np.void,  # VEHICLE whose driver asks: `row`, or a vehicle that yields to it
     scratch: Scratch,
 ) -> bool:
-    """Return whether a driver that `resolves_deadlocks` is in one and lets the others go now."""
+    """Return whether a driver that `resolves_deadlocks` is in a deadlock and now lets others go."""
     if row["hold"] != HOLD_YIELD or row["speed"] > STANDING_MPS or row["wait_s"] == 0.0:
         return False
     share = STRAIGHT_SHARE if roads.links[link]["direction"] == STRAIGHT else TURNING_SHARE

@@ -1,9 +1,10 @@
-"""Right of way: whether a driver may enter a link, or go on from a waiting position inside.
+"""Right of way: whether a driver may enter a link, or leave a waiting position inside a junction.
 
-A driver enters a link if no foe is in the shared area when it would be, if it gives way to those it
-must give way to, and if there is room behind the junction. Where the map lets drivers wait inside
-the junction (for oncoming traffic before a left turn), what lies beyond that place is asked there.
-All questions are minima and any-ofs over the foes: the order of rows plays no part.
+A driver enters a link if no foe occupies the shared area at the same time, if the driver yields to
+no foe with the right of way, and if there is room behind the junction. Some links have a waiting
+position inside the junction, for example for oncoming traffic before a left turn. Foes beyond that
+position are checked there and not at the stop line. All results are minima or disjunctions over the
+foes, so they do not depend on the order of rows.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from cavmarl.driving.kernels.junctions.gaps import (
     ROOM_M,
     STOOD_S,
     STOP_SIGN_S,
-    foe_blocks,
+    hold_for_foe,
     is_minor,
     link_signal,
     must_stop,
@@ -43,31 +44,29 @@ from cavmarl.driving.kernels.junctions.gaps import (
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
 from cavmarl.driving.kernels.junctions.swept_areas import MOST_BACK_M, wait_place
 from cavmarl.driving.kernels.lanes.route_following import next_step
-from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
-    before_line,
-    behind,
-    no_constraint,
-)
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
 
-# m/s², a driver stops for yellow where this braking is enough; Krauss's brakes as hard as it can
+# m/s²: a driver stops at yellow if this deceleration suffices. Drivers as in SUMO stop if their
+# full deceleration suffices.
 COMFORT_STOP = 3.0
-STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
-SEE_FOES_M = 4.5  # before a line, a driver that gives way is ready to stop, as SUMO's are
-LAST_CHANCE_M = 3.0  # with the front this near to the line
-STUB_LANES = 4  # looked along for a stop sign
-EXIT_LANES = 4  # looked along for room,
-EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
-CREPT_M = 2.4  # a steered car whose front is so little beyond a red line,
-CREPT_MPS = 2.0  # and that is so slow, stays there;
-INSIDE_M = 1.0  # nearer to a waiting position inside it may be one that waits there
-STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line,
-# and in an agent's seat nearer than this: it may wait so far before it, and with some slack
+STEERED_MPS = 5.0  # assumed top speed of a steered car in a turn
+SEE_FOES_M = 4.5  # up to this distance, a driver that yields is ready to stop, as in SUMO
+LAST_CHANCE_M = 3.0  # distance of the front to the line at which a driver still goes at yellow
+STUB_LANES = 4  # number of lanes ahead that are searched for a stop sign
+EXIT_LANES = 4  # number of lanes behind a junction that are searched for room
+EXIT_LOOK_M = 75.0  # limit of that search: room for ten cars
+# A steered car that is slower than `CREPT_MPS` and at most `CREPT_M` beyond a red line stays there.
+CREPT_M = 2.4
+CREPT_MPS = 2.0
+INSIDE_M = 1.0  # closer than this to a waiting position, a vehicle may be waiting there
+STOP_LINE_M = 5.0  # a vehicle that stands with its front closer than this stands at the line
+# The same for agents' vehicles, which may have to wait further back, with some slack.
 STOP_SIGN_M = MOST_BACK_M + 2.0 * LINE_MARGIN_M
 
 
 @kernel
-def _blocked_by_foes(
+def _hold_for_foes(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -80,11 +79,11 @@ def _blocked_by_foes(
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> int:
-    """Whether a foe is, or will be, where row i would be on `link`, `distance` m from its line.
+    """Return whether a foe keeps row i, `distance` m before its line, from driving on `link`.
 
-    Asks about the shared areas before `wait_m`, or, from `inside`, about those beyond. One that
-    stands and would have to drive over another that stays there is blocked (HOLD_EXIT_BLOCKED),
-    whatever else it gives way to (HOLD_YIELD): it will not come.
+    The shared areas before the waiting position at `wait_m` are checked or, if `inside`, those
+    beyond it. For a standing vehicle, HOLD_EXIT_BLOCKED (a foe stays in the way) has priority over
+    HOLD_YIELD: others need not wait for a vehicle that cannot go.
     """
     row = rows[i]
     hold = HOLD_NONE
@@ -108,7 +107,7 @@ def _blocked_by_foes(
             waits = both and conflict["must_yield"] and foe["dist"] > foe["half"]
             if waits and yields_in_deadlock(roads, rows, other, conflict["foe"], row, scratch):
                 continue
-            found = foe_blocks(
+            found = hold_for_foe(
                 roads,
                 travel,
                 rows,
@@ -133,13 +132,13 @@ def _blocked_by_foes(
 
 
 @kernel
-def _exit_blocked(
+def exit_blocked(
     roads: RoadArrays, travel: TripTables, row: np.void, link: int, way: int, scratch: Scratch
 ) -> bool:
-    """Whether a row could not clear the junction behind the last standing vehicle on its way.
+    """Return whether a row could not clear the junction behind the next standing vehicle ahead.
 
-    Vehicles still moving in between need room as well. Not counted: vehicles more than
-    `EXIT_LOOK_M` beyond the junction.
+    The vehicles that move in between need room as well. Vehicles more than `EXIT_LOOK_M` beyond the
+    junction do not count.
     """
     target = roads.links[link]
     room = 0.0
@@ -173,18 +172,18 @@ def _exit_blocked(
 
 
 @kernel
-def may_enter(
+def hold_at_line(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
-    i: int,  # the row that asks
+    i: int,  # row of the vehicle
     link: int,  # LINK row
-    distance: float,  # of its centre to the end of its lane in m
-    way: int,  # of the row beyond the junction
-    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    distance: float,  # from the vehicle's centre to the end of its lane, m
+    way: int,  # the vehicle's `way` beyond the junction
+    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
     scratch: Scratch,  # with the lane and link indices of this tick
 ) -> int:
-    """Whether row i may drive into `link`: HOLD_NONE, or why it has to stop at the line."""
+    """Return HOLD_NONE if row i may enter `link`, else the reason to stop at the line (HOLD_*)."""
     row = rows[i]
     signal = link_signal(roads, link, phase)
     back = roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
@@ -195,7 +194,7 @@ def may_enter(
     kind = travel.types[row["vtype"]]
     stops = kind["decel"] if kind["as_sumo"] else COMFORT_STOP
     if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < stops:
-        # A vehicle that gave way at the line all through green goes now, as the others stop.
+        # A vehicle that yielded at the line during green goes now, because the others stop.
         if row["hold"] != HOLD_YIELD or front > LAST_CHANCE_M:
             return HOLD_SIGNAL
     target = roads.links[link]
@@ -208,25 +207,25 @@ def may_enter(
     if resolves and yields_in_deadlock(roads, rows, row, link, row, scratch):
         return HOLD_YIELD
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    hold = _blocked_by_foes(
+    hold = _hold_for_foes(
         roads, travel, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
     )
     if hold != HOLD_NONE:
         return hold
-    if _exit_blocked(roads, travel, row, link, way, scratch):
+    if exit_blocked(roads, travel, row, link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
 
 @inlined_kernel
-def has_crept(
+def has_crept_over_red(
     roads: RoadArrays,
     row: np.void,  # VEHICLE
     link: int,  # LINK row
-    over_m: float,  # of its front beyond the line
-    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    over_m: float,  # distance of its front beyond the line, m
+    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
 ) -> bool:
-    """Whether an agent's vehicle that stood at a red line has crept over it, and stays there."""
+    """Return whether an agent's vehicle has crept over a red line and has to stay there."""
     if row["driver"] != DRIVER_AGENT or row["speed"] > CREPT_MPS:
         return False
     if over_m >= min(CREPT_M, roads.links[link]["wait_m"] - INSIDE_M):
@@ -241,11 +240,11 @@ def note_stop(
     roads: RoadArrays,
     plans: NDArray[np.void],
     row: np.void,  # VEHICLE of an agent before its tick; stopped_at is written
-    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
 ) -> None:
-    """Note before which stop sign an agent's vehicle has stood, until it leaves that lane.
+    """Record the stop sign at which an agent's vehicle has stopped, until it leaves that lane.
 
-    Where the lane before the sign is short the vehicle stands on one before that.
+    If the lane before the sign is short, the vehicle may stand on a previous lane.
     """
     lane = row["lane"]
     to_end = -row["s"] - 0.5 * row["length"]
@@ -272,13 +271,13 @@ def behind_merging(
     roads: RoadArrays,
     kind: np.void,
     row: np.void,
-    link: int,  # that it takes next
-    distance: float,  # of its centre to the end of its lane in m
+    link: int,  # that the vehicle takes next
+    distance: float,  # from the vehicle's centre to the end of its lane, m
     scratch: Scratch,
 ) -> float:
-    """The constraint of those that are on the junction on their way into the same lane.
+    """Return the constraint of vehicles on the junction that drive into the same lane.
 
-    They come slowly out of a turn: one that is fast brakes early.
+    These vehicles are slow in a turn, so a fast vehicle brakes early for them.
     """
     constraint = no_constraint(kind)
     front = 0.5 * row["length"] - distance
@@ -304,7 +303,7 @@ def behind_merging(
 
 
 @kernel
-def waits_inside(
+def hold_inside(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -315,21 +314,21 @@ def waits_inside(
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> int:
-    """Whether row i has to stop at the waiting position of `link`, if there is one: HOLD_*.
+    """Return the reason (HOLD_*) for row i to stop at the waiting position of `link`, if any.
 
-    Arguments as in `may_enter`; the distance is negative inside.
+    The arguments are those of `hold_at_line`. The distance is negative inside the junction.
     """
     wait_m = roads.links[link]["wait_m"]
     if wait_m == math.inf:
         return HOLD_NONE
     signal = link_signal(roads, link, phase)
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    hold = _blocked_by_foes(
+    hold = _hold_for_foes(
         roads, travel, rows, i, link, distance, wait_m, True, gives_way, phase, scratch
     )
     if hold != HOLD_NONE:
         return hold
-    if _exit_blocked(roads, travel, rows[i], link, way, scratch):
+    if exit_blocked(roads, travel, rows[i], link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
@@ -340,12 +339,12 @@ def before_waiting(
     kind: np.void,
     row: np.void,
     link: int,
-    place: float,  # of its front, m beyond its stop line
-    waits: int,  # why it stops at the waiting position inside, HOLD_*
-    minor: bool,  # whether it comes to that ready to stop, as SUMO's do that give way
+    place: float,  # distance of the front beyond the stop line, m
+    waits: int,  # reason to stop at the waiting position, HOLD_*
+    minor: bool,  # whether the driver yields and, as in SUMO, approaches ready to stop
     dt: float,
 ) -> float:
-    """The constraint of the waiting position inside."""
+    """Return the constraint of the waiting position inside the junction."""
     to_wait = wait_place(roads, link, 0.5 * row["length"]) - place
     if waits == HOLD_NONE:
         if not minor or to_wait <= SEE_FOES_M:
@@ -359,23 +358,23 @@ def constraint_inside(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
-    i: int,  # the row that asks
-    link: int,  # that it drives on
-    place: float,  # of its centre, m beyond the end of the lane that it comes from
-    way: int,  # of the row beyond the junction
-    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
-    dt: float,  # seconds a tick
+    i: int,  # row of the vehicle
+    link: int,  # that the vehicle drives on
+    place: float,  # distance of its centre beyond the end of the previous lane, m
+    way: int,  # the vehicle's `way` beyond the junction
+    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
+    dt: float,  # length of a tick, s
     scratch: Scratch,  # with the lane and link indices of this tick
 ) -> tuple[float, int, int]:
-    """The constraint of foes on the same junction on row i, whose front is beyond its stop line.
+    """Return the constraint of foes on the junction on row i, whose front has passed its line.
 
-    Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
-    distance the smaller id. Where both lead into one lane, the other follows it there. At a
-    waiting position inside, row i waits until it may go on.
+    Of two vehicles in conflict, the vehicle nearer to the shared area goes first; at equal
+    distance, the vehicle with the smaller id. If both drive into the same lane, the other one
+    follows. At a waiting position inside the junction, row i waits until it may go on.
 
     Returns:
-        The constraint; why it cannot go on (HOLD_*), be it that one which stays there is in its
-        way; and why it has to stop at the waiting position alone.
+        The constraint; the reason why the vehicle cannot go on (HOLD_*), including a foe that stays
+        in its way; the reason to stop at the waiting position only.
     """
     row = rows[i]
     kind = travel.types[row["vtype"]]
@@ -384,7 +383,7 @@ def constraint_inside(
     constraint, waits = no_constraint(kind), HOLD_NONE
     target = roads.links[link]
     if target["wait_m"] < math.inf and front <= target["wait_m"] + WAIT_SLACK_M:
-        waits = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
+        waits = hold_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
         minor = kind["as_sumo"] and is_minor(roads, link, phase)
         constraint = before_waiting(roads, kind, row, link, front, waits, minor, dt)
     hold = waits
@@ -416,7 +415,7 @@ def _constraint_of(
     place: float,
     dt: float,
 ) -> float:
-    """Constraint of one APPROACH on a row on the same junction, `place` m beyond its stop line."""
+    """Return the constraint of an APPROACH on a row that is `place` m beyond its stop line."""
     half = 0.5 * row["length"]
     front = place + half
     foe_front = foe["half"] - foe["dist"]
@@ -435,7 +434,7 @@ def _constraint_of(
         return no_constraint(kind)
     to_area = conflict["enter_m"] - front
     foe_to_area = conflict["foe_enter_m"] - foe_front
-    # How much further the one has to go to be out of the shared area than the other's rear.
+    # Gap between both vehicles, measured backwards from the end of the shared area.
     gap = (conflict["leave_m"] - front) - (conflict["foe_leave_m"] - foe_rear)
     if to_area >= 0.0:
         if foe_to_area > to_area or (foe_to_area == to_area and foe["id"] > row["id"]):
@@ -443,7 +442,7 @@ def _constraint_of(
         if conflict["merging"] and gap > to_area:
             return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])
         return before_line(kind, row["speed"], to_area, dt)
-    # Both are in it side by side: the one nearer to its end goes on, the other stays behind.
+    # Both are in the shared area: the vehicle nearer to its end goes first, the other follows.
     if foe_to_area > 0.0:
         return no_constraint(kind)
     rest = conflict["leave_m"] - front

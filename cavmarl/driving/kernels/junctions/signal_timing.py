@@ -1,4 +1,4 @@
-"""When a signal will show something else, as roadside units broadcast it (SPaT, SAE J2735)."""
+"""Time to the next change of a signal, as roadside units broadcast it (SPaT, SAE J2735)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ def time_to_change(
     # CONTROLLER (num_controllers,), the state of the actuated programs
     controllers: NDArray[np.void],
     link: int,  # LINK row that has a signal
-    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
     time: float,  # s since the world's reset
-    dt: float,  # seconds of a tick
+    dt: float,  # length of a tick, s
 ) -> float:
-    """Seconds until the signal of a link shows another letter; a whole cycle if it never does.
+    """Return the time in s until the signal of a link changes its state.
 
-    Of an actuated program it is the soonest time: phases that may be prolonged last their shortest.
+    If the state never changes, the result is the length of the cycle. For an actuated program it is
+    the earliest possible time: each phase counts with its minimum duration.
     """
     index = roads.links[link]["signal_index"]
     signal = roads.links[link]["signal"]
@@ -36,7 +37,7 @@ def time_to_change(
         left = -((time - program["offset_s"]) % program["cycle_s"])
         for earlier in range(program["first_phase"], row):
             left += roads.phases[earlier]["duration_s"]
-    # From the beginning of the phase that is on to that of the first with another letter.
+    # Add the phases from the start of the active phase to the first phase with another state.
     for _ in range(program["num_phases"]):
         if roads.phase_states[roads.phases[row]["first_state"] + index] != letter:
             return float(max(left, 0.0))

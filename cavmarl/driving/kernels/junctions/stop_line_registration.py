@@ -1,4 +1,4 @@
-"""Registration of vehicles at the stop lines ahead of them, for drivers that must yield there."""
+"""Registration of vehicles at the stop lines ahead of them, for drivers that have to yield."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import numpy as np
 from cavmarl.core.compiled import inlined_kernel
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
 
-APPROACH_M = 150.0  # a vehicle registers at most this far before a line,
-APPROACH_S = 8.0  # and this time before it arrives there,
-APPROACH_STANDING_M = 30.0  # but from this distance on in any case
+APPROACH_M = 150.0  # largest distance at which a vehicle registers
+APPROACH_S = 8.0  # time before the arrival at which a vehicle registers
+APPROACH_STANDING_M = 30.0  # distance at which a standing vehicle registers
 STANDING_MPS = 0.5  # a slower vehicle counts as stopped
-IMPATIENT_S = 3.0  # a vehicle that stands this long without reason is not waited for
+IMPATIENT_S = 3.0  # no driver waits for a vehicle that has stood this long without a reason
 
 
 @inlined_kernel
 def registration_distance_m(speed: float) -> float:
-    """Return the distance in m, centre to line, from which on a vehicle is registered there."""
+    """Return the distance in m, from centre to line, at which a vehicle registers at the line."""
     return min(APPROACH_STANDING_M + APPROACH_S * speed, APPROACH_M)
 
 
 @inlined_kernel
 def can_be_ignored(row: np.void) -> bool:
-    """Return whether drivers need not yield to a vehicle at a line: it has stopped and stays."""
+    """Return whether drivers need not yield to a vehicle at a line: it stands and cannot go."""
     hold = row["hold"]
     kept = (hold == HOLD_SIGNAL) | (hold == HOLD_EXIT_BLOCKED)
     idle = (hold == HOLD_NONE) & (row["wait_s"] > IMPATIENT_S)
-    stands: bool = (row["speed"] <= STANDING_MPS) & (kept | idle)  # no branch has to be guessed
+    stands: bool = (row["speed"] <= STANDING_MPS) & (kept | idle)  # `&`: no branch to predict
     return stands

@@ -1,8 +1,9 @@
-"""Swept areas: where a long or a steered vehicle in a bend, or one beside it, has to wait.
+"""Swept areas: where a vehicle waits because a long or steered vehicle sweeps over its path.
 
-No right of way says which goes first there. A vehicle in the area does; of two before it the
-one that is further along, unless something else holds it. What it waits for is no reason for others
-to let it pass: a driver that gives way to it goes on.
+The right of way does not apply there. A vehicle inside the area goes first. Of two vehicles before
+the area, the vehicle that is further along goes first, unless another reason holds it. Waiting
+before a swept area does not change the right of way elsewhere: a driver that yields to the waiting
+vehicle may go.
 """
 
 from __future__ import annotations
@@ -25,35 +26,35 @@ from cavmarl.driving.kernels.models.following import before_line, behind, no_con
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
 CAR_BODY_M, VAN_BODY_M, BUS_BODY_M = SIZE_BODIES_M
-EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
-HARD_STOP = 3.5  # one that needs more goes first
-AT_AREA_M = 0.01  # one that stands right before an area is not in it, however places are rounded
-MIN_STOP_M = 0.01  # a distance below counts as this
-SOON_M = 3.5  # one that is so near to the area may be in it at once
-LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
-WAIT_EARLIER_M = 3.0  # how much before the map's position a long vehicle waits inside, at most
-MOST_BACK_M = 5.0  # before its line, where a steered car waits so that others can pass
-GIVE_UP_S = 60.0  # one that has stood so long goes on, whatever is in the area
+EASY_STOP = 2.0  # m/s²: a vehicle that needs more to stop before the area is about to enter it
+HARD_STOP = 3.5  # m/s²: a vehicle that needs more to stop before the area goes first
+AT_AREA_M = 0.01  # tolerance: a vehicle that stands right before an area is outside of it
+MIN_STOP_M = 0.01  # smaller distances count as this
+SOON_M = 3.5  # a vehicle this close to the area may enter it at once
+LONG_FORK_M = 6.0  # additional distance at a fork until long vehicles are clear of one another
+WAIT_EARLIER_M = 3.0  # a long vehicle waits at most this far before the map's waiting position
+MOST_BACK_M = 5.0  # a steered car waits at most this far before its line so that others can pass
+GIVE_UP_S = 60.0  # after this wait, a vehicle goes on even if the area is occupied
 
 
 @inlined_kernel
 def size_of(half: float) -> int:
-    """The size class of a vehicle, of half its length in m."""
+    """Return the size class of a vehicle from half its length in m."""
     return int(2.0 * half > VAN_M) + int(2.0 * half > BUS_M)
 
 
 @inlined_kernel
 def _body_m(half: float, size: int) -> float:
-    """How long a vehicle counts as: areas end where a body of its class ends at the line."""
+    """Return the length in m that counts for a vehicle: at least that of the body of its class."""
     least = VAN_BODY_M if size == 1 else (BUS_BODY_M if size == 2 else CAR_BODY_M)
     return float(max(2.0 * half, least))
 
 
 @inlined_kernel
 def _nothing_sweeps(roads: RoadArrays, size: int, link: int, scratch: Scratch) -> bool:
-    """Whether a vehicle on `link` is a car, and none at the junction so large as to sweep over it.
+    """Return whether no vehicle at the junction is large enough to sweep over a car on `link`.
 
-    The answer for most, without a look at the areas.
+    This early exit, for most vehicles, does not read the areas.
     """
     row = roads.links[link]
     nothing: bool = size == 0 and row["swept_by"] > scratch.largest[row["junction"]]
@@ -64,16 +65,17 @@ def _nothing_sweeps(roads: RoadArrays, size: int, link: int, scratch: Scratch) -
 def stop_before_foe_sweep(
     roads: RoadArrays,
     rows: NDArray[np.void],  # VEHICLE (C,)
-    i: int,  # the row that asks
-    link: int,  # that it is on, or takes next
-    place: float,  # of its front, m beyond its stop line
-    # it has to stop anyway, and leaves room for those that are so near to their lines, m; or -inf
+    i: int,  # row of the vehicle
+    link: int,  # that the vehicle is on, or takes next
+    place: float,  # distance of its front beyond the stop line, m
+    # if the vehicle has to stop anyway: it leaves room for foes this close to their lines, m; else
+    # -inf
     room_m: float,
     scratch: Scratch,
 ) -> float:
-    """Return how far beyond its stop line row i may go without being swept by a foe, in m.
+    """Return how far beyond its stop line the front of row i may go without being swept by a foe.
 
-    The distance is that of its front; inf where no foe sweeps.
+    The result is in m, infinite if no foe sweeps over the vehicle.
     """
     row = rows[i]
     size = size_of(0.5 * row["length"])
@@ -87,13 +89,13 @@ def stop_before_foe_sweep(
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
         if sweep["own"] > own:
-            break  # they are sorted by it
+            break  # the rows are sorted by `own`
         if sweep["own"] != own or rear > sweep["leave_m"]:
             continue
         if has_left and place > sweep["enter_m"] + AT_AREA_M:
-            continue  # it clears the area, as it has left the junction
+            continue  # it has left the junction and clears the area
         if own == STEERED and room_m > 0.0 and -MOST_BACK_M < sweep["enter_m"] <= 0.0:
-            stop = min(stop, max(sweep["enter_m"], place))  # it waits where no other will sweep
+            stop = min(stop, max(sweep["enter_m"], place))  # it waits where no foe sweeps over it
         same_lane = roads.links[sweep["foe"]]["from_lane"] == roads.links[link]["from_lane"]
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
@@ -103,12 +105,12 @@ def stop_before_foe_sweep(
             if foe["row"] == i or other != sweep["other"]:
                 continue
             if same_lane and foe["half"] - foe["dist"] < place:
-                continue  # it comes behind the row
+                continue  # the foe is behind the row
             if own == STEERED and _stands_in_the_way(roads, row, link, place, sweep, foe):
-                continue  # that one brakes hard for it anyway: it does not stop there
+                continue  # the foe has to brake hard for the row anyway, so the row does not stop
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):
-                # One that is in the area, too, stops where it is. Behind one that stands, or may
-                # have to for it, it waits before the junction: else neither could go on.
+                # A vehicle inside the area stops where it is. If the foe stands, or may have to
+                # stop for the row, the row waits before the junction: otherwise neither could go.
                 stop = min(stop, max(sweep["enter_m"], place))
                 if place <= 0.0 and (
                     foe["speed"] <= STANDING_MPS or _must_yield(roads, sweep["foe"], link)
@@ -122,13 +124,13 @@ def foe_would_sweep_over(
     roads: RoadArrays,
     row: np.void,  # VEHICLE that enters
     link: int,  # that it takes next
-    place: float,  # of its front, m beyond its stop line
+    place: float,  # distance of its front beyond the stop line, m
     scratch: Scratch,
 ) -> bool:
     """Return whether a foe would sweep over a vehicle that enters the road here.
 
-    That foe is in the area, or can stop before it only by hard braking. Areas of steered cars do
-    not count: where roads share ground, none could enter any more.
+    Such a foe is in the area, or can stop before the area only by hard braking. Areas of steered
+    cars do not count: otherwise no vehicle could enter where roads overlap.
     """
     own = size_of(0.5 * row["length"])
     if _nothing_sweeps(roads, own, link, scratch):
@@ -138,7 +140,7 @@ def foe_would_sweep_over(
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
         if sweep["own"] > own:
-            break  # they are sorted by it
+            break  # the rows are sorted by `own`
         if sweep["own"] != own or rear > sweep["leave_m"]:
             continue
         to_area = sweep["enter_m"] - place
@@ -159,7 +161,7 @@ def foe_would_sweep_over(
 
 @kernel
 def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
-    """Whether vehicles on a link give way to those on another one."""
+    """Return whether vehicles on `link` yield to vehicles on `other`."""
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         if roads.conflicts[c]["foe"] == other:
@@ -171,10 +173,11 @@ def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
 def _stands_in_the_way(
     roads: RoadArrays, row: np.void, link: int, place: float, sweep: np.void, foe: np.void
 ) -> bool:
-    """Whether a row that stops for a foe's sweep stands where that one drives, and comes fast.
+    """Return whether a row that stops for the sweep of a fast foe would stand in the foe's path.
 
-    Its front is at `place`. The foe is still before its line. One that gives way has been let in,
-    and would stop behind the foe's front; one that has the right of way is there already.
+    The front of the row is at `place`, and the foe is before its line. If the row yields, it would
+    stop beyond the start of the swept area. If the row has the right of way, its present place
+    counts.
     """
     front = foe["dist"] - foe["half"]
     if front <= 0.0 or not _needs(foe["speed"], front, HARD_STOP):
@@ -194,10 +197,7 @@ def _stands_in_the_way(
 
 @inlined_kernel
 def room_m(at_line: int, inside: int) -> float:
-    """Return how near to their lines foes are for which a waiting vehicle leaves room, in m.
-
-    See `stop_before_foe_sweep`.
-    """
+    """Return `room_m` of `stop_before_foe_sweep` for the reasons to wait at the line and inside."""
     if at_line != HOLD_NONE:
         return APPROACH_STANDING_M
     return math.inf if inside != HOLD_NONE else -math.inf
@@ -205,10 +205,11 @@ def room_m(at_line: int, inside: int) -> float:
 
 @kernel
 def wait_place(roads: RoadArrays, link: int, half: float) -> float:
-    """Where inside a junction a vehicle on `link` waits, in m beyond its stop line.
+    """Return where inside a junction a vehicle on `link` waits, in m beyond its stop line.
 
-    That is the map's waiting position. Long vehicles wait up to `WAIT_EARLIER_M` before it where
-    others would sweep over it: cars go back only where one comes, see `stop_before_foe_sweep`.
+    The result is the map's waiting position. Long vehicles wait up to `WAIT_EARLIER_M` earlier if
+    others would sweep over them. Cars wait earlier only if a foe approaches
+    (`stop_before_foe_sweep`).
     """
     size = size_of(half)
     wait_m = place = roads.links[link]["wait_m"]
@@ -226,7 +227,7 @@ def wait_place(roads: RoadArrays, link: int, half: float) -> float:
 def _is_in_the_way(
     rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, room_m: float
 ) -> bool:
-    """Whether a row whose front is at `place` has to wait for one APPROACH."""
+    """Return whether a row whose front is at `place` has to wait for an APPROACH."""
     foe_place = foe["half"] - foe["dist"]
     foe_rear = foe_place - _body_m(foe["half"], sweep["other"])
     if foe_rear > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
@@ -240,15 +241,15 @@ def _is_in_the_way(
     to_area = sweep["foe_enter_m"] - foe_place
     comes = room_m > 0.0 and _needs(foe["speed"], to_area, EASY_STOP)
     if not inside and (comes or foe_place > -room_m):
-        return True  # it loses nothing if it leaves room
+        return True  # the row has to stop anyway, so leaving room costs nothing
     if rows[foe["row"]]["hold"] != HOLD_NONE:
         return False
     if inside:
         return _is_ahead(foe, foe_place, row, place)
-    # One that does not know of this area does not wait before it.
+    # Background vehicles do not know the areas of steered vehicles, so they do not wait there.
     unaware = sweep["own"] == STEERED and sweep["other"] != STEERED
     own_to_area = sweep["enter_m"] - place
-    # Of two that are late to stop the one that has to brake less waits, until the other has passed.
+    # If both can hardly stop before the area, the vehicle that has to brake less waits.
     foe_needs = _decel_to_stop(foe["speed"], to_area)
     own_needs = _decel_to_stop(row["speed"], own_to_area)
     if max(foe_needs, own_needs) > HARD_STOP and foe_needs != own_needs:
@@ -256,19 +257,19 @@ def _is_in_the_way(
     soon = to_area < SOON_M or _needs(foe["speed"], to_area, EASY_STOP)
     if unaware:
         return soon and (foe["speed"] > STANDING_MPS or _is_ahead(foe, foe_place, row, place))
-    # One that is ahead and stands is kept there by a leader, be it one that waits for this row.
+    # A foe that can be ignored is held by its leader, which may itself wait for this row.
     return soon and not can_be_ignored(rows[foe["row"]]) and _is_ahead(foe, foe_place, row, place)
 
 
 @inlined_kernel
 def _decel_to_stop(speed: float, distance: float) -> float:
-    """The braking in m/s² with which a vehicle stops within a distance."""
+    """Return the deceleration in m/s² with which a vehicle stops within a distance."""
     return float(speed * speed / (2.0 * max(distance, MIN_STOP_M)))
 
 
 @inlined_kernel
 def _needs(speed: float, distance: float, decel: float) -> bool:
-    """Whether stopping within a distance takes harder braking."""
+    """Return whether a stop within a distance needs a larger deceleration than `decel`."""
     needs: bool = speed * speed > 2.0 * decel * distance
     return needs
 
@@ -291,10 +292,10 @@ def before_foe_sweep(
     dt: float,
     scratch: Scratch,
 ) -> float:
-    """Return the constraint of areas that foes sweep, on row i with its front before a stop line.
+    """Return the constraint on row i of areas that foes sweep.
 
-    `front`: m from its front to the stop line of the link. `hold`: why it waits inside anyway,
-    HOLD_*.
+    `front` is the distance in m from the front to the stop line of the link, negative beyond it.
+    `hold` is the reason to wait inside the junction (HOLD_*).
     """
     if roads.links[link]["num_sweeps"] == 0:
         return no_constraint(kind)
@@ -321,7 +322,7 @@ def before_foe_sweep_beyond_junction(
 
 @inlined_kernel
 def before_line_gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
-    """The constraint of a line before which no vehicle brakes harder than those behind can."""
+    """Return the constraint of a line, limited so that followers can brake as hard."""
     constraint = before_line(kind, row["speed"], gap, dt)
     if kind["as_sumo"]:
         return float(min(constraint, kind["decel"] * dt - row["speed"]))
@@ -338,7 +339,7 @@ def behind_fork(
     distance: float,
     scratch: Scratch,
 ) -> float:
-    """The constraint of vehicles that have just turned off from the same lane into another link."""
+    """Return the constraint of vehicles that have just left the same lane by another link."""
     constraint = no_constraint(kind)
     first = roads.lanes[lane]["first_link"]
     for link in range(first, first + roads.lanes[lane]["num_links"]):

@@ -1,4 +1,4 @@
-"""Leaders on adjacent lanes that a vehicle covers, or that stick out into its own lane."""
+"""Leaders on adjacent lanes: on lanes that a vehicle also covers, or reaching into its own lane."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from cavmarl.driving.kernels.lanes.lane_index import ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.models.following import behind, no_constraint
 from cavmarl.roads.kernels.plans import TURNAROUND
 
-STICKS_OUT_M = 0.1  # over the side of its lane, so far that others have to mind it
-ASKEW_RAD = 0.15  # a vehicle that stands less askew does not stick out
-SWINGS_BACK_M = 3.0  # both bumpers on its way, a bus of 12 m that turns round stands further back
+STICKS_OUT_M = 0.1  # from this distance beyond the side of its lane on, a vehicle sticks out
+ASKEW_RAD = 0.15  # with a smaller angle to its lane, a vehicle does not stick out
+SWINGS_BACK_M = 3.0  # how far the rear of a 12 m bus moves back during a U-turn on its path
 
 
 @inlined_kernel
 def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
-    """The constraint of a leader by its ENTRY in the index of lanes; `gap`: between bumpers, m."""
+    """Return the constraint of a leader, an ENTRY; `gap` is between the bumpers in m."""
     return behind(kind, speed, gap, leader["speed"], leader["decel"])
 
 
 @inlined_kernel
-def swings_back_m(
+def rear_swing_m(
     roads: RoadArrays, travel: TripTables, rows: NDArray[np.void], leader: np.void
 ) -> float:
-    """How far a leader's rear may come back, in m: that of a bus does while it turns round."""
+    """Return how far a leader's rear may move back, in m: a bus's rear does so in a U-turn."""
     if leader["half"] <= 0.5 * BUS_M:
         return 0.0
     other = rows[leader["row"]]
@@ -48,7 +48,7 @@ def swings_back_m(
 def behind_adjacent_leader(
     roads: RoadArrays, travel: TripTables, kind: np.void, row: np.void, lane: int, scratch: Scratch
 ) -> float:
-    """Return the constraint of the leader on an adjacent lane that the body covers or will."""
+    """Return the constraint of the leader on an adjacent lane that the body covers, or will."""
     target = roads.lanes[lane]
     s = beside_s(roads, row["lane"], lane, row["s"])
     half = 0.5 * row["length"]
@@ -56,7 +56,7 @@ def behind_adjacent_leader(
     if j >= 0:
         leader = scratch.entries[j]
         return behind_entry(kind, row["speed"], leader["s"] - s - half - leader["half"], leader)
-    # Beyond the end of that lane, whichever way others have gone there.
+    # Search beyond the end of that lane, on all links that leave it.
     constraint = no_constraint(kind)
     for link in range(target["first_link"], target["first_link"] + target["num_links"]):
         distance = target["length_m"] - s
@@ -75,7 +75,7 @@ def behind_adjacent_leader(
 
 @kernel
 def _sticks_out(roads: RoadArrays, other: np.void, to_left: bool) -> bool:
-    """Whether a corner of a vehicle reaches over a side of its lane, as it crawls askew."""
+    """Return whether a corner of a vehicle that is askew reaches over a side of its lane."""
     here = roads.lanes[other["lane"]]
     _, _, _, cos, sin, _ = lane_pose(
         roads.points, here["first_point"], here["num_points"], other["s"]
@@ -91,19 +91,20 @@ def _sticks_out(roads: RoadArrays, other: np.void, to_left: bool) -> bool:
 
 
 @kernel
-def askew_beside(
+def next_askew(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     lane: int,
     s: float,
     own_id: int,
-    to_left: bool,  # whether it is asked of the left neighbour
+    to_left: bool,  # whether to search the left neighbour lane, else the right one
     scratch: Scratch,
 ) -> tuple[int, float]:
-    """The steered vehicle that sticks out from a neighbour lane into a lane, next ahead of `s`.
+    """Find the next steered vehicle ahead of `s` that sticks out from a neighbour lane.
 
-    Its entry, and how far ahead its centre is in m; (-1, inf) where there is none.
+    Returns:
+        The vehicle's entry and the distance of its centre in m, or (-1, inf).
     """
     here = roads.lanes[lane]
     neighbor = here["left"] if to_left else here["right"]
@@ -129,16 +130,16 @@ def behind_askew(
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     kind: np.void,
-    row: np.void,  # of an agent
-    lane: int,  # its own, or one ahead,
-    s: float,  # and where it is on it: before its start if negative
+    row: np.void,  # VEHICLE of an agent
+    lane: int,  # the vehicle's lane, or a lane ahead
+    s: float,  # position of the vehicle on that lane, negative before its start, m
     scratch: Scratch,
 ) -> float:
-    """The constraint of steered vehicles ahead on neighbour lanes that stick out into a lane."""
+    """Return the constraint of steered vehicles ahead that stick out from neighbour lanes."""
     constraint = no_constraint(kind)
     begin = max(s, 0.0)
     for to_left in (True, False):
-        k, apart = askew_beside(roads, travel, rows, lane, begin, row["id"], to_left, scratch)
+        k, apart = next_askew(roads, travel, rows, lane, begin, row["id"], to_left, scratch)
         apart += begin - s
         if k >= 0 and apart <= travel.view_m:
             leader = scratch.entries[k]

@@ -11,7 +11,7 @@ from cavmarl.driving.kernels.lanes.lane_choice import LOOK_BACK_M, SIDE_GAP_M
 from cavmarl.driving.kernels.lanes.lane_index import behind_by, beside_s
 from cavmarl.driving.kernels.models.following import accel_behind
 
-COOPERATIVE_DECEL = 3.0  # m/s², the hardest braking to let a vehicle merge, or to fall in behind
+COOPERATIVE_DECEL = 3.0  # m/s², largest deceleration to let a vehicle merge or to follow a leader
 
 
 @kernel
@@ -20,7 +20,8 @@ def brake_for_merging(
 ) -> None:
     """Slow down the follower on the lane that a vehicle needs to change to.
 
-    If that lane is free behind it, the next followers on all lanes that lead there slow down.
+    If that lane is free behind the vehicle, the next follower on each lane that leads there slows
+    down.
     """
     lane = roads.lanes[row["lane"]]
     target = lane["left"] if row["blinker"] > 0 else lane["right"]
@@ -44,7 +45,7 @@ def _brake_follower(
     apart: float,
     scratch: Scratch,
 ) -> None:
-    """Slow down one follower: entry `k` of the index, `apart` m behind `row`, for lane `target`."""
+    """Slow down the follower of entry `k`, `apart` m behind `row`, which changes to `target`."""
     follower = scratch.entries[k]
     gap = apart - 0.5 * row["length"] - follower["half"]
     if follower["side"] or gap < SIDE_GAP_M or apart > LOOK_BACK_M:

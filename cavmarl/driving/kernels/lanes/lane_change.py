@@ -1,4 +1,4 @@
-"""MOBIL: whether a lane change pays and imposes no hard braking.
+"""MOBIL: whether a lane change is worthwhile and imposes no hard braking.
 
 Kesting, Treiber, Helbing: "General lane-changing model MOBIL for car-following models",
 Transportation Research Record 1999, 2007, with highway-env's defaults (`IDMVehicle.mobil`).
@@ -9,10 +9,10 @@ from __future__ import annotations
 from cavmarl.core.compiled import kernel
 
 POLITENESS = 0.0  # weight of the followers' gains, from 0 (selfish) to 1
-MIN_ACCEL_GAIN = 0.2  # m/s², a change that gains less is not worth it
-MAX_BRAKING_IMPOSED = 2.0  # m/s², harder braking makes a change unsafe
-LANE_CHANGE_DELAY_S = 1.0  # s between two decisions of a driver
-MIN_SPEED_MPS = 1.0  # m/s, slower cars do not change lanes
+MIN_ACCEL_GAIN = 0.2  # m/s², smallest gain for which a driver changes lanes
+MAX_BRAKING_IMPOSED = 2.0  # m/s², a change that imposes harder braking is unsafe
+LANE_CHANGE_DELAY_S = 1.0  # time between two decisions of a driver
+MIN_SPEED_MPS = 1.0  # slower cars do not change lanes
 
 
 @kernel
@@ -23,12 +23,12 @@ def mobil_accepts(
     new_follower_accel_after: float,  # of that car after the change; 0 if there is none
     old_follower_accel: float,  # of the car that is behind, now; 0 if there is none
     old_follower_accel_after: float,  # of that car after the change; 0 if there is none
-    # the route needs the change, so it only has to be safe for both. The caller sees to it that the
-    # lane lies on the route's side
+    # the route needs the change, so safety alone decides. The caller checks that the route needs
+    # this side
     mandatory: bool,
     max_braking: float = MAX_BRAKING_IMPOSED,  # m/s², harder braking makes the change unsafe
 ) -> bool:
-    """Whether to change into a lane; all accelerations from the car-following model, in m/s²."""
+    """Return whether to change to a lane; accelerations in m/s², from the car-following model."""
     if new_follower_accel_after < -max_braking:
         return False
     if mandatory:

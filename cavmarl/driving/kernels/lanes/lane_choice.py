@@ -1,7 +1,7 @@
-"""Which lane a driver wants, for its way or to drive faster, and whether it may change now.
+"""Lane choice: the lane that a driver wants, for its route or for speed, and whether it may change.
 
-The question is MOBIL's (`lane_change`); this file finds the vehicles concerned, and when a way
-needs it.
+MOBIL decides (`lane_change`). This file finds the vehicles concerned, and the lane changes that the
+route needs.
 """
 
 from __future__ import annotations
@@ -29,41 +29,39 @@ from cavmarl.driving.kernels.lanes.lane_index import (
 )
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.lanes.side_clearance import has_side_clearance
-from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
-    accel_behind,
-    no_constraint,
-    wish,
-)
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import accel_behind, no_constraint, wish
 from cavmarl.driving.kernels.motion.ordered_stops import STAY, change_for_stop
 
-LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
-CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
-CHANGE_EARLY_S = 12.0  # plus the way of this time
-MAX_BRAKING_ACCEPTED = 4.0  # m/s², harder braking behind the new leader is never worth it
-MAX_BRAKING_NEEDED = 4.0  # m/s², what a change that the way needs may ask of the one behind
-QUEUED_M = 7.5  # of lane that a vehicle takes in a queue
-TURN_IN_M = 5.0  # behind a junction, where long vehicles still turn into the lanes beside,
-SPARE_M = 2.0  # on lanes that are longer by this than what two that want to swap need
-SLOW_MPS = 2.0  # with which one minds the corners of those that stand beside the lane it comes to
-CREEP_MPS = 1.0  # so slow, a driver that has to change does so to the very end of its lane
-SIDEWAYS_S = 2.5  # a lane change takes about this long, and has to end before the lane does
-BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
-SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
+LOOK_BACK_M = 60.0  # distance within which followers count for a lane change
+# Drivers start to look for a gap this far, plus this travel time, before a mandatory change.
+CHANGE_EARLY_M = 80.0
+CHANGE_EARLY_S = 12.0
+MAX_BRAKING_ACCEPTED = 4.0  # m/s², largest deceleration that a driver accepts behind a new leader
+MAX_BRAKING_NEEDED = 4.0  # m/s², largest deceleration that a mandatory change imposes
+QUEUED_M = 7.5  # length of lane per vehicle in a queue
+TURN_IN_M = 5.0  # distance behind a junction where long vehicles still turn into adjacent lanes
+SPARE_M = 2.0  # this rule holds on lanes longer, by this, than two vehicles need to swap lanes
+SLOW_MPS = 2.0  # below this speed, a lane change needs side clearance to stopped vehicles
+CREEP_MPS = 1.0  # up to this speed, a mandatory change is possible to the very end of the lane
+SIDEWAYS_S = 2.5  # duration of a lane change, which has to end before the lane does
+BRAKE_TIME_S = 0.5  # braking that ends within this time does not count
+SIDE_GAP_M = 1.0  # smallest gap between bumpers with which a lane change starts
 # A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
-# length further back to change left: two that want to swap do not stand side by side for ever.
+# length further back to change left. So two vehicles that swap lanes do not block each other.
 MERGE_ROOM_M = 2.0
 SWAP_ROOM_M = 3.0
-LEAST_SWAP_M = SIDE_GAP_M + 0.2  # of a background vehicle whose rear is in the junction otherwise
-LINE_SLACK_M = 0.3  # so far before the place where it waits a vehicle may stand
-MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
+# Smallest swap room of a background vehicle, if its rear would otherwise be in the junction.
+LEAST_SWAP_M = SIDE_GAP_M + 0.2
+LINE_SLACK_M = 0.3  # a vehicle may stand this far before the place where it waits
+MERGE_ROOM_SHARE = 0.25  # largest room for a change to the right, as a share of the lane's length
 
 
 @inlined_kernel
 def needed_change(roads: RoadArrays, travel: TripTables, row: np.void, step: np.void) -> int:
-    """The side that a vehicle's way needs it to change to by now: 1 left, -1 right, 0 none.
+    """Return the side of the lane change that the route needs now: 1 left, -1 right, 0 none.
 
-    `step` is its own one.
+    `step` is the PLAN of the vehicle's lane.
     """
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
@@ -78,15 +76,15 @@ def needed_change(roads: RoadArrays, travel: TripTables, row: np.void, step: np.
 
 
 @inlined_kernel
-def room_for_more(lane: np.void, row: np.void, step: np.void) -> float:
-    """Where a steered vehicle changes lanes more than once, room for all changes but the first."""
+def room_for_further_changes(lane: np.void, row: np.void, step: np.void) -> float:
+    """Return the room in m for all lane changes of a steered vehicle but the first one."""
     further = (step["changes"] - 1) * (row["length"] + SWAP_ROOM_M)
     return float(min(further, max(MERGE_ROOM_SHARE * lane["length_m"] - MERGE_ROOM_M, 0.0)))
 
 
 @inlined_kernel
 def _desired(roads: RoadArrays, kind: np.void, row: np.void, lane: int) -> float:
-    """The speed in m/s that a driver wants on a lane."""
+    """Return the desired speed in m/s of a driver on a lane."""
     limit = min(roads.lanes[lane]["speed_mps"], kind["desired_max_speed"])
     return float(min(limit * row["speed_factor"], kind["max_speed"]))
 
@@ -96,17 +94,18 @@ def wish_on_lane(
     roads: RoadArrays,
     travel: TripTables,
     row: np.void,
-    k: int,  # its entry
+    k: int,  # the vehicle's entry
     scratch: Scratch,
 ) -> float:
-    """The acceleration in m/s² that a steered vehicle would like of its lane and its leader there.
+    """Return the desired acceleration in m/s² of a steered vehicle on its lane.
 
-    What it slows down for on either lane, bends, lines and limits ahead, is no reason to change.
+    Only the leader counts: bends, lines and limits ahead affect both lanes and are no reason to
+    change lanes.
     """
     lane = row["lane"]
     kind = travel.types[row["vtype"]]
     desired = _desired(roads, kind, row, lane)
-    # Beyond the view a leader may be another zone's, and not known here.
+    # Leaders beyond the view may belong to another zone and may be unknown here.
     follows = (
         k + 1 < scratch.lane_end[lane] and scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m
     )
@@ -118,10 +117,10 @@ def wish_on_lane(
 
 
 @inlined_kernel
-def _is_left_slowly(scratch: Scratch, lane: np.void, front: float, gap_m: float) -> bool:
-    """Whether a rear before the end of a lane, wherever it goes, is within a gap.
+def _has_rear_close_beyond(scratch: Scratch, lane: np.void, front: float, gap_m: float) -> bool:
+    """Return whether the rear of a vehicle that leaves a lane is less than `gap_m` m ahead.
 
-    `front`: how far that end is ahead.
+    `front` is the distance in m from the own front to the end of the lane.
     """
     for link in range(lane["first_link"], lane["first_link"] + lane["num_links"]):
         for k in range(scratch.link_start[link], scratch.link_end[link]):
@@ -136,10 +135,12 @@ def _is_left_slowly(scratch: Scratch, lane: np.void, front: float, gap_m: float)
 def _next_beyond(
     roads: RoadArrays, travel: TripTables, row: np.void, lane: int, far: float, scratch: Scratch
 ) -> tuple[int, float]:
-    """The entry of the next vehicle behind the end of a lane, and how far ahead its centre is.
+    """Find the next vehicle behind the end of a lane, which is `far` m ahead.
 
-    `far`: how far that end is ahead. It looks as far as over a junction and onto the lane behind
-    it; -1 and as far as it has looked: there is none.
+    The search ends with the first lane behind the next junction.
+
+    Returns:
+        The vehicle's entry and the distance of its centre in m; or -1 and the searched distance.
     """
     j = -1
     beyond, way, _ = next_step(roads, travel, lane, row["way"])
@@ -155,7 +156,7 @@ def _next_beyond(
 
 
 @kernel
-def _asked_of_followers(
+def imposed_on_followers(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -164,10 +165,10 @@ def _asked_of_followers(
     s: float,
     scratch: Scratch,
 ) -> float:
-    """The least acceleration in m/s² that a change to place `s` of `target` asks of a follower.
+    """Return the lowest acceleration in m/s² that a change to `s` on `target` imposes on others.
 
-    -inf where one is beside that place. A far one that is fast may have to brake harder than a near
-    one that stands: every lane that leads there is asked.
+    The result is -inf if a follower is beside that place. A fast follower far behind may have to
+    brake harder than a near one that stands, so every lane that leads to `target` is searched.
     """
     kind = travel.types[row["vtype"]]
     half = 0.5 * row["length"]
@@ -185,13 +186,13 @@ def _asked_of_followers(
         limit = _desired(roads, theirs, other, target)
         net = gap - follower["half"] - half
         asked = accel_behind(theirs, pace, limit, net, row["speed"], kind["decel"])
-        # A standing or creeping vehicle cannot brake for long, whatever the model answers.
+        # A standing or slow vehicle cannot brake for long, whatever the model returns.
         least = min(least, max(asked, -pace / BRAKE_TIME_S))
     return least
 
 
 @kernel
-def _change_is_safe(
+def change_is_safe(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -201,7 +202,7 @@ def _change_is_safe(
     mandatory: bool,
     scratch: Scratch,
 ) -> bool:
-    """MOBIL's question for row i and lane `target`, with the gaps that it takes for granted."""
+    """Return whether MOBIL accepts that row i changes to lane `target`; also check the gaps."""
     row = rows[i]
     kind = travel.types[row["vtype"]]
     speed = row["speed"]
@@ -209,7 +210,7 @@ def _change_is_safe(
     lane = roads.lanes[target]
     s = beside_s(roads, row["lane"], target, row["s"])
     if s >= roads.lanes[target]["length_m"]:
-        return False  # it has ended beside
+        return False  # the target lane has already ended
     desired = _desired(roads, kind, row, target)
     ahead = 0.0
     j = ahead_on(scratch, target, s, row["id"], travel.view_m)
@@ -217,36 +218,36 @@ def _change_is_safe(
         ahead = scratch.entries[j]["s"] - s
     else:
         j, ahead = _next_beyond(roads, travel, row, target, lane["length_m"] - s, scratch)
-        if _is_left_slowly(scratch, lane, lane["length_m"] - s - half, kind["min_gap"]):
+        if _has_rear_close_beyond(scratch, lane, lane["length_m"] - s - half, kind["min_gap"]):
             return False
     after = wish(kind, speed, desired, no_constraint(kind))
     if j >= 0:
         leader = scratch.entries[j]
         net = ahead - half - leader["half"]
-        # In a turn a body sticks out behind the place of its rear on its way.
+        # In a turn, a body extends further back than its rear position on the path.
         turns = s + ahead + leader["half"] > lane["length_m"]
         if net < (kind["min_gap"] if turns else SIDE_GAP_M):
             return False
         after = accel_behind(kind, speed, desired, net, leader["speed"], leader["decel"])
-        # Krauss's answers for a reaction time, and asks for less than it takes at a crawl.
+        # Krauss's model brakes over a whole reaction time, which is too little at low speed.
         faster = speed - leader["speed"] if kind["as_sumo"] else 0.0
         if faster > 0.0 and faster * faster > 2.0 * MAX_BRAKING_ACCEPTED * net:
             return False
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
         return False
-    followers = _asked_of_followers(roads, travel, rows, row, target, s, scratch)
+    followers = imposed_on_followers(roads, travel, rows, row, target, s, scratch)
     most = MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED
-    # What followers gain or lose has no weight (POLITENESS), so what they do now is not asked.
+    # With POLITENESS = 0 the present accelerations of the followers do not count.
     return mobil_accepts(own_wish, after, 0.0, followers, 0.0, 0.0, mandatory, most)
 
 
 @inlined_kernel
-def _rear_is_inside(lane: np.void, row: np.void) -> bool:
-    """Whether a vehicle's rear is in the junction or near it, where others turn in beside it.
+def rear_is_inside(lane: np.void, row: np.void) -> bool:
+    """Return whether a vehicle's rear is in or near the junction, where others turn in beside it.
 
-    On lanes so short that two do not fit behind one another, with room to swap, that does not
-    count: a vehicle waits to change with its rear inside (`lane_ends`), and would never change.
+    The rule does not hold on lanes too short for two vehicles and room to swap: there, a vehicle
+    waits with its rear in the junction (`lane_ends`), and would never change lanes.
     """
     room = SWAP_ROOM_M
     if row["driver"] != DRIVER_AGENT:
@@ -254,7 +255,7 @@ def _rear_is_inside(lane: np.void, row: np.void) -> bool:
     spare = lane["length_m"] - 2.0 * row["length"] - room
     near_m = min(TURN_IN_M, max(spare - SPARE_M, 0.0))
     if row["driver"] == DRIVER_AGENT and row["speed"] < CREEP_MPS:
-        near_m = 0.0  # it may have stopped there for the change itself
+        near_m = 0.0  # it may have stopped there for the lane change
     inside: bool = spare > 0.0 and row["s"] < 0.5 * row["length"] + near_m
     return inside
 
@@ -270,13 +271,13 @@ def _may_change(
     own_wish: float,
     scratch: Scratch,
 ) -> bool:
-    """Whether row i wants to and can change to one side: for its way, or to drive faster."""
+    """Return whether row i wants to change to a side, for its route or for speed, and can do so."""
     row = rows[i]
     lane = roads.lanes[row["lane"]]
     target = lane["left"] if side > 0 else lane["right"]
     if lane["internal"] or target < 0 or (needed != 0 and needed != side):
         return False
-    if _rear_is_inside(lane, row):
+    if rear_is_inside(lane, row):
         return False
     rest = lane["length_m"] - row["s"] - SIDEWAYS_S * row["speed"]
     if rest < (0.5 * row["length"] if needed == 0 or row["speed"] > CREEP_MPS else 0.0):
@@ -284,7 +285,7 @@ def _may_change(
     if needed == 0:
         if row["speed"] < 1.0 or change_for_stop(roads, travel, row) == STAY:
             return False
-        # Not even an empty lane would be worth it.
+        # Early exit: even on an empty lane the gain would be too small.
         kind = travel.types[row["vtype"]]
         desired = _desired(roads, kind, row, target)
         if wish(kind, row["speed"], desired, no_constraint(kind)) - own_wish < MIN_ACCEL_GAIN:
@@ -292,31 +293,31 @@ def _may_change(
         beyond = travel.steps[row["way"] + target]
         if beyond["to_go"] == math.inf:
             return False
-        # What is won is not worth a turn that a steered car cannot take.
+        # Do not change to a lane that leads to a turn that a steered car cannot take.
         turns = travel.steps[row["way"] + row["lane"]]["turnarounds"]
         if row["driver"] == DRIVER_AGENT and beyond["turnarounds"] > turns:
             return False
         early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
         if beyond["change"] != 0:
-            # Back into its own lane it gets behind those that are on it now.
+            # The vehicle has to return, and would then be behind the vehicles on its present lane.
             queue_m = QUEUED_M * num_ahead(scratch, row["lane"], row["s"], row["id"], travel.view_m)
             if beyond["room"] - row["s"] - queue_m < 2.0 * early:
                 return False
-    if not _change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch):
+    if not change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch):
         return False
-    # One that is so slow goes sideways where it is.
+    # A slow vehicle moves sideways almost in place.
     place = beside_s(roads, row["lane"], target, row["s"])
     slow: bool = row["speed"] < SLOW_MPS and row["driver"] != DRIVER_AGENT
     return not slow or has_side_clearance(roads, rows, row, target, place, 0.0, side, scratch)
 
 
 @inlined_kernel
-def thinks_of_lanes(row: np.void, needed: int, tick: int, dt: float) -> bool:
-    """Whether a driver thinks of a lane change in this tick.
+def considers_lane_change(row: np.void, needed: int, tick: int, dt: float) -> bool:
+    """Return whether a driver considers a lane change in this tick.
 
-    Each does so once in LANE_CHANGE_DELAY_S for either side, not all in the same ticks; always, if
-    its way needs the change and it does not stand. A suggestion for an agent is made anew at each
-    step.
+    Each driver does so once per LANE_CHANGE_DELAY_S and side, in ticks that depend on its id. A
+    moving driver whose route needs the change does so in every tick. Suggestions for agents are
+    computed in every step.
     """
     if row["driver"] == DRIVER_AGENT or (needed != 0 and row["speed"] > 0.0):
         return True
@@ -336,11 +337,11 @@ def choose_lane(
     own_wish: float,
     scratch: Scratch,
 ) -> int:
-    """The lane change that row i makes now: 1 left, -1 right, 0 none.
+    """Return the lane change of row i in this tick: 1 left, -1 right, 0 none.
 
-    In even ticks background drivers may only change to the left, in odd ones to the right: two of
-    them never take the same gap from both sides in one tick, whichever is asked first. A suggestion
-    for an agent is not binding, so it has no such rule.
+    In even ticks background drivers may change only to the left, in odd ticks only to the right. So
+    two of them never take the same gap from both sides in one tick, whatever the order of rows. The
+    rule does not hold for agents, because their suggestions are not binding.
     """
     row = rows[i]
     if row["driver"] == DRIVER_AGENT:

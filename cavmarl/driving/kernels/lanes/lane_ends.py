@@ -1,4 +1,4 @@
-"""What the end of a lane asks of a driver: room to change lanes, and rears that are over it."""
+"""Constraints of the end of a lane: room for a lane change, and bodies that reach over the end."""
 
 from __future__ import annotations
 
@@ -16,12 +16,8 @@ from cavmarl.driving.kernels.lanes.lane_choice import LEAST_SWAP_M, MERGE_ROOM_S
 from cavmarl.driving.kernels.lanes.lane_index import beside_s, last_on
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.lanes.side_clearance import LONGEST_HALF_M
-from cavmarl.driving.kernels.models.following import (
-    LINE_MARGIN_M,
-    before_line,
-    behind,
-    no_constraint,
-)
+from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
 
 
 @kernel
@@ -36,17 +32,18 @@ def lane_end(
     merge_room_m: float,
     dt: float,
 ) -> float:
-    """The constraint of the end of a lane from which the way goes on only after a lane change."""
+    """Return the constraint of the end of a lane that the route leaves by a lane change."""
     step = travel.steps[way + lane]
     if step["to_go"] < math.inf and step["change"] == 0:
         return no_constraint(kind)
-    # Stop with room enough to swing out, but on this lane and not before it.
+    # Stop with enough room to swing out, but not before the start of this lane.
     length = roads.lanes[lane]["length_m"]
     half = 0.5 * row["length"]
     room = min(merge_room_m, MERGE_ROOM_SHARE * length)
     if step["change"] > 0 and merge_room_m > 0.0:
         swap = SWAP_ROOM_M
-        if row["driver"] != DRIVER_AGENT:  # it steers without room: on short lanes its rear counts
+        # Background vehicles need no room to steer; on short lanes their rear has to fit.
+        if row["driver"] != DRIVER_AGENT:
             swap = min(swap, length - room - 2.0 * (row["length"] + LINE_MARGIN_M))
             swap = max(swap, LEAST_SWAP_M)
         room += row["length"] + swap
@@ -55,13 +52,13 @@ def lane_end(
 
 
 @kernel
-def _behind_turning(
+def behind_turning(
     roads: RoadArrays, kind: np.void, row: np.void, lane: int, distance: float, scratch: Scratch
 ) -> float:
-    """The constraint of long vehicles that turn off from beside a lane that leads nowhere.
+    """Return the constraint of long vehicles that turn from a lane adjacent to a dead end.
 
-    `distance`: of the row's centre to the end of that lane, in m. Their rears swing out over
-    it, and without a link it has no swept areas.
+    `distance` is from the row's centre to the end of that lane in m. The rears of long vehicles
+    swing out over the lane; without a link, the lane has no swept areas.
     """
     constraint = no_constraint(kind)
     for neighbor in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
@@ -82,8 +79,8 @@ def _behind_turning(
 
 
 @kernel
-def misses_change(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> bool:
-    """Whether a lane that the way leaves sideways leads on to a turn that a car cannot take."""
+def misses_last_change(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> bool:
+    """Return whether a missed lane change would lead to a turn that a steered car cannot take."""
     if roads.lanes[lane]["internal"]:
         return False
     step = travel.steps[way + lane]
@@ -105,9 +102,9 @@ def behind_over_line(
     distance: float,
     scratch: Scratch,
 ) -> float:
-    """The constraint of a vehicle whose rear is still before the line, behind a short first lane.
+    """Return the constraint of a vehicle beyond short lanes whose rear is still before the line.
 
-    `lane`: that lane, which begins at the line, `distance` m ahead.
+    `lane` is the first lane behind the line, which is `distance` m ahead.
     """
     line = distance
     while distance - line < LONGEST_HALF_M:
@@ -126,7 +123,7 @@ def behind_over_line(
 
 
 @inlined_kernel
-def over_end(
+def constraint_over_lane_end(
     roads: RoadArrays,
     rows: NDArray[np.void],
     i: int,
@@ -137,25 +134,25 @@ def over_end(
     dt: float,
     scratch: Scratch,
 ) -> float:
-    """Constraint of row i by bodies over the end of a lane, `distance` m ahead, that it stops at.
+    """Return the constraint on row i of bodies that reach over the end of a lane.
 
-    Wherever it goes from there, a vehicle that has left the lane by any link may still have its
-    rear over the end, and others, which a background driver minds where that `is_near`, turn over
-    it.
+    The end is `distance` m ahead. A vehicle that has left the lane by any link may still have its
+    rear over the end. If the end `is_near`, a background driver also waits for vehicles that sweep
+    over it.
     """
     row = rows[i]
     constraint = behind_fork(roads, kind, row, lane, -1, distance, scratch)
     if not is_near or row["driver"] == DRIVER_AGENT:
         return constraint
     if roads.lanes[lane]["num_links"] == 0:
-        return max(constraint, _behind_turning(roads, kind, row, lane, distance, scratch))
+        return max(constraint, behind_turning(roads, kind, row, lane, distance, scratch))
     first, front = roads.lanes[lane]["first_link"], distance - 0.5 * row["length"]
     swept = before_foe_sweep(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
     return max(constraint, swept)
 
 
 @kernel
-def behind_beside(
+def constraint_of_side_lane(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -165,15 +162,17 @@ def behind_beside(
     dt: float,
     scratch: Scratch,
 ) -> float:
-    """The constraint of the lane beside that row i's body still covers, up to the end of it.
+    """Return the constraint of the adjacent lane that the body of row i still covers.
 
-    `see_m`: how near the end has to be, for those that turn over it to be asked about.
+    Vehicles that sweep over the end of that lane count if the end is at most `see_m` m ahead.
     """
     row = rows[i]
     lane = row["side_lane"]
     constraint = behind_adjacent_leader(roads, travel, kind, row, lane, scratch)
     distance = roads.lanes[lane]["length_m"] - beside_s(roads, row["lane"], lane, row["s"])
     if distance > 0.5 * row["length"]:
-        over = over_end(roads, rows, i, kind, lane, distance, distance < see_m, dt, scratch)
+        over = constraint_over_lane_end(
+            roads, rows, i, kind, lane, distance, distance < see_m, dt, scratch
+        )
         constraint = max(constraint, over)
     return constraint

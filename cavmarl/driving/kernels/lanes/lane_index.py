@@ -1,9 +1,9 @@
-"""Lane index: the vehicles of one world by lane and place, and searches along it.
+"""Lane index: the vehicles of one world sorted by lane and position, and searches in the index.
 
-The index lists, lane by lane, the vehicles on it by rising (s, id). A vehicle whose body also
-covers a neighbour lane stands in both lists, one that follows a script in those of all lanes that
-it covers or is about to cover, and one that is lost in none. What others look at is copied into the
-entries, which lie together in memory. Nothing here depends on the order of rows.
+For each lane, the index lists the vehicles by increasing (s, id). A vehicle whose body also covers
+an adjacent lane is in both lists. A vehicle that follows a script is in the lists of all lanes that
+it covers or is about to cover. A lost vehicle is in no list. The values that others read are copied
+to the entries, which are contiguous in memory. The index does not depend on the order of rows.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.junctions.stop_line_registration import registration_distance_m
 
 MAX_LOOK_BACK_LANES = 4
-GOES_ON_M = 1.0  # lanes of one road end beside each other but for this
-VIEW_M = 250.0  # the farthest view along the road that a world can have
+GOES_ON_M = 1.0  # lanes of one road end at the same place, up to this difference
+VIEW_M = 250.0  # the largest view along the road that a world can have
 
 ENTRY = np.dtype(
     [
         ("s", np.float64),  # of the centre on this lane, m
         ("speed", np.float64),  # m/s
         ("half", np.float64),  # half its length, m
-        ("decel", np.float64),  # with which it brakes in comfort, m/s²
+        ("decel", np.float64),  # comfortable deceleration, m/s², positive
         ("id", np.int64),
         ("row", np.int32),  # VEHICLE row
         ("blinker", np.int32),  # lane change wanted: 1 left, -1 right
-        ("side", np.bool_),  # its body covers this lane, its centre is on a neighbour
+        ("side", np.bool_),  # the body covers this lane, but the centre is on an adjacent lane
     ],
     align=True,
 )
@@ -43,9 +43,10 @@ ENTRY = np.dtype(
 
 @kernel
 def beside_s(roads: RoadArrays, lane: int, neighbor: int, s: float) -> float:
-    """Where on a neighbour lane a place on a lane lies, in m.
+    """Return the position in m on a neighbour lane of a place on a lane.
 
-    On one that goes on beside the junction, see `goes_on_m`, as far as the way has gone since.
+    If the neighbour lane continues beside a junction (`goes_on_m`), the distance driven inside the
+    junction is added.
     """
     row = roads.lanes[lane]
     driven = 0.0
@@ -65,7 +66,7 @@ def beside_s(roads: RoadArrays, lane: int, neighbor: int, s: float) -> float:
 
 @kernel
 def goes_on_m(roads: RoadArrays, lane: int, neighbor: int) -> float:
-    """How far a neighbour lane goes on beside the junction at the end of a lane, in m; or 0."""
+    """Return how far, in m, a neighbour lane continues beside the junction at a lane's end."""
     row = roads.lanes[neighbor]
     end = roads.points[roads.lanes[lane]["first_point"] + roads.lanes[lane]["num_points"] - 1]
     place = end["left_s"] if neighbor == roads.lanes[lane]["left"] else end["right_s"]
@@ -131,14 +132,14 @@ def index_lanes(
 def _insert(
     scratch: Scratch, types: NDArray[np.void], lane: int, row: np.void, i: int, s: float, side: bool
 ) -> None:
-    """Put an entry among those of its lane that are there already, by (s, id)."""
+    """Insert an entry into the list of its lane, by (s, id)."""
     k = _make_place(scratch, lane, s, row["id"])
     _fill(scratch.entries[k], types, row, i, s, side)
 
 
 @inlined_kernel
 def _make_place(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
-    """Where in the index the next entry of a lane comes, by (s, id); those behind it move up."""
+    """Return the index of a new entry of a lane by (s, id), and move the later entries up."""
     first = scratch.lane_start[lane]
     k = scratch.lane_end[lane]
     scratch.lane_end[lane] = k + 1
@@ -154,7 +155,7 @@ def _make_place(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 @kernel
 def _count_covers(travel: TripTables, row: np.void, scratch: Scratch) -> None:
-    """Ask for the entries of a row that follows a script."""
+    """Count the entries of a row that follows a script."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_cover"], frame["first_cover"] + frame["num_covers"]):
         add(scratch.lanes, travel.scripts.covers[c]["lane"])
@@ -162,7 +163,7 @@ def _count_covers(travel: TripTables, row: np.void, scratch: Scratch) -> None:
 
 @kernel
 def _insert_covers(travel: TripTables, row: np.void, i: int, scratch: Scratch) -> None:
-    """Put a row that follows a script onto all lanes that it covers, or is about to cover."""
+    """Insert a row that follows a script for all lanes that it covers or is about to cover."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_cover"], frame["first_cover"] + frame["num_covers"]):
         cover = travel.scripts.covers[c]
@@ -175,7 +176,7 @@ def _insert_covers(travel: TripTables, row: np.void, i: int, scratch: Scratch) -
 
 @kernel
 def _first_after(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
-    """Position of the first entry on `lane` beyond (s, own_id)."""
+    """Return the index of the first entry on `lane` beyond (s, own_id)."""
     low = int(scratch.lane_start[lane])
     high = int(scratch.lane_end[lane])
     while low < high:
@@ -190,10 +191,10 @@ def _first_after(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 @kernel
 def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) -> int:
-    """Position in the index of the next other vehicle on `lane` ahead of place `s`, or -1.
+    """Return the index of the next other vehicle on `lane` ahead of `s`, or -1.
 
-    Beyond `view_m` no vehicle is found. At equal s the larger id counts as ahead, so that of two
-    vehicles one is always the leader.
+    Vehicles further than `view_m` are not found. At equal s, the vehicle with the larger id counts
+    as ahead, so that one of two vehicles is always the leader.
     """
     k = _first_after(scratch, lane, s, own_id)
     end = scratch.lane_end[lane]
@@ -204,7 +205,7 @@ def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) 
 
 @kernel
 def first_from(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
-    """Position in the index of the rearmost other vehicle on `lane` from place `s` on, or -1."""
+    """Return the index of the rearmost other vehicle on `lane` from `s` on, or -1."""
     k = _first_after(scratch, lane, s, -1)
     end = scratch.lane_end[lane]
     while k < end and scratch.entries[k]["id"] == own_id:
@@ -214,15 +215,16 @@ def first_from(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 @kernel
 def num_ahead(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) -> int:
-    """How many others are on `lane` ahead of place `s`, at most `view_m`."""
+    """Return the number of vehicles on `lane` ahead of `s`, within `view_m`."""
     return _first_after(scratch, lane, s + view_m, own_id) - _first_after(scratch, lane, s, own_id)
 
 
 @inlined_kernel
 def last_on(scratch: Scratch, lane: int, own_id: int, distance: float, view_m: float) -> int:
-    """Position in the index of the rearmost other vehicle on `lane`, or -1.
+    """Return the index of the rearmost other vehicle on `lane`, or -1.
 
-    The asking vehicle is `distance` m before the start of the lane and sees `view_m` far.
+    The own vehicle is `distance` m before the start of the lane. Vehicles further from it than
+    `view_m` are not found.
     """
     k = int(scratch.lane_start[lane])
     end = scratch.lane_end[lane]
@@ -233,7 +235,7 @@ def last_on(scratch: Scratch, lane: int, own_id: int, distance: float, view_m: f
 
 @kernel
 def behind_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
-    """Position in the index of the nearest other vehicle on `lane` behind place `s`, or -1."""
+    """Return the index of the nearest other vehicle on `lane` behind `s`, or -1."""
     k = _first_after(scratch, lane, s, own_id) - 1
     first = scratch.lane_start[lane]
     while k >= first and scratch.entries[k]["id"] == own_id:
@@ -242,7 +244,7 @@ def behind_on(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 
 @kernel
-def comes_over(
+def _search_incoming(
     roads: RoadArrays,
     scratch: Scratch,
     before: int,
@@ -251,10 +253,10 @@ def comes_over(
     reach_m: float,
     view_m: float,
 ) -> tuple[int, float]:
-    """The nearest vehicle that comes from lane `before` to a place `s` m behind its end.
+    """Find the nearest vehicle that comes from lane `before` to a place `s` m behind its end.
 
-    Answers as `behind_by`. A vehicle that stands or creeps far from here does not announce
-    itself, and is passed over.
+    The result is that of `behind_by`. A vehicle that is too far to register at the line, because it
+    stands or is slow, is skipped.
     """
     distance = s
     for _ in range(MAX_LOOK_BACK_LANES):
@@ -271,8 +273,8 @@ def comes_over(
         distance += row["length_m"]
         if row["num_into"] == 0:
             break
-        # Beyond a junction the first of the lanes that lead here stands for all: the others
-        # are checked there, by the right of way.
+        # Beyond a junction only the first incoming lane is searched: the right of way decides
+        # about the other ones.
         before = roads.into[row["first_into"]]
     return -1, math.inf
 
@@ -284,17 +286,19 @@ def behind_by(
     lane: int,
     s: float,
     own_id: int,
-    n: int,  # of the lanes that lead to `lane`; 0 where none does
+    n: int,  # number of the incoming lane; 0 if there is none
     reach_m: float,
     view_m: float,
 ) -> tuple[int, float]:
-    """The nearest vehicle behind place `s` of `lane`: (position in the index, distance in m).
+    """Find the nearest vehicle behind `s` on `lane`.
 
-    Where the lane is free behind that place, it looks back along the n-th lane that leads there,
-    over lane borders that are up to `reach_m` away, for one that registers at the line
-    (`registration_distance_m`).
-    One that is on the lane itself is the answer for n = 0 alone, so that all n together give every
-    follower once. (-1, inf) where there is none within `view_m`.
+    If the lane is free behind `s`, the search continues on the n-th incoming lane, across lane
+    borders up to `reach_m` away, for a vehicle that registers at the line
+    (`registration_distance_m`). A vehicle on the lane itself is returned only for n = 0, so that
+    all n together return each follower once.
+
+    Returns:
+        The index of the entry and the distance in m, or (-1, inf) if there is none within `view_m`.
     """
     k = behind_on(scratch, lane, s, own_id)
     if k >= 0:
@@ -303,4 +307,6 @@ def behind_by(
     row = roads.lanes[lane]
     if n >= row["num_into"]:
         return -1, math.inf
-    return comes_over(roads, scratch, roads.into[row["first_into"] + n], s, own_id, reach_m, view_m)
+    return _search_incoming(
+        roads, scratch, roads.into[row["first_into"] + n], s, own_id, reach_m, view_m
+    )

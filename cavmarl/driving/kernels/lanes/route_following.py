@@ -1,9 +1,10 @@
-"""Route following: which lane and link a vehicle takes at the end of a lane.
+"""Route following: the lane and the link that a vehicle takes at the end of a lane.
 
-All plans lie in one table, `TripTables.steps`. A vehicle's `way` says where in it: the step of a
-lane outside junctions is `steps[way + lane]`. The plan of a goal covers every lane, so its way
-never changes. An explicit route has steps for its own edges only, one edge after the other; each
-step says by how much the way shifts on the next edge. Inside junctions lanes have one successor.
+All plans are stored in one table, `TripTables.steps`. A vehicle's `way` is an offset into it: the
+step of a lane outside junctions is `steps[way + lane]`. The plan of a goal covers every lane, so
+the `way` of such a vehicle never changes. An explicit route has steps for its own edges only, edge
+by edge; each step contains the shift of the `way` on the next edge. Inside junctions, a lane has
+one successor.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.roads.kernels.signal_phases import program_at
 
-MOST_CHANGES = 8  # of lanes at the end of one lane
+MOST_CHANGES = 8  # lane changes at the end of one lane
 
 
 @inlined_kernel
@@ -28,7 +29,7 @@ def own_step(roads: RoadArrays, row: np.void) -> int:
 
 @inlined_kernel
 def next_step_from(roads: RoadArrays, step: np.void, lane: int, way: int) -> tuple[int, int, int]:
-    """`next_step` from the lane that a vehicle is on, whose own step is known."""
+    """Return `next_step` from a vehicle's own lane, whose PLAN `step` is known."""
     if roads.lanes[lane]["internal"]:
         return roads.lanes[lane]["successor"], way, -1
     return step["next"], way + step["shift"], step["link"]
@@ -36,9 +37,10 @@ def next_step_from(roads: RoadArrays, step: np.void, lane: int, way: int) -> tup
 
 @inlined_kernel
 def next_step(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> tuple[int, int, int]:
-    """What follows the end of a lane: (lane, way there, link that is entered).
+    """Return what follows the end of a lane: (lane, `way` there, link that is entered).
 
-    The lane is -1 where the way ends or goes on from another lane; the link is -1 inside junctions.
+    The lane is -1 if the route ends or continues from another lane. The link is -1 inside
+    junctions.
     """
     if roads.lanes[lane]["internal"]:
         return roads.lanes[lane]["successor"], way, -1
@@ -48,7 +50,7 @@ def next_step(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> tup
 
 @inlined_kernel
 def fed_lane(roads: RoadArrays, lane: int) -> int:
-    """A lane, or where no link leads into it the one beside it into which one does."""
+    """Return a lane or, if no link leads into it, an adjacent lane into which a link leads."""
     row = roads.lanes[lane]
     if row["num_into"] == 0:
         for side in (row["left"], row["right"]):
@@ -59,9 +61,9 @@ def fed_lane(roads: RoadArrays, lane: int) -> int:
 
 @inlined_kernel
 def distance_left(roads: RoadArrays, row: np.void, step: np.void) -> float:
-    """Return the distance in m from a vehicle's centre to the end of its way; inf without one.
+    """Return the distance in m from a vehicle's centre to the end of its route, or inf.
 
-    `step` is its own one.
+    `step` is the PLAN of the vehicle's lane.
     """
     here = roads.lanes[row["lane"]]
     left = -row["s"]
@@ -74,7 +76,7 @@ def distance_left(roads: RoadArrays, row: np.void, step: np.void) -> float:
 def next_step_of_plan(
     roads: RoadArrays, travel: TripTables, lane: int, way: int
 ) -> tuple[int, int, int]:
-    """`next_step`, from the lane that the plan asks for where it does not go on from this one."""
+    """Return `next_step`, after the lane changes that the plan needs on this edge."""
     for _ in range(MOST_CHANGES):
         following, way_there, link = next_step(roads, travel, lane, way)
         if following >= 0 or roads.lanes[lane]["internal"]:
@@ -90,9 +92,10 @@ def next_step_of_plan(
 
 @kernel
 def route_time_s(roads: RoadArrays, travel: TripTables, row: np.void, begin_s: float) -> float:
-    """Return the time in s of a route at its limits, times `TripTables.trip_horizon`, and signals.
+    """Return the time in s after which a trip counts as too long.
 
-    Each signal counts with a whole cycle of the program that is on at `begin_s`.
+    It is the time at the speed limits times `TripTables.trip_horizon`, plus for each signal one
+    cycle of the program that is active at `begin_s`.
     """
     lane, way = row["lane"], row["way"]
     free_s = -row["s"] / roads.lanes[lane]["speed_mps"]

@@ -12,27 +12,27 @@ from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
 
-LONGEST_HALF_M = 10.0  # of vehicles: a body reaches no further from its centre
-STAYS_ASIDE = 2  # a lane change that waits between the two lanes
+LONGEST_HALF_M = 10.0  # half the length of the longest vehicle
+STAYS_ASIDE = 2  # value of `lane_change`: wait between two lanes
 MARGIN_M = 0.1  # on each side of the own body
-ASIDE_MPS = 5.0  # up to here one that sets off between two lanes minds what stands beside it
+ASIDE_MPS = 5.0  # up to this speed, a vehicle between two lanes checks its side clearance
 
 
 @kernel
 def has_side_clearance(
     roads: RoadArrays,
     rows: NDArray[np.void],  # VEHICLE (C,)
-    row: np.void,  # that is, or would be, on its way to the middle of a lane
+    row: np.void,  # VEHICLE that moves, or would move, to the middle of a lane
     target: int,  # that LANE
-    s: float,  # of its centre there, m
-    d: float,  # and how far to the left of the middle it is, m
+    s: float,  # position of its centre on that lane, m
+    d: float,  # offset of its centre from the middle of that lane, m, positive to the left
     side: int,  # to which it moves: 1 left, -1 right
     scratch: Scratch,
 ) -> bool:
     """Return whether a vehicle touches no stopped vehicle on the side to which it moves.
 
-    Vehicles on the lane and on the two beside it count, with those that come to them or have just
-    left them.
+    Vehicles on the lane and on the adjacent lanes count, and vehicles right before or behind these
+    lanes.
     """
     lane = roads.lanes[target]
     x, y, _, cos, sin, _ = lane_pose(roads.points, lane["first_point"], lane["num_points"], s)
@@ -62,13 +62,13 @@ def has_side_clearance(
 def _is_touched(
     rows: NDArray[np.void],
     row: np.void,
-    pose: tuple[float, float, float, float, float],  # x, y, cosine and sine, and the side
+    pose: tuple[float, float, float, float, float],  # x, y, cosine, sine, side
     lane: int,
     place: float,
     reach: float,
     scratch: Scratch,
 ) -> bool:
-    """Whether a body at a pose touches one that stands within reach of a place on a lane."""
+    """Return whether a body at a pose touches a stopped vehicle near a position of a lane."""
     x, y, cos, sin, side = pose
     half, half_width = 0.5 * row["length"] + MARGIN_M, 0.5 * row["width"] + MARGIN_M
     for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
@@ -89,8 +89,10 @@ def _is_touched(
 
 
 @inlined_kernel
-def stays_aside(roads: RoadArrays, rows: NDArray[np.void], row: np.void, scratch: Scratch) -> bool:
-    """Whether one between two lanes stays aside: it would touch another that stands."""
+def has_to_stay_aside(
+    roads: RoadArrays, rows: NDArray[np.void], row: np.void, scratch: Scratch
+) -> bool:
+    """Return whether a vehicle between two lanes has to stay there to touch no stopped vehicle."""
     if row["d"] == 0.0 or row["speed"] > ASIDE_MPS:
         return False
     side = -1 if row["d"] > 0.0 else 1

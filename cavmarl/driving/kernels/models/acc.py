@@ -1,35 +1,42 @@
-"""Adaptive cruise control: the acceleration that a measured controller asks for.
+"""Adaptive cruise control (ACC): the acceleration of a controller that was fitted to measurements.
 
 Milanés, Shladover: "Modeling cooperative and autonomous adaptive cruise control dynamic responses
 using experimental data", Transportation Research C 48, 2014; Xiao, Wang, van Arem: "Realistic
 car-following models for microscopic simulation of adaptive and cooperative adaptive cruise control
-vehicles", Transportation Research Record 2623, 2017, whose four modes these are. A vehicle keeps no
-mode from tick to tick: what stands ahead decides. As SUMO does, it never exceeds the safe speed of
-Krauss's model by more than `EMERGENCY_MPS`.
+vehicles", Transportation Research Record 2623, 2017, which describes the four modes. The mode is
+chosen anew in every tick, from the gap and the speeds. As in SUMO, the speed exceeds the safe speed
+of Krauss's model by at most `EMERGENCY_MPS`.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.scalars import clamp
+from cavmarl.core.records.codes import MODEL_ACC
+from cavmarl.driving.kernels.models.acceleration_models import acceleration_model
+from cavmarl.driving.kernels.models.car_following_model import CarFollowingModel
 from cavmarl.driving.kernels.models.krauss import safe_speed
 
-SPEED_MODE_S = 2.0  # time gap in s above which a leader does not count
+# Gains of the distance error in 1/s² (`…_SPACE`) and of the speed difference in 1/s (`…_SPEED`).
+SPEED_MODE_S = 2.0  # speed mode: the time gap is larger than this, and the leader is ignored
 SPEED_GAIN = 0.4  # 1/s
-CONTROL_SPACE, CONTROL_SPEED = 0.23, 0.07  # 1/s², 1/s: near the wanted gap,
-CONTROL_M, CONTROL_MPS = 0.2, 0.1  # nearer than so
-CLOSING_SPACE, CLOSING_SPEED = 0.04, 0.8  # the gap is larger
-AVOIDING_SPACE, AVOIDING_SPEED = 0.8, 0.23  # it is smaller
+CONTROL_SPACE, CONTROL_SPEED = 0.23, 0.07  # gap control mode
+CONTROL_M, CONTROL_MPS = 0.2, 0.1  # largest distance error and speed difference of that mode
+CLOSING_SPACE, CLOSING_SPEED = 0.04, 0.8  # gap closing mode
+AVOIDING_SPACE, AVOIDING_SPEED = 0.8, 0.23  # collision avoidance mode: the gap is too small
 EMERGENCY_MPS = 2.0
-SLOW_MPS, FAST_MPS = 10.8, 15.0  # the slower, the more room beyond the time gap:
-SLOW_ROOM_M = 2.0  # below the first; above the second none
+# Room in addition to the time gap: `SLOW_ROOM_M` below the first speed, none above the second one.
+SLOW_MPS, FAST_MPS = 10.8, 15.0
+SLOW_ROOM_M = 2.0
 
 
 @kernel
 def _extra_room_m(speed: float) -> float:
-    """The room in m that is kept beyond the time gap."""
+    """Return the room in m that is kept in addition to the time gap."""
     if speed >= FAST_MPS:
         return 0.0
     return 75.0 / speed - 5.0 if speed >= SLOW_MPS else SLOW_ROOM_M
@@ -38,15 +45,15 @@ def _extra_room_m(speed: float) -> float:
 @kernel
 def acc_acceleration(
     speed: float,  # m/s
-    allowed: float,  # the speed to keep on a free road, m/s
-    room: float,  # to the leader, less the gap at rest, m; inf: there is none
+    allowed: float,  # desired speed on a free road, m/s
+    room: float,  # gap to the leader minus the gap at rest, m; infinite without a leader
     front_speed: float,  # of the leader, m/s
-    front_decel: float,  # with which the leader can brake in comfort, m/s²
-    tau: float,  # time gap to keep, s
-    accel: float,  # the most that it accelerates, m/s²
-    decel: float,  # the most that it brakes to keep a speed, m/s², positive
+    front_decel: float,  # the leader's comfortable deceleration, m/s², positive
+    tau: float,  # desired time gap, s
+    accel: float,  # largest acceleration, m/s²
+    decel: float,  # largest deceleration in speed mode, m/s², positive
 ) -> float:
-    """Acceleration in m/s², at most `accel`."""
+    """Return the acceleration in m/s², at most `accel`."""
     asked = clamp(SPEED_GAIN * (allowed - speed), -decel, accel)
     if room == math.inf:
         return asked
@@ -61,3 +68,18 @@ def acc_acceleration(
             asked = min(asked, CLOSING_SPACE * error + CLOSING_SPEED * faster)
     safe = safe_speed(room, front_speed, decel, front_decel, tau) + EMERGENCY_MPS
     return min(asked, (safe - speed) / tau)
+
+
+@kernel
+def _acceleration(
+    kind: np.void, speed: float, allowed: float, gap: float, front_speed: float, front_decel: float
+) -> float:
+    min_gap = float(kind["min_gap"])
+    tau = float(kind["tau"])
+    accel = float(kind["accel"])
+    decel = float(kind["decel"])
+    room = gap - min_gap
+    return acc_acceleration(speed, allowed, room, front_speed, front_decel, tau, accel, decel)
+
+
+ACC = CarFollowingModel("ACC", MODEL_ACC, acceleration_model(_acceleration))

@@ -1,26 +1,34 @@
 """Krauss's model: the speed from which a driver can still stop behind its leader.
 
 Krauss: "Microscopic modeling of traffic flow: investigation of collision free vehicle dynamics",
-DLR-Forschungsbericht 98-08, 1998, eq. 2.13, in the form that SUMO drives by default: the leader's
-braking distance is taken with the harder of both decelerations.
+DLR-Forschungsbericht 98-08, 1998, eq. 2.13, in the form that is SUMO's default: the leader's
+braking distance is computed with the larger of the two decelerations.
 """
 
 from __future__ import annotations
 
 import math
 
-from cavmarl.core.compiled import kernel
+import numpy as np
+
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.driving.kernels.models.car_following_model import (
+    LINE_MARGIN_M,
+    CarFollowingModel,
+    FollowingFunctions,
+)
 
 
 @kernel
 def safe_speed(
-    gap: float,  # m that may be used up; a negative one answers 0 m/s
+    gap: float,  # m that may be used up; a negative gap gives 0 m/s
     front_speed: float,  # of the leader, m/s; 0 for a line
-    decel: float,  # with which the driver brakes, m/s², positive
-    front_decel: float,  # with which the leader brakes, m/s², positive
-    reaction_s: float,  # before the driver brakes, s
+    decel: float,  # of the driver, m/s², positive
+    front_decel: float,  # of the leader, m/s², positive
+    reaction_s: float,  # time before the driver brakes, s
 ) -> float:
-    """The largest speed in m/s at which braking after `reaction_s` does not use up the gap.
+    """Return the largest speed in m/s at which braking after `reaction_s` does not use up the gap.
 
     Solves v · reaction_s + v² / (2 · decel) = gap + front_speed² / (2 · max(decel, front_decel)).
     """
@@ -33,12 +41,60 @@ def safe_speed(
 
 @kernel
 def dawdle(
-    speed: float,  # wanted, m/s
+    speed: float,  # without imperfection, m/s
     accel: float,  # the largest acceleration, m/s²
     sigma: float,  # imperfection in [0, 1]
     share: float,  # a random number in [0, 1)
     dt: float,  # seconds of the tick
 ) -> float:
-    """The speed that is left of a wanted one by imperfect driving, in m/s."""
-    # A vehicle that starts from a stand is slowed in proportion, so that it does start.
+    """Return the speed in m/s after the random loss of imperfect driving."""
+    # At low speed the loss is proportional to the speed, so that a standing vehicle can start.
     return max(speed - dt * sigma * min(accel, speed) * share, 0.0)
+
+
+@inlined_kernel
+def _no_constraint(kind: np.void) -> float:
+    return -math.inf
+
+
+@inlined_kernel
+def _behind(
+    kind: np.void, speed: float, gap: float, front_speed: float, front_decel: float
+) -> float:
+    return -_speed_behind(kind, gap, front_speed, front_decel)
+
+
+@inlined_kernel
+def _before_line(kind: np.void, speed: float, gap: float, dt: float) -> float:
+    return -safe_speed(gap - LINE_MARGIN_M, 0.0, kind["decel"], kind["decel"], dt)
+
+
+@inlined_kernel
+def _wish(kind: np.void, speed: float, allowed: float, constraint: float) -> float:
+    # The next speed is reached within a reaction time, whatever the length of a tick.
+    wanted = min(-constraint, allowed, speed + kind["accel"] * kind["tau"])
+    return float((wanted - speed) / kind["tau"])
+
+
+@inlined_kernel
+def _speed_behind(kind: np.void, gap: float, front_speed: float, front_decel: float) -> float:
+    room = gap - kind["min_gap"]
+    return safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
+
+
+@inlined_kernel
+def _response(
+    kind: np.void, speed: float, allowed: float, constraint: float, share: float, dt: float
+) -> float:
+    wanted = min(-constraint, allowed, speed + kind["accel"] * dt)
+    wanted = dawdle(max(wanted, 0.0), kind["accel"], kind["sigma"], share, dt)
+    return float(max((wanted - speed) / dt, -kind["emergency_decel"]))
+
+
+KRAUSS = CarFollowingModel(
+    "Krauss",
+    MODEL_KRAUSS,
+    FollowingFunctions(_no_constraint, _behind, _before_line, _wish, _speed_behind, _response),
+    as_sumo=True,
+    uses_sigma=True,
+)

@@ -1,7 +1,7 @@
-"""Driver models from outside of the package: kernels call them through a table of addresses.
+"""Driver models that a user registers: kernels call them through a table of addresses.
 
-The table is a symbol, by name: compiled kernels refer to the name and not to what stands there, so
-their code is the same whichever models are registered.
+Compiled kernels refer to the table by the name of a symbol and not to its content. So their code is
+the same, whichever models are registered.
 """
 
 from __future__ import annotations
@@ -9,9 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from cavmarl.core.compiled import IS_PLAIN
+import numpy as np
+
+from cavmarl.core.compiled import IS_PLAIN, kernel
 from cavmarl.core.compiled.address_tables import define_table
 from cavmarl.core.compiled.intrinsic import intrinsic
+from cavmarl.driving.kernels.models.acceleration_models import acceleration_model
 
 FIRST_REGISTERED = 16  # MODEL_* code of the first registered model
 MAX_REGISTERED = 64
@@ -24,11 +27,11 @@ _COMPILED: dict[int, Any] = {}  # keeps the machine code of the addresses
 
 
 def put_model(code: int, model: Callable[..., float]) -> None:
-    """Let `ask_model` find a model; it is compiled now, and not kept on disk.
+    """Compile a model, and enter it in the table for `ask_model`; it is not kept on disk.
 
     Raises:
-        MissingExtraError: there is no Numba to compile the model with.
-        numba.core.errors.NumbaError: it does not compile.
+        MissingExtraError: Numba is not installed.
+        numba.core.errors.NumbaError: Numba cannot compile the model.
     """
     if not IS_PLAIN:
         from cavmarl.core.compiled.compiler import compile_callback
@@ -40,7 +43,7 @@ def put_model(code: int, model: Callable[..., float]) -> None:
 
 
 def _generate_call(typing: Any, code: Any, *numbers: Any) -> Any:
-    """Call what the table holds for a code."""
+    """Generate a call of the function whose address the table holds for a code."""
     from llvmlite import ir
     from numba.core import types
 
@@ -52,7 +55,7 @@ def _generate_call(typing: Any, code: Any, *numbers: Any) -> Any:
         if table is None:
             table = ir.GlobalVariable(module, table_type, _SYMBOL)
             table.linkage = "external"
-        # By `*numbers` the rest comes as one tuple.
+        # The second argument is the tuple `*numbers`.
         values = [builder.extract_value(arguments[1], k) for k in range(_NUM_NUMBERS)]
         index = builder.sub(arguments[0], place(FIRST_REGISTERED))
         address = builder.load(builder.gep(table, [place(0), index]))
@@ -79,3 +82,18 @@ def ask_model(
 ) -> float:
     """Return the acceleration in m/s² that a registered model asks for."""
     return float(_MODELS[code](speed, allowed, gap, front_speed, min_gap, tau, accel, decel))
+
+
+@kernel
+def _acceleration(
+    kind: np.void, speed: float, allowed: float, gap: float, front_speed: float, front_decel: float
+) -> float:
+    min_gap = float(kind["min_gap"])
+    tau = float(kind["tau"])
+    accel = float(kind["accel"])
+    decel = float(kind["decel"])
+    code = int(kind["model"])
+    return ask_model(code, speed, allowed, gap, front_speed, min_gap, tau, accel, decel)
+
+
+REGISTERED = acceleration_model(_acceleration)  # of all registered models

@@ -1,8 +1,8 @@
-"""The kinematic bicycle: how a car moves under acceleration and steering.
+"""The kinematic bicycle model: the motion of a car for an acceleration and a steering angle.
 
 Polack, Altché, d'Andréa-Novel, de La Fortelle: "The kinematic bicycle model: a consistent model for
-planning feasible trajectories for autonomous vehicles?", IV 2017; integrated as highway-env's
-`Vehicle.step`, with the same limits.
+planning feasible trajectories for autonomous vehicles?", IV 2017. The integration and the limits
+are those of highway-env's `Vehicle.step`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import cos_sin, tangent
 from cavmarl.core.math.geometry import wrap_angle
 
-MAX_SPEED_MPS = 40.0  # beyond it the engine gives way
+MAX_SPEED_MPS = 40.0  # the motor limits the speed
 MIN_SPEED_MPS = -40.0
 
 
@@ -25,10 +25,10 @@ def bicycle_step(
     speed: float,  # m/s along the heading, negative backwards
     accel: float,  # m/s²
     steering: float,  # angle of the front wheels in rad, within (-pi/2, pi/2), positive to the left
-    length: float,  # of the car, m; its half is the distance from the centre to each axle
+    length: float,  # of the car, m; the distance from the centre to each axle is half of it
     dt: float,  # s
 ) -> tuple[float, float, float, float, float]:
-    """Move a car for one tick; place and heading with the speed before it, explicit Euler.
+    """Move a car for one tick by explicit Euler, with the speed before the tick.
 
         slip    = atan(tan(steering) / 2)
         x      += speed · cos(heading + slip) · dt
@@ -37,10 +37,10 @@ def bicycle_step(
         speed  += accel · dt
 
     Returns:
-        x, y, heading, speed after the tick, and the yaw rate during it in rad/s. The heading
-        is kept in (-pi, pi]; highway-env lets it grow.
+        x, y, heading and speed after the tick, and the yaw rate during the tick in rad/s. The
+        heading is normalized to (-pi, pi]; in highway-env it is not.
     """
-    # Sine and cosine of the slip angle without inverse functions: tan(slip) is known.
+    # tan(slip) is known, so sine and cosine of the slip angle need no inverse functions.
     tan_slip = 0.5 * tangent(steering)
     cos_slip = 1.0 / math.sqrt(1.0 + tan_slip * tan_slip)
     sin_slip = tan_slip * cos_slip

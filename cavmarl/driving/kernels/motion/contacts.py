@@ -12,18 +12,19 @@ from cavmarl.core.math.elementary import cos_sin, cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.math.neighbors import Grid, aim, cell_at, cell_columns, cell_rows
 
-APART_M = 1e-6  # more than rounding makes of a distance
+APART_M = 1e-6  # larger than rounding errors of a distance
 
 
 @kernel
 def _bodies_touch(one: np.void, other: np.void) -> bool:
-    """Whether two VEHICLE records overlap: their rectangles share area and their heights overlap.
+    """Return whether two VEHICLE records overlap, in the plane and in height.
 
-    Vehicles on and under a bridge do not touch: their `z` differ by half the sum of their heights.
+    Vehicles on and under a bridge do not touch: their `z` differ by at least half the sum of their
+    heights.
     """
     cos, sin = cos_sin(one["heading"])
-    # The quick answer for those side by side on two lanes: how far the other one reaches towards
-    # the one, be it turned by so much. No sine is larger than its angle.
+    # Early exit for vehicles on adjacent lanes: compare the lateral distance with an upper bound of
+    # both half-widths. The sine of the angle between them is at most the angle.
     turn = abs(one["heading"] - other["heading"])
     reach = 0.5 * (one["width"] + other["width"] + turn * other["length"])
     across = (other["y"] - one["y"]) * cos - (other["x"] - one["x"]) * sin
@@ -51,12 +52,15 @@ def _bodies_touch(one: np.void, other: np.void) -> bool:
 def find_contacts(
     rows: NDArray[np.void],  # VEHICLE (C,)
     num: int,  # live rows of the world; at most the grid's capacity
-    grid: Grid,  # its `newest` and `spots` are overwritten
-    hit: NDArray[np.int64],  # (C,) by VEHICLE row, overwritten up to `num`: an id, or -1
+    grid: Grid,  # `newest` and `spots` are overwritten
+    # (C,) for each row the smallest id of the vehicles that it touches, or -1; overwritten up to
+    # `num`
+    hit: NDArray[np.int64],
 ) -> bool:
-    """For each vehicle the smallest id of those that it touches; whether any two do.
+    """Find the contacts of all vehicles, and return whether there are any.
 
-    One pass: each vehicle looks at those that are in the cells already and joins them.
+    In one pass, each vehicle is compared with the vehicles that are already in the grid, and then
+    added to the grid.
     """
     grid.newest[:] = -1
     aim(grid, rows, num)
@@ -84,7 +88,7 @@ def find_contacts(
 def _touches_earlier(
     rows: NDArray[np.void], i: int, spot: np.void, reach: float, grid: Grid, hit: NDArray[np.int64]
 ) -> bool:
-    """Note the vehicles in the cells that row i touches."""
+    """Write the contacts of row i with vehicles in the grid, and return whether there are any."""
     found = False
     first_column, last_column = cell_columns(grid, spot["x"], reach)
     first_row, last_row = cell_rows(grid, spot["y"], reach)
@@ -97,15 +101,15 @@ def _touches_earlier(
                 dy = spot["y"] - other["y"]
                 near = spot["radius"] + other["radius"]
                 if dx * dx + dy * dy < near * near and _bodies_touch(rows[i], rows[k]):
-                    _note(hit, i, rows[k]["id"])
-                    _note(hit, k, rows[i]["id"])
+                    _keep_smallest(hit, i, rows[k]["id"])
+                    _keep_smallest(hit, k, rows[i]["id"])
                     found = True
                 k = other["next"]
     return found
 
 
 @kernel
-def _note(hit: NDArray[np.int64], row: int, vehicle_id: int) -> None:
-    """Keep the smallest id seen."""
+def _keep_smallest(hit: NDArray[np.int64], row: int, vehicle_id: int) -> None:
+    """Keep the smallest id."""
     if hit[row] < 0 or vehicle_id < hit[row]:
         hit[row] = vehicle_id

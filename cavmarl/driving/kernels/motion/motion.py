@@ -1,8 +1,8 @@
-"""Motion of one vehicle over one tick, within its record.
+"""Motion of one vehicle over one tick, in place in its record.
 
-Background vehicles move along their lanes: arc length by the decided acceleration, lateral offset
-towards the lane's centre, the body a chord of the way. Agents' vehicles are kinematic
-bicycles that go where they are steered; `tracking.locate` then finds their place on the lanes.
+Background vehicles move along their lanes: `s` follows from the decided acceleration, `d` moves
+towards the lane's centre, and the body is a chord of the path. Agents' vehicles are kinematic
+bicycles; `tracking.locate` then finds their place on the lanes.
 """
 
 from __future__ import annotations
@@ -27,20 +27,21 @@ from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 from cavmarl.driving.kernels.motion.ordered_stops import advance_stop
 from cavmarl.driving.kernels.motion.tracking import locate, side_lane
 
-LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
-LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
-LATERAL_MIN_MPS = 0.5  # but never stuck between two lanes
-MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle that changes lanes and its lane,
-MAX_SWING_M = 0.3  # and by how much its corners swing out, at most
-MAX_BODY_LANES = 8  # that a body may lie on, before and behind its centre
+LATERAL_MPS = 1.4  # largest lateral speed of a lane change
+LATERAL_RATIO = 0.35  # largest lateral speed as a share of the speed
+LATERAL_MIN_MPS = 0.5  # but at least this, so that no vehicle is stuck between two lanes
+MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle that changes lanes and its lane
+MAX_SWING_M = 0.3  # largest distance by which its corners swing out
+MAX_BODY_LANES = 8  # lanes that a body can cover, in each direction from its centre
 STANDING_MPS = 0.1
-ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge; a background one's front
+# A trip ends this far before the end of its goal edge; for a background vehicle, its front counts.
+ARRIVE_M = 5.0
 MAX_SPEED_MPS = 60.0
-CROSSINGS_PER_TICK = 16  # lane borders that one tick can cross
+CROSSINGS_PER_TICK = 16  # largest number of lane borders crossed in one tick
 
 
 class Before(NamedTuple):
-    """What motion still asks of the committed record once it has begun to write the next one."""
+    """The fields of the committed record that motion needs after it has overwritten them."""
 
     speed: float  # m/s
     accel: float  # m/s²
@@ -52,7 +53,7 @@ class Before(NamedTuple):
 
 @inlined_kernel
 def before_tick(row: np.void) -> Before:
-    """Of a record that nothing has moved yet."""
+    """Return these fields of a record, before it moves."""
     return Before(row["speed"], row["accel"], row["heading"], row["lane"], row["link"], row["way"])
 
 
@@ -60,7 +61,7 @@ def before_tick(row: np.void) -> Before:
 def _way_point(
     roads: RoadArrays, travel: TripTables, row: np.void, s: float
 ) -> tuple[float, float]:
-    """X and y of a place on a vehicle's way, `s` m from the start of its lane, or behind it."""
+    """Return x and y of a point of a vehicle's path, `s` m from the start of its lane."""
     lane = row["lane"]
     way = row["way"]
     for _ in range(MAX_BODY_LANES):
@@ -87,7 +88,7 @@ def _way_point(
 
 @kernel
 def lane_before(roads: RoadArrays, lane: int, link: int) -> int:
-    """The lane that a vehicle has come from which has entered `link` last, or -1."""
+    """Return the lane before `lane` for a vehicle that last entered `link`, or -1."""
     here = roads.lanes[lane]
     if here["internal"]:
         return int(roads.into[here["first_into"]])
@@ -101,9 +102,9 @@ def lane_before(roads: RoadArrays, lane: int, link: int) -> int:
 
 @inlined_kernel
 def place_on_lane(roads: RoadArrays, travel: TripTables, row: np.void) -> float:
-    """Set x, y, z and pitch from lane, s and d; returns the direction of the body in rad.
+    """Set x, y, z and pitch from lane, s and d, and return the direction of the body in rad.
 
-    Both bumpers are on the way: in a bend the body is its chord.
+    Both bumpers are on the path: in a bend, the body is a chord.
     """
     lane = roads.lanes[row["lane"]]
     point = roads.points[
@@ -137,9 +138,9 @@ def place_on_lane(roads: RoadArrays, travel: TripTables, row: np.void) -> float:
 
 @inlined_kernel
 def account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: float) -> None:
-    """What motion of every kind leaves in the record: rates, ways, waiting time.
+    """Update the rates, distances and waiting time of a record after any kind of motion.
 
-    `pace` is the speed over the limit with which the way would have been driven freely.
+    `pace` is the free-flow speed divided by the speed limit.
     """
     row["accel"] = (row["speed"] - before.speed) / dt
     row["jerk"] = (row["accel"] - before.accel) / dt
@@ -154,7 +155,7 @@ def account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: fl
 
 @kernel
 def _cross_borders(roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
-    """Carry s beyond lane ends over to the lanes of the way; False where the way ends."""
+    """Move a row whose s is beyond its lane's end to the next lanes; False if the route ends."""
     for _ in range(CROSSINGS_PER_TICK):
         length = roads.lanes[row["lane"]]["length_m"]
         if row["s"] < length:
@@ -175,7 +176,7 @@ def _cross_borders(roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
 
 @inlined_kernel
 def _stand(row: np.void, throttle: float, dt: float) -> None:
-    """What changes in the record of a background vehicle that stands."""
+    """Update the record of a background vehicle that stands still."""
     row["throttle"] = throttle
     row["jerk"] = -row["accel"] / dt
     row["accel"] = 0.0
@@ -190,16 +191,16 @@ def _stand(row: np.void, throttle: float, dt: float) -> None:
 def move_background(
     roads: RoadArrays,
     travel: TripTables,
-    row: np.void,  # VEHICLE, the committed record, which becomes the next one
-    step: np.void,  # PLAN, its own step before the tick
-    accel: float,  # decided acceleration in m/s²
-    lane_change: int,  # 1 to the left, -1 to the right, 0 none, or STAYS_ASIDE
-    dt: float,  # seconds of the tick
+    row: np.void,  # VEHICLE, the committed record; updated
+    step: np.void,  # PLAN of its lane before the tick
+    accel: float,  # decided acceleration, m/s²
+    lane_change: int,  # 1 left, -1 right, 0 none, or STAYS_ASIDE
+    dt: float,  # length of the tick, s
 ) -> None:
     """Advance a background vehicle by one tick.
 
-    The new speed drives the whole tick (semi-implicit Euler), as the safe speed of Krauss's model
-    takes it.
+    The new speed holds for the whole tick (semi-implicit Euler), as the safe speed of Krauss's
+    model assumes.
     """
     before = before_tick(row)
     speed = clamp(before.speed + accel * dt, 0.0, MAX_SPEED_MPS)
@@ -251,19 +252,19 @@ def move_background(
 def move_agent(
     roads: RoadArrays,
     plans: NDArray[np.void],  # PLAN (G, L)
-    grid: LaneGrid,  # which lanes lie near a place
-    row: np.void,  # VEHICLE, the committed record, which becomes the next one
+    grid: LaneGrid,  # the lanes near each place
+    row: np.void,  # VEHICLE, the committed record; updated
     kind: np.void,  # its VTYPE
-    throttle: float,  # commanded acceleration in m/s²
-    steering: float,  # commanded angle of the front wheels in rad
-    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
-    dt: float,  # seconds of the tick
+    throttle: float,  # commanded acceleration, m/s²
+    steering: float,  # commanded angle of the front wheels, rad
+    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
+    dt: float,  # length of the tick, s
 ) -> None:
     """Advance an agent's vehicle by one tick."""
     before = before_tick(row)
     throttle = clamp(throttle, -kind["most_decel"], kind["most_accel"])
     steering = clamp(steering, -kind["most_steering"], kind["most_steering"])
-    # No reverse gear: the brake ends at a standstill.
+    # There is no reverse gear: braking ends at a standstill.
     throttle = max(throttle, -before.speed / dt)
     x, y, heading, speed, _ = bicycle_step(
         row["x"], row["y"], before.heading, before.speed, throttle, steering, kind["wheelbase"], dt

@@ -1,4 +1,4 @@
-"""Ordered stops: bus stops, deliveries, and other stops that a demand file asks for."""
+"""Ordered stops: bus stops, deliveries and other stops in a demand file."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import UNTIL_DEPARTURE
 
 STANDING_MPS = 0.1
-STOPPED_M = 3.0  # a front this far before the place has reached it
-PASSED_M = 1.0  # a front this far beyond it will not stop there any more
+STOPPED_M = 3.0  # a vehicle has reached a stop if its front is at most this far before it
+PASSED_M = 1.0  # a vehicle has missed a stop if its front is this far beyond it
 STAY = 2  # result of `change_for_stop`
-LANE_EARLY_M = 100.0  # this far before it the driver wants its lane
+LANE_EARLY_M = 100.0  # distance before a stop at which the driver changes to its lane
 
 
 @inlined_kernel
@@ -35,7 +35,7 @@ def distance_to_stop(roads: RoadArrays, travel: TripTables, row: np.void) -> flo
 def change_for_stop(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
     """Return the side to which a vehicle has to change for its next stop: 1 left, -1 right, 0 none.
 
-    The result is `STAY` if it is on that lane already.
+    The result is `STAY` if the vehicle is already on the lane of the stop.
     """
     if distance_to_stop(roads, travel, row) > LANE_EARLY_M:
         return 0
@@ -43,7 +43,7 @@ def change_for_stop(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
     if stop["lane"] == row["lane"]:
         return STAY
     inwards = 1 if stop["lane"] > row["lane"] else -1
-    # Lanes count from the kerb: where one drives on the left, the next one lies to the right.
+    # Lanes are numbered from the kerb: in left-hand traffic the next lane is to the right.
     here = roads.lanes[row["lane"]]
     mirrored = here["right"] == row["lane"] + 1 or here["left"] == row["lane"] - 1
     return -inwards if mirrored else inwards
@@ -54,10 +54,10 @@ def advance_stop(
     roads: RoadArrays,
     travel: TripTables,  # with the stops
     row: np.void,  # VEHICLE after the tick, written
-    lane_before: int,  # LANE that it was on before
-    dt: float,  # seconds a tick
+    lane_before: int,  # LANE of the vehicle before the tick
+    dt: float,  # length of a tick, s
 ) -> None:
-    """Count the time that a vehicle has spent at its stop, and end the stop when it is over.
+    """Add the tick to the time that a vehicle has spent at its stop, and end the stop when due.
 
     A stop that the vehicle has passed is skipped.
     """

@@ -1,8 +1,8 @@
-"""Rows that follow a script: pedestrians, and the vehicles of scenarios.
+"""Rows that follow a script: pedestrians and the vehicles of scenarios.
 
-A script is made before the first step: one FRAME a tick, each of which says which one follows. At
-some it waits until its cue has come. So where a row is depends on its frame and the cues alone,
-and every owner of the row moves it the same way.
+A script is computed before the first step. It has one FRAME per tick, and each FRAME names the next
+one. At some frames, the row waits for a cue. The place of a row depends only on its frame and on
+the cues, so every owner moves the row in the same way.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from cavmarl.driving.kernels.motion.motion import account, before_tick
 
 @inlined_kernel
 def stand_at(frame: np.void, row: np.void) -> None:
-    """Put a row where a FRAME says."""
+    """Set the position and the speed of a row to those of a FRAME."""
     row["x"] = frame["x"]
     row["y"] = frame["y"]
     row["z"] = frame["z"]
@@ -35,7 +35,7 @@ def stand_at(frame: np.void, row: np.void) -> None:
 
 @inlined_kernel
 def _let_go(roads: RoadArrays, travel: TripTables, row: np.void, goal: int) -> None:
-    """Make a row that of a background vehicle on its way to a goal."""
+    """Turn a row into a background vehicle with a goal."""
     row["driver"] = DRIVER_BACKGROUND
     row["goal"] = goal
     row["way"] = goal * roads.lanes.shape[0]
@@ -46,9 +46,9 @@ def _let_go(roads: RoadArrays, travel: TripTables, row: np.void, goal: int) -> N
 def follow_script(
     roads: RoadArrays,
     travel: TripTables,  # with the scripts
-    cues: NDArray[np.int64],  # (T,) the tick in which each came, -1: not yet
-    row: np.void,  # VEHICLE, the committed record, which becomes the next one
-    dt: float,  # seconds of the tick
+    cues: NDArray[np.int64],  # (T,) the tick in which each cue came, -1: not yet
+    row: np.void,  # VEHICLE, the committed record; updated
+    dt: float,  # length of the tick, s
 ) -> None:
     """Advance a row that follows a script by one tick."""
     before = before_tick(row)
@@ -65,14 +65,14 @@ def follow_script(
 @kernel
 def note_cues(
     cues: NDArray[np.void],  # CUE (T,)
-    rows: NDArray[np.void],  # VEHICLE (k, W, C), the committed ones of all zones
+    rows: NDArray[np.void],  # VEHICLE (k, W, C), the committed rows of all zones
     num_owned: NDArray[np.int64],  # (k, W)
     ticks: NDArray[np.int64],  # (W,) since reset
-    came: NDArray[np.int64],  # (W, T) the tick in which each came, -1: not yet; written
+    came: NDArray[np.int64],  # (W, T) the tick in which each cue came, -1: not yet; updated
 ) -> None:
-    """Note which cues come in this tick: at their time, or as soon as an agent is near a place.
+    """Record the cues that come in this tick: at their time, or when an agent is near their place.
 
-    An any-of over all agents of a world: neither the order of rows nor their owners matter.
+    The result does not depend on the order of rows or on their owners.
     """
     for w in range(ticks.size):
         for c in range(cues.size):

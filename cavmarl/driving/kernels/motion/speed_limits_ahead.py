@@ -1,4 +1,4 @@
-"""Speed limits ahead: how fast a driver may be before a lower limit or a sharp bend."""
+"""Speed limits ahead: the allowed speed before a lower limit or a sharp bend."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import atan2
 from cavmarl.core.records.arrays import RoadArrays
 
-LIMIT_DECEL = 2.0  # m/s², how a driver slows for a bend, or a lower limit ahead
-LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
-LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
-MIN_BEND_RAD = 0.2  # by more than this
-BEND_M = 6.0  # within this length
+LIMIT_DECEL = 2.0  # m/s², deceleration before a bend or a lower limit
+LIMIT_LEAD_S = 1.0  # the limit is reached this much earlier, as the model reacts with a delay
+LATERAL_ACCEL = 2.5  # m/s², lateral acceleration of a steered car in a bend
+# A bend is a change of direction by more than `MIN_BEND_RAD` within `BEND_M`.
+MIN_BEND_RAD = 0.2
+BEND_M = 6.0
 
 
 @kernel
 def bend_speed(roads: RoadArrays, before: int, lane: int, distance: float) -> float:
-    """Return the speed in m/s, now, at which a steered car can take all bends of a lane in comfort.
+    """Return the largest present speed in m/s with which a steered car can take a lane's bends.
 
-    `distance` is the way to the start of the lane in m, negative on it; there it comes from the
-    lane `before`, which is the same where it is on it.
+    `distance` is the distance in m to the start of the lane, negative on the lane. `before` is the
+    previous lane, or the lane itself if the car is on it.
     """
     row = roads.lanes[lane]
     first = row["first_point"]

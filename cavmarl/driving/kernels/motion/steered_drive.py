@@ -1,4 +1,4 @@
-"""The way of a steered car over a junction, as the built-in driver steers."""
+"""The path of a steered car over a junction, with the steering of the built-in driver."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from cavmarl.driving.kernels.motion.steering import steer_to_lane
 from cavmarl.driving.kernels.motion.tracking import locate
 
 ACCEL = 1.5  # m/s², out of a bend
-MOST_MPS = 10.0  # poses are near to one another: a tick apart
+MOST_MPS = 10.0  # so that successive poses, a tick apart, are close to one another
 LEAST_MPS = 1.0
-LANES_AHEAD = 4  # whose bends are asked about
+LANES_AHEAD = 4  # number of lanes ahead whose bends limit the speed
 
 
 @kernel
 def _allowed_mps(roads: RoadArrays, plan: NDArray[np.void], row: np.void) -> float:
-    """How fast it may be for the bends of its way."""
+    """Return the speed in m/s that the bends ahead allow."""
     lane = row["lane"]
     allowed = min(MOST_MPS, bend_speed(roads, lane, lane, -row["s"]))
     distance = roads.lanes[lane]["length_m"] - row["s"]
@@ -40,18 +40,22 @@ def _allowed_mps(roads: RoadArrays, plan: NDArray[np.void], row: np.void) -> flo
 @kernel
 def steered_poses(
     roads: RoadArrays,
-    plan: NDArray[np.void],  # PLAN (1, L) with what follows the lanes of the way, and the link
+    plan: NDArray[np.void],  # PLAN (1, L) with the next lanes of the path, and the link
     grid: LaneGrid,
-    row: np.void,  # VEHICLE, a blank one with its size; written
-    wheelbase: float,  # m, its own one
-    steering_rad: float,  # the most that its front wheels turn
-    link: int,  # that it takes
-    begin_m: float,  # before the line of it
-    end_m: float,  # behind the junction
+    row: np.void,  # VEHICLE, blank except for its size; overwritten
+    wheelbase: float,  # m
+    steering_rad: float,  # largest steering angle
+    link: int,  # LINK that the car takes
+    begin_m: float,  # start, before the stop line
+    end_m: float,  # end, behind the junction
     dt: float,  # s
-    poses: NDArray[np.float64],  # (m, 6) place from the line, x, y, z, cosine and sine; written
-) -> int:  # how many there are
-    """Drive a car over a link and note where it is; it ends where it leaves its way."""
+    # (m, 6) distance from the stop line, x, y, z, cosine and sine of the heading; overwritten
+    poses: NDArray[np.float64],
+) -> int:
+    """Drive a car over a link, write its poses, and return their number.
+
+    The drive ends early if the car leaves its path.
+    """
     way = roads.links[link]
     lane = way["from_lane"]
     here = roads.lanes[lane]

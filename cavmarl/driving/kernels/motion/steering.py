@@ -1,4 +1,4 @@
-"""How an action becomes throttle and steering: meta-actions, and the controllers behind them."""
+"""Conversion of actions to throttle and steering: meta-actions and their controllers."""
 
 from __future__ import annotations
 
@@ -24,30 +24,33 @@ from cavmarl.driving.kernels.motion.highway_control import (
     steering_control,
 )
 
-AIM_M = 4.0  # in a bend a driver aims at a place of the way so far ahead, or further:
-AIM_S = 0.6  # where it is after this time,
-AIM_RAD = 0.1  # if that lies so far aside of where the lane leads here
-MAX_AIM_LANES = 8  # that lie between, at most
-# Over junctions it aims nearer, and further again by this times the way by which an arc of the
-# turning circle begins before one of the path, but not further than this times the angle in rad.
+# In a bend, a driver aims at a point of the path that is `AIM_M` or `AIM_S` ahead, whichever is
+# further. A lane is a bend if that point deviates by `AIM_RAD` from the direction of the lane.
+AIM_M = 4.0
+AIM_S = 0.6
+AIM_RAD = 0.1
+MAX_AIM_LANES = 8  # largest number of lanes up to that point
+# In turns at junctions, the distance is `TURN_AIM_M`, plus `AIM_EARLIER` times the distance by
+# which an arc of the turning circle starts before the arc of the path. It is limited to
+# `AIM_M_PER_RAD` times the angle of the turn, and to `MOST_AIM_M`.
 TURN_AIM_M = 3.0
 AIM_EARLIER = 1.5
 AIM_M_PER_RAD = 2.6
 MOST_AIM_M = 7.0
-MOST_TURN_RAD = 2.8  # a sharper turn counts as this
-CUT_RADIUS_M = 6.0  # a turn of this radius is cut,
-WIDE_RADIUS_M = 9.0  # one of that is followed
-NEAR_TURN_M = 10.0  # before it, a junction counts as one
-TURN_MPS = 3.5  # in and behind junctions a slower car steers as one that turns at this speed
+MOST_TURN_RAD = 2.8  # sharper turns count as this
+CUT_RADIUS_M = 6.0  # a turn of this radius is cut
+WIDE_RADIUS_M = 9.0  # a turn of this radius is followed exactly
+NEAR_TURN_M = 10.0  # distance to a junction at which its turn counts
+TURN_MPS = 3.5  # in and behind junctions, slower cars steer as at this speed
 TURNING_RATIO = 1.118  # radius of the turning circle over the wheelbase, wheels turned by 45°
-SLOW_MPS = 3.0  # a slower car on its way to a lane may stop askew:
-SWING_OUT_M = 0.1  # its front does not reach further over the far side of that lane
-CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
+SLOW_MPS = 3.0  # a slower car that changes lanes may stop askew
+SWING_OUT_M = 0.1  # then its front extends at most this far beyond the far side of the lane
+CHORD_M = 1.5  # lanes have corners: their direction is that of a chord of twice this length
 
 
 @kernel
 def nearest_speed(target_speeds: NDArray[np.float64], speed: float) -> int:
-    """Index of the target speed nearest to `speed`; of two, the lower one."""
+    """Return the index of the target speed nearest to `speed`; of two, the lower one."""
     best = 0
     for k in range(1, target_speeds.shape[0]):
         if abs(target_speeds[k] - speed) < abs(target_speeds[best] - speed):
@@ -61,8 +64,8 @@ def take_meta_action(
 ) -> None:
     """Set target lane and target speed of a vehicle as highway-env's `MDPVehicle` does.
 
-    FASTER and SLOWER step from the present target speed; a lane change asks for the neighbour of
-    the present lane and is ignored where there is none.
+    FASTER and SLOWER select the next target speed up or down. A lane change selects the neighbour
+    of the present lane, and has no effect if there is none.
     """
     k = nearest_speed(target_speeds, row["target_speed"])
     if action == ACTION_FASTER:
@@ -80,12 +83,10 @@ def take_meta_action(
 def steer_to_lane(
     roads: RoadArrays, plans: NDArray[np.void], row: np.void, target_lane: int, wheelbase: float
 ) -> float:
-    """The steering angle in rad that brings a vehicle to the middle of a lane.
+    """Return the steering angle in rad that moves a vehicle to the middle of a lane.
 
-    `wheelbase` is its own one, in m.
-
-    A target that is neither the vehicle's lane nor a neighbour of it counts as the lane it is on.
-    Beyond the lane's end the lane that the plan names goes on.
+    If `target_lane` is neither the vehicle's lane nor a neighbour of it, the vehicle's lane counts.
+    Beyond the end of the lane, the next lane of the plan counts. `wheelbase` is in m.
     """
     lane = row["lane"]
     here = roads.lanes[lane]
@@ -122,10 +123,10 @@ def steer_to_lane(
 def _aim_m(
     roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float, wheelbase: float
 ) -> tuple[float, float]:
-    """How far ahead a driver aims in a bend, in m, and how exactly it follows it, from 0 to 1.
+    """Return the aim distance in m in a bend, and how exactly the car follows the path (0 to 1).
 
-    The tighter a turn is, the further ahead, and the more it cuts the corner: that of the kerb, so
-    that its front does not swing over the middle of the road.
+    The sharper a turn is, the larger the aim distance is, and the more the car cuts the corner at
+    the kerb, so that its front does not swing over the middle of the road.
     """
     here = roads.lanes[lane]
     link = here["link"]
@@ -154,11 +155,11 @@ def _aim_m(
 def _aim(
     roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float, wheelbase: float
 ) -> float:
-    """The steering angle in rad that brings a vehicle round a bend; inf where there is none.
+    """Return the steering angle in rad for a bend, or inf if there is no bend.
 
-    Pure pursuit: the arc through a place of the way ahead. So the car turns in before a bend that
-    is tighter than its turning circle. Coulter: "Implementation of the pure pursuit path tracking
-    algorithm", CMU-RI-TR-92-01.
+    Pure pursuit: the car drives on an arc through a point of the path ahead. So the car turns in
+    before a bend that is sharper than its turning circle. Coulter: "Implementation of the pure
+    pursuit path tracking algorithm", CMU-RI-TR-92-01.
     """
     here = roads.lanes[lane]
     x0, y0, _, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
@@ -174,8 +175,8 @@ def _aim(
     bearing = wrap_angle(atan2(y, x) - row["heading"])
     if abs(bearing) > 0.5 * math.pi:
         return math.copysign(MAX_STEERING_RAD, bearing)
-    # The arc that the middle of the rear drives, whose heading is the car's, and that of its centre
-    # if this went where it heads.
+    # `following` is the arc of the rear axle, whose direction is the car's heading. `cutting` is
+    # the arc of the centre, as if the centre moved in the direction of the heading.
     apart = max(apart, TURN_AIM_M)
     aside_m = wheelbase * sine(abs(bearing))
     following = atan2(2.0 * aside_m, apart + wheelbase * cosine(bearing))
@@ -189,7 +190,7 @@ def _aim(
 def _point_at(
     roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
 ) -> tuple[float, float]:
-    """The place at `s` of a lane, beyond its end on those that the plan names."""
+    """Return the point at `s` of a lane; beyond its end, the point is on the lanes of the plan."""
     here = roads.lanes[lane]
     for _ in range(MAX_AIM_LANES):
         following = plans[goal, lane]["next"]
@@ -206,7 +207,7 @@ def _point_at(
 def _direction_at(
     roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
 ) -> float:
-    """Direction of the way around place `s` of a lane in rad."""
+    """Return the direction in rad of the path around `s` of a lane."""
     x0, y0 = _point_at(roads, plans, goal, lane, s - CHORD_M)
     x1, y1 = _point_at(roads, plans, goal, lane, s + CHORD_M)
     return atan2(y1 - y0, x1 - x0)

@@ -1,8 +1,8 @@
-"""Where on the lanes a freely steered vehicle is.
+"""Tracking: the lane and the position on it of a freely steered vehicle.
 
-The vehicle stays with its lane, its neighbours and the lanes that follow, as long as it is on one
-of them. Off those, every lane near the place is asked: it may have cut across to another road, or
-be on the wrong side, or off the road.
+The vehicle's lane, its neighbours and the next lanes are checked first. If the vehicle is on none
+of them, all lanes near its place are searched: it may have crossed to another road, be on the wrong
+side, or be off the road.
 """
 
 from __future__ import annotations
@@ -19,23 +19,21 @@ from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.core.records.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
 from cavmarl.driving.kernels.lanes.lane_index import beside_s, goes_on_m
 
-JUNCTION_MARGIN_M = (
-    2.0  # inside junctions lanes are guides: this much beyond their sides is still road
-)
-END_MARGIN_M = 1.0  # lanes may leave gaps up to this between end and start,
-SEAM_M = 1.0  # and side by side, where they bend: what lies between is road
+JUNCTION_MARGIN_M = 2.0  # inside junctions, the road extends this far beyond the sides of a lane
+END_MARGIN_M = 1.0  # gaps up to this size between the end and the start of lanes are road
+SEAM_M = 1.0  # gaps up to this size between adjacent lanes, in bends, are road
 WINDOW_M = 40.0
-TURNING_M = 6.0  # the radius of a car's turning circle, a little more
-SIDE_MARGIN_M = 0.1  # a body this near to a neighbour lane counts as in it: it may stand askew
-LEVEL_M = 4.0  # lanes further above or below are another road
+TURNING_M = 6.0  # slightly more than the radius of a car's turning circle
+SIDE_MARGIN_M = 0.1  # a body this close to a neighbour lane covers it, as it may stand askew
+LEVEL_M = 4.0  # lanes further above or below belong to another road
 
 
 @kernel
 def side_lane(roads: RoadArrays, row: np.void) -> int:
-    """The neighbour lane that a vehicle's body also covers, or -1.
+    """Return the neighbour lane that a vehicle's body also covers, or -1.
 
-    Where its own lane has led into a junction beside which the neighbour goes on, it is that one
-    until the rear has passed its end.
+    Inside a junction beside which the neighbour of the previous lane continues, it is that
+    neighbour until the rear has passed its end.
     """
     lane = roads.lanes[row["lane"]]
     d = row["d"]
@@ -57,7 +55,7 @@ def side_lane(roads: RoadArrays, row: np.void) -> int:
 def _on(
     roads: RoadArrays, lane: int, x: float, y: float, hint: float
 ) -> tuple[float, float, float]:
-    """(s, d, how far outside the lane in m) of a place with respect to `lane`."""
+    """Return s, d and the distance outside the lane in m of a point relative to `lane`."""
     row = roads.lanes[lane]
     s, d, _, _ = project_near(
         roads.points, row["first_point"], row["num_points"], x, y, hint, WINDOW_M
@@ -71,9 +69,9 @@ def _on(
 
 @kernel
 def _follow(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> None:
-    """Move on to the lanes that follow while the vehicle is past its lane's end.
+    """Move a vehicle that has passed its lane's end to the next lanes.
 
-    It takes the planned lane unless it is nearer to the middle of another one.
+    The planned lane is preferred unless the vehicle is closer to the middle of another lane.
     """
     for _ in range(4):
         lane = roads.lanes[row["lane"]]
@@ -111,7 +109,7 @@ def _follow(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> None:
 
 @kernel
 def _search(roads: RoadArrays, grid: LaneGrid, row: np.void) -> int:
-    """Find the lane under a vehicle that left its own; returns EVENT_* bits."""
+    """Find the lane of a vehicle that has left its own lane, and return EVENT_* bits."""
     column = int((row["x"] - grid.min_x) // grid.cell_m)
     line = int((row["y"] - grid.min_y) // grid.cell_m)
     if column < 0 or line < 0 or column >= grid.num_x or line >= grid.num_y:
@@ -133,7 +131,7 @@ def _search(roads: RoadArrays, grid: LaneGrid, row: np.void) -> int:
             continue
         if abs(roads.points[here["first_point"]]["z"] - row["z"]) > LEVEL_M:
             continue
-        # Lanes in the vehicle's own direction first, then the one whose middle is nearest.
+        # Prefer lanes in the vehicle's direction, then the lane whose middle is nearest.
         rank = abs(d) + (0.0 if cos * cos_heading + sin * sin_heading > 0.0 else 100.0)
         if rank < best_rank:
             best = lane
@@ -151,8 +149,8 @@ def _search(roads: RoadArrays, grid: LaneGrid, row: np.void) -> int:
 
 
 @inlined_kernel
-def _tell_how_far(roads: RoadArrays, row: np.void) -> None:
-    """Let d say how far a vehicle is from its lane that is beyond its start, or its end."""
+def _set_distance_beyond(roads: RoadArrays, row: np.void) -> None:
+    """Set d to the distance beyond the start or the end of the lane if that is larger."""
     beyond = max(row["s"] - roads.lanes[row["lane"]]["length_m"], -row["s"])
     if beyond > abs(row["d"]):
         row["d"] = math.copysign(beyond, row["d"])
@@ -162,14 +160,16 @@ def _tell_how_far(roads: RoadArrays, row: np.void) -> None:
 def locate(
     roads: RoadArrays,
     plans: NDArray[np.void],  # PLAN (G, L)
-    grid: LaneGrid,  # which lanes lie near a place
-    row: np.void,  # VEHICLE with the new x, y, heading and the old lane context; written
+    grid: LaneGrid,  # the lanes near each place
+    row: np.void,  # VEHICLE with the new x, y and heading and the old lane; updated
 ) -> int:
-    """Bring lane, s, d and link of a steered vehicle up to its new place.
+    """Update lane, s, d and link of a steered vehicle for its new position.
+
+    A vehicle that is on no lane of its direction keeps its last lane. Then s is limited to that
+    lane, and d is the distance beyond the lane's start or end if that is larger.
 
     Returns:
-        EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0. A vehicle on no lane of its direction keeps the last
-        one; there s ends at the lane's ends, and d is then the way beyond, if that is more.
+        EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0.
     """
     lane = row["lane"]
     s, d, outside = _on(roads, lane, row["x"], row["y"], row["s"])
@@ -200,7 +200,7 @@ def locate(
     if outside > 0.0:
         events |= _search(roads, grid, row)
         if events:
-            _tell_how_far(roads, row)
+            _set_distance_beyond(roads, row)
     here = roads.lanes[row["lane"]]
     row["s"] = min(max(row["s"], 0.0), here["length_m"])
     if not _drives_along(roads, row):
@@ -210,10 +210,10 @@ def locate(
 
 @kernel
 def _drives_along(roads: RoadArrays, row: np.void) -> bool:
-    """Whether the vehicle heads within 90° of its lane's direction there, or a little away.
+    """Return whether the vehicle heads within 90° of its lane's direction, here or close by.
 
-    Lanes may turn more sharply than a car can, which then turns before them or after them. Inside a
-    junction the directions of the roads that it comes from, and goes to, are as good.
+    Lanes may turn more sharply than a car, which then turns earlier or later than its lane. Inside
+    a junction, the directions of the incoming and the outgoing road count as well.
     """
     lane = roads.lanes[row["lane"]]
     if _heads_along(roads, row, lane, row["s"]):
@@ -229,7 +229,7 @@ def _drives_along(roads: RoadArrays, row: np.void) -> bool:
 
 @kernel
 def _heads_along(roads: RoadArrays, row: np.void, lane: np.void, s: float) -> bool:
-    """Whether the vehicle heads within 90° of the direction of a lane at `s`."""
+    """Return whether the vehicle heads within 90° of the direction of a lane at `s`."""
     _, _, _, cos, sin, _ = lane_pose(roads.points, lane["first_point"], lane["num_points"], s)
     along: bool = cosine(row["heading"]) * cos + sine(row["heading"]) * sin >= 0.0
     return along

@@ -1,4 +1,4 @@
-"""A car alone, steered as the built-in driver steers: whether it stays on its road in a bend."""
+"""Trial drives of a single car with the built-in driver's steering: does it stay on its road?"""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 from cavmarl.driving.kernels.motion.steering import steer_to_lane
 from cavmarl.driving.kernels.motion.tracking import locate
 
-TRIAL_MPS = 3.5  # about the speed to which drivers slow down for sharp bends,
-FASTER_MPS = 4.2  # and for those of a right angle
+TRIAL_MPS = 3.5  # approximate speed of drivers in sharp bends
+FASTER_MPS = 4.2  # the same in bends of 90°
 TRIAL_DT_S = 0.1
-SWING_M = 0.5  # of a body beyond the middle of a road: others have so much room beside them
-BEYOND_M = 12.0  # before and behind a junction: there a car swings out
+SWING_M = 0.5  # tolerated distance of a body beyond the middle of a road
+BEYOND_M = 12.0  # distance before and behind a junction within which a car swings out
 MOST_TICKS = 5000
 
 
 @kernel
 def _reaches_over(roads: RoadArrays, row: np.void, lane: int, inwards: int) -> bool:
-    """Whether a corner of a body lies far beyond the inner side of the innermost lane of a road."""
+    """Return whether a corner of a body is far beyond the inner side of a road's innermost lane."""
     here = roads.lanes[lane]
     if inwards == 0 or (here["left"] if inwards > 0 else here["right"]) >= 0:
         return False
@@ -44,22 +44,22 @@ def _reaches_over(roads: RoadArrays, row: np.void, lane: int, inwards: int) -> b
 @kernel
 def stays_on_road(
     roads: RoadArrays,
-    plan: NDArray[np.void],  # PLAN (1, L) with what follows the lanes ahead
+    plan: NDArray[np.void],  # PLAN (1, L) with the next lanes of the path
     grid: LaneGrid,
-    row: np.void,  # VEHICLE, a blank one with its size; written
-    wheelbase: float,  # m, its own one
-    lane: int,  # on which it begins,
-    begin_m: float,  # and where on it
-    last_lane: int,  # on which it ends,
-    end_m: float,  # and where on it
-    steering_rad: float,  # the most that its front wheels turn
-    # 1: the middle of the road is to the left, -1: to the right, 0: where it is does not matter
+    row: np.void,  # VEHICLE, blank except for its size; overwritten
+    wheelbase: float,  # m
+    lane: int,  # LANE where the drive begins
+    begin_m: float,  # position on that lane
+    last_lane: int,  # LANE where the drive ends
+    end_m: float,  # position on that lane
+    steering_rad: float,  # largest steering angle
+    # 1: the middle of the road is to the left, -1: to the right, 0: it does not matter
     inwards: int,
     speed: float,  # m/s
 ) -> bool:
-    """Whether a car that creeps along its way is never off the road or on the wrong side.
+    """Return whether a slow car stays on its road and on the correct side of it.
 
-    Nor may a corner of its body reach far beyond the middle of either road, where others come.
+    No corner of its body may extend far beyond the middle of either road, where others drive.
     """
     here = roads.lanes[lane]
     x, y, z, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], begin_m)
