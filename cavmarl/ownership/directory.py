@@ -97,7 +97,7 @@ class Directory:
         """Restore the coordinator that wrote these records. Send `resend` before all else."""
         if not records or not isinstance(records[0], Reset):
             raise JournalError(
-                "the log does not begin with a RESET, which has the id of the run; use an intact log"
+                "the log does not begin with the RESET that has the run's id; use an intact log"
             )
         directory = cls(records[0].run, zones, store, limits, neighbours)
         for record in records:

@@ -26,4 +26,4 @@ class Limits:
         least |= {"capacity": 0, "schema": 0}
         for name, bound in least.items():
             if getattr(self, name) < bound:
-                raise ConfigError(f"{name} = {getattr(self, name)}: use a number from {bound} up")
+                raise ConfigError(f"{name} = {getattr(self, name)}: must be at least {bound}")

@@ -136,7 +136,7 @@ def replay(records: Iterable[Record]) -> Table:
     log = tuple(records)
     if not log or not isinstance(log[0], Reset):
         raise JournalError(
-            "the log does not begin with a RESET, which has the id of the run; use an intact log"
+            "the log does not begin with the RESET that has the run's id; use an intact log"
         )
     table = Table({record.zone for record in log if isinstance(record, Host)})
     for record in log:

@@ -141,7 +141,7 @@ def test_a_vehicle_that_is_lost(meddling: Meddling) -> None:
         worlds.num_owned[0] -= 1
         worlds.num_rows[0] -= 1
 
-    meddling.caught(meddle, r"population: vehicle \d+ of zone 2, epoch \d+, is lost: \d+ vehicles")
+    meddling.caught(meddle, r"population: vehicle \d+ of zone 2, epoch \d+, is lost: there are")
 
 
 def test_a_vehicle_that_has_never_entered(meddling: Meddling) -> None:
@@ -151,16 +151,14 @@ def test_a_vehicle_that_has_never_entered(meddling: Meddling) -> None:
         rows[owned]["id"], rows[owned]["tick"] = 9_999, meddling.simulation.ticks()[0] - 1
         meddling.simulation.shards[2].worlds.num_owned[0] += 1
 
-    meddling.caught(meddle, r"population: vehicle 9999 of zone 2 has never entered: \d+ vehicles")
+    meddling.caught(meddle, r"population: vehicle 9999 of zone 2 has never entered: there are")
 
 
 def test_a_row_whose_epoch_is_not_that_on_record(meddling: Meddling) -> None:
     def meddle() -> None:
         meddling.zone(1)[0]["epoch"][0] += 1
 
-    meddling.caught(
-        meddle, r"owner on record: vehicle \d+ is with zone 1 at epoch \d+, but the dir"
-    )
+    meddling.caught(meddle, r"owner on record: zone 1 owns vehicle \d+ at epoch \d+, but the dir")
 
 
 def test_a_row_that_is_with_another_zone_than_on_record(meddling: Meddling) -> None:
@@ -169,7 +167,7 @@ def test_a_row_that_is_with_another_zone_than_on_record(meddling: Meddling) -> N
         own, other = source.rows[0, 0].copy(), target.rows[0, 0].copy()
         source.rows[0, 0], target.rows[0, 0] = other, own
 
-    meddling.caught(meddle, r"owner on record: vehicle \d+ is with zone \d at epoch \d+, but the d")
+    meddling.caught(meddle, r"owner on record: zone \d owns vehicle \d+ at epoch \d+, but the d")
 
 
 def test_a_clock_that_is_late(meddling: Meddling) -> None:
@@ -186,7 +184,9 @@ def test_a_ghost_of_the_tick_before(meddling: Meddling) -> None:
         assert num > owned
         rows[owned]["tick"] -= 1
 
-    meddling.caught(meddle, r"age of ghosts: zone 1 has vehicle \d+ with tick = \d+, but its owner")
+    meddling.caught(
+        meddle, r"age of ghosts: zone 1 has a ghost of vehicle \d+ with tick = \d+, but"
+    )
 
 
 def test_a_ghost_that_somebody_has_written(meddling: Meddling) -> None:
@@ -194,14 +194,16 @@ def test_a_ghost_that_somebody_has_written(meddling: Meddling) -> None:
         rows, owned, _ = meddling.zone(1)
         rows[owned]["speed"] += 0.5
 
-    meddling.caught(meddle, r"age of ghosts: zone 1 has vehicle \d+ with speed = ")
+    meddling.caught(meddle, r"age of ghosts: zone 1 has a ghost of vehicle \d+ with speed = ")
 
 
 def test_a_ghost_that_is_not_there(meddling: Meddling) -> None:
     def meddle() -> None:
         meddling.simulation.shards[1].worlds.num_rows[0] -= 1
 
-    meddling.caught(meddle, r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: zone \d owns")
+    meddling.caught(
+        meddle, r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: the vehicle of zone \d is"
+    )
 
 
 @pytest.fixture
@@ -219,7 +221,9 @@ def test_a_ghost_that_is_there_twice(narrow: Meddling) -> None:
         rows[num] = rows[owned]
         narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
-    narrow.caught(meddle, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: zone \d owns it")
+    narrow.caught(
+        meddle, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: the vehicle of zone \d is"
+    )
 
 
 def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
@@ -231,7 +235,9 @@ def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
         rows[num] = others[int(np.argmax(away))]
         narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
-    narrow.caught(meddle, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: zone 2 owns it")
+    narrow.caught(
+        meddle, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: the vehicle of zone 2 is"
+    )
 
 
 def test_a_ghost_of_nobody(narrow: Meddling) -> None:
@@ -240,7 +246,7 @@ def test_a_ghost_of_nobody(narrow: Meddling) -> None:
         rows[num]["id"] = 7_777
         narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
-    narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which is not there")
+    narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which does not exist")
 
 
 def test_an_arrival_of_somebody_who_is_there(

@@ -96,7 +96,7 @@ def test_r36_a_change_to_a_zone_that_is_no_neighbour_is_refused() -> None:
             assert [switch.vehicle for switch in begun.switches] == [7, 8]
             assert begun.teleports == (7,)
             continue
-        with pytest.raises(ProtocolError, match=r"vehicle 7 of zone 0 .* zone 2, .* to zones 1 in"):
+        with pytest.raises(ProtocolError, match=r"vehicle 7 of zone 0 .* zone 2, .* only zones 1;"):
             bench.begin([(7, 2)])
         bench.begin([(8, 2)])
         checker = TraceChecker(2, 16, near=in_a_row)
