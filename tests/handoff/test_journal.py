@@ -305,7 +305,7 @@ def test_what_no_coordinator_writes_is_refused_with_its_line(tmp_path: Path) -> 
         return str(said.value)
 
     log = eventful().log
-    assert "begins with a RESET" in refused(log[1:])
+    assert "not begin with a RESET" in refused(log[1:])
     assert "no complete line" in refused([])
     assert "line 5 of the log: BEGIN of tick 1" in refused([*log[:4], log[3]])
 

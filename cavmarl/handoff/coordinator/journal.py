@@ -130,7 +130,7 @@ class Journal:
         sync: Sync = "flush",
     ) -> None:
         if sync not in get_args(Sync):
-            raise ConfigError(f"sync = {sync!r}: use one of {get_args(Sync)}")
+            raise ConfigError(f"sync = {sync!r}: must be one of {get_args(Sync)}")
         self.path = path
         self.dropped = ""
         self._chain = LogChain()

@@ -60,7 +60,7 @@ def cut_map(
     if weight not in _WEIGHTS:
         raise ConfigError(f"weight '{weight}' does not exist; use {', '.join(_WEIGHTS)}")
     if not 1 <= count <= MAX_ZONES:
-        raise ConfigError(f"{count} zones: use a whole number from 1 to {MAX_ZONES}")
+        raise ConfigError(f"{count} zones: must be a whole number from 1 to {MAX_ZONES}")
     min_x, min_y, max_x, max_y = network.extent_m
     area = _Area(
         bounds=(min_x - _RIM_M, min_y - _RIM_M, max_x + _RIM_M, max_y + _RIM_M),
@@ -80,7 +80,7 @@ def _samples(network: RoadNetwork, weight: str, density: Floats | None) -> Float
     density = np.asarray(density, dtype=np.float64)
     shaped = density.ndim == 2 and density.shape[1] == 3
     if not (shaped and np.isfinite(density).all() and (density[:, 2] >= 0.0).all()):
-        raise ConfigError("density: use rows of finite x, y and weight, with no weight below 0")
+        raise ConfigError("density: must be rows of finite x, y and weight, with no weight below 0")
     return density[density[:, 2] > 0.0]
 
 
