@@ -88,7 +88,6 @@ PHRASES_AT_MOST = 350
 WORDS_OF_A_PAGE = 2500  # outside of tables, generated blocks and code
 LONG_PAGES = {
     "docs/decisions/010-traffic-after-sumo.md",
-    "docs/explanation/realism.md",
     "docs/guides/nodes.md",
 }
 
