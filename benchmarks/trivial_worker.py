@@ -1,4 +1,4 @@
-"""What workers do for worlds in which nothing happens. The program of their processes."""
+"""A worker program for worlds in which nothing happens."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["TrivialJob", "make_jobs"]
 
 
 class TrivialJob(Job):
-    """Worlds in which every agent sees how many tasks there have been.
+    """Worlds in which every agent observes the number of tasks so far.
 
     Args:
-        arrays: of these worlds.
+        arrays: arrays of these worlds.
     """
 
     def __init__(self, arrays: StepArrays) -> None:
@@ -31,21 +31,21 @@ class TrivialJob(Job):
         arrays.acted[:] = True
 
     def perform(self, task: int, letter: Any) -> None:
-        """Show the number of this task."""
+        """Write the number of this task to all observations."""
         self._tasks += 1
         self._arrays.observations[:] = self._tasks[0]
 
     def save(self) -> list[NDArray[Any]]:
-        """How many there have been."""
+        """Return the number of tasks so far."""
         return [self._tasks]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave."""
+        """Restore the state returned by `save`."""
         self._tasks[:] = saved[0]
 
 
 def make_jobs(message: Mapping[str, Any]) -> list[Job]:
-    """The jobs of all workers."""
+    """Return the jobs of all workers."""
     config = validate(EnvConfig, message["config"], "the environment")
     layout = layout_of(config, message["capacity"], message["num_worlds"])
     arrays = StepArrays.of(arrays_in(Segment(message["arrays"], 0).map(), layout))

@@ -34,7 +34,7 @@ from cavmarl.roads.network import (
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 48
+FORMAT = 49
 
 _DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: of a broken one nothing is read
 _ALIGNED = 64  # arrays begin at multiples of so many bytes

@@ -120,5 +120,5 @@ def test_config_holds_nested_keys_of_the_entry() -> None:
     assert made.terms.weights == {**entry.terms.weights, "collision": -9.0}
     with pytest.raises(ConfigError, match="lanes_count"):
         gymnasium.make("cavmarl/merge-v6", config={"lanes_count": 4})
-    with pytest.raises(ConfigError, match="must be a mapping of keys"):
+    with pytest.raises(ConfigError, match="must be a mapping from keys"):
         gymnasium.make("cavmarl/merge-v6", config=[1])

@@ -57,7 +57,7 @@ def test_a_program_shows_and_writes(capsys: pytest.CaptureFixture[str], tmp_path
     with pytest.raises(SystemExit) as ended:
         run(profile.measure, words)
     assert not ended.value.code
-    assert "ns a vehicle" in capsys.readouterr().out
+    assert "ns per vehicle" in capsys.readouterr().out
     found = json.loads(path.read_text())
     assert next(row["ns"] for row in found["rows"] if row["name"] == "sense") > 0.0
     assert found["hardware"]["usable_cores"] >= 1

@@ -163,7 +163,7 @@ def test_a_run_goes_on_where_it_ended_and_keeps_the_files_of_the_worst(
 
 def test_rows_of_other_settings_are_not_mixed(tmp_path: Path, stubbed: list[int]) -> None:
     run_worlds(WorldSeries(tmp_path, 1, 0))
-    with pytest.raises(ConfigError, match="rows of other settings"):
+    with pytest.raises(ConfigError, match="rows with other settings"):
         run_worlds(WorldSeries(tmp_path, 1, 0, seconds=200))
     assert stubbed == [0]
 

@@ -140,5 +140,5 @@ def test_one_inside_a_junction_waits_for_room_behind_it_and_for_no_signal() -> N
 
 
 def test_no_map_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no map: name some"):
+    with pytest.raises(ConfigError, match="no map: give maps"):
         yardstick.measure()

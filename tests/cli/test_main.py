@@ -248,7 +248,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("view", "merge", "--seconds", "0", "--video", "x.mp4"), "must be above 0"),
         (("view", "merge", "--seconds", "nan", "--video", "x.mp4"), "must be above 0"),
         (("view", "merge", "--policy", "nobody", "--video", "x.mp4"), "no policy"),
-        (("view", "merge", "--video", "film.gif"), "ends in .mp4"),
+        (("view", "merge", "--video", "film.gif"), "must end in .mp4"),
         (("bench", "step", "--agents", "0"), "agents = 0"),
         (("bench", "step", "--worlds", "-2"), "worlds = -2"),
         (("bench", "step", "--repeats", "x"), "valid integer"),

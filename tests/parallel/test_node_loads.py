@@ -54,7 +54,7 @@ def test_pages_show_the_loads_of_machines(make: Make, monkeypatch: pytest.Monkey
     monkeypatch.setattr("cavmarl.viewer.run_loads.EVERY_S", 0.05)
     audience = Audience()
     told: list[Any] = []
-    monkeypatch.setattr(audience, "tell_all", told.append)
+    monkeypatch.setattr(audience, "send_all", told.append)
     loads = RunLoads(nodes, audience)
     loads.look()
     assert not told  # no page watches

@@ -64,5 +64,5 @@ def test_pitch_looks_up_and_uphill() -> None:
 def test_a_place_outside_of_the_body_is_refused(place: dict[str, float]) -> None:
     car = generated_types()[0]
     check_place("a", OdometryConfig(rate_hz=1.0, x_m=2.5, y_m=-1.0, z_m=1.6), car)
-    with pytest.raises(ConfigError, match=r"rig\.a\.[xyz]_m = .*outside of the vehicle"):
+    with pytest.raises(ConfigError, match=r"rig\.a\.[xyz]_m = .*outside the vehicle's body"):
         check_place("a", OdometryConfig(rate_hz=1.0, **place), car)

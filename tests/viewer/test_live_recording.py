@@ -144,7 +144,7 @@ def test_an_agent_is_told_with_what_it_observed(
 def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) -> None:
     (path / "network.bin").rename(tmp_path / "network.bin")
     try:
-        with pytest.raises(RecordingError, match="without its map"):
+        with pytest.raises(RecordingError, match="has no map"):
             recording_stages(Recording(path))
     finally:
         (tmp_path / "network.bin").rename(path / "network.bin")
@@ -152,5 +152,5 @@ def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) 
     empty.mkdir()
     for name in ("recording.json", "network.bin"):
         (empty / name).write_bytes((path / name).read_bytes())
-    with pytest.raises(RecordingError, match="no frame was committed"):
+    with pytest.raises(RecordingError, match="the recording has no frames"):
         recording_stages(Recording(empty))

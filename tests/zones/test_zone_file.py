@@ -72,7 +72,7 @@ def document() -> dict[str, Any]:
             lambda it: it["zones"][4].update(rect_m=[10, 10, 20, 19]),
             r"no zone covers x 10 to 20, y 19 to 20",
         ),
-        (lambda it: it["zones"][1]["rect_m"].__setitem__(2, 31), r"zone 1: .* leaves bounds_m"),
+        (lambda it: it["zones"][1]["rect_m"].__setitem__(2, 31), r"zone 1: .* exceeds bounds_m"),
         (lambda it: it.update(zones=[]), r"there are no zones"),
         (
             lambda it: it.update(zones=[{"id": 0, "rect_m": [0, 0, 1, 1]}] * 300),

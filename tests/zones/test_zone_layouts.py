@@ -78,7 +78,7 @@ def test_a_density_is_shared_out_instead_of_lanes(cross: RoadNetwork) -> None:
     crowd = np.array([[x, 0.0, 1.0] for x in range(40)] + [[-90.0, 0.0, 40.0], [70.0, 0.0, 0.0]])
     zones = cut_map(cross, "bisection", 2, density=crowd)
     assert -90.0 < zones.arrays.cuts_x[0] <= 0.0
-    with pytest.raises(ConfigError, match="density: must be rows of x, y and weight"):
+    with pytest.raises(ConfigError, match="density: use rows of finite x, y and weight"):
         cut_map(cross, "bisection", 2, density=crowd[:, :2])
     with pytest.raises(ConfigError, match="density"):
         cut_map(cross, "bisection", 2, density=crowd * np.nan)
