@@ -29,7 +29,7 @@ class WorldArguments(TypedDict, total=False):
             (docs/guides/nodes.md). "nodes:N@HOST:PORT": in N nodes that are started by hand and
             join there.
             "nodes:N@mpi": in N other ranks of an MPI run. "ray:N": in N actors of a Ray cluster
-            (docs/guides/cluster.md), "ray": in as many as are of use.
+            (docs/guides/nodes.md), "ray": in as many as are of use.
             The name of a registered backend: there, "name:N" with N workers.
         workers: short form: N for "processes:N", 0 for "local".
         nodes: short form: N for "nodes:N".
