@@ -28,7 +28,7 @@ class WorldArguments(TypedDict, total=False):
             "nodes:N": in N processes without shared memory, started on this machine
             (docs/guides/nodes.md). "nodes:N@HOST:PORT": in N nodes that are started by hand and
             connect to that address. "nodes:N@mpi": in N other ranks of an MPI run.
-            "ray:N": in N actors of a Ray cluster (docs/guides/cluster.md); "ray": in as many
+            "ray:N": in N actors of a Ray cluster (docs/guides/nodes.md); "ray": in as many
             actors as are useful. The name of a registered backend: there; "name:N": there, with
             N workers.
         workers: short form: N for "processes:N", 0 for "local".

@@ -376,7 +376,9 @@ def _pages() -> Iterator[ScoreTable]:
     ]
     write = partial(names_table, "task", TASKS, columns)
     yield ScoreTable(tasks, "trained drivers", (TRAINED, TRAINED_ALONE), write, TASKS)
-    yield ScoreTable("docs/figures/messages.md", "messages", (MESSAGES,), messages_table, tuple(LOSSES.values()))
+    yield ScoreTable(
+        "docs/figures/messages.md", "messages", (MESSAGES,), messages_table, tuple(LOSSES.values())
+    )
     rows: Rows = [
         *shares("arrived", "collision", "off_road", "unfinished", "red_light", "wrong_way"),
         (
