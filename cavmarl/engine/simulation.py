@@ -63,7 +63,7 @@ class Simulation(WorldViews):
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
         zeros: Zeros = huge_zeros,  # allocates the arrays that shards write
         like: Simulation | None = None,  # of the same environment; its tables are shared
-        runs: Sequence[OpenRun] | None = None,  # journals of the coordinators; None: `config.zones`
+        runs: Sequence[OpenRun] | None = None,  # one per world; None: made as `config.zones` says
         late_ticks: int = 0,  # extra ticks that a vehicle across a border may stay with its owner
     ) -> None:
         self._carried_from = carried_from(config.sensors)
