@@ -86,10 +86,7 @@ PHRASES = re.compile(
 PHRASES_AT_MOST = 350
 
 WORDS_OF_A_PAGE = 2500  # outside of tables, generated blocks and code
-LONG_PAGES = {
-    "docs/decisions/010-traffic-after-sumo.md",
-    "docs/guides/nodes.md",
-}
+LONG_PAGES: set[str] = set()
 
 
 def sources(*folders: str) -> Iterator[tuple[str, str]]:

@@ -340,13 +340,9 @@ def test_a_path_over_a_junction_is_limited(
     ):
         read_network(far)
     monkeypatch.setenv("CAVMARL_MAX_CROSSING_M", "1")
-<<<<<<< HEAD
     with pytest.raises(
         MapError, match=r"more than 1 \(CAVMARL_MAX_CROSSING_M\): repair the shapes"
     ):
-=======
-    with pytest.raises(MapError, match=r"more than 1 \(CAVMARL_MAX_CROSSING_M\): repair"):
->>>>>>> w-e3
         read_network(crossing())
 
 

@@ -76,7 +76,7 @@ def document() -> dict[str, Any]:
         (lambda it: it.update(zones=[]), r"there are no zones"),
         (
             lambda it: it.update(zones=[{"id": 0, "rect_m": [0, 0, 1, 1]}] * 300),
-            r"300 zones: at most 256",
+            r"300 zones; use at most 256",
         ),
     ],
 )
