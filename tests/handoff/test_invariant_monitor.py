@@ -184,9 +184,7 @@ def test_a_ghost_of_the_tick_before(meddling: Meddling) -> None:
         assert num > owned
         rows[owned]["tick"] -= 1
 
-    meddling.caught(
-        meddle, r"age of ghosts: zone 1 has a ghost of vehicle \d+ with tick = \d+, but"
-    )
+    meddling.caught(meddle, r"age of ghosts: zone 1 has a ghost of vehicle \d+ with tick = ")
 
 
 def test_a_ghost_that_somebody_has_written(meddling: Meddling) -> None:
@@ -201,9 +199,7 @@ def test_a_ghost_that_is_not_there(meddling: Meddling) -> None:
     def meddle() -> None:
         meddling.simulation.shards[1].worlds.num_rows[0] -= 1
 
-    meddling.caught(
-        meddle, r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: the vehicle of zone \d is"
-    )
+    meddling.caught(meddle, r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: the vehicle of")
 
 
 @pytest.fixture
@@ -221,9 +217,7 @@ def test_a_ghost_that_is_there_twice(narrow: Meddling) -> None:
         rows[num] = rows[owned]
         narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
-    narrow.caught(
-        meddle, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: the vehicle of zone \d is"
-    )
+    narrow.caught(meddle, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: the vehicle of")
 
 
 def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
@@ -235,9 +229,7 @@ def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
         rows[num] = others[int(np.argmax(away))]
         narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
-    narrow.caught(
-        meddle, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: the vehicle of zone 2 is"
-    )
+    narrow.caught(meddle, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: .* zone 2")
 
 
 def test_a_ghost_of_nobody(narrow: Meddling) -> None:
