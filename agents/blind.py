@@ -1,7 +1,7 @@
-"""A driver that sees no other vehicle and no signal: an opponent to learn caution from.
+"""A driver that sees no other vehicle and no signal: an opponent that teaches caution.
 
-It steers as the built-in driver does, towards a speed of its own: a share of the limit that is
-drawn for each seat. It needs `sensors.ego` and continuous actions.
+It steers like the built-in driver and keeps its own target speed: a share of the limit that is
+drawn per seat. It needs `sensors.ego` and continuous actions.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from cavmarl.core.errors import PolicyError
 from cavmarl.engine.spaces import observation_parts
 from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
-LEAST, MOST = 0.5, 1.1  # of the limit
+LEAST, MOST = 0.5, 1.1  # as a share of the limit
 REACT_S = 1.0
 
-# Features of `ego` and their scale, see the table of any environment's card.
+# Indices of `ego` features and their scale, see the table of any environment's card.
 SPEED, LIMIT = 0, 6
 SPEED_SCALE = 40.0
 
@@ -36,12 +36,12 @@ class BlindPolicy(Policy):
         self.reset(0)
 
     def reset(self, seed: int | None = None) -> None:
-        """Draw the shares anew; None draws a seed from the operating system."""
+        """Draw the shares again; None draws a seed from the operating system."""
         self._random = np.random.Generator(np.random.Philox(seed))
         self._shares = np.zeros((0, 0))
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """(W, A, 2): the built-in driver's steering, and the throttle for the own speed."""
+        """Return (W, A, 2): the built-in driver's steering, and throttle for the target speed."""
         if self._shares.shape != mask.shape:
             self._shares = self._random.uniform(LEAST, MOST, mask.shape)
         actions = built_in_actions(self.env, mask)
@@ -53,5 +53,5 @@ class BlindPolicy(Policy):
 
 
 def make_policy(env: Environment) -> Policy:
-    """Seat the driver."""
+    """Create the driver."""
     return BlindPolicy(env)

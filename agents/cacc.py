@@ -1,10 +1,10 @@
-"""Cooperative adaptive cruise control: follows by what the vehicle ahead says that it does.
+"""Cooperative adaptive cruise control: car following by messages of the vehicle ahead.
 
-It steers, stops and gives way as the built-in driver does, and near junctions it is as careful.
-Behind a vehicle whose messages it receives it takes its acceleration from van Arem, van Driel,
+The driver steers, stops and yields like the built-in driver, and near junctions it is as careful.
+Behind a vehicle whose messages it receives, it uses the acceleration of van Arem, van Driel,
 Visser: "The impact of cooperative adaptive cruise control on traffic-flow characteristics", IEEE
-Trans. ITS 7 (4), 2006: a radar measures gap and relative speed (the sensor `lanes`), and the
-acceleration of the vehicle ahead, which no radar can measure in time, comes over the air (the
+Trans. ITS 7 (4), 2006. A radar measures gap and relative speed (the sensor `lanes`); the
+acceleration of the vehicle ahead, which a radar cannot measure in time, comes by message (the
 sensor `messages`).
 """
 
@@ -26,9 +26,9 @@ SPEED_GAIN = 1.0  # 1/s, towards the limit
 ACCEL_GAIN = 1.0
 APPROACH_GAIN = 0.58  # 1/s
 GAP_GAIN = 0.1  # 1/s²
-HEADWAY_S = 0.5  # behind somebody who tells what it does
+HEADWAY_S = 0.5  # behind a vehicle that sends its acceleration
 MIN_GAP_M = 2.0
-SAME_M = 4.0  # what is told and what is measured may differ by so much, and mean the same vehicle
+SAME_M = 4.0  # a message and a measurement within this distance belong to the same vehicle
 
 # Scales of the features, see the table of any environment's card.
 SPEED_SCALE = 40.0
@@ -36,8 +36,8 @@ ACCEL_SCALE = 10.0
 LENGTH_SCALE = 20.0
 HALF_M = 10.0
 OBJECT_FEATURES = 11
-LANE_CHANGE = 9  # of the features of `ego`
-CROSSING = 10  # of those of `lanes`
+LANE_CHANGE = 9  # index in the features of `ego`
+CROSSING = 10  # index in the features of `lanes`
 OWN_LENGTH_M = 5.0
 
 NEEDED = {
@@ -51,10 +51,10 @@ NEEDED = {
 
 
 class CaccPolicy(Policy):
-    """Drives by messages where there are any, and as the built-in driver elsewhere.
+    """Follows by messages where it has any, and drives like the built-in driver elsewhere.
 
     Args:
-        env: where it drives.
+        env: the environment.
     """
 
     def __init__(self, env: CavEnv | CavVectorEnv) -> None:
@@ -67,8 +67,8 @@ class CaccPolicy(Policy):
             or config.action.kind != "continuous"
         ):
             raise PolicyError(
-                f"cacc needs what other vehicles say, a look at lanes and signals, and continuous "
-                f"actions: make the environment with overrides={NEEDED}"
+                f"cacc needs messages, sensors of lanes and signals, and continuous "
+                f"actions: create the environment with overrides={NEEDED}"
             )
         self._places = {name: part.place for name, part in parts.items()}
         self._frame = sum(place.stop - place.start for place in self._places.values())
@@ -77,19 +77,19 @@ class CaccPolicy(Policy):
         self._accel_mps2 = config.action.acceleration_mps2
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """(W, A, 2): the built-in driver's steering, and its throttle or that of a follower."""
+        """Return (W, A, 2): the built-in driver's steering, and its or the following throttle."""
         newest = observations[..., -self._frame :].astype(np.float64)
         actions: NDArray[Any] = self._suggested(mask.shape).copy()
         follows, accel = self._follow(newest)
         followed = np.clip(accel / self._accel_mps2, -1.0, 1.0)
-        # There it is not only the vehicle ahead that counts: the more careful one does.
+        # Other vehicles matter there too, so the more careful throttle wins.
         careful = np.minimum(followed, actions[..., 0])
         throttle = np.where(self._near_others(newest), careful, followed)
         actions[..., 0] = np.where(follows, throttle, actions[..., 0])
         return actions.astype(np.float32)
 
     def _suggested(self, shape: tuple[int, ...]) -> NDArray[Any]:
-        """What the built-in driver would do, (W, A, 2)."""
+        """Return the built-in driver's actions, (W, A, 2)."""
         suggested = self.env.suggest_actions()
         if not isinstance(suggested, dict):
             return suggested
@@ -103,7 +103,7 @@ class CaccPolicy(Policy):
         return part
 
     def _near_others(self, newest: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(W, A) whether a line is in sight, somebody crosses the way, or the lane is to change."""
+        """Return (W, A) whether a line, a crossing vehicle or a lane change is ahead."""
         ego, signal = self._part(newest, "ego"), self._part(newest, "signal")
         crossing = self._part(newest, "lanes")[..., CROSSING]
         found: NDArray[np.bool_] = (
@@ -112,26 +112,26 @@ class CaccPolicy(Policy):
         return found
 
     def _gap_m(self, newest: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(W, A) to the vehicle ahead on the own way; inf: there is none in range."""
+        """Return the gap (W, A) to the vehicle ahead on the ego path; inf: none in range."""
         closeness = self._part(newest, "lanes")[..., 0]
         with np.errstate(divide="ignore"):
             gap: NDArray[np.float64] = HALF_M / closeness - HALF_M
         return gap
 
     def _follow(self, newest: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """(W, A) whether the vehicle ahead says what it does, and the acceleration behind it."""
+        """Return (W, A) whether the vehicle ahead sends, and the acceleration behind it."""
         ego, lanes = self._part(newest, "ego"), self._part(newest, "lanes")
         gap_m = self._gap_m(newest)
-        told = self._part(newest, "messages")[..., : self._objects * OBJECT_FEATURES]
-        told = told.reshape(*told.shape[:-1], self._objects, OBJECT_FEATURES)
-        centre_m = hypot_all(told[..., 1], told[..., 2]) * self._scale_m
-        between_m = centre_m - 0.5 * (told[..., 8] * LENGTH_SCALE + OWN_LENGTH_M)
-        ahead = (told[..., 0] > 0.0) & (told[..., 1] > 0.0) & (told[..., 10] > 0.0)
+        reports = self._part(newest, "messages")[..., : self._objects * OBJECT_FEATURES]
+        reports = reports.reshape(*reports.shape[:-1], self._objects, OBJECT_FEATURES)
+        centre_m = hypot_all(reports[..., 1], reports[..., 2]) * self._scale_m
+        between_m = centre_m - 0.5 * (reports[..., 8] * LENGTH_SCALE + OWN_LENGTH_M)
+        ahead = (reports[..., 0] > 0.0) & (reports[..., 1] > 0.0) & (reports[..., 10] > 0.0)
         with np.errstate(invalid="ignore"):
             off_m = np.where(ahead, np.abs(between_m - gap_m[..., None]), np.inf)
         which = np.argmin(off_m, axis=-1)[..., None]
         follows = np.take_along_axis(off_m, which, axis=-1)[..., 0] < SAME_M
-        accel = np.take_along_axis(told[..., 7], which, axis=-1)[..., 0] * ACCEL_SCALE
+        accel = np.take_along_axis(reports[..., 7], which, axis=-1)[..., 0] * ACCEL_SCALE
         speed = ego[..., 0] * SPEED_SCALE
         wanted_m = np.maximum(HEADWAY_S * speed, MIN_GAP_M)
         cooperative = (
@@ -144,5 +144,5 @@ class CaccPolicy(Policy):
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
-    """Seat a driver with cooperative adaptive cruise control."""
+    """Create a driver with cooperative adaptive cruise control."""
     return CaccPolicy(env)

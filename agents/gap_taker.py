@@ -1,11 +1,11 @@
-"""Crosses a road where it knows a gap: by messages from its line, else by a look from the edge.
+"""Crosses a road in a known gap: by messages before its line, or else by sight from the edge.
 
-It follows its lane as the built-in driver steers. At a line where it gives way, vehicles that it
-sees or hears of (`sensors.conflicts.heard`) are taken to go on as they go; it crosses if none of
-them comes within `GAP_S` of the time that it needs. If it has heard of any vehicle in the last
-seconds, it decides before the line. If not, it stands at the edge of the other road first, and
-counts on what it sees from there. It is made for straight ways over one road, and needs the sensors
-`ego`, `signal` and `conflicts` with `heard`.
+The driver steers like the built-in driver. At a line where it must yield, it assumes that vehicles
+that it sees or receives messages of (`sensors.conflicts.heard`) keep their speed; it crosses if
+none of them comes within `GAP_S` of the time that it needs. If it has received any message in the
+last seconds, it decides before the line. Otherwise, it first stops at the edge of the other road
+and relies on what it sees from there. It is made for straight paths over one road, and needs the
+sensors `ego`, `signal` and `conflicts` with `heard`.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from cavmarl.core.errors import PolicyError
 from cavmarl.engine.spaces import observation_parts
 from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
-GAP_S = 0.8  # between its own time in the other's way and the other's
+GAP_S = 0.8  # between the times of the ego vehicle and of another one in the conflict area
 BRISK_MPS2 = 2.5
 STOP_MPS2 = 2.0
-LEAST_MPS = 3.0  # a vehicle that moves and is nearer than `NEAR_M` may come as fast as this
+LEAST_MPS = 3.0  # assumed lower bound of the speed of a moving vehicle nearer than `NEAR_M`
 NEAR_M = 15.0
 STANDING_MPS = 0.3
-LINE_M = 0.2  # before the line it stands there,
-EDGE_M = 4.2  # and so far beyond it at the edge of the other road
+LINE_M = 0.2  # stopping distance before the line
+EDGE_M = 4.2  # distance of the other road's edge behind the line
 HEARD_S = 3.0
 LENGTH_M, HALF_M = 5.0, 2.5
-ASIDE_M = 1.2  # half of a width, and some room
+ASIDE_M = 1.2  # half of a width, plus a margin
 
-# Scales and places of the features, see the table of any environment's card.
+# Scales and indices of the features, see the table of any environment's card.
 SPEED_SCALE = 40.0
-RATIO = 10.0  # m and m/s that are 0.5
+RATIO = 10.0  # m and m/s that are scaled to 0.5
 SIZE = 11
 NEEDED = {
     "sensors.conflicts.count": 6,
@@ -48,13 +48,13 @@ Floats = NDArray[np.float64]
 
 
 def straight(ratio: Floats) -> Floats:
-    """The m or m/s of a feature that is value / (RATIO + abs(value))."""
+    """Invert value / (RATIO + abs(value)), to m or m/s."""
     found: Floats = ratio * RATIO / np.maximum(1.0 - np.abs(ratio), 1e-6)
     return found
 
 
 def time_for(way_m: Floats, speed: Floats, limit: Floats) -> Floats:
-    """Seconds for a way, speeding up to a limit; 0 for none."""
+    """Return the time in s for a distance, accelerating up to a limit; 0 for none."""
     speed, way_m = np.minimum(speed, limit), np.maximum(way_m, 0.0)
     ramp_m = (limit**2 - speed**2) / (2.0 * BRISK_MPS2)
     within = (np.sqrt(speed**2 + 2.0 * BRISK_MPS2 * way_m) - speed) / BRISK_MPS2
@@ -64,7 +64,7 @@ def time_for(way_m: Floats, speed: Floats, limit: Floats) -> Floats:
 
 
 class GapTaker(Policy):
-    """Crosses where it knows a gap."""
+    """Crosses in a known gap."""
 
     def __init__(self, env: Environment) -> None:
         super().__init__(env)
@@ -76,7 +76,7 @@ class GapTaker(Policy):
             or config.action.kind != "continuous"
         ):
             raise PolicyError(
-                f"gap_taker needs to know what crosses its way, and continuous actions: make the "
+                f"gap_taker needs sensors of crossing vehicles, continuous actions: create the "
                 f"environment with overrides={NEEDED}"
             )
         self._places = {name: part.place for name, part in parts.items()}
@@ -87,13 +87,13 @@ class GapTaker(Policy):
         self.reset()
 
     def reset(self, seed: int | None = None) -> None:
-        """Forget where all are; nothing is drawn."""
-        self._beyond_m = np.zeros((0, 0))  # (W, A) of the front over the line
-        self._silent_s = np.zeros((0, 0))  # since it heard of one
+        """Forget the state of all agents; nothing is drawn."""
+        self._beyond_m = np.zeros((0, 0))  # (W, A) distance of the front beyond the line
+        self._silent_s = np.zeros((0, 0))  # time since the last message
         self._goes = np.zeros((0, 0), dtype=np.bool_)
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """(W, A, 2): the built-in driver's steering, and a throttle of its own."""
+        """Return (W, A, 2): the built-in driver's steering, and an own throttle."""
         if self._goes.shape != mask.shape:
             self._beyond_m, self._silent_s = np.zeros(mask.shape), np.full(mask.shape, np.inf)
             self._goes = np.zeros(mask.shape, dtype=np.bool_)
@@ -109,7 +109,7 @@ class GapTaker(Policy):
         return actions
 
     def _follow(self, others: Floats, speed: Floats, limit: Floats) -> Floats:
-        """(W, A) acceleration by IDM behind the nearest vehicle on the own way."""
+        """Return the acceleration (W, A) by IDM behind the nearest vehicle on the ego path."""
         ahead_m, aside_m = straight(others[..., 2]), straight(others[..., 3])
         is_ahead = (others[..., 0] > 0.0) & (others[..., 6] > 0.5)
         is_ahead &= (ahead_m > 0.0) & (np.abs(aside_m) < 1.5)
@@ -124,7 +124,7 @@ class GapTaker(Policy):
         return found
 
     def _cross(self, others: Floats, signal: Floats, speed: Floats, limit: Floats) -> Floats:
-        """(W, A) the most acceleration that a line, or the edge behind it, leaves."""
+        """Return the largest acceleration (W, A) that a line, or the edge behind it, allows."""
         before = signal[..., 0] > 0.0
         to_line_m = signal[..., 1] * self._signal_m - HALF_M
         self._beyond_m = np.where(before, -to_line_m, self._beyond_m + speed * self._dt_s)
@@ -140,14 +140,14 @@ class GapTaker(Policy):
         self._goes = (self._goes & (self._beyond_m > -NEAR_M)) | (
             clear & np.where(hears, cannot_stop, looked)
         )
-        self._goes |= left_m < -1.0  # it is beyond: it goes on
+        self._goes |= left_m < -1.0  # beyond the edge, the vehicle continues
         wanted = np.sqrt(2.0 * STOP_MPS2 * np.maximum(left_m - 0.2, 0.0))
         free = self._goes | (hears & clear) | (signal[..., 5] == 0.0) & before
         found: Floats = np.where(free, np.inf, (wanted - speed) / (2.0 * self._dt_s))
         return found
 
     def _in_the_way(self, others: Floats, speed: Floats, limit: Floats) -> NDArray[np.bool_]:
-        """(W, A) whether a known vehicle crosses the own way when the own one is there."""
+        """Return (W, A) whether a known vehicle will be in the conflict area at the same time."""
         ahead_m, aside_m = straight(others[..., 2]), straight(others[..., 3])
         across = straight(others[..., 5])
         crosses = (others[..., 0] > 0.0) & (np.abs(others[..., 6]) < 0.5)
@@ -163,11 +163,11 @@ class GapTaker(Policy):
         gone_s = np.maximum(gone_m, 0.0) / np.maximum(np.abs(across), STANDING_MPS)
         meets = (enters_s - GAP_S < gone_s) & (arrives_s - GAP_S < leaves_s)
         counts = crosses & (ahead_m + HALF_M + ASIDE_M > 0.0) & (gone_m > 0.0)
-        counts &= np.where(moves, True, away_m < there_m)  # one that stands lets it go first
+        counts &= np.where(moves, True, away_m < there_m)  # a standing vehicle lets it go first
         found: NDArray[np.bool_] = np.logical_or.reduce(counts & meets, axis=-1)
         return found
 
 
 def make_policy(env: Environment) -> Policy:
-    """Seat the driver."""
+    """Create the driver."""
     return GapTaker(env)

@@ -1,11 +1,11 @@
-"""A driver for dense traffic on one lane that speeds up so gently that no wave can grow.
+"""A driver for dense single-lane traffic that accelerates so gently that no wave can grow.
 
-It drives towards a little less than the speed of uniform flow, by 0.03 m/s more each second, after
-a stop hardly faster, and never faster than it can brake behind the vehicle ahead. Those behind
-follow without a stop. In `ring22` this dissolves the stop and go of 21 human drivers; elsewhere it
-is of no use. It reads the world's clock, which no sensor shows, and steers towards a point ahead on
-its way (pure pursuit: Coulter 1992). It needs `sensors.ego`, `sensors.route`, `sensors.lanes` and
-continuous actions.
+Its target speed is slightly below that of uniform flow and rises by 0.03 m/s per second; after a
+stop it rises hardly faster, and it never exceeds the speed from which it can brake behind the
+vehicle ahead. The vehicles behind follow without stopping. In `ring22` this dissolves the
+stop-and-go waves of 21 human drivers; elsewhere it is of no use. It reads the world's clock, which
+is not in the sensors, and steers towards a point ahead on its path (pure pursuit: Coulter 1992). It
+needs `sensors.ego`, `sensors.route`, `sensors.lanes` and continuous actions.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ HALF_M = 10.0
 
 
 class GentlePolicy(Policy):
-    """Follows its lane, and asks for the speed that is due.
+    """Follows its lane at a scheduled speed.
 
     Args:
-        env: where it drives.
+        env: the environment.
     """
 
     def __init__(self, env: CavEnv | CavVectorEnv) -> None:
@@ -50,7 +50,7 @@ class GentlePolicy(Policy):
         needed = {"ego", "route", "lanes"}
         if not needed <= parts.keys() or config.action.kind != "continuous":
             raise PolicyError(
-                "gentle needs a look at lanes, points of its way and continuous actions: make the "
+                "gentle needs sensors of lanes and route and continuous actions: create the "
                 "environment with overrides={'sensors.lanes.range_m': 100.0, "
                 "'sensors.route.points': 3, 'action.kind': 'continuous'}"
             )
@@ -65,13 +65,13 @@ class GentlePolicy(Policy):
         self._tick_s = config.clock.sim_dt_s
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """(W, A, 2): throttle for the speed that is due, and steering along the lane."""
+        """Return (W, A, 2): throttle for the scheduled speed, and steering along the lane."""
         if isinstance(self.env, CavEnv):
             raise PolicyError("act_batch() drives a make_vec; a parallel_env is driven by act()")
         return self._controls(observations)
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """The same for one world."""
+        """Return the actions for one world."""
         if isinstance(self.env, CavVectorEnv):
             raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
         return {
@@ -81,7 +81,7 @@ class GentlePolicy(Policy):
         }
 
     def _controls(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(W, A, 2)."""
+        """Return the actions (W, A, 2)."""
         newest = observations[..., -self._frame :].astype(np.float64)
         ahead_m, left_m = np.moveaxis(newest[..., self._aim] * self._aim_scale_m, -1, 0)
         squared = np.maximum(ahead_m**2 + left_m**2, 1.0)
@@ -90,7 +90,7 @@ class GentlePolicy(Policy):
         return controls.astype(np.float32)
 
     def _throttle(self, newest: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(W, A)."""
+        """Return the throttle (W, A)."""
         ego, lanes = newest[..., self._ego], newest[..., self._lanes]
         with np.errstate(divide="ignore"):
             gap_m = HALF_M / lanes[..., 0] - HALF_M
@@ -107,5 +107,5 @@ class GentlePolicy(Policy):
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
-    """Seat the driver."""
+    """Create the driver."""
     return GentlePolicy(env)

@@ -1,4 +1,4 @@
-"""Keeps its lane and its speed, whatever comes: what scenarios must not let pass."""
+"""Keeps its lane and its speed under all circumstances: a driver that scenarios must catch."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from cavmarl.policies.policy import Policy
 
 
 class NeverYieldPolicy(Policy):
-    """Follows the middle of its lanes, and neither brakes nor speeds up.
+    """Follows the centre of its lanes, and neither brakes nor accelerates.
 
-    It reads the world and not observations, so the worlds have to run in this process.
+    It reads the world instead of observations, so the worlds must run in this process.
     """
 
     def __init__(self, env: CavEnv | CavVectorEnv) -> None:
@@ -27,7 +27,7 @@ class NeverYieldPolicy(Policy):
             raise PolicyError("never_yield steers: it needs action.kind = continuous")
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """(W, A, 2): no throttle, and steering along the lanes."""
+        """Return (W, A, 2): no throttle, and steering along the lanes."""
         actions = np.zeros((*mask.shape, 2), dtype=np.float32)
         for world in range(len(mask)):
             for agent, steering in self._steerings(world).items():
@@ -35,7 +35,7 @@ class NeverYieldPolicy(Policy):
         return actions
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """The same by agent."""
+        """Return the actions by agent."""
         if isinstance(self.env, CavVectorEnv):
             raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
         steerings = self._steerings(0)
@@ -46,7 +46,7 @@ class NeverYieldPolicy(Policy):
         }
 
     def _steerings(self, world: int) -> dict[int, float]:
-        """By agent, from -1 to 1."""
+        """Return the steering by agent, from -1 to 1."""
         simulation, limit = self.env.simulation, self.env.config.action.steering_rad
         rows = simulation.vehicles(world)
         found = {}
@@ -63,5 +63,5 @@ class NeverYieldPolicy(Policy):
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
-    """Seat a driver that never yields."""
+    """Create a driver that never yields."""
     return NeverYieldPolicy(env)

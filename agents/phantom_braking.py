@@ -1,6 +1,6 @@
-"""The built-in driver, which now and then brakes for nothing: an opponent to learn distance from.
+"""The built-in driver with occasional phantom braking: an opponent that teaches distance.
 
-How often each seat does so, how hard and for how long is drawn. It needs continuous actions.
+Frequency, strength and duration of the braking are drawn per seat. It needs continuous actions.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from numpy.typing import NDArray
 
 from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
-BETWEEN_S = (5.0, 30.0)  # on average
+BETWEEN_S = (5.0, 30.0)  # mean range
 LONG_S = (0.5, 3.0)
 BRAKE_MPS2 = (2.0, 6.0)
 
 
 class PhantomBrakingPolicy(Policy):
-    """Draws by the seed of `reset`; the decisions since then count."""
+    """Draws by the seed of `reset` and the number of decisions since then."""
 
     def __init__(self, env: Environment) -> None:
         super().__init__(env)
         self.reset(0)
 
     def reset(self, seed: int | None = None) -> None:
-        """Draw anew; None draws a seed from the operating system."""
+        """Draw again; None draws a seed from the operating system."""
         self._random = np.random.Generator(np.random.Philox(seed))
         self._left_s = np.zeros((0, 0))
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """(W, A, 2): the built-in driver's actions, or the brake."""
+        """Return (W, A, 2): the built-in driver's actions, or the brake."""
         draw = self._random.uniform
         if self._left_s.shape != mask.shape:
             self._left_s = np.zeros(mask.shape)
@@ -48,5 +48,5 @@ class PhantomBrakingPolicy(Policy):
 
 
 def make_policy(env: Environment) -> Policy:
-    """Seat the driver."""
+    """Create the driver."""
     return PhantomBrakingPolicy(env)

@@ -1,4 +1,4 @@
-"""Uniform random actions: what every policy must beat."""
+"""Uniformly random actions: the baseline that every policy must beat."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class RandomPolicy(Policy):
         self._random = np.random.Generator(np.random.Philox(seed))
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Uniform over the action space, for every agent."""
+        """Draw uniformly from the action space, for every agent."""
         if self.env.config.action.kind == "continuous":
             return self._random.uniform(-1.0, 1.0, (*mask.shape, 2)).astype(np.float32)
         return self._random.integers(0, self.env.config.action.choices, mask.shape)
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
-    """Seat random actions."""
+    """Create random actions."""
     return RandomPolicy(env)

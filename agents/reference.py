@@ -1,7 +1,7 @@
 """The reference stack: perception, localisation, planning and control from sensors and the map.
 
-It needs the sensors of `cavmarl.cosim.stack.stack` on its vehicle. Here it runs in
-the process of the environment, from the same snapshots that `cavmarl follow` gets over a socket.
+It needs the sensors of `cavmarl.cosim.stack.stack` on its vehicle. It runs in the process of the
+environment, on the same snapshots that `cavmarl follow` gets over a socket.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from cavmarl.policies.policy import Policy
 
 
 class ReferencePolicy(Policy):
-    """One stack an agent.
+    """One stack per agent.
 
     Args:
-        env: with the sensors that the stack needs, in this process.
+        env: environment in this process, with the sensors that the stack needs.
     """
 
     def __init__(self, env: CavEnv | CavVectorEnv) -> None:
@@ -40,7 +40,7 @@ class ReferencePolicy(Policy):
         self._episodes += 1
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Controls (W, A, 2) from what the sensors of each vehicle have."""
+        """Return controls (W, A, 2) from the sensor data of each vehicle."""
         actions = np.zeros((*mask.shape, 2), dtype=np.float32)
         ticks = self.env.worlds.ticks()
         self._episodes[ticks < self._ticks] += 1
@@ -54,7 +54,7 @@ class ReferencePolicy(Policy):
         return actions
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Controls of the agents that are in the world."""
+        """Return the controls of the agents in the world."""
         mask = self.env.worlds.arrays.mask
         actions = self.act_batch(np.zeros((*mask.shape, 0), dtype=np.float32), mask)[0]
         index = {agent: k for k, agent in enumerate(self.env.possible_agents)}
@@ -63,9 +63,9 @@ class ReferencePolicy(Policy):
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:
-    """Seat the stack.
+    """Create the stack.
 
     Raises:
-        ConfigError: the environment has no GNSS, or meta-actions.
+        ConfigError: the environment has no GNSS, or uses meta-actions.
     """
     return ReferencePolicy(env)

@@ -1,5 +1,5 @@
-"""Benchmarks that are run beside the package, one file each; `python -m benchmarks` lists them.
+"""Benchmarks outside the package, one file each; `python -m benchmarks` lists them.
 
-They stand on `cavmarl` and are no part of its wheel. What users and papers need is in
+They use `cavmarl` but are no part of its wheel. The benchmarks that users and papers need are in
 `cavmarl bench`.
 """

@@ -10,14 +10,14 @@ from pathlib import Path
 from cavmarl.cli import main as cavmarl
 
 KEPT = {
-    "step": "Agent-steps a second next to highway-env's.",
-    "traffic": "Our traffic next to SUMO's own run of the same demand.",
-    "train": "PPO from end to end next to stable-baselines3's.",
+    "step": "Agent-steps per second compared with highway-env.",
+    "traffic": "Traffic compared with SUMO's own run of the same demand.",
+    "train": "End-to-end PPO compared with stable-baselines3.",
 }
 
 
 def programs() -> dict[str, str]:
-    """What each file here measures, by its name; files that are no programs are left out."""
+    """Return the description of each program by name; modules that are no programs are left out."""
     found = {}
     for path in sorted(Path(__file__).parent.glob("*.py")):
         text = path.read_text(encoding="utf-8")
@@ -27,7 +27,7 @@ def programs() -> dict[str, str]:
 
 
 def main(words: list[str]) -> None:
-    """List, or run what the first word names with the options that follow."""
+    """List the benchmarks, or run the one that the first word names with the remaining options."""
     name, *options = words or [""]
     if name in KEPT:
         cavmarl(["bench", name, *options])

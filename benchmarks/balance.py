@@ -1,7 +1,7 @@
-"""What placing shards by load saves, on traces of loads of an environment.
+"""Gains from placing shards by load, on load traces of an environment.
 
-Traces are generated on its map, or recorded while it runs; each is replayed through every way to
-place shards, by `balance_replay`.
+Traces are generated on the environment's map, or recorded while it runs; `balance_replay` replays
+each one through every placement strategy.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from cavmarl.evaluate.statistics import Interval
 from cavmarl.roads.cache import load_network
 from cavmarl.zones.partition.zone_file import named_zones
 
-ROUND_S = 10  # simulated seconds of a recorded round
-BEFORE_S = 20  # simulated seconds before the first one
-AFTER_S = 1  # so that no episode ends within the last one
+ROUND_S = 10  # simulated seconds per recorded round
+BEFORE_S = 20  # simulated seconds before the first round
+AFTER_S = 1  # so that no episode ends within the last round
 
 
 def measure(
     env: Annotated[str, typer.Argument(help="Name, folder or map file of an environment.")],
-    zones: Annotated[int, about("Zones that the map is divided into.")] = 9,
-    workers: Annotated[int, about("Workers that host them.")] = 3,
+    zones: Annotated[int, about("Number of zones.")] = 9,
+    workers: Annotated[int, about("Number of workers that host the zones.")] = 3,
     layout: Annotated[str, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")] = "bisection",
     recorded: Annotated[
-        bool, about("Record what zones cost while the environment runs.", "--recorded")
+        bool, about("Record the costs of zones while the environment runs.", "--recorded")
     ] = False,
-    traces: Annotated[int, about("Number of traces, each with a seed of its own.", min=1)] = 10,
-    rounds: Annotated[int, about("Rounds of a trace; the first quarter is to learn from.")] = 80,
+    traces: Annotated[int, about("Number of traces, each with its own seed.", min=1)] = 10,
+    rounds: Annotated[int, about("Rounds per trace; the first quarter is for learning.")] = 80,
     tolerance: Annotated[float, about("Imbalance below which nothing moves.")] = 0.1,
-    max_moves: Annotated[int, about("Most shards that move in one round.")] = 4,
-    move_ms: Annotated[float, about("Supposed price of a shard's move.")] = 10.0,
+    max_moves: Annotated[int, about("Largest number of shards that move in one round.")] = 4,
+    move_ms: Annotated[float, about("Assumed cost of moving a shard.")] = 10.0,
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Static, balanced and the extensions on the same traces: makespans beside the static one's."""
+    """Compare static placement, balancing and its extensions on the same traces, by makespan."""
     rule = BalanceRule(tolerance=tolerance, max_moves=max_moves, move_s=1e-3 * move_ms)
     check_range(workers=(workers, 1, float("inf")))
     make = recorded_traces if recorded else generated_traces
@@ -86,8 +86,8 @@ def _report(found: BalanceReplay, kind: str) -> BenchmarkReport:
         f"traces of {found.rounds} rounds",
         {
             "placement": "name",
-            "time over static's": "time",
-            "beside balanced": "beside",
+            "time / static": "time",
+            "time / balanced": "beside",
             "max / mean": "imbalance:.2f",
             "moves": "moves:.2f",
             "handed over": "handoffs:.1f",
@@ -99,9 +99,9 @@ def _report(found: BalanceReplay, kind: str) -> BenchmarkReport:
                 for verdict in verdicts
             ),
             "calibrated, mean: {:.2f} CPU + {:.2f} RAM + {:.2f} GPU".format(*fitted),
-            "calibrated, predicted, re-cut: extensions of balanced; perfect: no shard whole; "
-            f"supposed: {1e3 * found.rule.move_s:g} ms a move, {found.ticks} ticks a round, what "
-            "others use of workers",
+            "calibrated, predicted, re-cut: extensions of balanced; perfect: divisible shards; "
+            f"assumed: {1e3 * found.rule.move_s:g} ms per move, {found.ticks} ticks per round, "
+            "other load on workers",
         ],
         facts={"recorded": kind == "recorded", "rule": asdict(found.rule), "ticks": found.ticks},
     )
@@ -123,9 +123,9 @@ def generated_traces(
     seeds: Sequence[int],
     overrides: Mapping[str, Any],
 ) -> Iterator[LoadTrace]:
-    """A crowd on the environment's map for each seed."""
+    """Yield a trace of a generated crowd on the environment's map for each seed."""
     if overrides:
-        raise ConfigError("--set: a generated crowd has no settings; give --recorded with it")
+        raise ConfigError("--set: a generated crowd has no settings; add --recorded")
     network = load_network(find_map(env))
     partition = named_zones(network, layout, zones)
     for seed in seeds:
@@ -142,7 +142,7 @@ def recorded_traces(
     seeds: Sequence[int],
     overrides: Mapping[str, Any],
 ) -> Iterator[LoadTrace]:
-    """What zones cost while the built-in driver is in all seats, for each seed."""
+    """Yield the recorded costs of zones, with the built-in driver in all seats, for each seed."""
     for seed in seeds:
         simulation = world_maker(
             env,

@@ -1,9 +1,9 @@
-"""What each way to place shards would have taken, beside the static one, on the same traces.
+"""Replay of load traces through each placement strategy, compared with static placement.
 
-The truth of the replay is a model: a worker gets the share of its processor that others leave, so
-its shards take their cost over 1 - CPU, and memory and GPU in use slow no worker down. All workers
-wait for the slowest. A shard that moves costs the rule's `move_s` once, a vehicle that is given to
-another zone because the map is cut anew `HANDOFF_S`.
+The replay uses a model of the true cost: a worker gets the share of its processor that other
+programs leave, so its shards take their cost over 1 - CPU; memory and GPU in use slow no worker
+down. All workers wait for the slowest. Moving a shard costs the rule's `move_s` once, and a vehicle
+that changes its zone because the map is cut again costs `HANDOFF_S`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cavmarl.evaluate.statistics import Interval, mean_interval
 __all__ = ["BalanceReplay", "StrategyResult", "Verdict", "replay_traces"]
 
 HANDOFF_S = 1e-4
-WARM_SHARE = 0.25  # of the rounds, before what is learnt is used and times count
+WARM_SHARE = 0.25  # share of rounds before learnt values are used and times count
 
 
 Verdict = Literal[
@@ -38,37 +38,37 @@ Verdict = Literal[
 
 @dataclass(frozen=True)
 class StrategyResult:
-    """One way to place shards; means over traces."""
+    """One placement strategy; all values are means over traces."""
 
-    name: str  # of `STRATEGIES`, or `perfect`: as if shards could be divided at will
-    ratio: float  # its time over that of the static placement
-    ratio95: Interval | None  # between traces; None: of one trace
-    beside_balanced: float  # its time over that of `balanced`
-    beside_balanced95: Interval | None  # the same
+    name: str  # of `STRATEGIES`, or `perfect`: with arbitrarily divisible shards
+    ratio: float  # time over that of the static placement
+    ratio95: Interval | None  # between traces; None: a single trace
+    beside_balanced: float  # time over that of `balanced`
+    beside_balanced95: Interval | None  # between traces; None: a single trace
     imbalance: float  # maximum over mean of the workers' ticks, mean over rounds
-    moves: float  # shards a round
-    handoffs: float  # vehicles a round that the cutting moved
-    weights: tuple[float, float, float]  # of the last round's score, mean
-    verdict: Verdict  # `ratio95` beside 1
+    moves: float  # moved shards per round
+    handoffs: float  # vehicles per round that changed their zone by a new cut
+    weights: tuple[float, float, float]  # weights of the last round's score, mean
+    verdict: Verdict  # from `ratio95`
 
 
 @dataclass(frozen=True)
 class BalanceReplay:
     """Result of `replay_traces`."""
 
-    map_name: str  # the map's name
-    zones: int  # k
-    workers: int  # m
-    traces: int  # how many
-    rounds: int  # of each, those before times count among them
-    ticks: int  # of a round
-    rule: BalanceRule  # when shards move, and what that costs
-    rows: tuple[StrategyResult, ...]  # by strategy
+    map_name: str  # name of the map
+    zones: int  # number of zones
+    workers: int  # number of workers
+    traces: int  # number of traces
+    rounds: int  # rounds per trace, including those before times count
+    ticks: int  # ticks per round
+    rule: BalanceRule  # when shards move, and the cost of a move
+    rows: tuple[StrategyResult, ...]  # results by strategy
 
 
 @dataclass(frozen=True)
 class _Totals:
-    """One strategy on one trace, from the first round that counts."""
+    """Sums of one strategy on one trace, from the first round that counts."""
 
     time_s: float
     imbalance: float
@@ -80,12 +80,12 @@ class _Totals:
 def replay_traces(traces: Sequence[LoadTrace], rule: BalanceRule) -> BalanceReplay:
     """Replay every trace through every strategy."""
     if not traces:
-        raise ConfigError("traces: there must be at least one")
+        raise ConfigError("traces: at least one is needed")
     first = traces[0]
     rounds = len(first.rounds)
     warm = math.ceil(WARM_SHARE * rounds)
     if rounds < 4:
-        raise ConfigError(f"rounds = {rounds}: must be at least 4, of which the first are learnt")
+        raise ConfigError(f"rounds = {rounds}: must be at least 4; the first ones are for learning")
     totals = {name: [_replay(name, one, rule, warm) for one in traces]
               for name in (*STRATEGIES, "perfect")}  # fmt: skip
     static, balanced = (
@@ -140,7 +140,7 @@ def _replay(name: str, trace: LoadTrace, rule: BalanceRule, warm: int) -> _Total
 
 
 def _tick_s(trace: LoadTrace, number: int, placed: Placed) -> tuple[float, float]:
-    """How long a tick takes, and would if shards could be divided at will."""
+    """Return the time of a tick, and the time with arbitrarily divisible shards."""
     costs_s = trace.costs_s(number, placed.partition)
     workers = trace.rounds[number].snapshot.workers
     speeds = np.array([1.0 - candidate.use.cpu for candidate in workers])
@@ -175,7 +175,7 @@ def _summary(
 def _verdict(ratios: NDArray[np.float64]) -> Verdict:
     if len(ratios) < 2:
         return "one trace tells nothing"
-    low = high = float(ratios.mean())  # there is no interval where all are the same
+    low = high = float(ratios.mean())  # there is no interval if all ratios are equal
     if (interval := mean_interval(ratios)) is not None:
         low, high = interval.low, interval.high
     if high < 1.0:

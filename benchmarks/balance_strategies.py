@@ -1,4 +1,4 @@
-"""Ways to place shards, round by round, on one trace of loads."""
+"""Strategies that place shards, round by round, on one load trace."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ RECUT_EVERY = 10  # rounds
 
 @dataclass(frozen=True)
 class Placed:
-    """Where shards are in one round."""
+    """The placement of shards in one round."""
 
     partition: ZonePartition  # the zones
     homes: tuple[int, ...]  # worker of each zone
-    moved_shards: int = 0  # since the round before
-    moved_vehicles: int = 0  # that other zones got, since the map was cut anew
+    moved_shards: int = 0  # since the previous round
+    moved_vehicles: int = 0  # that changed their zone because the map was cut again
 
 
 class StaticPlacement:
-    """The paper's baseline: placed once, before anything is measured, and never moved.
+    """The paper's baseline: shards are placed once, before any measurement, and never move.
 
     Args:
         trace: the loads.
-        rule: of the first plan.
+        rule: rule of the first plan.
 
     Attributes:
-        partition: the zones now.
+        partition: the present zones.
         balancer: has the plan.
     """
 
@@ -50,11 +50,11 @@ class StaticPlacement:
         self.balancer = self._begin(trace.partition, equal_costs(1, trace.partition.count), 0)
 
     def place(self, number: int) -> Placed:
-        """Where shards are in a round, from what is known before it."""
+        """Return the placement in a round, from the knowledge before it."""
         return Placed(self.partition, self.balancer.plan.homes)
 
     def learn(self, number: int) -> None:
-        """Take in what was measured in a round."""
+        """Process the measurements of a round."""
 
     def _begin(
         self, partition: ZonePartition, costs: tuple[ShardCost, ...], number: int
@@ -64,15 +64,15 @@ class StaticPlacement:
 
 
 class LoadStrategy(StaticPlacement):
-    """Moves a few shards a round by measured costs; each extension is a switch.
+    """Moves a few shards per round by measured costs; each extension is a switch.
 
     Args:
         trace: the loads.
         rule: when shards move.
-        warm: rounds before anything that was learnt is used.
-        calibrated: fit the score's weights to what workers took.
-        predicted: cost of the coming round from what is in the zones now.
-        repartitioned: cut the map anew where moving shards does not help, at most every
+        warm: rounds before learnt values are used.
+        calibrated: whether to fit the score's weights to the workers' times.
+        predicted: whether to predict costs from the present contents of zones.
+        repartitioned: whether to cut the map again if moving shards does not help, at most every
             `RECUT_EVERY` rounds.
     """
 
@@ -92,10 +92,10 @@ class LoadStrategy(StaticPlacement):
         self._ticks: list[LoggedTick] = []
         self._contents: list[ShardContent] = []
         self._measured_s: list[float] = []
-        self._usual = np.array(trace.contents(0, trace.partition))  # smoothed as costs are
+        self._usual = np.array(trace.contents(0, trace.partition))  # smoothed like costs
 
     def place(self, number: int) -> Placed:
-        """Where shards are in a round, from what is known before it."""
+        """Return the placement in a round, from the knowledge before it."""
         before = self.balancer.plan.homes
         if number == 0:
             return Placed(self.partition, before)
@@ -112,7 +112,7 @@ class LoadStrategy(StaticPlacement):
         return Placed(self.partition, homes, moved, moved_vehicles)
 
     def learn(self, number: int) -> None:
-        """Take in what was measured in a round."""
+        """Process the measurements of a round."""
         trace, partition = self.trace, self.partition
         measured_s = trace.measured_s(number, partition)
         contents = trace.contents(number, partition)
@@ -150,7 +150,7 @@ class LoadStrategy(StaticPlacement):
         return self._recut and number >= self._warm and number % RECUT_EVERY == 0
 
     def _cut_anew(self, number: int) -> int:
-        """Other zones, if they pay; how many vehicles get another one."""
+        """Cut the map again if this pays; return the number of vehicles that change their zone."""
         trace = self.trace
         places = trace.rounds[number - 1].places
         costs_s = [shard.cost_s for shard in self.balancer.costs]
@@ -168,5 +168,5 @@ class LoadStrategy(StaticPlacement):
 
 
 def _shards(costs_s: Sequence[float]) -> tuple[ShardCost, ...]:
-    """Zones of the one world of a trace."""
+    """Return the shards of a trace's only world."""
     return tuple(ShardCost(0, zone, cost_s) for zone, cost_s in enumerate(costs_s))

@@ -1,4 +1,4 @@
-"""Junctions where signs have links give way in a circle: vehicles there wait for each other."""
+"""Junctions whose signs make links yield in a circle, so that vehicles wait for each other."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.network import RoadNetwork
 
-SIGNED = [ord(state) for state in "Mms"]  # states of links: major, minor, behind a stop sign
+SIGNED = [ord(state) for state in "Mms"]  # link states: major, minor, stop sign
 
 
 def circular_priority(network: RoadNetwork) -> NDArray[np.int64]:
-    """LINK rows that give way in a circle, or that lie between two circles.
+    """Return the LINK rows that yield in a circle, or that lie between two circles.
 
-    Only junctions count where signs say which road comes first: among equals, at all-way stops and
-    at signals drivers settle it another way.
+    Only junctions with priority signs count: at uncontrolled junctions, all-way stops and signals,
+    drivers resolve the conflict in other ways.
     """
     links = network.links
     owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
@@ -23,7 +23,7 @@ def circular_priority(network: RoadNetwork) -> NDArray[np.int64]:
     asked = network.conflicts["must_yield"] & signed[owner] & signed[foe]
     edges = np.stack([owner[asked], foe[asked]], axis=1)
     while True:
-        left = np.intersect1d(edges[:, 0], edges[:, 1])  # it gives way, and others to it
+        left = np.intersect1d(edges[:, 0], edges[:, 1])  # the link yields, and others yield to it
         inside = np.isin(edges, left).all(axis=1)
         if inside.all():
             return left

@@ -1,4 +1,4 @@
-"""The clock of a master and that of a follower in another process, after the same steps."""
+"""The clocks of a time master and of a follower in another process, after the same steps."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from cavmarl.config.world_spec import WorldSpec
 def measure(
     world: WorldSpec,
     env: OptionalEnvironment = "ring",
-    steps: Annotated[int, about("Steps of the master; a step is one tick here.")] = 5000,
+    steps: Annotated[int, about("Steps of the master; a step is one tick.")] = 5000,
     rogue: Annotated[
-        float, about("Share of steps in which the follower also ticks by itself.")
+        float, about("Share of steps in which the follower also ticks on its own.")
     ] = 0.0,
     own_ticks: Annotated[
         Literal["obey", "refuse", "ignore"],
-        about("What the master does with such a tick; obey: the world really ticks."),
+        about("Master's reaction to such a tick; obey: the world ticks."),
     ] = "obey",
     pace: Annotated[
         float | None,
-        about("Simulated seconds a second; then a clock of the follower's own is read, too."),
+        about("Simulated seconds per second; also compares the follower's own clock."),
     ] = None,
-    csv_path: Annotated[Path | None, about_file("Write the table here.", "--csv")] = None,
+    csv_path: Annotated[Path | None, about_file("Write the table to this file.", "--csv")] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Read a master's clock and that of a follower in another process: Table II."""
+    """Compare a master's clock with that of a follower in another process (Table II)."""
     say(f"{steps} steps")
     found = measure_drift(world, steps=steps, rogue=rogue, answer=own_ticks, pace=pace)
     if csv_path is not None:
         write_rows(csv_path, found.rows)
     return BenchmarkReport(
-        f"{found.environment}, {1000.0 * found.dt_s:g} ms a step",
+        f"{found.environment}, {1000.0 * found.dt_s:g} ms per step",
         {
             "step": "step",
             "master, s": "master_s:.1f",
@@ -58,12 +58,12 @@ def measure(
 def _verdict(found: ClockDrift) -> str:
     if not found.own_ticks:
         equal = "equal" if found.holds else "[bold]not equal[/]"
-        return f"the follower did not tick by itself; the clocks are {equal}"
-    told = f"the follower ticked by itself {found.own_ticks} times ({found.answer})"
+        return f"the follower did not tick on its own; the clocks are {equal}"
+    event = f"the follower ticked on its own {found.own_ticks} times ({found.answer})"
     if found.noticed_ticks is None:
-        return f"{told}; the master counted {found.counted}, and the world went on only with it"
+        return f"{event}; the master counted {found.counted}, and the world went on only with it"
     return (
-        f"{told}; the master noticed {found.drift_events} times that the world had gone on without "
+        f"{event}; the master noticed {found.drift_events} times that the world advanced without "
         f"it, first {found.noticed_ticks} of its ticks after the first time"
     )
 

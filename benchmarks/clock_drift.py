@@ -1,7 +1,7 @@
-"""How far the clock of a follower in another process drifts from its master's: Table II.
+"""Drift between a time master's clock and that of a follower in another process (Table II).
 
-The table is that of the co-simulation paper. Both clocks are read where they are: the master's
-here, the follower's in its own process, from what it is sent.
+The table is that of the co-simulation paper. Each clock is read in its own process; the follower's
+clock is derived from the messages it gets.
 """
 
 from __future__ import annotations
@@ -25,47 +25,45 @@ from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Unpaced
 from cavmarl.env.parallel import parallel_env
 
 PROGRAM = "benchmarks.clock_reader"
-ENDS_S = 30.0  # for the follower to end by itself
-JOINS_S = 60.0  # for it to start
+ENDS_S = 30.0  # time for the follower to exit
+JOINS_S = 60.0  # time for the follower to start
 TIMEOUT_S = 60.0
-BEFORE = 20  # steps that the world has gone on before the follower joins
+BEFORE = 20  # steps of the world before the follower joins
 
 
 @dataclass(frozen=True)
 class DriftRow:
     """The two clocks after a step; times are simulated."""
 
-    step: int  # steps since the follower has joined
-    master_s: float  # the master's time since then
-    follower_s: float  # the world's time as the follower has it
-    normalised_s: float  # the same since it has joined
-    delta_s: float  # by how much that is ahead of the master's
-    ratio: float  # of the two
-    # by how much the clock of the follower's own process, by which it does not go, is ahead of the
-    # master's; None: steps are not paced by a clock
+    step: int  # steps since the follower joined
+    master_s: float  # master's time since the follower joined
+    follower_s: float  # world time as known to the follower
+    normalised_s: float  # the same since the follower joined
+    delta_s: float  # follower's lead over the master
+    ratio: float  # follower's time over the master's
+    # lead of the follower's process clock, which it does not use, over the master's; None: steps
+    # are not paced
     own_delta_s: float | None
 
 
 @dataclass(frozen=True)
 class ClockDrift:
-    """What was measured."""
+    """Result of `measure_drift`."""
 
-    environment: str  # on which
-    dt_s: float  # seconds a tick, which is a step here
-    rogue: float  # the share of steps in which the follower ticked by itself
-    answer: OwnTicks  # what the master did about that
-    pace: (
-        float | None
-    )  # simulated seconds a second of the master's process; None: as fast as it goes
-    rows: tuple[DriftRow, ...]  # at steps 100, 500, 1000, 5000 and so on, and the last one
-    own_ticks: int  # how often it did, by its own count
-    counted: int  # the same by the master's
-    drift_events: int  # how often the master has noticed that the world had gone on without it
-    noticed_ticks: int | None  # of the master, from the first such tick on; None: it did not
+    environment: str  # name of the environment
+    dt_s: float  # seconds per tick; a step is one tick
+    rogue: float  # share of steps in which the follower ticked on its own
+    answer: OwnTicks  # the master's reaction to such ticks
+    pace: float | None  # simulated seconds per second of the master; None: unpaced
+    rows: tuple[DriftRow, ...]  # at steps 100, 500, 1000, 5000, …, and the last one
+    own_ticks: int  # number of its own ticks counted by the follower
+    counted: int  # the same, counted by the master
+    drift_events: int  # number of times that the master noticed the world had advanced without it
+    noticed_ticks: int | None  # ticks of the master until it first noticed; None: it did not
 
     @property
     def holds(self) -> bool:
-        """The clocks are equal; or, where own ticks are obeyed, that was noticed in time."""
+        """Return whether the clocks agree or, with obeyed own ticks, the master noticed in time."""
         if self.answer == "obey" and self.own_ticks:
             return self.noticed_ticks is not None and self.noticed_ticks <= 1
         return all(row.delta_s == 0.0 and row.ratio == 1.0 for row in self.rows)
@@ -80,10 +78,10 @@ def measure_drift(
     pace: float | None = None,
     **keys: Unpack[WorldKeys],
 ) -> ClockDrift:
-    """Run a world as master, with a follower in a process of its own that reads its clock.
+    """Run a world as time master, with a follower in its own process that reads the clock.
 
-    With `pace` the master's steps wait for the wall clock, and the table says how far a follower
-    would be off that went by the clock of its own process instead of the master's.
+    With `pace`, the master's steps wait for the wall clock, and the table also shows the error of a
+    follower that used its own process clock instead of the master's.
     """
     pacer = _FromJoining(Unpaced() if pace is None else RealTime(pace))
     check_range(steps=(steps, 1, math.inf), rogue=(rogue, 0.0, 1.0))
@@ -127,7 +125,7 @@ def measure_drift(
 
 
 class _FromJoining:
-    """Paces steps from when the follower has joined on."""
+    """Paces steps from the moment when the follower has joined."""
 
     def __init__(self, then: Pacer) -> None:
         self._then = then
@@ -141,7 +139,7 @@ class _FromJoining:
 def _followed(
     world: FollowedWorld, pacer: _FromJoining, steps: int, rogue: float
 ) -> tuple[list[int], dict[str, Any]]:
-    """The master's ticks after each step since the follower has joined, and what that has read."""
+    """Return the master's ticks per step since the follower joined, and the follower's output."""
     words = ["-m", PROGRAM, str(world.address), str(rogue)]
     with start_python(words, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -153,29 +151,29 @@ def _followed(
                 clock.append(world.master.tick - joined)
             world.master.look_for_drift()
             world.close()
-            told, _ = process.communicate(timeout=ENDS_S)
+            output, _ = process.communicate(timeout=ENDS_S)
         finally:
             process.kill()
     if process.returncode:
-        raise EvaluationError(f"{PROGRAM} ended with {process.returncode}; see its own words")
-    return clock, json.loads(told)
+        raise EvaluationError(f"{PROGRAM} ended with {process.returncode}; see its output")
+    return clock, json.loads(output)
 
 
 def own_s(seconds: list[float], pace: float | None) -> list[float] | None:
-    """What a clock of the follower's own says in simulated seconds, where there is one."""
+    """Convert the follower's own clock to simulated seconds, if there is a pace."""
     return None if pace is None else [pace * since_s for since_s in seconds]
 
 
 def rows_of(
     master: list[int], follower: list[int], dt_s: float, own_s: list[float] | None = None
 ) -> tuple[DriftRow, ...]:
-    """Table II of two series of ticks, from when the follower has joined on.
+    """Build Table II from two series of ticks that begin when the follower joined.
 
     Args:
-        master: its tick after each step.
-        follower: the tick that the follower has then.
-        dt_s: seconds a tick.
-        own_s: what a clock of the follower's own says after each step.
+        master: the master's tick after each step.
+        follower: the follower's tick after each step.
+        dt_s: seconds per tick.
+        own_s: the follower's own clock after each step.
     """
     last = len(master) - 1
     marks = [mark for n in range(2, 9) for mark in (10**n, 5 * 10**n) if mark < last]

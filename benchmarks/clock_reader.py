@@ -1,11 +1,10 @@
-"""A program that follows a world's clock, records it, and on request ticks by itself.
+"""A program that follows a world's clock, records it, and optionally ticks on its own.
 
     python -m benchmarks.clock_reader ADDRESS SHARE
 
-At the end it prints one line of JSON: the world's tick when it joined, then after each step, as the
-follower has it then, what the clock of its own process says meanwhile (seconds since it joined),
-and how many of its own ticks were refused. It ticks by itself in SHARE of the steps, spread as
-evenly as can be.
+At the end it prints one line of JSON: the world's tick when it joined and after each step, as known
+to the follower; its own process clock (seconds since it joined); and the number of its own ticks
+that were refused. It ticks on its own in SHARE of the steps, evenly spread.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from cavmarl.cosim.followers.follower_client import Follower
 
 
 def is_due(step: int, share: Fraction) -> bool:
-    """Whether step 1, 2, … is one of those: of the first n there are always floor(n · share)."""
+    """Return whether to tick in a step, from 1; of the first n steps, floor(n · share) are due."""
     return int(step * share) > int((step - 1) * share)
 
 

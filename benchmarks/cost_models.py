@@ -1,9 +1,9 @@
-"""Models that the balance benchmark tries beside measured costs; no setting of cavmarl uses them.
+"""Cost models that the balance benchmark compares with measured costs; cavmarl does not use them.
 
-Calibrated: the LoadScore stands for the share of a worker that its shards do not get. A worker that
-took `tick_s` for shards that cost `load_s` has lost the share 1 - load_s / tick_s, and the weights
-are those that explain the lost shares best. Predicted: a shard's coming cost is linear in the
-vehicles, sensor readings and migrations in it now. No coefficient of either is below 0.
+Calibrated: the LoadScore is the share of a worker that its shards do not get. A worker that took
+`tick_s` for shards that cost `load_s` has lost the share 1 - load_s / tick_s; the weights are those
+that best explain the lost shares. Predicted: a shard's future cost is linear in its present
+vehicles, sensor readings and migrations. No coefficient is negative.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 class LoggedTick(NamedTuple):
-    """What others used of a worker, what its shards cost, and how long it took, seconds a tick."""
+    """Other load on a worker, the cost of its shards, and its time, in seconds per tick."""
 
     use: Utilisation
     load_s: float
@@ -29,7 +29,7 @@ class LoggedTick(NamedTuple):
 
 
 class ShardContent(NamedTuple):
-    """What is in a shard in a tick: vehicles, readings of agents' sensors, vehicles that came."""
+    """The contents of a shard in a tick: vehicles, sensor readings of agents, arrived vehicles."""
 
     vehicles: float
     readings: float
@@ -37,7 +37,7 @@ class ShardContent(NamedTuple):
 
 
 class CostModel(NamedTuple):
-    """Seconds a tick of a shard, and of each thing in it."""
+    """Cost of a shard and of each object in it, in seconds per tick."""
 
     shard_s: float
     vehicle_s: float
@@ -45,18 +45,18 @@ class CostModel(NamedTuple):
     migration_s: float
 
     def predict(self, content: ShardContent) -> float:
-        """What a shard with this content costs, seconds a tick."""
+        """Return the cost of a shard with this content, in seconds per tick."""
         return self.shard_s + float(np.dot(self[1:], content))
 
     def shift(self, cost_s: float, before: ShardContent, now: ShardContent) -> float:
-        """What a shard costs with its content of now that cost `cost_s` with that before."""
+        """Return the cost of a shard after its content changes, given its cost before."""
         return max(cost_s + self.predict(now) - self.predict(before), 0.0)
 
 
 def calibrate(
     log: Sequence[LoggedTick], given: tuple[float, float, float] = WEIGHTS
 ) -> tuple[float, float, float]:
-    """Weights of CPU, RAM and GPU that sum to 1; those given where nothing can be learnt."""
+    """Return weights of CPU, RAM and GPU that sum to 1; `given` if nothing can be learnt."""
     rows = [row for row in log if row.load_s > 0.0]
     if not rows:
         return given
@@ -70,18 +70,19 @@ def calibrate(
 
 
 def fit_costs(contents: Sequence[ShardContent], costs_s: Sequence[float]) -> CostModel:
-    """The model that fits logged rows best."""
+    """Return the model that fits logged rows best."""
     rows = np.column_stack([np.ones(len(contents)), np.array(contents)])
     scale = np.abs(rows).max(axis=0)
-    scale[scale == 0.0] = 1.0  # of what never was there
+    scale[scale == 0.0] = 1.0  # columns without data
     return CostModel(*(fit_non_negative(rows / scale, np.array(costs_s)) / scale).tolist())
 
 
 def fit_non_negative(rows: Floats, values: Floats) -> Floats:
-    """Coefficients (c,) ≥ 0 that minimise |rows · coefficients - values|², of a few columns.
+    """Return coefficients (c,) ≥ 0 that minimise |rows · coefficients - values|².
 
-    The optimum is an ordinary least-squares fit on the columns that are not at 0 (Lawson and
-    Hanson, Solving Least Squares Problems, 1974, chapter 23): all choices of them are tried.
+    The optimum is an ordinary least-squares fit on the columns with positive coefficients (Lawson
+    and Hanson, Solving Least Squares Problems, 1974, chapter 23). All subsets of columns are tried,
+    so use it with few columns.
     """
     columns = range(rows.shape[1])
     best, least = np.zeros(len(columns)), float(values @ values)

@@ -1,4 +1,4 @@
-"""Demand of a map that is empty at first and fills: worlds of different ages differ in cost."""
+"""Demand that fills an empty map, so that worlds of unequal age differ in cost."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["write_filling_demand"]
 def write_filling_demand(
     network: RoadNetwork, path: Path, *, seconds: float, period_s: float
 ) -> Path:
-    """Flows from every road into the map to every road out of it."""
+    """Write flows from every road into the map to every road out of it."""
     ins, outs = _ends(network, "num_into"), _ends(network, "num_links")
     if not (ins and outs):
         raise ConfigError(
-            f"map '{network.name}': no roads lead into it and out of it; name another"
+            f"map '{network.name}': it needs roads that lead in and out; choose another"
         )
     flows = "\n".join(
         f'  <flow id="{a}-{b}" from="{a}" to="{b}" begin="{period_s * n:g}" end="{seconds:g}" '
@@ -34,7 +34,7 @@ def write_filling_demand(
 
 
 def _ends(network: RoadNetwork, links: str) -> list[str]:
-    """Roads none of whose lanes has such links."""
+    """Return the ids of roads whose lanes have no such links."""
     lanes, edges = network.lanes, network.edges
     linked: NDArray[np.int64] = np.bincount(lanes["edge"], lanes[links], len(edges))
     return [network.edge_ids[e] for e in np.flatnonzero((linked == 0) & ~edges["internal"])]

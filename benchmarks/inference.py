@@ -1,7 +1,7 @@
-"""Driver networks in their kernel next to torch, by turns, on one core.
+"""Inference of driver networks by the kernel compared with torch, in turn, on one core.
 
-All weights and observations are random numbers. The sides evaluate the same rows, torch in
-`inference_mode` with one thread.
+All weights and observations are random. Both sides evaluate the same rows; torch uses
+`inference_mode` and one thread.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from cavmarl.core.errors import require
 from cavmarl.policies.driver_network import DriverNetwork
 from cavmarl.policies.network_files import MAX_OBSERVATION_SIZE, MAX_WIDTH, NetworkConfig
 
-FORMS = {"tanh": False, "LayerNorm, ReLU": True}  # of the layers: whether `shared`
+FORMS = {"tanh": False, "LayerNorm, ReLU": True}  # kind of layers → `shared`
 
 Pass = Callable[[], NDArray[np.float32]]
 
@@ -41,11 +41,11 @@ def measure(
     rows: Annotated[int, about("Observations per call.")] = 1600,
     inputs: Annotated[int, about("Numbers per observation.")] = 105,
     hidden: Annotated[int, about("Width of each of the two hidden layers.")] = 128,
-    repeats: Annotated[int, about("Turns.")] = 40,
+    repeats: Annotated[int, about("Number of turns.")] = 40,
     most_ratio: Annotated[float | None, about("Exit with 1 if the ratio is above this.")] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Time of a driver's forward pass: the kernel that evaluates drivers, and torch."""
+    """Time a driver's forward pass by the kernel that evaluates drivers, and by torch."""
     check_range(rows=(rows, 1, 1_000_000), inputs=(inputs, 1, MAX_OBSERVATION_SIZE))
     check_range(hidden=(hidden, 1, MAX_WIDTH), repeats=(repeats, 1, 100_000))
     check_positive("--most-ratio", most_ratio)
@@ -79,7 +79,7 @@ def measure(
 
 
 def _compare(config: NetworkConfig, rows: int, repeats: int, say: Say) -> dict[str, Any]:
-    """Time both sides by turns."""
+    """Time both sides in turn."""
     ours, theirs = _sides(config, rows)
     difference = float(np.abs(ours() - theirs()).max())
     taken = take_turns({"ours": _timed(ours), "theirs": _timed(theirs)}, repeats, say)

@@ -1,7 +1,7 @@
-"""What each library's view of the same world adds to a step of the world itself.
+"""The time that each library's adapter adds to a step of the same world.
 
-Every view has a world of its own; all agents coast, and those that ended get new vehicles. Times
-are those of the processor, on one core, each step right after one of the plain arrays.
+Each adapter has its own world; all agents coast, and agents that end get new vehicles. Times are
+processor times on one core; each step is measured right after a step of the plain arrays.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ Step = Callable[[], object]
 def measure(
     env: Annotated[str, about("Name, folder or map file of an environment.")] = "town",
     agents: Annotated[int, about("Agents in the one world.")] = 1000,
-    steps: Annotated[int, about("Steps of each view.")] = 30,
+    steps: Annotated[int, about("Steps of each adapter.")] = 30,
     at_most: Annotated[
-        float | None, about("Exit with 1 if TorchRL's view adds more ms a step.")
+        float | None, about("Exit with 1 if TorchRL's adapter adds more ms per step.")
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """What the libraries' views add to a step of the same world, in the processor's time."""
+    """Measure the processor time that adapters add to a step of the same world."""
     check_positive("--at-most", at_most)
     check_range(agents=(agents, 1, 10_000), steps=(steps, 1, 10_000))
     settings = {"agents": agents, "background": 0, "overrides": KEYS}
     rows: list[dict[str, Any]] = []
     with one_core(), _one_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what libraries say of themselves
+        warnings.simplefilter("ignore")  # notices of the libraries
         for view, make in VIEWS.items():
             say(f"measuring {view}")
             row: dict[str, Any] = {"view": view, "step_ms": None, "added_ms": None, "missing": ""}
@@ -81,7 +81,7 @@ def _measured(step: Step, arrays: Step, steps: int) -> dict[str, float]:
 
 
 def _milliseconds(step: Step) -> float:
-    """Of the processor: others on a busy machine do not count."""
+    """Return the processor time, which other programs do not affect."""
     began = time.process_time_ns()
     step()
     return (time.process_time_ns() - began) / 1e6
@@ -89,7 +89,7 @@ def _milliseconds(step: Step) -> float:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Keep torch, if it is there, to one thread: it is to have no more than the others."""
+    """Restrict torch, if installed, to one thread, like the other adapters."""
     try:
         torch = require("torch", "train")
     except MissingExtraError:

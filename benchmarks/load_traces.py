@@ -1,8 +1,8 @@
-"""Traces of loads: where vehicles were, what they cost, how busy workers were with other things.
+"""Load traces: positions and costs of vehicles, and other load on workers.
 
-A trace is generated or recorded. Both are replayed through the same balancer, by `balance_replay`.
-What others use of the workers is generated in both: a test that loads the machine on purpose would
-measure its own program.
+A trace is generated or recorded; `balance_replay` replays both kinds through the same balancer. The
+other load is always generated, because a test that loads the machine on purpose would measure its
+own program.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LoadRound:
-    """One round between two chances to move shards."""
+    """One round between two opportunities to move shards."""
 
     ids: NDArray[np.int64]  # (n,) vehicles
-    places: Floats  # (n, 2) where they are, m
-    agents: NDArray[np.bool_]  # (n,) which of them agents drive
-    vehicle_s: Floats  # (n,) what each costs, seconds a tick
+    places: Floats  # (n, 2) positions, m
+    agents: NDArray[np.bool_]  # (n,) whether an agent drives the vehicle
+    vehicle_s: Floats  # (n,) cost of each vehicle, s per tick
     noise: Floats  # (k,) measured over true cost of each zone
-    snapshot: LoadSnapshot  # what others use of the workers
+    snapshot: LoadSnapshot  # other load on workers
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,14 @@ class LoadTrace:
     """Rounds of one world on one map."""
 
     network: RoadNetwork  # the map
-    partition: ZonePartition  # its zones at first
-    ticks: int  # of a round
-    # what a vehicle costs more that has come to its zone since the last round, seconds a tick
+    partition: ZonePartition  # its initial zones
+    ticks: int  # per round
+    # additional cost of a vehicle that has changed its zone since the last round, s per tick
     migration_s: float
-    rounds: tuple[LoadRound, ...]  # in time
+    rounds: tuple[LoadRound, ...]  # in temporal order
 
     def arrivals(self, number: int, partition: ZonePartition) -> NDArray[np.int64]:
-        """(k,) vehicles that were in another zone a round before; none in the first round."""
+        """Return how many vehicles of each zone (k,) were in another one in the round before."""
         now = self.rounds[number]
         if number == 0:
             return np.zeros(partition.count, dtype=np.int64)
@@ -62,18 +62,18 @@ class LoadTrace:
         return np.bincount(came, minlength=partition.count)
 
     def costs_s(self, number: int, partition: ZonePartition) -> Floats:
-        """(k,) what each zone truly costs in a round, seconds a tick."""
+        """Return the true cost (k,) of each zone in a round, s per tick."""
         now = self.rounds[number]
         zones = partition.zones_of(now.places)
         own = np.bincount(zones, now.vehicle_s, partition.count)
         return np.asarray(own + self.migration_s * self.arrivals(number, partition))
 
     def measured_s(self, number: int, partition: ZonePartition) -> Floats:
-        """(k,) what a clock on each zone would say."""
+        """Return the measured cost (k,) of each zone, s per tick."""
         return np.asarray(self.costs_s(number, partition) * self.rounds[number].noise)
 
     def contents(self, number: int, partition: ZonePartition) -> list[ShardContent]:
-        """What is in each zone."""
+        """Return the content of each zone."""
         now = self.rounds[number]
         zones = partition.zones_of(now.places)
         counts = np.bincount(zones, minlength=partition.count)
@@ -84,19 +84,19 @@ class LoadTrace:
 
 @dataclass(frozen=True)
 class Crowd:
-    """Vehicles that gather where the city is busy, and the busy place wanders."""
+    """A crowd of vehicles around a hot spot that wanders over the map."""
 
-    vehicles: int = 600  # how many
-    agents: float = 0.2  # share that agents drive
-    vehicle_s: float = 1e-6  # seconds a tick of each
-    agent_s: float = 4e-6  # more of one that senses
-    migration_s: float = 2e-5  # of one that changes its zone, once
-    ticks: int = 200  # of a round
-    pull: float = 15.0  # how many times as many drive in the middle of the crowd as elsewhere
-    width: float = 0.2  # of the crowd, as a share of the map's shorter side
-    stride: float = 0.04  # how far its middle wanders a round, as the same share
-    turnover: float = 0.2  # share of vehicles that find another place each round
-    noise: float = 0.1  # of a measured cost, standard deviation of its logarithm
+    vehicles: int = 600  # number of vehicles
+    agents: float = 0.2  # share driven by agents
+    vehicle_s: float = 1e-6  # cost of each vehicle, s per tick
+    agent_s: float = 4e-6  # additional cost of an agent's sensors, s per tick
+    migration_s: float = 2e-5  # cost of a change of zone, once
+    ticks: int = 200  # per round
+    pull: float = 15.0  # density at the hot spot over that elsewhere
+    width: float = 0.2  # of the hot spot, as a share of the map's shorter side
+    stride: float = 0.04  # movement of the hot spot per round, as the same share
+    turnover: float = 0.2  # share of vehicles that get a new position each round
+    noise: float = 0.1  # standard deviation of the logarithm of measured costs
 
 
 def generated_trace(
@@ -108,7 +108,7 @@ def generated_trace(
     seed: int,
     crowd: Crowd | None = None,
 ) -> LoadTrace:
-    """A crowd that wanders over the map; the same seed gives the same trace."""
+    """Generate a crowd that wanders over the map; the same seed gives the same trace."""
     crowd = crowd or Crowd()
     draw = np.random.default_rng(seed)
     samples = lane_samples(network)
@@ -147,13 +147,13 @@ def recorded_trace(
     workers: int,
     seed: int,
 ) -> LoadTrace:
-    """What was measured; in other zones each vehicle costs what it did on average in its own."""
+    """Build a trace from measurements; outside its zone, a vehicle has its mean measured cost."""
     others = _other_loads(np.random.default_rng(seed), len(measured), workers)
     return LoadTrace(
         network,
         partition,
         ticks,
-        0.0,  # what migrations cost is in what vehicles cost
+        0.0,  # the costs of vehicles include migrations
         tuple(
             LoadRound(
                 ids=one.ids,
@@ -168,13 +168,13 @@ def recorded_trace(
     )
 
 
-# Of what others use, by resource: its mean, how far it strays from it, its most.
+# Other load by resource: mean, standard deviation, maximum.
 _OTHERS = {"cpu": (0.3, 0.15, 0.95), "ram": (0.5, 0.1, 0.85), "gpu": (0.4, 0.15, 0.9)}
-_STAYS = 0.9  # of what it strays by, from one round to the next
+_STAYS = 0.9  # autocorrelation of the deviation from round to round
 
 
 def _other_loads(draw: np.random.Generator, rounds: int, workers: int) -> list[LoadSnapshot]:
-    """Utilisations that come and go slowly; now and then a worker is above its threshold."""
+    """Draw slowly varying utilisations; now and then a worker exceeds its threshold."""
     means, spreads, most = np.array(list(_OTHERS.values())).T
     stray = draw.normal(0.0, spreads, (workers, len(means)))
     found = []

@@ -1,6 +1,6 @@
-"""How far the reference stack takes its vehicle to be from where it is, without and with scans.
+"""Localisation error of the reference stack, without and with scan matching.
 
-The built-in driver drives; both stages see the same sensors. The first seconds are left out.
+The built-in driver drives; both stages get the same sensor data. The first seconds are left out.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ from cavmarl.maps.fidelity.map_surface import map_surface
 
 AGENT = "car_0"
 STEP_S = 0.05
-STAGES = {"gnss_imu": "filter", "scan_matching": "scans"}  # as the table has them
+STAGES = {"gnss_imu": "filter", "scan_matching": "scans"}  # names in the table
 CLOUD_SPACING_M, CLOUD_NOISE_M = 0.4, 0.03  # of the map's own surface
 
 
 def measure(
     env: OptionalEnvironment = "grid4x4",
-    cloud: Annotated[Path | None, about("A point-cloud map; none: the map's own surface.")] = None,
-    buildings: Annotated[str, about("As map.buildings.")] = "map/buildings.poly.xml",
-    noise: Annotated[float, about("Of GNSS, standard deviation, m.")] = 1.0,
-    bias: Annotated[float, about("Of GNSS, standard deviation east and north, m.")] = 0.0,
-    markings: Annotated[bool, about("With a sensor of lane markings.")] = True,
-    time_s: Annotated[float, about("Simulated seconds of each drive.")] = 35.0,
-    skip_s: Annotated[float, about("Of them left out at the beginning.")] = 5.0,
-    background: Annotated[int, about("Other vehicles.")] = 20,
-    seeds: Annotated[str, about("A drive for each, with commas between.")] = "1,2,3",
+    cloud: Annotated[Path | None, about("Point-cloud map [default: the map's surface].")] = None,
+    buildings: Annotated[str, about("Buildings, as in map.buildings.")] = "map/buildings.poly.xml",
+    noise: Annotated[float, about("Standard deviation of GNSS noise, m.")] = 1.0,
+    bias: Annotated[float, about("Standard deviation of GNSS bias, east and north, m.")] = 0.0,
+    markings: Annotated[bool, about("Use a sensor for lane markings.")] = True,
+    time_s: Annotated[float, about("Simulated seconds per drive.")] = 35.0,
+    skip_s: Annotated[float, about("Seconds to leave out at the beginning.")] = 5.0,
+    background: Annotated[int, about("Number of background vehicles.")] = 20,
+    seeds: Annotated[str, about("Comma-separated seeds, one drive each.")] = "1,2,3",
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """How far the place is off, by GNSS, IMU and odometry, and with scan matching."""
+    """Measure the position error with GNSS, IMU and odometry, and with scan matching."""
     check_range(time_s=(time_s, 1.0, 3600.0), skip_s=(skip_s, 0.0, time_s - STEP_S))
     check_range(noise=(noise, 0.0, 100.0), bias=(bias, 0.0, 100.0))
     overrides = {
@@ -72,15 +72,13 @@ def measure(
         columns[f"{short} mean"] = f"{stage}_mean_m:.3f"
         columns[f"{short} 95 %"] = f"{stage}_p95_m:.3f"
     columns |= {"used": "matched", "refused": "refused", "ms": "step_ms:.1f"}
-    notes = [
-        "GNSS: how far its fixes are off in the mean; used, refused: scans; ms: a step, processor"
-    ]
-    title = f"place off, m: GNSS {noise:g} m of noise, {bias:g} m of bias"
+    notes = ["GNSS: mean error of its fixes; used, refused: scans; ms: processor time per step"]
+    title = f"position error, m: GNSS {noise:g} m of noise, {bias:g} m of bias"
     return BenchmarkReport(title + ("" if markings else ", no lane markings"), columns, rows, notes)
 
 
 def rig_with(noise_m: float, bias_m: float, markings: bool) -> dict[str, dict[str, Any]]:
-    """The reference rig with another GNSS."""
+    """Return the reference rig with other GNSS errors."""
     rig = {name: dict(keys) for name, keys in REFERENCE_RIG.items()}
     rig["gnss"] |= {"noise": [noise_m, noise_m, 2.0 * noise_m], "bias": [bias_m, bias_m, 0.0]}
     if not markings:
@@ -89,7 +87,7 @@ def rig_with(noise_m: float, bias_m: float, markings: bool) -> dict[str, dict[st
 
 
 def write_surface(world: CavEnv, path: Path) -> Path:
-    """The map's own lanes and walls as a cloud."""
+    """Write the map's lanes and walls as a point cloud."""
     surface, _ = map_surface(world.network, world.network.extent_m, CLOUD_SPACING_M)
     noise = np.random.default_rng(0).normal(0.0, CLOUD_NOISE_M, surface.points.shape)
     write_cloud(path, Cloud("surface", surface.points + noise))
@@ -102,7 +100,7 @@ def _row(world: CavEnv, cloud: Path, seed: int, steps: int, skipped: int) -> dic
         if not drive.step():
             break
     if drive.steps <= skipped:
-        raise ConfigError(f"seed {seed}: the trip ends before --skip-s: take another seed")
+        raise ConfigError(f"seed {seed}: the trip ends before --skip-s: choose another seed")
     row: dict[str, Any] = {"seed": seed, "bias_m": float(np.hypot(*np.mean(drive.fixes_m, 0)))}
     for stage in STAGES:
         off = np.array(drive.off_m[stage][skipped:])
@@ -120,8 +118,8 @@ class Drive:
     """One trip of the first agent, located by each stage.
 
     Attributes:
-        off_m: of each stage, how far the place was off in each step.
-        fixes_m: how far fixes were off, east and north.
+        off_m: position error in each step, by stage.
+        fixes_m: errors of fixes, east and north.
         busy_s: processor time of scan matching.
     """
 
@@ -131,7 +129,7 @@ class Drive:
         sensors = [sensor_of(v.name, v.settings) for v in welcome_to(world, [AGENT], 0).sensors]
         vehicle = vehicle_of(HdMap(world.network), sensors, STEP_S, cloud)
         if vehicle.geodesy is None:
-            raise ConfigError(f"{world.network.name}: no GNSS is mounted: leave `rig` as it is")
+            raise ConfigError(f"{world.network.name}: no GNSS is mounted; do not override `rig`")
         self._geodesy = vehicle.geodesy
         kept = (sensors, vehicle.geodesy, vehicle.hd_map, STEP_S)
         self.stages: Mapping[str, GnssInertial] = {
@@ -144,7 +142,7 @@ class Drive:
         self.steps = 0
 
     def step(self) -> bool:
-        """Locate once and drive on; False: the trip has ended."""
+        """Locate the vehicle once and step; return False when the trip has ended."""
         world = self._world
         if AGENT not in world.agents:
             return False

@@ -1,4 +1,4 @@
-"""Names of rules that a map falls under, by which worlds are told apart."""
+"""Names of properties of a map by which worlds are grouped."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MAP_FEATURES = frozenset(("circular_priority", "shared_ground", "stub_lanes"))
 
 
 def map_features(network: RoadNetwork) -> tuple[str, ...]:
-    """The names of the rules that a network falls under."""
+    """Return the names of the properties that a network has."""
     found = {
         "circular_priority": circular_priority(network).size,
         "shared_ground": shared_ground(network),

@@ -1,4 +1,4 @@
-"""How much faster worlds of unequal cost are if they may change their worker."""
+"""Speedup of worlds of unequal cost if they may move between workers."""
 
 from __future__ import annotations
 
@@ -25,40 +25,40 @@ from cavmarl.cli.output import OptionalEnvironment, Seed, Settings, about, parse
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.zones.partition.zone_statistics import imbalance
 
-SETTLE_ROUNDS = 6  # before anything is timed
+SETTLE_ROUNDS = 6  # rounds of moves before the first measurement
 
 
 def measure(
     env: OptionalEnvironment = "grid4x4",
     worlds: Annotated[int, about("Number of parallel worlds.")] = 16,
-    workers: Annotated[int, about("Workers that the worlds are shared out over.")] = 2,
-    lead: Annotated[int, about("Steps before half of the worlds begin anew.")] = 600,
+    workers: Annotated[int, about("Number of workers.")] = 2,
+    lead: Annotated[int, about("Steps before half of the worlds restart.")] = 600,
     every: Annotated[int, about("Steps between two rounds of moves.")] = 10,
-    period: Annotated[float, about("Seconds between two vehicles of a road into the map.")] = 5.0,
-    steps: Annotated[int, about("Steps of each turn.")] = 20,
-    repeats: Annotated[int, about("Turns of each.")] = 7,
+    period: Annotated[float, about("Seconds between vehicles on each road into the map.")] = 5.0,
+    steps: Annotated[int, about("Steps per turn.")] = 20,
+    repeats: Annotated[int, about("Turns of each side.")] = 7,
     seed: Seed = 0,
     settings: Settings = None,
     at_least: Annotated[
-        float | None, about("Exit with 1 if moving is not so many times faster.")
+        float | None, about("Exit with 1 if moving is not at least this many times faster.")
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Worlds of unequal cost over workers: shared out by number, and moving by what they cost.
+    """Compare worlds of unequal cost on workers: placed once, and moving by their costs.
 
-    Worlds fill, half of them begin anew, and they are stepped, placed once and moving, by turns.
-    They are shared out evenly by number at first, so the first half of the workers has the full
-    ones.
+    The worlds fill with vehicles, and half of them restart. Both sides are then stepped in turn.
+    Initially, each worker gets the same number of worlds, so the first half of the workers has the
+    full ones.
     """
     check_positive("--at-least", at_least)
     if not 2 <= workers <= worlds or min(lead, every, steps, repeats) < 1 or not period > 0.0:
         raise ConfigError(
             f"{worlds} worlds over {workers} workers, {lead} steps before, a round every {every}, "
             f"{repeats} turns of {steps} steps, {period:g} s: at least 2 workers, no more than "
-            "worlds, and all others above 0"
+            "worlds, and all other numbers above 0"
         )
     overrides = parse_settings(settings)
     measured: dict[str, _Measured] = {}
@@ -95,7 +95,7 @@ def measure(
             for one in measured.values():
                 one.vec.close()
     if fixed != moved:
-        raise EvaluationError(f"{env}: worlds that move are not those that do not")
+        raise EvaluationError(f"{env}: the states of moving and fixed worlds differ")
     rows = [one.row(name, turns[name], repeats * steps) for name, one in measured.items()]
     return _report(env, rows, workers, fixed[1], at_least)
 
@@ -122,7 +122,7 @@ def _report(
             "busiest, ms": "busiest_ms:.2f",
             "max / mean": "imbalance:.2f",
             "moves": "moves",
-            "ms a move": "move_ms:.1f",
+            "ms per move": "move_ms:.1f",
         },
         rows,
         notes=[
@@ -140,7 +140,7 @@ def _report(
 
 
 class _Measured:
-    """Worlds over workers, and what their turns have taken."""
+    """Worlds on workers, and the times of their turns."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
         assert isinstance(vec.worlds, PooledWorlds)
@@ -149,7 +149,7 @@ class _Measured:
         self._busy_s = np.zeros(len(vec.worlds.pool.pids))
 
     def lead(self, seed: int, steps: int, settle: int) -> None:
-        """Fill the worlds, begin the second half anew, and let the moving ones move."""
+        """Fill the worlds, restart the second half, and let the movable ones move."""
         vec = self.vec
         vec.reset(seed=seed)
         self._drive(steps)
@@ -157,7 +157,7 @@ class _Measured:
         self._drive(settle)
 
     def turner(self, steps: int) -> Any:
-        """A turn of so many steps: ms a step."""
+        """Return a function that runs a turn and returns ms per step."""
 
         def turn() -> float:
             before = self._processor_s()
@@ -168,13 +168,13 @@ class _Measured:
         return turn
 
     def state(self) -> tuple[list[str], tuple[int, ...]]:
-        """Hashes of all worlds, and their vehicles."""
+        """Return the hashes of all worlds, and their numbers of vehicles."""
         vec, worlds = self.vec, range(self.vec.num_envs)
         vehicles = tuple(int(vec.traffic_stats(w)["running"]) for w in worlds)
         return [vec.state_hash(w) for w in worlds], vehicles
 
     def row(self, name: str, step_ms: tuple[float, ...], steps: int) -> dict[str, Any]:
-        """What has been found in so many steps."""
+        """Return the results of a number of steps."""
         mover = self._worlds.mover
         moves = 0 if mover is None else mover.moves
         return {
@@ -189,7 +189,7 @@ class _Measured:
         }
 
     def _drive(self, steps: int) -> float:
-        """Seconds that the steps have taken; agents coast."""
+        """Return the time of the steps in s; agents coast."""
         actions = np.zeros_like(self.vec.action_space.sample())
         began = time.perf_counter()
         for _ in range(steps):

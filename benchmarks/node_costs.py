@@ -1,4 +1,4 @@
-"""A model of what a tick over nodes costs and takes, and its parameters out of measured runs."""
+"""A model of the costs and times of ticks over nodes, with parameters fitted to measured runs."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ import numpy as np
 from cavmarl.driving.vehicles import VEHICLE
 
 CACHES = Path("/sys/devices/system/cpu/cpu0/cache")
-CACHE_BYTES = {"index2": 1 << 20, "index3": 32 << 20}  # where the system does not tell
-ROW_BYTES = 2 * VEHICLE.itemsize  # of a vehicle: a tick reads one table and writes another
+CACHE_BYTES = {"index2": 1 << 20, "index3": 32 << 20}  # if the system does not report them
+ROW_BYTES = 2 * VEHICLE.itemsize  # per vehicle: a tick reads one table and writes another
 
 
 @dataclass(frozen=True)
 class NodeSample:
-    """One run: a city of some size over some nodes; 0 nodes: undivided, in one process."""
+    """One run of a city over nodes; 0 nodes: undivided, in one process."""
 
-    vehicles: int  # in all
-    nodes: int  # that host them
-    tick_s: float  # by the clock
-    node_s: float  # time of the processor a tick, of the dearest node; undivided: of the process
-    caller_s: float  # the same of the caller
-    own: float  # vehicles of the dearest node
-    ghosts: float  # that it sees
-    crossings: float  # vehicles that change their node, a step
-    memory_bytes: float  # resident, of the largest process
-    latency_s: float  # that was added to each connection
+    vehicles: int  # total number
+    nodes: int  # number of nodes
+    tick_s: float  # wall time
+    node_s: float  # processor time per tick of the most expensive node; undivided: of the process
+    caller_s: float  # processor time per tick of the caller
+    own: float  # vehicles of the most expensive node
+    ghosts: float  # its ghosts
+    crossings: float  # vehicles that change their node, per step
+    memory_bytes: float  # resident memory of the largest process
+    latency_s: float  # added to each connection
     ticks_per_step: float
 
     def to_dict(self) -> dict[str, float]:
@@ -40,50 +40,50 @@ class NodeSample:
 
 
 class Caches(NamedTuple):
-    """Of how many vehicles they hold the rows, and how many cores share the larger one."""
+    """Numbers of vehicles whose rows fit the caches, and the number of cores per shared cache."""
 
-    own: float  # of a core
-    shared: float  # of all cores
+    own: float  # cache of a core
+    shared: float  # cache of all cores
     cores: int
 
     def beyond(self, rows: float, busy: int) -> tuple[float, float]:
-        """How many rows of a core are not in its own cache, and not in its share of the other."""
+        """Return a core's rows beyond its own cache, and beyond its share of the shared one."""
         share = self.shared / max(min(busy, self.cores), 1)
         return max(rows - self.own, 0.0), max(rows - share, 0.0)
 
 
 @dataclass(frozen=True)
 class NodeCosts:
-    """The parameters."""
+    """Parameters of the cost model."""
 
-    tick_s: float  # of a node's processor in each tick, whatever it has
-    ghost_s: float  # for each vehicle of others that it sees
-    whole_s: float  # of an undivided tick, whatever there is
-    vehicle_s: float  # for each vehicle, of a node or undivided
-    far_s: float  # more for each row, of a ghost, too, that is not in a core's own cache
-    memory_s: float  # more for each that is in no cache
+    tick_s: float  # processor time of a node per tick, constant part
+    ghost_s: float  # per ghost
+    whole_s: float  # of an undivided tick, constant part
+    vehicle_s: float  # per vehicle, of a node or undivided
+    far_s: float  # additional time per row, including ghosts, beyond a core's own cache
+    memory_s: float  # additional time per row beyond all caches
     caches: Caches
-    caller_s: float  # of the caller in each tick
-    caller_node_s: float  # for each node
+    caller_s: float  # processor time of the caller per tick
+    caller_node_s: float  # the same per node
     wake_s: float  # from one process to another, without latency
-    uneven: float  # how much longer the last of several nodes takes in a tick, as a share
-    base_bytes: float  # of a node, whatever there is
-    city_bytes: float  # for each vehicle that the city has room for: map and tables, at every node
-    own_bytes: float  # for each vehicle that a node owns or sees
+    uneven: float  # additional time of the last node in a tick, as a share
+    base_bytes: float  # of a node, constant part
+    city_bytes: float  # per vehicle that the city has room for: map and tables, at every node
+    own_bytes: float  # per owned vehicle and ghost
     ghost_factor: float  # ghosts over the square root of a node's vehicles, per border
-    crossing_share: float  # of a node's ghosts change their node in a step
+    crossing_share: float  # share of a node's ghosts that change their node in a step
     ticks_per_step: float
 
     def ghosts(self, vehicles: float, nodes: int) -> float:
-        """How many vehicles of others a node in the middle of the city sees."""
+        """Return the number of ghosts of a node in the middle of the city."""
         return self.ghost_factor * borders(nodes) * math.sqrt(vehicles / max(nodes, 1))
 
     def hops(self, vehicles: float, nodes: int) -> float:
-        """Frames of a tick that go one after the other, on average.
+        """Return the mean number of sequential messages of a tick.
 
-        Of a step these are the command, the report, and of several nodes what they tell each other
-        of each tick and of the agents. Where a vehicle has crossed, an offer and its answer come in
-        the place of the report.
+        Per step there are the command and the report and, with several nodes, their messages to
+        each other for each tick and for the agents. If a vehicle has crossed a border, an offer and
+        its answer replace the report.
         """
         if nodes < 2:
             return 2.0 / self.ticks_per_step
@@ -92,15 +92,16 @@ class NodeCosts:
         return (self.ticks_per_step + 3.0 + offers) / self.ticks_per_step
 
     def work(self, vehicles: float, ghosts: float, busy: int) -> float:
-        """Seconds of a core for the vehicles that it steps in a tick, beside what ghosts cost.
+        """Return the processor time per tick for stepping vehicles, without the cost of ghosts.
 
-        Of more rows than a cache holds, as many as it holds come from there. `busy`: cores at work.
+        Rows that fit a cache are read from it, the others from memory. `busy`: number of working
+        cores.
         """
         far, farthest = self.caches.beyond(vehicles + ghosts, busy)
         return self.vehicle_s * vehicles + self.far_s * far + self.memory_s * farthest
 
     def tick(self, vehicles: float, nodes: int, latency_s: float, cores: int) -> float:
-        """Seconds of a tick; nodes beyond `cores` take turns, and share a core's caches."""
+        """Return the time of a tick in s; nodes beyond `cores` share cores and their caches."""
         if nodes == 0:
             return self.whole_s + self.work(vehicles, 0.0, 1)
         turns = math.ceil(nodes / cores)
@@ -112,18 +113,18 @@ class NodeCosts:
         return node_s + caller_s + self.hops(vehicles, nodes) * (self.wake_s + latency_s)
 
     def memory(self, vehicles: float, nodes: int) -> float:
-        """Bytes of a node, or of the undivided world."""
+        """Return the memory of a node or of the undivided world, in bytes."""
         own = vehicles / max(nodes, 1) + (self.ghosts(vehicles, nodes) if nodes else 0.0)
         return self.base_bytes + self.city_bytes * vehicles + self.own_bytes * own
 
 
 def borders(nodes: int) -> float:
-    """Borders of a zone in a square of so many zones, on average; each as long as its side."""
+    """Return the mean number of borders of a zone in a square of equal square zones."""
     return 0.0 if nodes < 2 else 4.0 - 4.0 / math.sqrt(nodes)
 
 
 def caches_here() -> Caches:
-    """Those of this machine."""
+    """Return the caches of this machine."""
     own, shared = (_cache_bytes(level) / ROW_BYTES for level in CACHE_BYTES)
     return Caches(own, shared, os.cpu_count() or 1)
 
@@ -137,16 +138,16 @@ def _cache_bytes(level: str) -> int:
 
 
 def fitted(samples: Sequence[NodeSample], caches: Caches) -> NodeCosts:
-    """The parameters that fit runs best; of several sizes, over 0 and more nodes.
+    """Fit the parameters to runs of several sizes, with 0 and more nodes.
 
     Raises:
-        ValueError: too few runs to tell them.
+        ValueError: there are too few runs.
     """
     whole = [s for s in samples if s.nodes == 0]
     calm = [s for s in samples if s.nodes > 0 and s.latency_s == 0.0]
     divided = [s for s in calm if s.nodes > 1]
     if len({s.vehicles for s in whole}) < 2 or len({(s.vehicles, s.nodes) for s in calm}) < 3:
-        raise ValueError("a fit needs two sizes undivided, and three runs over nodes")
+        raise ValueError("a fit needs undivided runs of two sizes and three runs over nodes")
     work = [
         [s.nodes == 0, s.nodes > 0, s.ghosts, s.own, *caches.beyond(s.own + s.ghosts, s.nodes)]
         for s in (*whole, *calm)
@@ -177,7 +178,7 @@ def fitted(samples: Sequence[NodeSample], caches: Caches) -> NodeCosts:
         crossing_share=_mean([s.crossings / (s.ghosts * s.nodes) for s in divided if s.ghosts]),
         ticks_per_step=samples[0].ticks_per_step,
     )
-    # what is left of the clock's time: waking a process, and waiting for the last node
+    # The rest of the wall time is waking a process and waiting for the last node.
     waits = [s.tick_s - s.node_s - s.caller_s for s in calm]
     hops = [costs.hops(s.vehicles, s.nodes) for s in calm]
     rows = [[n, s.node_s if s.nodes > 1 else 0.0] for n, s in zip(hops, calm, strict=True)]
@@ -192,13 +193,13 @@ def _mean(values: Sequence[float]) -> float:
 def _solve(
     rows: Sequence[Sequence[float]],
     values: Sequence[float],
-    scales: Sequence[float] = (),  # what deviations are relative to; none: to the values
+    scales: Sequence[float] = (),  # deviations are relative to these; by default to the values
 ) -> list[float]:
-    """Non-negative least squares of relative deviations."""
+    """Solve a non-negative least-squares problem with relative deviations."""
     weights = 1.0 / np.maximum(np.array(scales or values), 1e-12)
     matrix, wanted = np.array(rows, dtype=np.float64) * weights[:, None], values * weights
     chosen = list(range(matrix.shape[1]))
-    while True:  # what would be negative is none
+    while True:  # drop negative coefficients
         found = np.zeros(matrix.shape[1])
         found[chosen] = np.linalg.lstsq(matrix[:, chosen], wanted, rcond=None)[0]
         below = [n for n in chosen if found[n] < 0.0]

@@ -1,4 +1,4 @@
-"""How long an empty tick over nodes takes, and how long a killed node's zones stand still."""
+"""Time of an empty tick over nodes, and the time until zones of a killed node continue."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.processes import start_python
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.backend_name import NODES, BackendName
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.placement.backend_name import NODES, BackendName
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 
 TURN_STEPS = 50
-LEAST_STEPS = 3  # of a round, before a node is killed
-REPLACED_S = 120.0  # for another node to have joined
+LEAST_STEPS = 3  # per round, before a node is killed
+REPLACED_S = 120.0  # time limit for a replacement node to join
 LOCAL = "127.0.0.1"
-FRAME = bytes(96)  # about as long as those of an empty tick
+FRAME = bytes(96)  # about the size of the messages of an empty tick
 PORT_BYTES = 4
-SUM_BYTES = 8  # of a checksum
+SUM_BYTES = 8  # size of a checksum
 SERVES = "import sys; from benchmarks.node_latencies import serve; serve(*sys.argv[1:])"
 
 
 def measure(
     env: OptionalEnvironment = "merge",
-    nodes: Annotated[int, about("Nodes; as many zones.")] = 2,
+    nodes: Annotated[int, about("Number of nodes, and of zones.")] = 2,
     turns: Annotated[int, about(f"Turns of {TURN_STEPS} steps without traffic.")] = 20,
-    kills: Annotated[int, about("Times that a node is killed.")] = 100,
-    background: Annotated[int, about("Vehicles beside the agent while nodes are killed.")] = 20,
-    seed: Annotated[int, about("Of the moments at which nodes are killed.")] = 0,
+    kills: Annotated[int, about("Number of times that a node is killed.")] = 100,
+    background: Annotated[int, about("Background vehicles while nodes are killed.")] = 20,
+    seed: Annotated[int, about("Seed of the times at which nodes are killed.")] = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Time ticks of a world with one vehicle; then kill nodes, and wait for the zones to go on."""
+    """Time ticks of a world with one vehicle; then kill nodes and wait until the zones continue."""
     check_positive("--turns", turns)
     check_positive("--kills", kills)
     if nodes < 2:
-        raise ConfigError(f"--nodes {nodes}: of fewer than two none takes the zones of another")
+        raise ConfigError(f"--nodes {nodes}: must be at least 2, so that one can take over")
     say("empty ticks")
     rows = _empty_ticks(env, nodes, turns)
     rows.append(_kills(env, nodes, kills, background, random.Random(seed), say))
@@ -68,17 +68,17 @@ def measure(
         },
         rows,
         notes=[
-            "tick, wall: of a turn's ticks on average, by the clock; tick, processor: the same of "
-            "the caller and of all nodes together; tick, least: what cannot be left out, by the "
-            "clock, by turns with the others: as many frames between as many processes, which do "
-            "nothing else but run the phases of the same world, undivided; zones stand still: from "
-            "SIGKILL to the end of the step of the caller that was under way or came next",
+            "tick, wall: mean wall time of a tick; tick, processor: mean processor time of "
+            "the caller and all nodes together; tick, least: wall time of a lower bound, measured "
+            "in turn with the others: the same number of messages and processes, which only "
+            "run the phases of the same world, undivided; zones stand still: from "
+            "SIGKILL to the end of the caller's current or next step",
         ],
     )
 
 
 class _Worlds:
-    """One world over nodes, one zone each."""
+    """One world over nodes, with one zone each."""
 
     def __init__(self, env: str, nodes: int, background: int) -> None:
         config, base_dir = load_config(
@@ -97,7 +97,7 @@ class _Worlds:
         self.nodes.step(self._commands)
 
     def cpu_s(self) -> float:
-        """Of the caller and of the nodes, since this was asked last."""
+        """Return the processor time of caller and nodes since the last call."""
         return time.process_time() + sum(load.cpu_s for load in self.nodes.node_loads())
 
 
@@ -114,7 +114,7 @@ def _empty_ticks(env: str, nodes: int, turns: int) -> list[dict[str, Any]]:
             wall_s = time.perf_counter() - began_s
             cpu_s = worlds.cpu_s() - began_cpu_s
             least_s = least.turn()
-            if turn:  # the first one warms up
+            if turn:  # the first turn warms up
                 ticks = TURN_STEPS * worlds.ticks_per_step
                 wall_us.append(1e6 * wall_s / ticks)
                 cpu_us.append(1e6 * cpu_s / ticks)
@@ -127,13 +127,13 @@ def _empty_ticks(env: str, nodes: int, turns: int) -> list[dict[str, Any]]:
 
 
 class _Least:
-    """Processes between which the frames of empty ticks go; this one is the caller."""
+    """Processes that exchange the messages of empty ticks; this process is the caller."""
 
     def __init__(self, env: str, nodes: int, ticks_per_step: int) -> None:
         with socket.create_server((LOCAL, 0)) as listener:
-            told = [env, str(listener.getsockname()[1]), str(nodes), str(ticks_per_step)]
+            words = [env, str(listener.getsockname()[1]), str(nodes), str(ticks_per_step)]
             self._processes: list[subprocess.Popen[Any]] = [
-                start_python(["-c", SERVES, *told, str(number)]) for number in range(nodes)
+                start_python(["-c", SERVES, *words, str(number)]) for number in range(nodes)
             ]
             self._nodes = [_answered(listener) for _ in range(nodes)]
         ports = [_read(node, PORT_BYTES) for node in self._nodes]
@@ -142,7 +142,7 @@ class _Least:
         self.turn()
 
     def turn(self) -> float:
-        """Seconds of a turn."""
+        """Return the time of a turn, s."""
         began_s = time.perf_counter()
         for _ in range(TURN_STEPS):
             for node in self._nodes:
@@ -160,7 +160,7 @@ class _Least:
 
 
 def serve(env: str, port: str, nodes: str, ticks_per_step: str, number: str) -> None:
-    """Be one of the nodes; its number is not that by which the caller knows it."""
+    """Run one of the nodes; its number is independent of the caller's numbering."""
     config, base_dir = load_config(env, agents=1, background=0, max_cycles=1_000_000)
     worlds = LocalWorlds(make_world(config, base_dir), 1, warm=True)
     worlds.arrays.chosen[:] = True
@@ -170,8 +170,8 @@ def serve(env: str, port: str, nodes: str, ticks_per_step: str, number: str) -> 
     with socket.create_server((LOCAL, 0)) as listener:
         own = listener.getsockname()[1].to_bytes(PORT_BYTES, "little")
         caller.sendall(own)
-        told = _read(caller, PORT_BYTES * int(nodes))
-        ports = [told[at : at + PORT_BYTES] for at in range(0, len(told), PORT_BYTES)]
+        data = _read(caller, PORT_BYTES * int(nodes))
+        ports = [data[at : at + PORT_BYTES] for at in range(0, len(data), PORT_BYTES)]
         before = ports.index(own)
         others = [_call(int.from_bytes(one, "little")) for one in ports[:before]]
         others += [_answered(listener) for _ in ports[before + 1 :]]
@@ -180,7 +180,7 @@ def serve(env: str, port: str, nodes: str, ticks_per_step: str, number: str) -> 
         for tick in range(int(ticks_per_step)):
             is_last = tick == int(ticks_per_step) - 1
             worlds.simulation.run_tick(commands, tick == 0, is_last)
-            for _ in range(1 + is_last):  # rows, and after the last tick what agents got
+            for _ in range(1 + is_last):  # rows and, after the last tick, the agents' outputs
                 for other in others:
                     other.sendall(_framed())
                 for other in others:
@@ -208,7 +208,7 @@ def _framed() -> bytes:
 def _take(connection: socket.socket) -> None:
     data = _read(connection, len(FRAME) + SUM_BYTES)
     if xxh3_64_digest(data[:-SUM_BYTES]) != data[-SUM_BYTES:]:
-        raise ConfigError("a frame is not what was sent")
+        raise ConfigError("a received message differs from the sent one")
 
 
 def _read(connection: socket.socket, size: int) -> bytes:

@@ -1,7 +1,7 @@
-"""What two nodes can gain at most: two worlds of half the size side by side, that share nothing.
+"""Upper bound of the speedup of two nodes: two independent worlds of half the size.
 
-Both nodes of a divided world do at least that, and have to exchange ghosts and leases besides. If
-the halves take long, the machine is the limit: cores that share a cache, memory, or a core's parts.
+Both nodes of a divided world do at least this work, and also exchange ghosts and leases. If the
+halves are slow, the machine is the limit: cores that share a cache, memory, or a core's units.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from cavmarl.core.errors import ConfigError
 
 
 def measure(
-    vehicles: Annotated[int, about("Size of the city.")] = 10_000,
-    steps: Annotated[int, about("Steps of each turn.")] = 40,
-    repeats: Annotated[int, about("Turns of each side, one after the other.")] = 7,
+    vehicles: Annotated[int, about("Number of vehicles.")] = 10_000,
+    steps: Annotated[int, about("Steps per turn.")] = 40,
+    repeats: Annotated[int, about("Turns of each side.")] = 7,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Time a city, half of it alone, and two halves at once, by turns."""
+    """Time a city, half of it alone, and two halves at once, in turn."""
     check_positive("--steps", steps)
     check_positive("--repeats", repeats)
     if vehicles < PER_JUNCTION * 32:
-        raise ConfigError(f"--vehicles {vehicles}: at least {PER_JUNCTION * 32}")
+        raise ConfigError(f"--vehicles {vehicles}: must be at least {PER_JUNCTION * 32}")
     with tempfile.TemporaryDirectory() as folder:
         whole, half = (make_city(Path(folder), n) for n in (vehicles, vehicles // 2))
-        say("three worlds are made")
-        told = ((whole, vehicles), (half, vehicles // 2), (half, vehicles // 2))
+        say("creating three worlds")
+        cities = ((whole, vehicles), (half, vehicles // 2), (half, vehicles // 2))
         with ExitStack() as stack:
             worlds = [
-                stack.enter_context(closing(WorldProcess(net, number))) for net, number in told
+                stack.enter_context(closing(WorldProcess(net, number))) for net, number in cities
             ]
             sides = {
                 f"{vehicles:,} vehicles": worlds[:1],
@@ -51,10 +51,10 @@ def measure(
     base_s = median(wall_s for wall_s, _ in next(iter(found.values())))
     rows = [_row(name, turns, base_s) for name, turns in found.items()]
     return BenchmarkReport(
-        "what two nodes can gain at most",
+        "upper bound of the speedup of two nodes",
         {"world": "world", "ms": "wall_ms:.3g", "cpu ms": "cpu_ms:.3g", "faster": "faster:.2f"},
         rows,
-        notes=["ms: a tick by the clock; cpu ms: a tick of each process's processor; medians"],
+        notes=["ms: wall time per tick; cpu ms: processor time per tick and process; medians"],
     )
 
 
@@ -69,7 +69,7 @@ def _row(name: str, turns: list[tuple[float, float]], base_s: float) -> dict[str
 
 
 def _turn(worlds: list[WorldProcess], steps: int) -> tuple[float, float]:
-    """Seconds of a tick of the slower one: by the clock, and of the processor."""
+    """Return wall time and processor time per tick of the slower world, s."""
     for world in worlds:
         world.go(steps)
     found = [world.read() for world in worlds]

@@ -1,4 +1,4 @@
-"""One city over zone nodes: time and memory beside the undivided world, and a model of both."""
+"""Time and memory of one city over zone nodes, compared with the undivided world and a model."""
 
 from __future__ import annotations
 
@@ -24,28 +24,29 @@ OVER = (1, 2, 4, 16, 64, 256)
 
 
 def measure(
-    vehicles: Annotated[str, about("Sizes of the city.", metavar="N,…")] = "2500,10000",
-    nodes: Annotated[str, about("Numbers of nodes beside the undivided world.", metavar="N,…")] = (
-        "1,2,4"
-    ),
+    vehicles: Annotated[str, about("Numbers of vehicles.", metavar="N,…")] = "2500,10000",
+    nodes: Annotated[
+        str, about("Numbers of nodes, besides the undivided world.", metavar="N,…")
+    ] = ("1,2,4"),
     latencies: Annotated[
-        str, about("Latencies in ms that are added to all connections, too.", metavar="MS,…")
+        str, about("Latencies in ms to add to all connections.", metavar="MS,…")
     ] = "",
-    steps: Annotated[int, about("Steps of each turn.")] = 5,
-    repeats: Annotated[int, about("Turns of each world, one after the other.")] = 40,
+    steps: Annotated[int, about("Steps per turn.")] = 5,
+    repeats: Annotated[int, about("Turns of each world.")] = 40,
     realtime: Annotated[
         bool,
         about(
-            "Turns have real-time priority, and after each round other programs have as long.",
+            "Run turns with real-time priority; other programs run between rounds.",
             "--realtime",
         ),
     ] = False,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure worlds by turns, fit a model to the runs with 0 to 2 nodes, and compare the rest.
+    """Measure worlds in turn, fit a model to the runs with 0 to 2 nodes, and compare the others.
 
-    Each world is in processes of its own, and has its heap in huge pages. They take turns in one
-    order, then in the other. A turn begins with steps that do not count: others have had the cache.
+    Each world has its own processes, with its heap in huge pages. The worlds take turns in one
+    order, then in reverse. A turn begins with unmeasured steps, because the others have used the
+    cache.
     """
     if steps < 1 or repeats < 1:
         raise ConfigError(f"{steps} steps, {repeats} turns: must be at least 1")
@@ -53,11 +54,11 @@ def measure(
     added = [float(text) * 1e-3 for text in latencies.split(",") if text]
     if len(set(sizes)) < 2 or min(sizes) < PER_JUNCTION * 16 or not {1, 2} <= set(counts):
         raise ConfigError(
-            f"--vehicles {vehicles} --nodes {nodes}: name two sizes from {PER_JUNCTION * 16} on, "
-            "and among the nodes 1 and 2: the model is fitted to these"
+            f"--vehicles {vehicles} --nodes {nodes}: give two sizes from {PER_JUNCTION * 16} on, "
+            "and the nodes 1 and 2, to which the model is fitted"
         )
     sides = [_Side(size, n, s) for size in sizes for s in (0.0, *added) for n in counts]
-    sides += [_Side(size, 0, 0.0) for size in sizes]  # the last: nodes have put maps in the cache
+    sides += [_Side(size, 0, 0.0) for size in sizes]  # last, when maps are in the cache
     turns = _turns(sides, steps, repeats, realtime, say)
     samples = {side: _sample(side, turns[side]) for side in sorted(sides)}
     known = [s for s in samples.values() if s.nodes <= 2 and s.latency_s == 0.0]
@@ -80,8 +81,8 @@ def measure(
         },
         rows,
         notes=[
-            "ms: a tick, median; + ms: latency added to each connection; faster: than undivided, "
-            "by the turns that follow each other, with an interval of 95 %; MB: resident, the "
+            "ms: median tick; + ms: latency added to each connection; faster: than undivided, "
+            "by adjacent turns, with an interval of 95 %; MB: resident memory of the "
             "largest process; the models are fitted to runs with at most 2 nodes",
             *_predictions(costs, max(cores, max(OVER))),
         ],
@@ -94,11 +95,11 @@ def measure(
 
 
 class _Side(NamedTuple):
-    """What takes turns."""
+    """One world of the comparison."""
 
     vehicles: int
     nodes: int  # 0: undivided
-    latency_s: float  # that is asked for
+    latency_s: float  # requested latency
 
 
 def _turns(
@@ -155,7 +156,7 @@ def _row(
 
 
 def _predictions(costs: NodeCosts, cores: int) -> list[str]:
-    """Where dividing pays, by the model, with a core for each node."""
+    """Describe at which sizes dividing pays by the model, with a core for each node."""
     lines = []
     for vehicles in PREDICTED:
         found = {n: costs.tick(vehicles, n, 0.0, cores) for n in (0, *OVER)}

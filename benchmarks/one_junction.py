@@ -1,7 +1,7 @@
-"""One junction of each kind, a share of the vehicles turning: ours beside SUMO's.
+"""One junction of each kind with turning traffic, compared with SUMO.
 
-A net drawn by chance mixes kinds of junctions and turns. Here each kind stands alone, with four
-arms of one lane and the same trips for both, so that a deviation has one cause.
+A random net mixes kinds of junctions and turns. Here each kind stands alone, with four single-lane
+arms and the same trips for both sides, so that a deviation has one cause.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cavmarl.cli.output import about
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 
-# Kind of junction → vehicles an hour and arm that go straight on, to the left, to the right.
+# Kind of junction → vehicles per hour and arm that go straight on, left, right.
 FLOWS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "traffic_light": ((900, 0, 0), (0, 300, 0), (0, 0, 600), (300, 150, 0), (300, 0, 150)),
     "priority": ((150, 60, 60), (80, 30, 30)),
@@ -27,22 +27,22 @@ FLOWS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "allway_stop": ((250, 100, 100), (150, 60, 60)),
 }
 ARM_M = 400
-ARMS = ("top", "right", "bottom", "left")  # clockwise, so that the arm after next lies opposite
-TURNS = (2, 1, 3)  # arms further on that straight on, left and right lead to
+ARMS = ("top", "right", "bottom", "left")  # clockwise, so that the opposite arm is two further on
+TURNS = (2, 1, 3)  # number of arms further on for straight on, left and right
 
 
 def measure(
-    kinds: Annotated[str, about("Kinds of junction, by commas.")] = ",".join(FLOWS),
-    seeds: Annotated[str, about("Seeds of trips and of both, as 1,2,3.")] = "1,2,3",
-    seconds: Annotated[int, about("Simulated seconds of each run.")] = 900,
+    kinds: Annotated[str, about("Comma-separated kinds of junction.")] = ",".join(FLOWS),
+    seeds: Annotated[str, about("Comma-separated seeds of trips and of both sides.")] = "1,2,3",
+    seconds: Annotated[int, about("Simulated seconds per run.")] = 900,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Arrivals, delay and speed at one junction over several seeds: sums of ours over SUMO's."""
+    """Compare arrivals, delay and speed at one junction with SUMO, summed over several seeds."""
     check_range(seconds=(seconds, 1, 100_000))
     chosen = numbers_of("--seeds", seeds)
     unknown = sorted(set(kinds.split(",")) - set(FLOWS))
     if unknown:
-        raise ConfigError(f"--kinds: no {', '.join(unknown)}; there are {', '.join(FLOWS)}")
+        raise ConfigError(f"--kinds: unknown {', '.join(unknown)}; must be of {', '.join(FLOWS)}")
     rows: list[dict[str, Any]] = []
     with TemporaryDirectory() as name:
         for kind in kinds.split(","):
@@ -51,7 +51,7 @@ def measure(
                 say(f"{kind}, {flow}")
                 rows.append({"kind": kind} | _row(net, flow, chosen, seconds))
     columns = {head: head for head in rows[0]}
-    return BenchmarkReport(f"ours (SUMO's), {seconds} s, seeds {seeds}", columns, rows)
+    return BenchmarkReport(f"cavmarl (SUMO), {seconds} s, seeds {seeds}", columns, rows)
 
 
 def _draw(kind: str, folder: Path) -> Path:
@@ -64,7 +64,7 @@ def _draw(kind: str, folder: Path) -> Path:
 
 
 def _trips(path: Path, flow: tuple[int, int, int], seed: int, seconds: int) -> Path:
-    """Cars that come by chance, exponentially, from each arm."""
+    """Write cars that arrive at random, with exponential gaps, from each arm."""
     chance = random.Random(seed)
     trips = []
     for per_h, turn in zip(flow, TURNS, strict=True):

@@ -1,4 +1,4 @@
-"""Where the processor's time of a step goes, by the phases that the runtime names."""
+"""Processor time of a step by the phases of the runtime."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import Agents, Background, Seed, Settings, about, parse_settings
 from cavmarl.env.vector import CavVectorEnv, make_vec
 
-VIEW = "view"  # actions checked and decoded, results copied: what is no phase
+VIEW = "view"  # checking and decoding actions, copying results: time outside all phases
 
 
 def measure(
@@ -23,16 +23,17 @@ def measure(
     agents: Agents = None,
     background: Background = None,
     worlds: Annotated[int, about("Number of parallel worlds.")] = 16,
-    steps: Annotated[int, about("Steps of each turn.")] = 200,
+    steps: Annotated[int, about("Steps per turn.")] = 200,
     repeats: Annotated[int, about("Number of turns; the fastest counts.")] = 5,
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """The processor's nanoseconds a vehicle and step, phase by phase.
+    """Measure processor nanoseconds per vehicle and step, by phase.
 
-    A world with stopwatches and one without go the same ways, by turns. What the stopwatch takes
-    itself is measured before and taken off, and so is the built-in driver in the agents' seats.
+    A world with stopwatches and one without run the same episodes in turn. The time of the
+    stopwatches is measured beforehand and subtracted, and so is that of the built-in driver in the
+    agents' seats.
     """
     check_range(steps=(steps, 1, 1_000_000), repeats=(repeats, 1, 1_000_000))
     overrides = parse_settings(settings)
@@ -54,14 +55,14 @@ def measure(
     vehicles, acting = best.vehicle_steps / steps, best.agent_steps / steps
     ticks = timed.config.clock.ticks_per_step
     return BenchmarkReport(
-        f"{vehicles:,.0f} vehicles, {acting:,.0f} of them agents; {ticks} ticks a step",
-        {"phase": "name", "ns a vehicle and step": "ns:,.0f", "share": "share:.1%"},
+        f"{vehicles:,.0f} vehicles, {acting:,.0f} of them agents; {ticks} ticks per step",
+        {"phase": "name", "ns per vehicle and step": "ns:,.0f", "share": "share:.1%"},
         [
             {"name": name, "ns": ns * share, "share": ns / best.ns}
             for name, ns in Counter(phases).most_common()
         ],
         notes=[
-            f"sum: {timed_ns:,.0f} ns; a step without stopwatches: {plain_ns:,.0f} ns a vehicle; "
+            f"sum: {timed_ns:,.0f} ns; a step without stopwatches: {plain_ns:,.0f} ns per vehicle; "
             f"the phases sum to {timed_ns / plain_ns - 1.0:+.1%} of that"
         ],
         facts={
@@ -76,13 +77,13 @@ def measure(
 
 @dataclass(frozen=True)
 class _Turn:
-    ns: float  # in steps alone
+    ns: float  # in steps only
     vehicle_steps: int
     agent_steps: int
 
 
 def _drive(vec: CavVectorEnv, watch: Stopwatch, steps: int, seed: int) -> _Turn:
-    """Step from a reset, with the built-in driver in all seats; nothing else is timed."""
+    """Step from a reset, with the built-in driver in all seats, which is not timed."""
     vec.reset(seed=seed)
     vec.step(vec.suggest_actions())
     watch.clear()

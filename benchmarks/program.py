@@ -1,7 +1,7 @@
-"""How a benchmark is run as a program.
+"""Runs a benchmark as a program.
 
-A benchmark is a function that takes options and a `say`, and returns a `BenchmarkReport` of
-`cavmarl.bench.harness`, which has turns, medians and checks of numbers, too.
+A benchmark is a function that takes options and a `say`, and returns a `BenchmarkReport`.
+`cavmarl.bench.harness` also has helpers for turns, medians and checks of numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cavmarl.core.errors import CavmarlError
 
 
 def run(measure: Callable[..., BenchmarkReport], words: Sequence[str] | None = None) -> None:
-    """Run a benchmark as a program; an error that is raised on purpose is one line and code 2."""
+    """Run a benchmark as a program; an expected error prints one line and exits with code 2."""
     app = typer.Typer(pretty_exceptions_enable=False)
     app.command()(report_command(measure))
     try:

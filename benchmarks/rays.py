@@ -1,7 +1,7 @@
-"""How long mounted sensors take, each for itself and the ten of `ten_sensors`, on one core.
+"""Times of mounted sensors, each alone and all of `ten_sensors`, on one core.
 
-The sensors are due in every tick and sense the same seeded worlds by turns; times are those of the
-processor that this process had.
+The sensors are due in every tick and sense the same seeded worlds in turn; times are processor
+times of this process.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ENV = "grid4x4"
 CARS_PER_KM2 = 400
 AGENTS = 100
 WARM_S = 10
-TICKS = 20  # of one turn
+TICKS = 20  # per turn
 
 DT_S = 0.05
 TEN_SENSORS = "ten_sensors"
@@ -40,14 +40,14 @@ LIDAR = {"type": "lidar", "rays": 64, "z_m": 0.8, "range_m": 100.0}
 def measure(
     repeats: Annotated[int, about("Turns of each sensor.")] = 5, say: Say = silent
 ) -> BenchmarkReport:
-    """Each sensor of the rig `ten_sensors`, and all together, at 400 cars/km² on one core.
+    """Time each sensor of the rig `ten_sensors`, and all together, at 400 cars/km² on one core.
 
-    The rows are means over 100 vehicles of one world; what a tick of ten sensors takes is measured
-    in a world in which only one of as many cars has any.
+    The rows are means over 100 vehicles of one world. The tick of ten sensors is measured in a
+    world of the same density in which only one car has sensors.
     """
     check_range(repeats=(repeats, 1, 100))
     with one_core():
-        say("making the worlds")
+        say("creating the worlds")
         rig = _ten_sensors()
         many = _driven(AGENTS, {**rig, PLANE_LIDAR: {**LIDAR, "rate_hz": 1.0 / DT_S}})
         one = _driven(1, rig)
@@ -65,15 +65,15 @@ def measure(
         {
             "sensor": "name",
             "sample": "shape",
-            "µs a sample": "median_us:.1f",
+            "µs per sample": "median_us:.1f",
             "min": "low_us:.1f",
             "max": "high_us:.1f",
-            "ns a number": "number_ns:.1f",
+            "ns per number": "number_ns:.1f",
         },
         rows,
         notes=[
-            f"the plane lidar takes {lidar_ns:.1f} ns a ray, a depth and a semantic picture "
-            f"{cameras_ms:.3f} ms,\nall ten sensors of one vehicle {tick_ms:.2f} ms a tick"
+            f"the plane lidar takes {lidar_ns:.1f} ns per ray, a depth and a semantic picture "
+            f"{cameras_ms:.3f} ms,\nall ten sensors of one vehicle {tick_ms:.2f} ms per tick"
         ],
         facts={
             "cars_per_km2": density,
@@ -86,7 +86,7 @@ def measure(
 
 
 def _ten_sensors() -> dict[str, dict[str, Any]]:
-    """The rig, with all of it due in every tick."""
+    """Return the rig, with every sensor due in every tick."""
     config, _ = load_config(ENV, overrides={"rig": TEN_SENSORS})
     return {
         name: {**asdict(sensor), "rate_hz": 1.0 / DT_S, "phase_ticks": 0}
@@ -100,7 +100,7 @@ def _area_km2(simulation: Simulation) -> float:
 
 
 def _driven(agents: int, rig: dict[str, dict[str, Any]]) -> Simulation:
-    """A world with so many agents, all sensors due in every tick, some seconds after its reset."""
+    """Create a world of agents with all sensors due in every tick, some time after its reset."""
     probe = world_maker(ENV, seconds=2 * WARM_S, agents=1, background=0)(1)
     cars = round(CARS_PER_KM2 * _area_km2(probe))
     simulation = world_maker(
@@ -126,7 +126,7 @@ def _mounted(simulation: Simulation) -> RigComponent:
 
 
 class _Sensors:
-    """The sensors on all agents of one world, one at a time."""
+    """The sensors on all agents of one world, used one at a time."""
 
     def __init__(self, simulation: Simulation) -> None:
         mounted = _mounted(simulation)
@@ -138,7 +138,7 @@ class _Sensors:
         self._due = Due(np.ones(1, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64))
 
     def time_us(self, name: str) -> float:
-        """Microseconds that one sample of one vehicle takes."""
+        """Return the time of one sample of one vehicle, µs."""
         sensor, frames = self._sensors[name], self._frames[name]
         sensor.sense(self._scenes, self._due, frames)
         began = time.process_time_ns()
@@ -147,7 +147,6 @@ class _Sensors:
         return (time.process_time_ns() - began) / (1e3 * TICKS * self._num)
 
     def row(self, name: str, times_us: tuple[float, ...]) -> dict[str, Any]:
-        """What was measured."""
         config = self._sensors[name].config
         return {
             "name": name,
@@ -161,7 +160,7 @@ class _Sensors:
 
 
 def _tick_ms(simulation: Simulation) -> float:
-    """Milliseconds that all sensors of a world take in one tick."""
+    """Return the time of all sensors of a world in one tick, ms."""
     mounted = _mounted(simulation)
     began = time.process_time_ns()
     for _ in range(TICKS):

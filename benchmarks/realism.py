@@ -1,7 +1,7 @@
-"""Make the table of docs/explanation/realism.md: our traffic beside SUMO's, over maps and seeds.
+"""The table of docs/figures/realism.md: traffic compared with SUMO, over maps and seeds.
 
-The maps that are not in the eclipse-sumo wheel come from a folder; a demand whose files are not
-there is left out and named.
+Maps outside the eclipse-sumo wheel come from a folder. Demands with missing files are left out and
+listed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cavmarl.core.errors import require
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficFigures
 
-DEMANDS = {  # folder, map and demand; MAPS is the folder of maps, GAME that of the wheel's games
+DEMANDS = {  # folder, map and demand; MAPS: the folder of maps, GAME: the games in the wheel
     "Bologna Acosta": "MAPS/net/bologna_acosta acosta_buslanes.net.xml run.sumocfg",
     "Mcity": "MAPS/net/mcity mcity.net.xml mcity.rou.xml mcity.add.xml",
     "Town10HD, 25 vehicles": "MAPS net/Town10HD.net.xml demand/town10hd_25.rou.xml",
@@ -27,7 +27,7 @@ DEMANDS = {  # folder, map and demand; MAPS is the folder of maps, GAME that of 
     "cross_demo": "GAME cross/cross.net.xml cross_demo.sumocfg",
     "ramp": "GAME/ramp ramp.net.xml ramp.rou.xml",
 }
-COLUMNS: dict[str, tuple[str, str]] = {  # head → figure and how it is written
+COLUMNS: dict[str, tuple[str, str]] = {  # column head → figure and its format
     "arrived": ("arrived", ",.0f"),
     "mean speed, m/s": ("mean_speed_mps", ".2f"),
     "mean delay, s": ("mean_delay_s", ".0f"),
@@ -38,12 +38,12 @@ COLUMNS: dict[str, tuple[str, str]] = {  # head → figure and how it is written
 
 
 def measure(
-    maps: Annotated[Path, about("Folder of the maps that the wheel does not have.")] = Path("maps"),
-    seeds: Annotated[str, about("Seeds of both, as 1,2,3.")] = "1,2,3",
-    seconds: Annotated[int, about("Simulated seconds of each run.")] = 900,
+    maps: Annotated[Path, about("Folder of the maps outside the wheel.")] = Path("maps"),
+    seeds: Annotated[str, about("Comma-separated seeds of both sides.")] = "1,2,3",
+    seconds: Annotated[int, about("Simulated seconds per run.")] = 900,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Ours beside SUMO's over several seeds; of each figure the least and the greatest."""
+    """Compare with SUMO over several seeds; show the least and the greatest of each figure."""
     check_range(seconds=(seconds, 1, 100_000))
     chosen = numbers_of("--seeds", seeds)
     game = Path(require("sumo", "sumo").SUMO_HOME) / "tools" / "game"
@@ -53,7 +53,7 @@ def measure(
         folder, *files = words.replace("MAPS", str(maps)).replace("GAME", str(game)).split()
         network, *demand = (Path(folder, file) for file in files)
         if not network.exists():
-            notes.append(f"{name} is left out: no {network}; give the folder of maps with --maps")
+            notes.append(f"{name} is left out: no {network}; set the folder with --maps")
             continue
         found = []
         for seed in chosen:
@@ -63,7 +63,7 @@ def measure(
         shown = {head: _both(ours, sumo, *figure) for head, figure in COLUMNS.items()}
         rows.append({"demand": name, **shown})
     columns = {"demand": "demand", **{head: head for head in COLUMNS}}
-    return BenchmarkReport(f"ours (SUMO's), {seconds} s, seeds {seeds}", columns, rows, notes)
+    return BenchmarkReport(f"cavmarl (SUMO), {seconds} s, seeds {seeds}", columns, rows, notes)
 
 
 def _both(

@@ -1,4 +1,4 @@
-"""What recording costs a step: the same worlds with and without, turn about."""
+"""Cost of recording a step: the same worlds with and without a recording, in turn."""
 
 from __future__ import annotations
 
@@ -25,18 +25,19 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 
 def measure(
     env: OptionalEnvironment = "town",
-    vehicles: Annotated[int, about("Vehicles of the world, one in ten of them an agent.")] = 1000,
-    steps: Annotated[int, about("Steps of a turn; several parts are written in it.")] = 400,
+    vehicles: Annotated[int, about("Number of vehicles; one in ten is an agent.")] = 1000,
+    steps: Annotated[int, about("Steps per turn, which writes several parts.")] = 400,
     turns: Annotated[int, about("Turns of each side.")] = 7,
     seed: Seed = 0,
     at_most: Annotated[
-        float | None, about("Exit with 1 if a recorded step takes more times as long.")
+        float | None, about("Exit with 1 if recording makes a step more times as long.")
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Milliseconds a step with and without a recording; both drive the same episodes.
+    """Measure ms per step with and without a recording; both drive the same episodes.
 
-    Of the wall, and of the processor for the thread that steps: it is not disturbed by others.
+    Both wall time and processor time of the stepping thread are shown; the latter is not affected
+    by other programs.
     """
     check_positive("--at-most", at_most)
     if not (vehicles >= 10 and steps >= 1 and turns >= 1):
@@ -50,7 +51,7 @@ def measure(
         return make_vec(env, seed=seed, agents=agents, background=background, record=record)
 
     with TemporaryDirectory() as room:
-        say("making the worlds")
+        say("creating the worlds")
         path = Path(room) / "recording"
         sides = {"not recorded": made(None), "recorded": made(path)}
         for vec in sides.values():
@@ -76,11 +77,11 @@ def measure(
     own_ratio = paired_ratio(own["recorded"], own["not recorded"])
     return BenchmarkReport(
         f"A step of {env}, {vehicles} vehicles",
-        {"": "side", "ms a step": "ms:.3f", "least": "least:.3f", "processor": "own:.3f"},
+        {"": "side", "ms per step": "ms:.3f", "least": "least:.3f", "processor": "own:.3f"},
         rows,
         [
             f"recorded: {ratio:.3f} times as long, {own_ratio:.3f} times the processor time of "
-            f"the thread that steps, {size / frames / 1e3:.1f} kB a frame"
+            f"the thread that steps, {size / frames / 1e3:.1f} kB per frame"
         ],
         {"ratio": ratio, "own_ratio": own_ratio, "bytes_per_frame": size / frames},
         holds=at_most is None or ratio <= at_most,
@@ -88,9 +89,9 @@ def measure(
 
 
 def _steps_s(vec: CavVectorEnv, steps: int, own: list[float]) -> float:
-    """Seconds of some steps of built-in drivers, without what chooses their actions.
+    """Return the time of steps of built-in drivers, s, without the choice of actions.
 
-    `own` gets one entry more: seconds of the processor that this thread has had.
+    Append the processor time of this thread in s to `own`.
     """
     took = spent = 0.0
     for _ in range(steps):

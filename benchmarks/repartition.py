@@ -1,4 +1,4 @@
-"""How evenly zones share out vehicles if they become others while a world runs, and its price."""
+"""Balance of zones that are cut again while a world runs, and the cost of it."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def measure(
     env: OptionalEnvironment = "rush",
     zones: Annotated[int, about("Zones of each world.")] = 4,
     every: Annotated[int, about("Steps between checks of the zones.")] = 20,
-    steps: Annotated[int, about("Steps of each seed.")] = 300,
-    seeds: Annotated[int, about("Number of seeds; an interval needs two.")] = 5,
+    steps: Annotated[int, about("Steps per seed.")] = 300,
+    seeds: Annotated[int, about("Number of seeds; at least two for an interval.")] = 5,
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """A world whose zones stay beside one whose zones become others: evenness, and its price."""
+    """Compare static zones with zones that are cut again: balance, and cost."""
     most = float("inf")
     check_range(
         zones=(zones, 2, most), every=(every, 1, most), steps=(steps, 1, most),
@@ -49,7 +49,7 @@ def measure(
             uneven[name].append(float(imbalance.mean()))
             taken[name].append(float(np.median(step_ms)))
         if len({vec.state_hash() for vec in pair.values()}) > 1:
-            raise EvaluationError(f"seed {seed}: the world that was cut anew is another one")
+            raise EvaluationError(f"seed {seed}: the states of static and re-cut worlds differ")
         vehicles.append(int(pair["static"].simulation.running()[0]))
     rows = [_row(name, vec, uneven[name], taken[name]) for name, vec in pair.items()]
     ratios = np.array(uneven["repartitioned"]) / np.array(uneven["static"])
@@ -84,7 +84,7 @@ def measure(
 def _run_beside(
     pair: dict[str, CavVectorEnv], seed: int, steps: int
 ) -> dict[str, tuple[Floats, Floats]]:
-    """(imbalance, ms) of each step, of both."""
+    """Return (imbalance, ms) of each step, for both worlds."""
     found = {name: (np.zeros(steps), np.zeros(steps)) for name in pair}
     for vec in pair.values():
         vec.reset(seed=seed)

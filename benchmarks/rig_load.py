@@ -1,7 +1,7 @@
-"""Make a rig for the benchmark `sensors`, so heavy that it takes a given time a tick.
+"""Create a rig for the benchmark `sensors` that takes a given time per tick.
 
-Resolutions and rates are raised until all sensors together, each due in every tick, take so long;
-each takes about as much as the others, as far as it can have any resolution.
+Resolutions and rates are raised until all sensors together, each due in every tick, take this time.
+Each sensor takes about the same share, as far as its resolution can be changed.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from cavmarl.core.errors import ConfigError
 
 TRIES = 8  # to find a load
 TRIED_STEPS = 12
-MARGIN = 1.15  # above the load that was asked for
+MARGIN = 1.15  # margin above the requested load
 TOO_MUCH = 1.5
 
-# The most of each that a sensor can have; see `config/rig.py`.
+# Upper limits of a sensor's settings; see `config/rig.py`.
 _LIMITS = {"rays": 8192, "layers": 128, "width": 4096, "height": 4096}
 _LEAST_CELL_M = 0.05
 _SCALED = {*_LIMITS, "cell_m"}
@@ -39,16 +39,16 @@ _SCALED = {*_LIMITS, "cell_m"}
 
 def measure(
     env: OptionalEnvironment = "town",
-    load: Annotated[float, about("Milliseconds of sensing a tick.", metavar="MS")] = 20.0,
-    out: Annotated[Path, about("Write the rig here.")] = Path("rig.yaml"),
-    rig: Annotated[str, about("Sensors: a name in configs/rigs/, or a .yaml.")] = "ten_sensors",
-    agents: Annotated[int, about("Vehicles with sensors.")] = 1,
-    background: Annotated[int, about("Vehicles without sensors.")] = 0,
+    load: Annotated[float, about("Milliseconds of sensing per tick.", metavar="MS")] = 20.0,
+    out: Annotated[Path, about("Write the rig to this file.")] = Path("rig.yaml"),
+    rig: Annotated[str, about("Rig: a name in configs/rigs/, or a .yaml file.")] = "ten_sensors",
+    agents: Annotated[int, about("Number of vehicles with sensors.")] = 1,
+    background: Annotated[int, about("Number of vehicles without sensors.")] = 0,
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Find resolutions at which a rig takes so long a tick, and write it as a file."""
+    """Find resolutions at which a rig takes a given time per tick, and write it to a file."""
     if not 0.0 < load <= 1e4:
         raise ConfigError(f"load {load:g} ms: must be above 0 and at most 10000")
     keys = {"agents": agents, "background": background, "seed": seed}
@@ -63,7 +63,7 @@ def measure(
     dt_s = config.clock.sim_dt_s
     rows = [{"name": name, "shape": sensor.shape} for name, sensor in config.rig.items()]
     return BenchmarkReport(
-        f"{out}: {load:g} ms a tick",
+        f"{out}: {load:g} ms per tick",
         {"sensor": "name", "sample": "shape"},
         rows,
         notes=[f"python -m benchmarks sensors {env} --rig {out} --set clock.ctrl_dt_s={dt_s:g}"],
@@ -79,11 +79,10 @@ def _plain(rig: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
-    """The job with resolutions at which the sensors take so long a tick.
+    """Return the job with resolutions at which the sensors take a given time per tick.
 
-    Those that can have any resolution take about as long as each other. What they take does not
-    grow in proportion to their resolutions, so once one rig is too light and another too heavy, the
-    next one lies between them.
+    Sensors with variable resolution take about equal times. Times are not proportional to
+    resolutions, so once one rig is too light and another too heavy, the next one is interpolated.
     """
     even, found_ms = _evened(job, load_ms, say), 0.0
     scale, light, heavy = 1.0, 0.0, math.inf
@@ -99,21 +98,21 @@ def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
         between = 0.0 < light and heavy < math.inf
         scale = math.sqrt(light * heavy) if between else scale * MARGIN * load_ms / found_ms
     raise ConfigError(
-        f"load {load_ms:g} ms a tick: after {TRIES} tries this rig takes {found_ms:.1f} ms; use "
-        "more agents or other sensors, or nothing else on this machine"
+        f"load {load_ms:g} ms per tick: after {TRIES} tries this rig takes {found_ms:.1f} ms; use "
+        "more agents or other sensors, or stop other programs"
     )
 
 
 def _evened(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
-    """The job with each sensor due in every tick, and taking about its share of a load."""
+    """Return the job with each sensor due in every tick and taking about its share of a load."""
     dt_s = job_config(job).clock.sim_dt_s
     even = _changed(job, {"clock.ctrl_dt_s": dt_s})
     factors = dict.fromkeys(job.spec.overrides["rig"], 1.0)
     share_ms = load_ms / len(factors)
-    for grown in (False, True):  # what a sensor takes at a low resolution says little
+    for grown in (False, True):  # at a low resolution, times are not representative
         even = _scaled_by(even, factors)
         found_ms, costs_ms = _tried(even, load_ms, say)
-        if grown:  # some cannot take their share: the others get what is left of it
+        if grown:  # some sensors cannot take their share; the others take the rest
             share_ms *= MARGIN * load_ms / found_ms
         for name, cost_ms in zip(factors, costs_ms, strict=True):
             factors[name] = share_ms / (cost_ms * (job.spec.agents or 1)) if cost_ms else 1.0
@@ -131,18 +130,17 @@ def _scaled_by(job: SensorJob, factors: Mapping[str, float]) -> SensorJob:
 
 
 def _tried(job: SensorJob, load_ms: float, say: Say) -> tuple[float, Sequence[float]]:
-    """What all sensors take a tick, in ms, and each of them."""
+    """Return the time of all sensors per tick in ms, and that of each."""
     tried = run_job(replace(job, warmup=TRIED_STEPS, steps=TRIED_STEPS))
     found_ms = statistics.median(tried.parts_ms["sensor compute"])
-    say(f"looking for a load of {load_ms:g} ms: it was {found_ms:.3g} ms")
+    say(f"searching a load of {load_ms:g} ms: found {found_ms:.3g} ms")
     return found_ms, tried.costs_ms
 
 
 def scaled(config: EnvConfig, factors: Mapping[str, float], rate_hz: float) -> Rig:
-    """The rig of an environment with more pixels, rays and cells.
+    """Return the rig of an environment with more pixels, rays and cells, within their limits.
 
-    As far as may be: there is a most of each. Pictures keep the proportions of their sides. Sensors
-    that have none of them stay as they are.
+    Pictures keep their proportions. Sensors without a resolution stay unchanged.
     """
     return {name: _scaled(sensor, factors[name], rate_hz) for name, sensor in config.rig.items()}
 
@@ -160,7 +158,7 @@ def _scaled(sensor: MountedConfig, factor: float, rate_hz: float) -> dict[str, A
     for name in ("rays", "layers"):
         if name in values:
             wanted = max(1, min(round(values[name] * factor), _LIMITS[name]))
-            factor *= values[name] / wanted  # what is left of it
+            factor *= values[name] / wanted  # the rest after rounding
             values[name] = wanted
     return values
 

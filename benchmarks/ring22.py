@@ -1,7 +1,7 @@
-"""How one driver among 21 others moves all of them: the mean speed on `ring22`.
+"""Effect of one driver among 21 human drivers: the mean speed on `ring22`.
 
-Flow's measure of a driver that stabilises a ring (Wu et al. 2017): the mean speed of all 22 cars
-once the waves of stop and go have grown, beside that of 22 human drivers.
+This is Flow's measure of a driver that stabilises a ring (Wu et al. 2017): the mean speed of all 22
+cars after stop-and-go waves have formed, compared with that of 22 human drivers.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from cavmarl.evaluate.built_in_runs import DrivenWorld
 from cavmarl.policies.loading import driver_keys, load_policy, policy_files
 
 ENV = "ring22"
-HUMAN = "human"  # one more of them in the agent's seat
+HUMAN = "human"  # a further human driver in the agent's seat
 ALL_HUMAN = {"traffic.demand": ["map/all_human.rou.xml"]}
 
 
 def measure(
     policy: Annotated[
-        list[str] | None, typer.Option("--policy", "-p", help="In the agent's seat; may repeat.")
+        list[str] | None, typer.Option("--policy", "-p", help="Policy of the agent; repeatable.")
     ] = None,
-    episodes: Annotated[int, about("Episodes of each.")] = 8,
-    after_s: Annotated[int, about("Seconds of each that do not count.")] = 75,
+    episodes: Annotated[int, about("Episodes per policy.")] = 8,
+    after_s: Annotated[int, about("Seconds of each episode to leave out.")] = 75,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Mean speed of all cars of `ring22`, by the driver of one of them.
+    """Measure the mean speed of all cars of `ring22`, by the driver of one of them.
 
-    Episodes differ by where the agent starts. Those in which it crashes have no mean speed.
+    Episodes differ in the agent's starting position. Episodes with a crash have no mean speed.
     """
     check_range(episodes=(episodes, 1, 1000), after_s=(after_s, 0, 299))
     say(HUMAN)
@@ -57,7 +57,7 @@ def measure(
             "crashed": "crashed",
         },
         rows,
-        notes=[f"from {after_s} s to the end; {episodes} episodes; human drivers are always alike"],
+        notes=[f"from {after_s} s to the end; {episodes} episodes; humans are deterministic"],
     )
 
 
@@ -75,7 +75,7 @@ def _row(name: str, means: NDArray[np.float64], base: float | None) -> dict[str,
 
 
 def human_mps(after_s: float) -> float:
-    """Mean speed of 22 human drivers, of whom none draws anything."""
+    """Return the mean speed of 22 human drivers, who make no random choices."""
     world = load_world(ENV, agents=0, overrides=ALL_HUMAN)
     simulation = Simulation(world.config, world.network, demand=world.demand)
     simulation.seed(0)
@@ -90,8 +90,8 @@ def human_mps(after_s: float) -> float:
 
 
 def driver_mps(name: str, episodes: int, after_s: float, seed: int) -> NDArray[np.float64]:
-    """Mean speed of all 22 in each episode with this driver; not a number where it crashed."""
-    is_trained = len(policy_files(name)) > 1  # it says what it sees and does
+    """Return the mean speed of all 22 cars per episode with this driver; nan after a crash."""
+    is_trained = len(policy_files(name)) > 1  # a trained policy defines its sensors and actions
     keys = driver_keys(name) if is_trained else {}
     vec = cavmarl.make_vec(ENV, num_envs=episodes, overrides=keys)
     with closing(vec):
@@ -100,7 +100,7 @@ def driver_mps(name: str, episodes: int, after_s: float, seed: int) -> NDArray[n
         policy.reset(seed)
         steps, first = _steps(vec.worlds.simulation, after_s)
         sums, crashed = np.zeros(episodes), np.zeros(episodes, dtype=bool)
-        for step in range(steps - 1):  # in the last one all begin anew
+        for step in range(steps - 1):  # all agents restart in the last step
             actions = policy.act_batch(observations, infos["mask"])
             observations, _, ended, _, infos = vec.step(actions)
             crashed |= ended.any(1)
@@ -110,7 +110,7 @@ def driver_mps(name: str, episodes: int, after_s: float, seed: int) -> NDArray[n
 
 
 def _steps(simulation: Simulation, after_s: float) -> tuple[int, int]:
-    """Steps of an episode, and how many of them come before this time."""
+    """Return the steps of an episode, and the number of steps before this time."""
     step_s = simulation.config.clock.ctrl_dt_s
     return round(simulation.config.horizon_s / step_s), round(after_s / step_s)
 

@@ -1,7 +1,7 @@
-"""What the paper on distributed CARLA (A) has in scope, beside what a short run here shows.
+"""The scope of the paper on distributed CARLA (A), compared with the results of a short run.
 
-What A says is cited by its sections and Table 1 (`docs/explanation/papers.md`). Each row of
-ours is checked: it holds, or the exit code is 1.
+A is cited by its sections and Table 1 (`docs/explanation/papers.md`). Each row is checked for
+cavmarl; if one fails, the exit code is 1.
 """
 
 from __future__ import annotations
@@ -31,54 +31,54 @@ TOLD = {"v2x.enabled": True, "v2x.roadside.signals": ["all"], "v2x.perception.ra
 
 @dataclass(frozen=True)
 class Found:
-    """What a check has found, and whether that is what it should be."""
+    """The result of a check, and whether it is as required."""
 
     shown: str
     holds: bool
 
 
 def divided(steps: int, seed: int) -> tuple[Found, Found]:
-    """One city over several zones beside the undivided world; and its hand-overs."""
+    """Compare one city over several zones with the undivided world, and count hand-overs."""
     hashes, owners, transfers, once = [], 0, 0, True
     for zones in (1, ZONES):
         with closing(make_vec(ENV, zones=zones, **CROWD)) as vec:
             vec.reset(seed=seed)
-            told = []
+            states = []
             for _ in range(steps):
                 vec.step(vec.suggest_actions())
-                told.append(vec.state_hash())
+                states.append(vec.state_hash())
                 ids = vec.world_frames()[0].vehicles["id"]
                 once &= len(np.unique(ids)) == len(ids)
                 owners = len(ids)
-            hashes.append(told)
+            hashes.append(states)
             transfers = sum(one.switched for one in vec.simulation.coordinators)
     same = sum(one == other for one, other in zip(*hashes, strict=True))
     return (
         Found(
-            f"{ZONES} zones: {same} of {steps} steps bit for bit the undivided world's",
+            f"{ZONES} zones: {same} of {steps} steps bit for bit equal to the undivided world",
             same == steps,
         ),
         Found(
-            f"{transfers} in {steps} steps; of {owners} vehicles none twice or lost",
+            f"{transfers} in {steps} steps; of {owners} vehicles none duplicated or lost",
             transfers > 0 and once and same == steps,
         ),
     )
 
 
 def placed() -> Found:
-    """The LoadScore: who is left out, and which of the others is chosen."""
+    """Check which workers the LoadScore excludes, and which one it chooses."""
     busy = [Candidate(k, Utilisation(*row)) for k, row in enumerate(np.diag(THRESHOLDS) + 1e-6)]
     fleet = [*busy, Candidate(3, Utilisation(0.5, 0.5)), Candidate(4, Utilisation(0.2, 0.1))]
     found = select(fleet)
     out = len(found.rejections)
     return Found(
-        f"{out} workers above a threshold left out; of 2 others the idler one",
+        f"{out} workers above a threshold left out; of 2 others the less loaded one",
         out == len(THRESHOLDS) and found.worker == 4,
     )
 
 
-def told(steps: int, seed: int) -> Found:
-    """Messages by kind."""
+def messages_sent(steps: int, seed: int) -> Found:
+    """Count messages by kind."""
     with closing(make_vec(ENV, **CROWD, overrides=TOLD)) as vec:
         vec.reset(seed=seed)
         for step in range(steps):
@@ -95,38 +95,38 @@ def told(steps: int, seed: int) -> Found:
 
 
 def pictured(seed: int) -> Found:
-    """A camera's picture."""
+    """Check a camera's picture."""
     with closing(make_vec(ENV, **CROWD, overrides={"rig": {"front": CAMERA}})) as vec:
         vec.reset(seed=seed)
         vec.step(vec.suggest_actions())
         picture = vec.frames()["front"].data[0, 0, -1]
     colours = len(np.unique(picture.reshape(-1, 3), axis=0))
-    return Found(f"shaded shapes, no photographs: {colours} colours in a picture", colours > 10)
+    return Found(f"shaded shapes, not photorealistic: {colours} colours in a picture", colours > 10)
 
 
 def clocked(steps: int, seed: int) -> Found:
-    """A follower's clock beside the master's."""
+    """Compare a follower's clock with the master's."""
     found = measure_drift("ring", steps=steps, seed=seed)
     off = max(abs(row.delta_s) for row in found.rows)
     return Found(f"a follower is {off:.1f} s off after {steps} steps", found.holds)
 
 
 def measure(
-    steps: Annotated[int, about("Steps of each run.")] = 100,
+    steps: Annotated[int, about("Steps per run.")] = 100,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Check what is in scope, row by row."""
+    """Check the scope, row by row."""
     check_range(steps=(steps, 20, 100_000))
     say("zones")
     city, handed_over = divided(steps, seed)
     weights = " / ".join(f"{weight:g}" for weight in WEIGHTS)
     checks: list[tuple[str, str, Callable[[], Found]]] = [
-        ("one city over several instances", "CARLA instances, one a zone (3.3)", lambda: city),
+        ("one city over several instances", "CARLA instances, one per zone (3.3)", lambda: city),
         ("hand-over between instances", "acknowledged, then switched (3.7)", lambda: handed_over),
         ("placement by load", f"eq. (1), (2), weights {weights} (3.5)", placed),
         ("one clock for all", "synchronous steps (3.8)", lambda: clocked(steps, seed)),
-        ("V2X", "logical interfaces; no network yet (Table 1)", lambda: told(steps, seed)),
+        ("V2X", "logical interfaces; no network yet (Table 1)", lambda: messages_sent(steps, seed)),
         ("rendering", "photographs, by CARLA (Table 1)", lambda: pictured(seed)),
     ]
     rows = []
@@ -135,7 +135,7 @@ def measure(
         found = check()
         rows.append({"what": name, "A": paper, "here": found.shown, "holds": found.holds})
     return BenchmarkReport(
-        "in scope: A beside a short run here",
+        "scope: A compared with a short run",
         {"what": "what", "A": "A", "here": "here", "holds": "holds"},
         rows,
         holds=all(row["holds"] for row in rows),

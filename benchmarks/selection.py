@@ -1,4 +1,4 @@
-"""How much the choice of a worker depends on the LoadScore's weights, and how long it takes."""
+"""Sensitivity of the choice of a worker to the LoadScore's weights, and its time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import Seed, about
 from cavmarl.evaluate.statistics import share_interval
 
-# Beside the paper's: all alike, each resource alone, and each pair.
+# In addition to the paper's weights: equal, each resource alone, and each pair.
 OTHER_WEIGHTS = (
     (1 / 3, 1 / 3, 1 / 3),
     (0.5, 0.25, 0.25),
@@ -32,15 +32,15 @@ OTHER_WEIGHTS = (
     (0.0, 1.0, 0.0),
     (0.0, 0.0, 1.0),
 )
-FEW, MANY = 5, 100  # workers: to choose among, and to be timed with
+FEW, MANY = 5, 100  # numbers of workers for choices, and for timing
 
 
 def measure(
-    choices: Annotated[int, about("Choices with each weights.")] = 1000,
+    choices: Annotated[int, about("Choices per set of weights.")] = 1000,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Choose among random admissible workers with several weights, and take the time."""
+    """Choose among random admissible workers with several weights, and time the choice."""
     check_range(choices=(choices, 1, 1_000_000))
     fleets = list(_fleets(FEW, choices, seed))
     paper = LoadRule()
@@ -72,7 +72,7 @@ def measure(
     latency = {f"p{quantile}": float(np.percentile(spent, quantile)) for quantile in (50, 95, 99)}
     timed = ", ".join(f"{name} {value:.0f} µs" for name, value in latency.items())
     return BenchmarkReport(
-        f"weights beside 0.6, 0.2, 0.2: {choices} choices of {FEW} workers",
+        f"weights compared with 0.6, 0.2, 0.2: {choices} choices of {FEW} workers",
         {
             "weights": "weights",
             "other choice": "changed:.2f",
@@ -85,7 +85,7 @@ def measure(
 
 
 def _fleets(workers: int, count: int, seed: int) -> Iterator[list[Candidate]]:
-    """Admissible workers, uniform in what is used of them."""
+    """Yield admissible workers with uniformly random utilisation."""
     draw = np.random.default_rng(seed)
     for _ in range(count):
         uses = (draw.random((workers, len(WEIGHTS))) * THRESHOLDS).tolist()

@@ -1,4 +1,4 @@
-"""One vehicle with its sensors over some numbers of sensor workers, each run in processes anew."""
+"""One vehicle with sensors over several numbers of sensor workers, with new processes per run."""
 
 from __future__ import annotations
 
@@ -35,31 +35,31 @@ CEILING_STEPS, CEILING_TURNS = 10, 7
 
 @dataclass(frozen=True)
 class Turn:
-    """One run: which it was, and what it found."""
+    """One run with its place in the order, and its result."""
 
     repeat: int  # from 1
-    place: int  # in the order in which all were run, from 1
-    workers: int  # sensor workers
-    run: SensorRun  # what was found
+    place: int  # place in the order of all runs, from 1
+    workers: int  # number of sensor workers
+    run: SensorRun  # result
 
 
 @dataclass(frozen=True)
 class SensorBench:
     """Result of `measure_sensor_workers`."""
 
-    env: str  # of which environment
+    env: str  # name of the environment
     agents: int  # vehicles with sensors
-    background: int  # vehicles without
-    warmup: int  # steps that did not count
-    steps: int  # of each run that did
+    background: int  # vehicles without sensors
+    warmup: int  # unmeasured steps
+    steps: int  # measured steps per run
     seed: int  # of every run, and of their order
-    placement: str  # how sensors were shared out: by `cost` or `in_turn`
-    turns: tuple[Turn, ...]  # all runs, in their order
-    # of as many programs with the same sensing as the most workers that have a core; None: one
+    placement: str  # placement of sensors: by `cost` or `in_turn`
+    turns: tuple[Turn, ...]  # all runs, in order
+    # for as many independent programs as the largest number of workers with a core each; None: one
     ceiling: CoreCeiling | None
 
     def of(self, workers: int) -> list[SensorRun]:
-        """The runs with so many sensor workers."""
+        """Return the runs with a number of sensor workers."""
         return [turn.run for turn in self.turns if turn.workers == workers]
 
     @property
@@ -76,7 +76,7 @@ class SensorBench:
 
     @property
     def is_same(self) -> bool:
-        """Whether all runs have come to the same states and frames, step by step."""
+        """Return whether all runs have the same states and frames, step by step."""
         return len({turn.run.digests for turn in self.turns}) == 1
 
     def parts_ms(self, workers: int) -> dict[str, float]:
@@ -85,19 +85,20 @@ class SensorBench:
 
     @property
     def sensing_ms(self) -> float:
-        """What the sensors take in a tick where the fewest workers share them."""
+        """Time of the sensors per tick with the fewest workers."""
         least = self.numbers[0]
         return self.parts_ms(least)["sensor compute"] / self.of(least)[0].ticks_per_step
 
     @property
     def costs_ms(self) -> list[float]:
-        """Of one frame of each sensor, median of all runs."""
+        """Cost of one frame of each sensor, median of all runs."""
         return [median(of) for of in zip(*(turn.run.costs_ms for turn in self.turns), strict=True)]
 
     def shares(self, workers: int) -> dict[str, Shares]:
-        """Both ways to share out all sensors of one vehicle, by what they have cost.
+        """Return both placements of all sensors of one vehicle, by their measured costs.
 
-        As if all lines of a frame cost the same: dividing frames finds out which cost more.
+        All lines of a frame are assumed to cost the same; dividing frames at run time corrects
+        this.
         """
         costs_ms = self.costs_ms
         num_lines = [sensor["lines"] for sensor in self.turns[0].run.sensors]
@@ -113,11 +114,11 @@ class SensorBench:
         }
 
     def windows(self, workers: int) -> list[Window]:
-        """Resources of the last run with so many workers."""
+        """Return the resources of the last run with a number of workers."""
         return list(self.of(workers)[-1].windows)
 
     def facts(self) -> dict[str, Any]:
-        """Return plain values, for a report: all but `rows`."""
+        """Return plain values for a report: all but `rows`."""
         numbers = self.numbers
         shares = {
             number: {name: asdict(found) for name, found in self.shares(number).items()}
@@ -146,15 +147,15 @@ def measure_sensor_workers(
     say: Say = silent,
     **keys: Unpack[WorldKeys],
 ) -> SensorBench:
-    """Run the same world with each number of sensor workers, in a random order.
+    """Run the same world with each number of sensor workers, in random order.
 
-    Every run has processes of its own, which share nothing with those of another but files. By
-    default one agent has the rig, and there are no other vehicles.
+    Each run has its own processes, which share only files with those of other runs. By default, one
+    agent has the rig, and there are no other vehicles.
     """
     if not workers or len(set(workers)) < len(workers) or not 1 <= min(workers) <= max(workers):
-        raise ConfigError(f"workers {list(workers)}: must be numbers from 1, each once")
+        raise ConfigError(f"workers {list(workers)}: must be distinct numbers of at least 1")
     if max(workers) > MAX_WORKERS:
-        raise ConfigError(f"workers {list(workers)}: at most {MAX_WORKERS}")
+        raise ConfigError(f"workers {list(workers)}: must be at most {MAX_WORKERS}")
     if warmup < 0 or steps < 2 or repeats < 1:
         raise ConfigError(
             f"{warmup} steps of warm-up, {steps} steps, {repeats} repeats: must be at least 0, 2 "
@@ -183,19 +184,19 @@ def measure_sensor_workers(
 
 
 def _ceiling(spec: WorldSpec, workers: Sequence[int], say: Say) -> CoreCeiling | None:
-    """What the machine allows with as many workers as it has cores for; see `SensorBench`."""
+    """Measure the machine's limit with as many programs as cores allow; see `SensorBench`."""
     programs = max((number for number in workers if number <= len(usable_cores())), default=1)
     if programs == 1:
         return None
-    say(f"{programs} programs that share nothing")
+    say(f"{programs} independent programs")
     counts: dict[str, Any] = {"worlds": programs, "programs": programs}
     return measure_ceiling(spec, **counts, steps=CEILING_STEPS, repeats=CEILING_TURNS, alike=True)
 
 
 def first_job(spec: WorldSpec, rig: Rig, steps: tuple[int, int]) -> SensorJob:
-    """The run with one sensor worker; no episode ends in it, whatever a step is.
+    """Return the run with one sensor worker, in which no episode ends.
 
-    `steps` are those of the warm-up, and those that count.
+    `steps`: unmeasured and measured steps.
     """
     given = {"horizon_s": float(10 * (sum(steps) + 1)), **spec.overrides, "rig": rig}
     agents = 1 if spec.agents is None else spec.agents
@@ -208,6 +209,6 @@ def job_config(job: SensorJob) -> EnvConfig:
 
 
 def run_job(job: SensorJob) -> SensorRun:
-    """A run in processes of its own."""
+    """Run a job in new processes."""
     what = f"a run with {job.sensor_workers} sensor workers"
     return call_in_fresh_process(what, run_sensors, job)

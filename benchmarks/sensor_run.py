@@ -1,6 +1,6 @@
-"""One run of a world with sensor workers, step by step, and what it gives.
+"""One run of a world with sensor workers, step by step, and its measurements.
 
-What is in no part has not been timed: the parts are not made to sum up.
+Time outside all parts is not measured: the parts need not sum up to the step.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from cavmarl.config.io import read_yaml
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers, SensorWorkerTimes
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.sensors.registry import type_of
 
 Rig = dict[str, dict[str, Any]]
@@ -31,8 +31,8 @@ PARTS = (
     "physics", "SUMO", "ghosts", "transfers", "sensor compute", "sensor transport", "barrier",
     "observation", "environment",
 )  # fmt: skip
-# Calls of the runtime that belong to a part; the executor's and the traffic's others are physics.
-# Those of SUMO's side are its own step, for which this process waits, and what comes of it here.
+# Calls of the runtime by part; all other calls of executor and traffic are physics. `SUMO` is the
+# time that this process waits for SUMO's step, plus that of processing its results.
 _PART_OF = {
     **dict.fromkeys(("step", "mirror", "forgive", "let_in", "order", "send_on", "show"), "SUMO"),
     "exchange": "ghosts",
@@ -45,17 +45,17 @@ _PLACE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 
 
 def load_rig(path: Path) -> Rig:
-    """The sensors in a file, as they stand under `rig` of an env.yaml."""
+    """Read the sensors in a file, with the structure of `rig` in env.yaml."""
     found = read_yaml(path)
     if not isinstance(found, Mapping) or not all(
         isinstance(sensor, Mapping) for sensor in found.values()
     ):
-        raise ConfigError(f"{path}: must be sensors by name, as under rig of an env.yaml")
+        raise ConfigError(f"{path}: must contain sensors by name, as under rig in env.yaml")
     return {name: dict(sensor) for name, sensor in found.items()}
 
 
 def describe_rig(config: EnvConfig) -> list[dict[str, Any]]:
-    """Type, resolution, lines, rate and placement of each sensor of an environment."""
+    """Return type, resolution, lines, rate and placement of each sensor of an environment."""
     return [
         {
             "name": name,
@@ -71,45 +71,45 @@ def describe_rig(config: EnvConfig) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class SensorJob:
-    """What to run."""
+    """A run to measure."""
 
     spec: WorldSpec  # each agent has a rig; background vehicles are sensed
-    sensor_workers: int  # how many
-    warmup: int  # steps that do not count
-    steps: int  # that do
+    sensor_workers: int  # number of sensor workers
+    warmup: int  # unmeasured steps
+    steps: int  # measured steps
 
 
 @dataclass(frozen=True)
 class Window:
-    """What some steps have taken, all processes together."""
+    """Resources used by a number of steps, over all processes."""
 
-    steps: int  # how many
-    leader_cpu_s: float  # processor time of the process that keeps the state
+    steps: int  # number of steps
+    leader_cpu_s: float  # processor time of the process with the state
     worker_cpu_s: tuple[float, ...]  # of each sensor worker
-    leader_rss_mb: float  # resident memory at the end, shared memory among it
+    leader_rss_mb: float  # resident memory at the end, including shared memory
     worker_rss_mb: tuple[float, ...]  # of each sensor worker
-    sent_bytes: int  # that workers were given to read
-    got_bytes: int  # of frames that they have written
+    sent_bytes: int  # input of the workers
+    got_bytes: int  # frames written by the workers
     messages: int  # orders and answers
 
 
 @dataclass(frozen=True)
 class SensorRun:
-    """What was found."""
+    """Result of a run."""
 
-    step_ms: tuple[float, ...]  # of each step, tick and sensors, all that `step` does among it
-    wait_ms: tuple[float, ...]  # of that, waiting for sensor workers
-    parts_ms: dict[str, tuple[float, ...]]  # of each step, by the names of `PARTS`
+    step_ms: tuple[float, ...]  # per step: tick and sensors, everything in `step`
+    wait_ms: tuple[float, ...]  # share of that waiting for sensor workers
+    parts_ms: dict[str, tuple[float, ...]]  # per step, by the names of `PARTS`
     windows: tuple[Window, ...]  # resources
     costs_ms: tuple[float, ...]  # processor time of one agent's frame of each sensor
     sensors: list[dict[str, Any]]  # type, resolution, rate and placement of each
-    digests: tuple[str, ...]  # of the state with all frames, after the warm-up's steps and the last
+    digests: tuple[str, ...]  # hashes of state and frames, after warm-up steps and the last
     ticks_per_step: int
-    deaths: int  # sensor workers that had to be replaced
+    deaths: int  # number of replaced sensor workers
 
 
 def run_sensors(job: SensorJob) -> SensorRun:
-    """Run a job in this process; agents are driven by the built-in driver, which is not timed."""
+    """Run a job in this process; the built-in driver drives the agents and is not timed."""
     spec = job.spec
     vec = make_vec(spec.env, sensor_workers=job.sensor_workers, copy=False, **spec.keywords)
     try:
@@ -170,7 +170,7 @@ class _Timed:
         )
 
     def step(self) -> float:
-        """One step; the processor time that it has taken here, s."""
+        """Run one step and return its processor time in this process, s."""
         vec = self._vec
         actions = vec.suggest_actions()
         for watch in (self._runtime, self._rig, self._ticks):
@@ -200,7 +200,7 @@ class _Timed:
             self._parts_ms[name].append(1e3 * part_s)
 
     def digest(self) -> None:
-        """Note the state; not between steps that count, since it goes through all frames."""
+        """Record the state's hash; not called between measured steps, as it reads all frames."""
         self._digests.append(self._vec.state_hash())
 
     def run(self, windows: tuple[Window, ...]) -> SensorRun:
@@ -219,6 +219,6 @@ class _Timed:
 
 
 def _resident_mb(pid: int) -> float:
-    """Memory of a process that is in use."""
+    """Return the resident memory of a process."""
     pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

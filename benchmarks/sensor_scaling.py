@@ -1,9 +1,8 @@
-"""What follows from step times over several numbers of sensor workers, and its figure.
+"""Derived figures and the plot of step times over numbers of sensor workers.
 
-Every figure of such a table is made here, from raw series, and nowhere else. A standard deviation
-within a run is that of its steps, by n - 1; it says nothing about another run. What another run
-would give is said by the interval between runs, for which there have to be five. Nothing is said
-about numbers of workers that have not been measured.
+All figures of such a table are computed here from raw series. A standard deviation within a run is
+that of its steps (n - 1); it says nothing about other runs. The interval between runs does, and
+needs at least five runs. There are no predictions for numbers of workers that were not measured.
 """
 
 from __future__ import annotations
@@ -20,33 +19,33 @@ from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.statistics import Interval, mean_interval
 from cavmarl.evaluate.traffic.traffic_plot import save_figure
 
-MIN_RUNS = 5  # from so many on there is an interval between runs
+MIN_RUNS = 5  # smallest number of runs for an interval between runs
 FPS, STEP = "#2f6db5", "#d1793b"
-HEADROOM = 1.1  # over the largest value
+HEADROOM = 1.1  # of the axis over the largest value
 
 
 @dataclass(frozen=True)
 class Series:
     """The steps of one run."""
 
-    step_ms: Sequence[float]  # tick and sensors, of each step
-    wait_ms: Sequence[float]  # of that, waiting for sensors
+    step_ms: Sequence[float]  # tick and sensors, per step
+    wait_ms: Sequence[float]  # share of that waiting for sensors
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What has been measured with some number of sensor workers, in the mean."""
+    """Mean measurements with one number of sensor workers."""
 
     workers: int  # n
     step_ms: float  # T, tick and sensors
-    sd_within_run: float  # sample standard deviation of the steps of a run, ms
-    wait_ms: float  # of T, waiting for sensors
-    ci95_between_runs: Interval | None = None  # of T, from independent runs; None: too few
+    sd_within_run: float  # sample standard deviation of steps within a run, ms
+    wait_ms: float  # part of T waiting for sensors
+    ci95_between_runs: Interval | None = None  # of T, from independent runs; None: too few runs
 
 
 @dataclass(frozen=True)
 class ScalingRow:
-    """What was measured with n sensor workers, and what follows from it."""
+    """Measurements with n sensor workers, and derived figures."""
 
     workers: int
     step_ms: float
@@ -55,26 +54,26 @@ class ScalingRow:
     ci95_between_runs: Interval | None
     wait_ms: float
     speedup: float  # T of the fewest workers / T
-    efficiency_pct: float  # speedup / n, times the fewest workers
-    cv_pct: float  # coefficient of variation, standard deviation / T
-    wait_share_pct: float  # waiting / T
-    rest_ms: float  # T less waiting
-    fps_gain_pct: float  # above the FPS of the fewest workers
-    step_gain_pct: float  # T above that of the fewest workers; negative where it is shorter
-    is_best: bool  # the shortest T of those that were measured
+    efficiency_pct: float  # speedup / n, times the smallest n
+    cv_pct: float  # coefficient of variation: standard deviation / T
+    wait_share_pct: float  # waiting time / T
+    rest_ms: float  # T minus waiting time
+    fps_gain_pct: float  # relative to the FPS of the fewest workers
+    step_gain_pct: float  # T relative to that of the fewest workers; negative if shorter
+    is_best: bool  # whether T is the shortest of those measured
 
 
 def summarize(runs: Mapping[int, Sequence[Series]]) -> list[Measured]:
-    """Means of independent runs, by the number of sensor workers.
+    """Return means of independent runs, by number of sensor workers.
 
-    The standard deviation is the root of the runs' mean variance, so that what lies between the
-    runs is not in it.
+    The standard deviation is the root of the runs' mean variance, so it excludes differences
+    between runs.
     """
     series = [run for of in runs.values() for run in of]
     lengths = {len(part) for run in series for part in (run.step_ms, run.wait_ms)}
     if len(lengths) != 1 or min(lengths) < 2 or not all(runs.values()):
         raise ConfigError(
-            f"runs of {sorted(lengths)} steps: every number of workers needs runs, all of one "
+            f"runs of {sorted(lengths)} steps: every number of workers needs runs, all of equal "
             "length, of at least 2 steps"
         )
     found = []
@@ -91,14 +90,14 @@ def summarize(runs: Mapping[int, Sequence[Series]]) -> list[Measured]:
 def scaling_table(
     measured: Sequence[Measured], *, paper_rounding: bool = False
 ) -> list[ScalingRow]:
-    """Every derived figure."""
+    """Compute all derived figures."""
     numbers = [one.workers for one in measured]
     if not numbers or numbers != sorted(set(numbers)) or numbers[0] < 1:
-        raise ConfigError(f"sensor workers {numbers}: must be rising numbers from 1")
+        raise ConfigError(f"sensor workers {numbers}: must be increasing numbers of at least 1")
     for one in measured:
         if not (0.0 < one.step_ms < math.inf and 0.0 <= one.wait_ms <= one.step_ms):
             raise ConfigError(
-                f"{one.workers} sensor workers: {one.wait_ms:g} ms of {one.step_ms:g} ms cannot be"
+                f"{one.workers} sensor workers: {one.wait_ms:g} ms of {one.step_ms:g} ms is wrong"
             )
     rounded: Callable[[float], float] = _to_two_places if paper_rounding else float
     best = min(measured, key=lambda one: one.step_ms)
@@ -125,12 +124,12 @@ def _row(
 
 
 def _to_two_places(value: float) -> float:
-    """Halves up, of the number as it is written in decimal."""
+    """Round half up, based on the number's decimal representation."""
     return float(Decimal(repr(value)).quantize(Decimal("0.01"), ROUND_HALF_UP))
 
 
 def plot_sensor_workers(rows: Sequence[ScalingRow], title: str, path: Path) -> None:
-    """Write FPS and the time of a step over the number of sensor workers; the best is marked."""
+    """Plot FPS and step time over the number of sensor workers; mark the best."""
     figure = require("matplotlib.figure", "report").Figure(figsize=(7.0, 4.2), layout="constrained")
     left = figure.subplots()
     right = left.twinx()
@@ -144,7 +143,7 @@ def plot_sensor_workers(rows: Sequence[ScalingRow], title: str, path: Path) -> N
         color=FPS, weight="bold",
     )  # fmt: skip
     for axes, label, color in (
-        (left, "frames a second", FPS),
+        (left, "frames per second", FPS),
         (right, "tick and sensors, ms (± SD within a run)", STEP),
     ):
         axes.set_ylabel(label, color=color)

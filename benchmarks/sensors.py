@@ -1,4 +1,4 @@
-"""One vehicle's sensors over several numbers of sensor workers."""
+"""The sensors of one vehicle over several numbers of sensor workers."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ def measure(
     world: WorldSpec,
     env: OptionalEnvironment = "town",
     workers: Annotated[
-        str, about("Numbers of sensor workers to compare.", metavar="N,…")
+        str, about("Comma-separated numbers of sensor workers.", metavar="N,…")
     ] = "1,2,3,4",
-    warmup: Annotated[int, about("Steps before the measured ones.")] = 40,
-    steps: Annotated[int, about("Measured steps of each run.")] = 150,
-    repeats: Annotated[int, about("Runs of each number of sensor workers.")] = 5,
-    rig: Annotated[str, about("Sensors: a name in configs/rigs/, or a .yaml.")] = "ten_sensors",
-    agents: Annotated[int, about("Vehicles with sensors.")] = 1,
-    background: Annotated[int, about("Vehicles without sensors.")] = 0,
+    warmup: Annotated[int, about("Unmeasured steps at the beginning.")] = 40,
+    steps: Annotated[int, about("Measured steps per run.")] = 150,
+    repeats: Annotated[int, about("Runs per number of sensor workers.")] = 5,
+    rig: Annotated[str, about("Rig: a name in configs/rigs/, or a .yaml file.")] = "ten_sensors",
+    agents: Annotated[int, about("Number of vehicles with sensors.")] = 1,
+    background: Annotated[int, about("Number of vehicles without sensors.")] = 0,
     csv_path: Annotated[
-        Path | None, about_file("Write every step of every run here.", "--csv")
+        Path | None, about_file("Write every step of every run to this file.", "--csv")
     ] = None,
-    plot: Annotated[Path | None, about_file("Write the figure here (.png, .svg, .pdf).")] = None,
+    plot: Annotated[Path | None, about_file("Write a figure (.png, .svg, .pdf).")] = None,
     at_least: Annotated[
         float | None,
         about(
-            "Exit with 1 if the second number is not so many times faster.", callback=check_bound
+            "Exit with 1 if the second number is not this many times faster.", callback=check_bound
         ),
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """One vehicle and its sensors, with each number of sensor workers, in processes anew.
+    """Run one vehicle and its sensors with each number of sensor workers, in new processes.
 
-    Exit code 1: states or frames differed between runs, or --at-least did not hold.
+    Exit with 1 if states or frames differ between runs, or if --at-least does not hold.
     """
     mounted = load_rig(find_settings("rig", rig))
     found = measure_sensor_workers(
@@ -124,7 +124,7 @@ def _sensors(found: SensorBench) -> Table:
 
 
 def _homes(plan: Shares) -> dict[int, str]:
-    """Workers that write the frames of each sensor, or parts of them."""
+    """Return the workers that write each sensor's frames, or parts of them."""
     homes: dict[int, list[str]] = {}
     for unit, home in zip(plan.units, plan.homes, strict=True):
         homes.setdefault(unit.sensor, []).append(str(home))
@@ -154,7 +154,7 @@ def _parts(found: SensorBench) -> Table:
     sums = (f"{sum(parts.values()) / step_ms:.1%}" for parts, step_ms in columns)
     rows += [None, ("sum, of the step", *sums)]
     head = ("ms a step", *(str(row.workers) for row in found.rows))
-    return make_table("parts of a step, each with a clock of its own", head, rows)
+    return make_table("parts of a step, timed separately", head, rows)
 
 
 _RESOURCES: dict[str, Callable[[Window], float]] = {
@@ -173,7 +173,7 @@ def _resources(found: SensorBench) -> Table:
     rows = [
         (name, *(f"{value(window):,.1f}" for window in last)) for name, value in _RESOURCES.items()
     ]
-    return make_table("resources", ("a step", *map(str, found.numbers)), rows)
+    return make_table("resources", ("per step", *map(str, found.numbers)), rows)
 
 
 def _notes(found: SensorBench, rows: list[ScalingRow]) -> list[str]:
@@ -184,31 +184,31 @@ def _notes(found: SensorBench, rows: list[ScalingRow]) -> list[str]:
         if row.ci95_between_runs is not None
     ]
     lines = [
-        f"the best of those measured: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
-        f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms a tick on "
+        f"the best number: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
+        f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms per tick on "
         f"{rows[0].workers}",
-        f"95 % between runs: {'; '.join(intervals) or f'none, it takes {MIN_RUNS} runs'}",
+        f"95 % between runs: {'; '.join(intervals) or f'none, needs {MIN_RUNS} runs'}",
         "states and frames of all runs, step by step: "
         + ("the same" if found.is_same else "[red]not the same[/]"),
     ]
     if found.ceiling is not None:
         lines.append(
-            f"{found.ceiling.programs} programs that share nothing and do the same, side by side: "
-            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other: more this machine does "
-            "not give"
+            f"{found.ceiling.programs} independent programs with the same work, side by side: "
+            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other; this is the machine's "
+            "limit"
         )
     cores = len(usable_cores())
     order = ", ".join(str(turn.workers) for turn in found.turns)
     lines.append(f"cores: {cores}; runs in this order: {order}")
     crowded = [number for number in found.numbers if number > cores]
     if crowded:
-        told = ", ".join(map(str, crowded))
-        lines.append(f"[yellow]note: {told} are more sensor workers than cores[/]")
+        counts = ", ".join(map(str, crowded))
+        lines.append(f"[yellow]note: {counts} are more sensor workers than cores[/]")
     return lines
 
 
 def _write_csv(path: Path, found: SensorBench) -> None:
-    """One line a step: the raw series."""
+    """Write the raw series, one line per step."""
     parts = list(found.turns[0].run.parts_ms)
     try:
         with path.open("w", newline="", encoding="utf-8") as file:

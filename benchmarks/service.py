@@ -1,4 +1,4 @@
-"""What coordination costs: choosing among many nodes, their beats, a day of coming and going."""
+"""Cost of coordination: selection among many nodes, heartbeats, and a day of churn."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from cavmarl.service.event_store import EventStore
 from cavmarl.service.request_bodies import BeatBody, NodeBody
 
 CONFIGURATION = "0" * 64
-NODES_AN_IDENTITY = 100  # whose requests are limited together
-SESSION_S, NODE_S = 600.0, 7200.0  # mean lives in the churn
-FLUSHED_EVERY = 20  # seconds of it
+NODES_AN_IDENTITY = 100  # requests of one identity share a rate limit
+SESSION_S, NODE_S = 600.0, 7200.0  # mean lifetimes
+FLUSHED_EVERY = 20  # seconds of churn
 
 
 def measure(
     nodes: Annotated[int, about("Nodes.")] = 1000,
-    requests: Annotated[int, about("Selections that are timed.")] = 10_000,
-    seconds: Annotated[int, about("Seconds of beats at 1 Hz.")] = 20,
+    requests: Annotated[int, about("Number of timed selections.")] = 10_000,
+    seconds: Annotated[int, about("Seconds of heartbeats at 1 Hz.")] = 20,
     hours: Annotated[float, about("Simulated hours of churn, with a tenth of the nodes.")] = 24.0,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Time selections and beats, and replay a day in which nodes and sessions come and go."""
+    """Time selections and heartbeats, and replay a day in which nodes and sessions come and go."""
     check_range(
         nodes=(nodes, 1, 10_000), requests=(requests, 1, 1_000_000),
         seconds=(seconds, 1, 3600), hours=(hours, 0.01, 1000.0),
@@ -52,7 +52,7 @@ def measure(
     with TemporaryDirectory() as room:
         say(f"{requests} selections among {nodes} nodes")
         timed = _selections(Path(room) / "selection.sqlite", nodes, requests, rng)
-        say(f"{seconds} s of beats")
+        say(f"{seconds} s of heartbeats")
         share, beats_hz = _beats(Path(room) / "beats.sqlite", nodes, seconds)
         say(f"{hours:g} h of churn")
         churn = _churn(Path(room) / "churn.sqlite", max(nodes // 10, 3), hours, rng)
@@ -60,7 +60,7 @@ def measure(
         {"what": f"selection among {nodes} nodes, {name}, ms", "value": value}
         for name, value in timed.items()
     ]
-    rows.append({"what": f"{beats_hz:.0f} beats a second, share of one core", "value": share})
+    rows.append({"what": f"{beats_hz:.0f} heartbeats/s, share of one core", "value": share})
     rows += [{"what": f"churn: {name}", "value": value} for name, value in churn.items()]
     return BenchmarkReport(
         "the coordination service",
@@ -72,7 +72,7 @@ def measure(
 
 
 class _Fleet:
-    """A broker and what speaks to it, with a clock of its own."""
+    """A broker and its clients, with a simulated clock."""
 
     def __init__(self, store: Path, rng: np.random.Generator) -> None:
         self.now_s, self.beats, self.rng = 0.0, 0, rng
@@ -101,7 +101,7 @@ class _Fleet:
 def _selections(
     store: Path, nodes: int, requests: int, rng: np.random.Generator
 ) -> dict[str, float]:
-    """Percentiles of the time of a whole assignment without its wait for the disk, in ms."""
+    """Return percentiles of an assignment's time in ms, without waiting for the disk."""
     fleet = _Fleet(store, rng)
     for k in range(nodes):
         fleet.register(f"node-{k}")
@@ -119,14 +119,14 @@ def _selections(
         opened.append(fleet.broker.open(fleet.client, CONFIGURATION).id)
         spent.append(1e-6 * (time.perf_counter_ns() - began))
         if k % 1000 == 999:
-            fleet.now_s += 4000.0  # what is over is forgotten
+            fleet.now_s += 4000.0  # expire finished sessions
             fleet.broker.sweep()
     fleet.log.store.close()
     return {f"p{quantile}": float(np.percentile(spent, quantile)) for quantile in (50, 95, 99)}
 
 
 def _beats(store: Path, nodes: int, seconds: int) -> tuple[float, float]:
-    """Processor time of a real service a second of beats, and how many came in one."""
+    """Return a real service's processor time per second of heartbeats, and their rate."""
     words = [sys.executable, "-m", "cavmarl", "serve", "--port", "0", "--store", str(store)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -146,17 +146,17 @@ def _beats(store: Path, nodes: int, seconds: int) -> tuple[float, float]:
 async def _beat(
     url: str, granted: list[str], nodes: int, seconds: int, process: psutil.Process
 ) -> tuple[float, float]:
-    """Each connection speaks for the nodes of one identity, one after the other."""
+    """Send the heartbeats of one identity's nodes over each connection, one after another."""
     tokens = []
     async with httpx.AsyncClient(base_url=f"{url}/v1") as http:
         for secret in granted:
-            told = (await http.post("/token", json={"secret": secret})).json()
-            tokens.append(told["access_token"])
+            grant = (await http.post("/token", json={"secret": secret})).json()
+            tokens.append(grant["access_token"])
     place = urlsplit(url)
     lines = [await asyncio.open_connection(place.hostname, place.port) for _ in granted]
     owned = [range(k, nodes, len(granted)) for k in range(len(granted))]
 
-    async def tell(k: int, path: str, body: dict[str, Any]) -> None:
+    async def post(k: int, path: str, body: dict[str, Any]) -> None:
         reader, writer = lines[k]
         content = json.dumps(body).encode()
         head = (
@@ -171,13 +171,13 @@ async def _beat(
     async def register(k: int) -> None:
         for node in owned[k]:
             port = {"address": "127.0.0.1", "client_port": 1, "simulator_port": 1}
-            await tell(k, "/nodes", {"name": f"node-{node}", **port})
+            await post(k, "/nodes", {"name": f"node-{node}", **port})
 
     async def beat(k: int, second: int) -> None:
         load = {"cpu": 0.2, "ram": 0.3, "gpu": 0.0}
         for node in owned[k]:
-            told = {"incarnation": 1, "sequence": second, "sent_s": time.time(), **load}
-            await tell(k, f"/nodes/node-{node}/beat", told)
+            content = {"incarnation": 1, "sequence": second, "sent_s": time.time(), **load}
+            await post(k, f"/nodes/node-{node}/beat", content)
 
     await asyncio.gather(*map(register, range(len(granted))))
     began_s, before_s = time.monotonic(), sum(process.cpu_times()[:2])
@@ -188,11 +188,11 @@ async def _beat(
     used_s = sum(process.cpu_times()[:2]) - before_s
     for _, writer in lines:
         writer.close()
-    return used_s / seconds, nodes * seconds / took_s  # of a second in which each beats once
+    return used_s / seconds, nodes * seconds / took_s  # per second with one heartbeat of each node
 
 
 def _churn(store: Path, nodes: int, hours: float, rng: np.random.Generator) -> dict[str, float]:
-    """Nodes die, drain and come back, sessions begin and end; then the log is replayed."""
+    """Let nodes fail, drain and return, and sessions begin and end; then replay the log."""
     fleet = _Fleet(store, rng)
     names = [f"node-{k}" for k in range(nodes)]
     dead_until = dict.fromkeys(names, 0.0)
@@ -205,7 +205,7 @@ def _churn(store: Path, nodes: int, hours: float, rng: np.random.Generator) -> d
         for name in names:
             if fleet.now_s < dead_until[name]:
                 continue
-            if rng.random() < 1.0 / NODE_S:  # it dies, is drained, or begins again
+            if rng.random() < 1.0 / NODE_S:  # it fails, is drained, or restarts
                 dead_until[name] = fleet.now_s + rng.exponential(60.0)
                 if rng.random() < 0.5:
                     fleet.broker.drain(fleet.nodes, name, rng.random() < 0.5)

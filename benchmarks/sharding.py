@@ -1,10 +1,9 @@
-"""What it costs to divide a world, by phases of the tick, beside the same world undivided.
+"""Cost of dividing a world, by phases of the tick, compared with the undivided world.
 
-All zones run in this process on one core, so the whole of the work is seen. Every number of zones
-has two worlds, one with a stopwatch on every phase. All worlds are advanced by turns, each of them
-a part of its turn at a time and in an order that is drawn anew for every part, and ratios are taken
-within a turn: what else the machine does, and what a world before has pushed out of the caches,
-falls on all of them.
+All zones run in this process on one core, so the whole work is visible. For each number of zones
+there are two worlds, one of them with a stopwatch on every phase. All worlds advance in turn, each
+by a part of its turn, in a random order per part; ratios are taken within a turn. So other load on
+the machine, and data evicted from caches, affect all of them.
 """
 
 from __future__ import annotations
@@ -28,32 +27,32 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.evaluate.built_in_runs import world_maker
 
 TURN_S = 10
-PARTS = 5  # of a turn, of all worlds in between
+PARTS = 5  # per turn, interleaved with the other worlds
 
 
 def measure(
     env: Annotated[str, typer.Argument(help="Name, folder or map file of an environment.")],
     demand: Annotated[
         list[Path] | None,
-        about("A .rou.xml, .add.xml or .sumocfg instead of the environment's vehicles; "
+        about("A .rou.xml, .add.xml or .sumocfg file that replaces the environment's vehicles; "
               "repeatable.", "--demand", "-d"),
     ] = None,
-    zones: Annotated[str, about("Numbers of zones; 1 is measured in any case.")] = "1,4",
+    zones: Annotated[str, about("Comma-separated numbers of zones; 1 is always measured.")] = "1,4",
     layout: Annotated[str, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")] = "bisection",
     agents: Agents = None,
     background: Background = None,
     after: Annotated[int, about("Simulated seconds before the first turn.")] = 120,
-    repeats: Annotated[int, about("Turns of 10 simulated seconds of each world.")] = 5,
-    check: Annotated[bool, about("Measure the monitor of invariants, too.", "--check")] = False,
+    repeats: Annotated[int, about("Turns per world, of 10 simulated seconds.")] = 5,
+    check: Annotated[bool, about("Also measure the monitor of invariants.", "--check")] = False,
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:  # fmt: skip
-    """The same world in several numbers of zones, by phases; an error if they differ."""
+    """Measure the same world in several numbers of zones, by phase; fail if the states differ."""
     counts = numbers_of("--zones", zones)
     check_numbers(counts, after, repeats)
     if demand and (agents, background) != (None, None):
-        raise ConfigError("--demand: its vehicles are alone; leave --agents and --background out")
+        raise ConfigError("--demand: it replaces all vehicles; omit --agents and --background")
 
     def maker(**more: Any) -> Callable[[int], Simulation]:
         return world_maker(
@@ -82,10 +81,10 @@ def measure_sharding(
     make_checked: Callable[[int], Simulation] | None = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure by turns on one core."""
+    """Measure in turn on one core."""
     check_numbers(zones, after_s, repeats)
     with one_core():
-        say("making the worlds")
+        say("creating the worlds")
         worlds = [TwinWorlds(make, count, make_checked) for count in sorted({1, *zones})]
         first = worlds[0].plain.simulation
         clock = first.config.clock
@@ -117,7 +116,7 @@ def _report(
 ) -> BenchmarkReport:
     agents, dt_s = first.config.population.agents, first.config.clock.sim_dt_s
     notes = [
-        f"{row['zones']} zones, ns a vehicle and tick: "
+        f"{row['zones']} zones, ns per vehicle and tick: "
         + ", ".join(f"{name} {ns:,.1f}" for name, ns in row["phases"].items())
         + f"; sum {row['timed_ns']:,.1f}, without stopwatches {row['plain_ns']:,.1f}"
         for row in rows
@@ -128,12 +127,12 @@ def _report(
         f"{dt_s:g} s; states of all worlds are equal",
         {
             "zones": "zones",
-            "side of\na zone, m": "side_m:,.0f",
+            "zone\nside, m": "side_m:,.0f",
             "ghosts": "ghosts:,.0f",
             "max /\nmean": "imbalance:.2f",
             "fullest": "largest_share:.0%",
-            "moves\na tick": "migrations:.2f",
-            "µs a\nmove": "migration_us:.2f",
+            "moves\nper tick": "migrations:.2f",
+            "µs per\nmove": "migration_us:.2f",
             "cost": "ratio:.2f",
             "with the\nmonitor": "checked_ratio:.2f",
         },
@@ -151,16 +150,16 @@ def _report(
 
 
 def check_numbers(zones: Sequence[int], after_s: int, repeats: int) -> None:
-    """Refuse what cannot be measured before a world is made for it."""
+    """Refuse invalid numbers before worlds are created."""
     check_range(after=(after_s, 1, 3600), repeats=(repeats, 1, 100))
     if not zones:
-        raise ConfigError("zones: name at least one number of zones, as in 1,4,9")
+        raise ConfigError("zones: give at least one number of zones, such as 1,4,9")
     for count in zones:
         check_range(zones=(count, 1, MAX_ZONES))
 
 
 def _check_equal(worlds: Sequence[TwinWorlds]) -> None:
-    """Refuse to compare what is not the same world."""
+    """Refuse to compare worlds with different states."""
     first = worlds[0].plain.simulation
     expected = first.state_hash()
     for own in worlds:
@@ -175,10 +174,10 @@ def _check_equal(worlds: Sequence[TwinWorlds]) -> None:
 
 
 def _row(own: TwinWorlds, turns: list[Pair], undivided: list[Pair]) -> dict[str, Any]:
-    """Means of the loads and medians of the times over all turns.
+    """Return means of the loads and medians of the times over all turns.
 
-    `largest_share` is the rows of the fullest zone, ghosts among them, over all vehicles: the least
-    time that a worker for each zone could leave of the undivided tick.
+    `largest_share` is the number of rows of the fullest zone, including ghosts, over all vehicles:
+    a lower bound of the time of one worker per zone, relative to the undivided tick.
     """
     simulation = own.plain.simulation
     min_x, min_y, max_x, max_y = simulation.network.extent_m
@@ -188,7 +187,7 @@ def _row(own: TwinWorlds, turns: list[Pair], undivided: list[Pair]) -> dict[str,
     }
     steps = loads["steps"]
     moves = sum(sum(turn.plain.moves) for turn in turns)
-    # The phases of one turn: medians of each would not add up to a tick.
+    # The phases of one turn, because medians per phase would not add up to a tick.
     middle_ns = median_low([turn.timed_ns for turn in turns])
     middle = next(turn for turn in turns if turn.timed_ns == middle_ns)
     pairs = zip(turns, undivided, strict=True)
@@ -214,7 +213,7 @@ def _row(own: TwinWorlds, turns: list[Pair], undivided: list[Pair]) -> dict[str,
 
 
 def _migration_us(turns: Sequence[Turn]) -> float | None:
-    """By how much each vehicle that moves makes `migrate` longer, by regression over steps."""
+    """Return the additional time of `migrate` per moving vehicle, by regression over steps."""
     moves = [number for turn in turns for number in turn.moves]
     if len(set(moves)) < 2:
         return None

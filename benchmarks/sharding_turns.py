@@ -1,7 +1,7 @@
-"""Turns of one world in some number of zones, without a stopwatch and with one on every phase.
+"""Turns of one world in zones, without a stopwatch and with one on every phase.
 
-A turn is run in parts, so that those of all worlds can be taken in between: the machine's other
-work does not fall on one of them alone.
+A turn is run in parts, interleaved with those of other worlds, so that other load on the machine
+affects all of them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cavmarl.zones.partition.zone_statistics import imbalance
 __all__ = ["PHASES", "Pair", "Turn", "TwinWorlds"]
 
 PHASES = ("traffic", "advance", "exchange", "resolve", "migrate", "sense", "other")
-# Calls of the runtime that belong to a phase of another name; what is left is `other`.
+# Calls of the runtime by phase, for calls with another name than their phase; the rest is `other`.
 _MEMBERS = {
     "traffic": (
         "choose_goals", "leave", "settle",
@@ -37,44 +37,44 @@ _PHASE_OF = {phase: phase for phase in PHASES} | {
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of one world, or a part of it: sums over its steps."""
+    """One turn of one world or a part of it: sums over its steps."""
 
-    ns: float  # in steps
-    steps: int  # how many
+    ns: float  # time of the steps
+    steps: int  # number of steps
     vehicles: int  # in the world
     ghosts: int  # in all zones
     imbalance: float  # maximum over mean of the vehicles that zones own
-    largest: int  # rows of the zone with most
-    moves: tuple[int, ...]  # vehicles that changed their zone, step by step
-    move_ns: tuple[int, ...]  # in the phase `migrate`, step by step; 0 without a stopwatch
+    largest: int  # rows of the fullest zone
+    moves: tuple[int, ...]  # vehicles that changed their zone, per step
+    move_ns: tuple[int, ...]  # time of the phase `migrate`, per step; 0 without a stopwatch
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One turn of all worlds; times in ns a vehicle and tick."""
+    """One turn of all worlds; times are in ns per vehicle and tick."""
 
-    plain: Turn  # of the world without a stopwatch
-    timed: Turn  # of that with one
-    plain_ns: float  # a tick of the first
-    timed_ns: float  # a tick of the second, less the stopwatch's own time
-    checked_ns: float | None  # a tick of the third, with the monitor; None: there is none
+    plain: Turn  # world without a stopwatch
+    timed: Turn  # world with a stopwatch
+    plain_ns: float  # per tick, without a stopwatch
+    timed_ns: float  # per tick with a stopwatch, minus the stopwatch's own time
+    checked_ns: float | None  # per tick with the monitor; None: not measured
     phases: dict[str, float]  # by the names of `PHASES`; their sum is `timed_ns`
     calls: dict[str, float]  # by the names of the runtime's calls
 
 
 class TwinWorlds:
-    """The same world twice in some number of zones, once with a stopwatch.
+    """The same world twice in a number of zones, once with a stopwatch.
 
     Args:
-        make: the world in k zones, at the start of an episode.
-        zones: k.
-        make_checked: the same world with the monitor of invariants; None: it is not measured.
+        make: creates the world in k zones, at the start of an episode.
+        zones: number of zones, k.
+        make_checked: creates the same world with the monitor of invariants; None: not measured.
 
     Attributes:
-        zones: k.
-        plain: the one without.
-        timed: the one with it.
-        checked: a third one, with the monitor; None: not asked for, or nothing is divided.
+        zones: number of zones.
+        plain: the world without a stopwatch.
+        timed: the world with a stopwatch.
+        checked: a third world with the monitor; None: not requested, or undivided.
     """
 
     def __init__(
@@ -94,22 +94,21 @@ class TwinWorlds:
 
     @property
     def worlds(self) -> list[DrivenWorld]:
-        """All of them."""
         return [self.plain, self.timed, *([] if self.checked is None else [self.checked])]
 
     def run(self, number: int, steps: int) -> None:
-        """The next steps of one of `worlds`, as a part of the present turn."""
+        """Run the next steps of one of `worlds`, as a part of the present turn."""
         if not any(self._parts):
             self._watch.clear()
         self._parts[number].append(_run(self.worlds[number], steps, self._watch))
 
     def end_turn(self) -> Pair:
-        """The turn that has been run; another one begins."""
+        """End the present turn and return its result; the next turn begins."""
         plain, timed, *checked = (_joined(parts) for parts in self._parts)
         watch = self._watch
         watch.forget("suggest", "loads")
         if not plain.vehicles:
-            raise ConfigError("no vehicle drives: another --after, or more demand")
+            raise ConfigError("no vehicle drives: change --after, or add demand")
         share = 1.0 / (plain.vehicles * self.plain.simulation.config.clock.ticks_per_step)
         timed_ns = (timed.ns - watch.own()) * share
         calls = {name: ns * share for name, ns in sorted(watch.phases().items())}
@@ -124,7 +123,7 @@ class TwinWorlds:
 
 
 def _joined(parts: Sequence[Turn]) -> Turn:
-    """One turn of its parts."""
+    """Return the sum of a turn's parts."""
     sums = {
         name: sum(getattr(part, name) for part in parts)
         for name in ("ns", "steps", "vehicles", "ghosts", "imbalance", "largest")
@@ -137,7 +136,7 @@ def _joined(parts: Sequence[Turn]) -> Turn:
 
 
 def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
-    """Steps of a world; what its agents decide and how many there are is not timed."""
+    """Run steps of a world; decisions of agents and counting are not timed."""
     simulation = world.simulation
     ns = vehicles = ghosts = largest = 0
     uneven = 0.0
@@ -162,5 +161,5 @@ def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
 
 
 def _spent(watch: Stopwatch) -> int:
-    """In the phase `migrate` up to now, ns."""
+    """Return the time spent in the phase `migrate` so far, ns."""
     return sum(watch.spent[name] for name in _MEMBERS["migrate"])

@@ -1,4 +1,4 @@
-"""What a map draws so that its vehicles touch whatever drivers do: rules, by which it is named."""
+"""Parts of a map on which vehicles touch whatever drivers do, grouped by property."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ STEP_M = 1.0
 
 
 def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
-    """Pairs of LANE rows that lie nearer to each other than cars are wide, without a rule.
+    """Return pairs of LANE rows that are closer than a car's width without any right of way.
 
-    Those are of two roads of which neither leads into the other, of movements over two junctions
-    of which neither leads to the road that the other leaves, or of a road and a junction elsewhere.
+    These are lanes of two roads of which neither leads to the other; movements over two junctions
+    of which neither leads to the road that the other leaves; or lanes of a road and of a junction
+    elsewhere.
     """
     grid = lane_grid(network)
     links = network.links[network.links["direction"] != ord("t")]
@@ -42,17 +43,17 @@ def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
 
 
 def stub_lanes(network: RoadNetwork) -> NDArray[np.int64]:
-    """LANE rows of roads of several lanes that are shorter than a car: too short for changes."""
+    """Return the LANE rows, on roads with several lanes, that are too short for lane changes."""
     edges = network.edges[network.lanes["edge"]]
     stubs = ~network.lanes["internal"] & (edges["num_lanes"] > 1)
     return np.flatnonzero(stubs & (network.lanes["length_m"] < CAR_LENGTH_M))
 
 
 class _Owners(NamedTuple):
-    """Of each lane: its road or junction, and what lies before and beyond it."""
+    """The road or junction of each lane, and the elements before and after it."""
 
-    inside: list[bool]  # it is part of a junction
-    ground: list[int]  # EDGE, or JUNCTION row
+    inside: list[bool]  # whether it is part of a junction
+    ground: list[int]  # EDGE or JUNCTION row
     before: list[int]  # JUNCTION row before a road, EDGE row before a movement over a junction
     beyond: list[int]
 
@@ -70,7 +71,7 @@ def _owners(network: RoadNetwork) -> _Owners:
 
 
 def _are_apart(owners: _Owners, one: int, other: int) -> bool:
-    """Whether two lanes are of two roads or junctions of which neither leads to the other."""
+    """Return whether two lanes belong to roads or junctions of which neither leads to the other."""
     inside, ground, before, beyond = owners
     if inside[one] != inside[other]:
         road, junction = (other, one) if inside[one] else (one, other)

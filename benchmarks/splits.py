@@ -1,4 +1,4 @@
-"""How much faster one world is in zones over several workers than undivided in one process."""
+"""Speedup of one world in zones over several workers, compared with one process."""
 
 from __future__ import annotations
 
@@ -27,21 +27,19 @@ from cavmarl.core.errors import ConfigError, EvaluationError
 def measure(
     env: OptionalEnvironment = "rush",
     vehicles: Annotated[
-        str, about("Vehicles of the world; default: the environment's.", metavar="N,…")
+        str, about("Numbers of vehicles [default: the environment's].", metavar="N,…")
     ] = "",
-    workers: Annotated[int, about("Workers that the zones are shared out over.")] = 2,
-    zones: Annotated[
-        int | None, about("Zones of the divided world; default: one a worker.")
-    ] = None,
+    workers: Annotated[int, about("Number of workers.")] = 2,
+    zones: Annotated[int | None, about("Number of zones [default: one per worker].")] = None,
     agents: Agents = None,
     background: Background = None,
-    steps: Annotated[int, about("Steps of each turn.")] = 20,
+    steps: Annotated[int, about("Steps per turn.")] = 20,
     repeats: Annotated[int, about("Turns of each world.")] = 7,
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """One world undivided, in zones on one worker, and in zones over several, by turns."""
+    """Compare one world undivided, in zones on one worker, and in zones on several, in turn."""
     if workers < 2 or steps < 1 or repeats < 1:
         raise ConfigError(
             f"{workers} workers, {steps} steps, {repeats} turns: must be at least 2, 1 and 1"
@@ -72,16 +70,16 @@ def measure(
         },
         rows,
         notes=[
-            "splitting one world does not pay here"
+            "splitting one world does not pay on this machine"
             if line is None
-            else f"splitting one world pays from {line} vehicles on here"
+            else f"splitting one world pays from {line} vehicles on"
         ],
         facts={"workers": workers, "zones": zones or workers, "split_pays_from": line},
     )
 
 
 def split_line(found: Sequence[tuple[int, float]]) -> int | None:
-    """The least vehicles from which on every split world was the faster one, if any."""
+    """Return the smallest number of vehicles from which every split world was faster, if any."""
     line = None
     for vehicles, ratio in sorted(found, reverse=True):
         if ratio <= 1.0:
@@ -106,7 +104,7 @@ def _measured(
         for one in measured:
             one.vec.close()
     if len(hashes) > 1:
-        raise EvaluationError(f"{spec.env}: the worlds in {zones} zones are not the undivided one")
+        raise EvaluationError(f"{spec.env}: {zones} zones differ from the undivided world")
     undivided, whole, split = (one.row(repeats * steps).step_ms for one in measured)
     return {
         "vehicles": running,

@@ -1,4 +1,4 @@
-"""Which calls of the runtime take how much of the processor's time."""
+"""Measures the processor time of the runtime's calls."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CALIBRATION = 20_000  # empty calls
 
 
 class Stopwatch:
-    """Adds up the time of named calls, less what it takes itself; `clock` is in ns."""
+    """Adds up the times of named calls, minus its own time; `clock` is in ns."""
 
     def __init__(self, clock: Callable[[], int] = time.process_time_ns) -> None:
         self._clock = clock
@@ -31,20 +31,20 @@ class Stopwatch:
         self.calls.clear()
 
     def around(self, part: Any) -> Any:
-        """What stands for a part of the runtime and times each call of its methods."""
+        """Return a proxy of a part of the runtime that times each call of its methods."""
         return _Timed(self, part, self._clock)
 
     def forget(self, *names: str) -> None:
-        """As if they had never been called."""
+        """Drop the times of these names."""
         for name in names:
             del self.spent[name], self.calls[name]
 
     def phases(self) -> dict[str, float]:
-        """Time of each name in ns."""
+        """Return the time of each name in ns."""
         return {name: ns - self._inside * self.calls[name] for name, ns in self.spent.items()}
 
     def own(self) -> float:
-        """What all calls together took for themselves, in ns."""
+        """Return the stopwatch's own time in all calls, ns."""
         return self._around * self.calls.total()
 
 
@@ -54,7 +54,7 @@ class _Nothing:
 
 
 class _Timed:
-    """Stands for a part of the runtime and times each call of its methods."""
+    """A proxy of a part of the runtime that times each call of its methods."""
 
     def __init__(self, watch: Stopwatch, part: Any, clock: Callable[[], int]) -> None:
         self._watch = watch
@@ -63,7 +63,7 @@ class _Timed:
 
     def __getattr__(self, name: str) -> Any:
         method = getattr(self._part, name)
-        if not callable(method):  # a part's values do not change; asking again would take time
+        if not callable(method):  # constant values; looking them up again would take time
             self.__dict__[name] = method
             return method
         watch, clock = self._watch, self._clock

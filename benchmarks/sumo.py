@@ -1,8 +1,8 @@
-"""What SUMO as global traffic costs: libsumo alone, and a world that is coupled to one.
+"""Cost of SUMO as global traffic: libsumo alone, compared with a world coupled to SUMO.
 
-Both run the same demand with the same step length and seed up to the same second; then they take
-turns of the same simulated length. Of the coupled world the time of both of its processes counts:
-its SUMO's and its own, with all that goes between them.
+Both run the same demand with the same step length and seed up to the same second, then take turns
+of equal simulated length. The time of the coupled world includes both of its processes and their
+communication.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cavmarl.traffic.sumo.sumo_input import read_input
 
 
 class Source(StrEnum):
-    """How a world is coupled to SUMO."""
+    """The kind of coupling to SUMO."""
 
     DEMAND = "sumo-demand"
     TRAFFIC = "sumo-traffic"
@@ -42,15 +42,15 @@ def measure(
     demand: Annotated[
         list[Path], about("A .rou.xml, .add.xml or .sumocfg; may be repeated.", "--demand", "-d")
     ],
-    source: Annotated[Source, about("How the world is coupled.")] = Source.TRAFFIC,
-    dt: Annotated[float, about("Step length of both, in seconds.")] = 0.1,
-    agents: Annotated[int, about("Vehicles driven by agents.", min=1)] = 4,
+    source: Annotated[Source, about("Kind of coupling.")] = Source.TRAFFIC,
+    dt: Annotated[float, about("Step length of both sides, in seconds.")] = 0.1,
+    agents: Annotated[int, about("Number of agents.", min=1)] = 4,
     seed: Seed = 0,
     after: Annotated[int, about("Simulated seconds before the first turn.")] = 120,
-    repeats: Annotated[int, about("Turns of 10 simulated seconds of each side.")] = 5,
+    repeats: Annotated[int, about("Turns per side, of 10 simulated seconds.")] = 5,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """What coupling a world to SUMO adds to the time that libsumo takes alone."""
+    """Measure the time that coupling a world to SUMO adds to that of libsumo alone."""
     check_range(after=(after, 1, 3600), repeats=(repeats, 1, 100))
     path = find_map(map_name)
     job = SumoJob(path, read_input(demand), after, dt, seed)
@@ -81,13 +81,13 @@ def measure(
         ours.close()
     alone, coupled = rows = [_row(name, own, ticks) for name, own in turns.items()]
     if not alone["vehicles"] > 0.0:
-        raise ConfigError("no vehicle drives: another --after, or more demand")
+        raise ConfigError("no vehicle drives: change --after, or add demand")
     added, added_wall = (coupled[key] / alone[key] - 1.0 for key in ("median_ms", "median_wall_ms"))
     return BenchmarkReport(
         f"{path.name.removesuffix('.gz').removesuffix('.net.xml')}, {source.value}, step {dt:g} s, "
         f"{agents} agents, {repeats} turns of each, after {after} s",
         {
-            "ms a tick": "name",
+            "ms per tick": "name",
             "vehicles": "vehicles:,.0f",
             "min": "low_ms:.2f",
             "median": "median_ms:.2f",
@@ -96,8 +96,8 @@ def measure(
         },
         rows,
         notes=[
-            f"coupling adds {added:.2f} times what libsumo takes alone ({added_wall:.2f} by the "
-            "wall clock)"
+            f"coupling adds {added:.2f} times the time of libsumo alone ({added_wall:.2f} by "
+            "wall time)"
         ],
         facts={"added": added, "added_wall": added_wall, "agents": agents, "dt_s": dt},
     )
@@ -121,7 +121,7 @@ def _turn_of_ours(vec: CavVectorEnv, ticks: int) -> Turn:
     pids = () if sumo is None else sumo.worlds.pids
     vehicle_ticks, spent_s, wall_s = 0, -sum(map(processor_s, pids)), 0.0
     for _ in range(ticks):
-        actions = vec.suggest_actions()  # what drives the agents is not what is measured
+        actions = vec.suggest_actions()  # not timed
         began, began_s = time.perf_counter(), time.process_time()
         vec.step(actions)
         spent_s += time.process_time() - began_s

@@ -1,4 +1,4 @@
-"""Worlds drawn by chance: our traffic beside SUMO's own in each of them."""
+"""Random worlds: traffic compared with SUMO in each of them."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ def measure(
     worlds: Annotated[int, about("Number of worlds.")] = 100,
     first_seed: Annotated[int, about("Seed of the first world.")] = 0,
     seconds: Annotated[int, about("Simulated seconds of each world.")] = 900,
-    dt: Annotated[float, about("Step length of both, in seconds.")] = 0.1,
-    out: Annotated[Path, about("Folder of the results; rows that are there stay.")] = Path(
+    dt: Annotated[float, about("Step length of both sides, in seconds.")] = 0.1,
+    out: Annotated[Path, about("Folder of the results; existing rows are kept.")] = Path(
         "traffic_worlds"
     ),
     without: Annotated[
-        list[str] | None, about("A feature that no world has; may be repeated.")
+        list[str] | None, about("A feature to exclude from all worlds; repeatable.")
     ] = None,
     maps: Annotated[
-        Path | None, about("Folder of maps to cut; default: those in SUMO's wheel.")
+        Path | None, about("Folder of maps to cut [default: those in SUMO's wheel].")
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Draw worlds, run the ones that have no row yet, and show all rows and the worst."""
+    """Draw worlds, run those without a row, and show all rows and the worst."""
     make_folder(out)
     job = WorldSeries(out, worlds, first_seed, seconds, dt, tuple(without or ()), maps)
 
@@ -91,10 +91,10 @@ def _shares(found: Row) -> list[dict[str, str]]:
 def _caption(found: Row) -> str:
     contacts, queue = found.get("contacts", {}), found.get("queue", {})
     return (
-        "near: within 15 % (speed), 5 % (arrived, departed), 25 % or 3 s (delay), or SUMO's own "
-        "spread; SUMO near: each of its seeds, beside the others; contacts: "
+        "near: within 15 % (speed), 5 % (arrived, departed), 25 % or 3 s (delay), or SUMO's "
+        "spread; SUMO near: each of its seeds, compared with the others; contacts: "
         f"{contacts.get('ours')} in {contacts.get('worlds')} worlds "
-        f"(SUMO {contacts.get('sumo')}); locks above 120 s that SUMO has not: "
+        f"(SUMO {contacts.get('sumo')}); locks above 120 s that SUMO does not have: "
         f"{found.get('own_locks')}; queue: {queue.get('ours', 0.0):.1f} "
         f"(SUMO {queue.get('sumo', 0.0):.1f})"
     )
@@ -126,7 +126,7 @@ def worst_table(rows: list[Row], out: Path) -> Table:
         else:
             off, contacts = deviation(row, "mean_speed_mps"), row["ours"]["contacts"]
             cells.append((name, ", ".join(row["features"]), _percent(off), str(contacts)))
-    title = f"the worst; files, commands and pictures are in {escape(str(out))}"
+    title = f"the worst worlds; their files, commands and pictures are in {escape(str(out))}"
     return grid(("world", "features", "mean speed", "contacts"), cells, title, lefts=2)
 
 

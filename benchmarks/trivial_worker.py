@@ -1,4 +1,4 @@
-"""What workers do for worlds in which nothing happens. The program of their processes."""
+"""A worker program for worlds in which nothing happens."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import validate
-from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
+from cavmarl.parallel.memory.shared_memory import Segment, arrays_in
 from cavmarl.parallel.processes.worker_loop import Job, serve
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
 
 __all__ = ["TrivialJob", "make_jobs"]
 
 
 class TrivialJob(Job):
-    """Worlds in which every agent sees how many tasks there have been.
+    """Worlds in which every agent observes the number of tasks so far.
 
     Args:
-        arrays: of these worlds.
+        arrays: arrays of these worlds.
     """
 
     def __init__(self, arrays: StepArrays) -> None:
@@ -31,25 +31,25 @@ class TrivialJob(Job):
         arrays.acted[:] = True
 
     def perform(self, task: int, letter: Any) -> None:
-        """Show the number of this task."""
+        """Write the number of this task to all observations."""
         self._tasks += 1
         self._arrays.observations[:] = self._tasks[0]
 
     def save(self) -> list[NDArray[Any]]:
-        """How many there have been."""
+        """Return the number of tasks so far."""
         return [self._tasks]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave."""
+        """Restore the state returned by `save`."""
         self._tasks[:] = saved[0]
 
 
-def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
-    """The jobs of all workers."""
-    config = validate(EnvConfig, recipe["config"], "the environment")
-    layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
-    arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
-    return [TrivialJob(arrays.part(first, last)) for first, last, _ in recipe["parts"]]
+def make_jobs(message: Mapping[str, Any]) -> list[Job]:
+    """Return the jobs of all workers."""
+    config = validate(EnvConfig, message["config"], "the environment")
+    layout = layout_of(config, message["capacity"], message["num_worlds"])
+    arrays = StepArrays.of(arrays_in(Segment(message["arrays"], 0).map(), layout))
+    return [TrivialJob(arrays.part(first, last)) for first, last, _ in message["parts"]]
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""What messages cost in a tick: several channels side by side, on the vehicles of one world.
+"""Cost of messages per tick: several channels on the vehicles of one world.
 
-The world itself is run without messages. After each of its ticks every bus takes the same rows and
-sends and receives, with a clock on it; so all of them, and the tick, see the same machine.
+The world itself runs without messages. After each of its ticks, every bus sends and receives with
+the same rows, and is timed; so all of them run under the same conditions.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cavmarl.evaluate.built_in_runs import DrivenWorld
 from cavmarl.shards.shard import common_of
 from cavmarl.v2x.bus import Bus, V2xStatistics
 
-# As exponent and spread that of Cheng et al. (JSAC 2007) in a suburb; the air as of IEEE 802.11p.
+# Exponent and spread of Cheng et al. (JSAC 2007) in a suburb; airtime of IEEE 802.11p.
 CHANNELS: Mapping[str, Mapping[str, Any]] = {
     "ideal": {},
     "range 300 m": {"v2x.channel.range_m": 300.0},
@@ -40,28 +40,28 @@ SHAPE = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05, "sensors.lidar.r
 
 def measure(
     env: OptionalEnvironment = "town",
-    vehicles: Annotated[int, about("Vehicles that send, as far as there is room.")] = 1000,
+    vehicles: Annotated[int, about("Number of sending vehicles, as far as they fit.")] = 1000,
     receivers: Annotated[
-        int | None, about("Agents among them, which receive; default: all.")
+        int | None, about("Number of agents, which receive [default: all vehicles].")
     ] = None,
-    ticks: Annotated[int, about("Ticks that are timed.")] = 200,
-    warmup: Annotated[int, about("Ticks before.")] = 40,
+    ticks: Annotated[int, about("Timed ticks.")] = 200,
+    warmup: Annotated[int, about("Untimed ticks at the beginning.")] = 40,
     seed: Seed = 0,
     at_most: Annotated[
-        float | None, about("Exit with 1 if any channel takes more ms a tick.")
+        float | None, about("Exit with 1 if any channel takes more ms per tick.")
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Milliseconds a tick for messages among vehicles, by channel, beside the tick itself."""
+    """Measure ms per tick for messages among vehicles, by channel, and for the tick itself."""
     check_positive("--at-most", at_most)
     receivers = vehicles if receivers is None else receivers
     if not 1 <= receivers <= vehicles <= 100_000 or ticks < 1 or warmup < 0:
         raise ConfigError(
             f"vehicles = {vehicles}, receivers = {receivers}, ticks = {ticks}, warmup = {warmup}: "
-            "must be at least 1 receiver among the vehicles, and 1 tick"
+            "needs at least 1 receiver, at most as many as vehicles, and 1 tick"
         )
     counts = {"agents": receivers, "background": vehicles - receivers}
-    say("making the world")
+    say("creating the world")
     config, network, demand, partition = load_world(env, **counts, overrides=SHAPE)
     with one_core():
         simulation = Simulation(config, network, 1, demand, partition)
@@ -90,11 +90,11 @@ def measure(
         rows.append(_row(name, bus.statistics(), bus_ms[name], warmup))
     mean, rate_hz = fmean(running[warmup:]), config.v2x.cam.rate_hz
     return BenchmarkReport(
-        f"{env}: {mean:,.0f} vehicles at {rate_hz:g} Hz, up to {receivers:,} of them receive; "
+        f"{env}: {mean:,.0f} vehicles at {rate_hz:g} Hz, up to {receivers:,} of them receiving; "
         "one core",
         {
             "channel": "name",
-            "ms a tick": "median_ms:.2f",
+            "ms per tick": "median_ms:.2f",
             "in reach": "reachable:,.0f",
             "received": "reception_ratio:.1%",
             "busy": "busy_ratio:.1%",
@@ -118,7 +118,7 @@ def _row(name: str, found: V2xStatistics, every_ms: list[float], warmup: int) ->
 
 
 def _bus_beside(simulation: Simulation, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
-    """Return a bus beside a world, which stations of the world do not hear, and its exchange."""
+    """Return a bus that is separate from a world's stations, and a function that runs it once."""
     division, worlds = simulation.division, simulation.shards[0].worlds
     bus = Bus(config, simulation.network, simulation.types, division.zoned, common_of(worlds))
     return bus, lambda: bus.exchange(division.side)

@@ -1,9 +1,9 @@
-"""What it takes to step worlds over worker processes in which nothing happens.
+"""Overhead of stepping worlds over worker processes, measured with worlds that do nothing.
 
-The agents are shared out evenly over the workers, one world each; they see the same numbers in
-every library, all rewards are 0, and no agent leaves. So a step takes what vectorization takes. The
-order is what our workers add: actions into shared memory, the command, until results are in shared
-memory and committed, without checking actions and copying results.
+The agents are divided evenly among the workers, one world each. In every library they see the same
+numbers, all rewards are 0, and no agent leaves, so the time of a step is that of vectorization.
+`ORDER` is the part of cavmarl's workers: actions into shared memory, the command, and waiting until
+results are committed, without checking actions and copying results.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from cavmarl.core.errors import ConfigError, MissingExtraError, require
 from cavmarl.engine.spaces import flat_observation_space
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.shards.shard import Commands
 
 PROGRAM = "benchmarks.trivial_worker"
 SETTINGS = {"population.mode": "respawn", "observation.kind": "flat", "action.kind": "continuous"}
-STEPS = 300  # a turn
+STEPS = 300  # per turn
 WARM_STEPS = 50
 ORDER = "our workers alone"
 LIBRARIES = {
@@ -49,28 +49,28 @@ Step = Callable[[], object]
 
 
 def measure(
-    agents: Annotated[int, about("Agents in all worlds together.")] = 100,
-    workers: Annotated[int, about("Worker processes of each library, one world each.")] = 2,
+    agents: Annotated[int, about("Total number of agents.")] = 100,
+    workers: Annotated[int, about("Worker processes per library, one world each.")] = 2,
     repeats: Annotated[int, about("Turns of each library.")] = 7,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Step worlds in which nothing happens through each library's workers, by turns."""
+    """Step worlds that do nothing through each library's workers, in turn."""
     if workers < 1 or agents < 1 or agents % workers:
-        raise ConfigError(f"{agents} agents over {workers} workers: must be the same for each")
+        raise ConfigError(f"{agents} agents over {workers} workers: must divide evenly")
     each = agents // workers
     world = load_world("merge", agents=each, background=0, overrides=SETTINGS)
     size = flat_observation_space(world.config).shape[0]
     steps: dict[str, Step] = {}
     missing: dict[str, str] = {}
     with ExitStack() as stack:
-        # Those that fork this process go first: it has not mapped anything yet.
+        # Libraries that fork this process go first, before it has mapped memory.
         for library, make in (("supersuit", _supersuit), ("gymnasium", _gymnasium)):
             say(f"starting the workers of {library}")
             try:
                 steps[library] = stack.enter_context(make(each, size, workers))
             except MissingExtraError as error:
                 missing[library] = str(error)
-        say("starting ours")
+        say("starting cavmarl")
         worlds = PooledWorlds(world, Path(), workers, workers, program=PROGRAM)
         vec = CavVectorEnv(worlds)
         stack.callback(vec.close)
@@ -93,7 +93,7 @@ def measure(
         f"a step of {agents} agents over {workers} workers, {size} numbers each",
         {
             "library": "name",
-            "µs a step": "median_us:,.0f",
+            "µs per step": "median_us:,.0f",
             "times ours": "ratio:.1f",
             "times our workers alone": "order_ratio:.1f",
         },
@@ -104,7 +104,7 @@ def measure(
 
 
 def _microseconds(step: Step) -> float:
-    """Median of a turn."""
+    """Return the median of a turn."""
     found = []
     for n in range(WARM_STEPS + STEPS):
         began = time.perf_counter()
@@ -127,7 +127,7 @@ def _gymnasium(agents: int, size: int, workers: int) -> Iterator[Step]:
 @contextmanager
 def _supersuit(agents: int, size: int, workers: int) -> Iterator[Step]:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what the library says of itself
+        warnings.simplefilter("ignore")  # notices of the library
         supersuit = require("supersuit", "bench")
         rows = supersuit.pettingzoo_env_to_vec_env_v1(_TrivialAgents(agents, size))
         vec = supersuit.concat_vec_envs_v1(rows, workers, workers, base_class="gymnasium")
@@ -139,14 +139,14 @@ def _supersuit(agents: int, size: int, workers: int) -> Iterator[Step]:
 
 
 def _boxes(*shape: int) -> tuple[spaces.Box, spaces.Box]:
-    """Of observations and of actions."""
+    """Return the spaces of observations and actions."""
     *agents, size = shape
     actions = spaces.Box(-1.0, 1.0, (*agents, 2), np.float32)
     return spaces.Box(-1.0, 1.0, (*agents, size), np.float32), actions
 
 
 class _TrivialWorld(gymnasium.Env[Any, Any]):
-    """All agents of a world in one array."""
+    """A world with all agents in one array."""
 
     def __init__(self, agents: int, size: int) -> None:
         self.observation_space, self.action_space = _boxes(agents, size)
@@ -161,7 +161,7 @@ class _TrivialWorld(gymnasium.Env[Any, Any]):
 
 
 class _TrivialAgents(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
-    """The agents of a world in dicts that are made once."""
+    """A world with agents in dicts that are created once."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo declares it as an instance's attribute
         "name": "trivial",

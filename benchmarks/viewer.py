@@ -1,7 +1,7 @@
-"""What watching costs: bytes of a frame, time to publish it, many clients, the page's JavaScript.
+"""Cost of the viewer: bytes and time of a frame, many clients, and the page's JavaScript.
 
-Vehicles are made up, all with new places in each frame, and sent through the viewer's own server.
-With a Chromium and Playwright the page itself is measured, too.
+Generated vehicles, all moving in each frame, are sent through the viewer's own server. With
+Chromium and Playwright, the page itself is measured too.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ WATCHED_STEPS, WATCHED_TURNS = 200, 5
 
 def measure(
     env: OptionalEnvironment = "grid4x4",
-    vehicles: Annotated[int, about("Vehicles of a frame.")] = 10_000,
-    clients: Annotated[int, about("Clients that watch at once.")] = 100,
-    rate_hz: Annotated[float, about("Frames a second that they are sent.")] = 10.0,
-    moving: Annotated[int, about("Vehicles of the town that is stepped, watched and not.")] = 1000,
-    seconds: Annotated[float, about("That clients and the page are watched for.")] = 10.0,
+    vehicles: Annotated[int, about("Number of vehicles.")] = 10_000,
+    clients: Annotated[int, about("Number of concurrent clients.")] = 100,
+    rate_hz: Annotated[float, about("Frames per second.")] = 10.0,
+    moving: Annotated[int, about("Vehicles of the town stepped with and without watchers.")] = 1000,
+    seconds: Annotated[float, about("Seconds of each measurement.")] = 10.0,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Bytes, milliseconds and shares of one core that the viewer costs."""
+    """Measure bytes, milliseconds and shares of one core that the viewer costs."""
     if moving < 10:
         raise ConfigError(f"moving = {moving}: must be at least 10")
     if not (1 <= vehicles <= 100_000 and 0 <= clients <= 200 and rate_hz > 0.0 and seconds > 0.0):
@@ -78,7 +78,7 @@ def measure(
     columns = {
         "what": "name",
         "kB": "kb:.1f",
-        "ms a frame": "ms:.2f",
+        "ms per frame": "ms:.2f",
         "core": "core:.0%",
         "frames/s": "fps:.1f",
         "calls": "calls",
@@ -89,7 +89,7 @@ def measure(
 
 
 def made_up_frames(env: CavEnv, count: int, seed: int, number: int = 20) -> list[WorldFrame]:
-    """Frames of vehicles all over the map, of which one in a hundred enters or leaves a frame."""
+    """Return frames of vehicles all over the map, with 1 % entering or leaving per frame."""
     random = np.random.default_rng(seed)
     min_x, min_y, max_x, max_y = env.network.extent_m
     signals = np.zeros(len(env.network.signals), np.int32)
@@ -122,7 +122,7 @@ def encoding(env: CavEnv, frames: list[WorldFrame]) -> dict[str, Any]:
 def serving(
     env: CavEnv, frames: list[WorldFrame], clients: int, rate_hz: float, seconds: float
 ) -> dict[str, Any]:
-    """CPU time of the server's process while clients of another process read all frames."""
+    """Measure the server's CPU time while clients in another process read all frames."""
     audience, server, encoder = served(env)
     ours, theirs = multiprocessing.get_context("spawn").Pipe()
     reader = multiprocessing.get_context("spawn").Process(
@@ -151,9 +151,9 @@ def serving(
 
 
 def watching(vehicles: int, seed: int, say: Say) -> dict[str, Any]:
-    """A step of a town that a client watches over one that none watches, turn about.
+    """Compare the steps of a town with and without a watching client, in turn.
 
-    Processor time of this process, in which server and client are, too.
+    Processor time of this process is measured, which includes server and client.
     """
     agents = vehicles // 10
     vec = make_vec("town", seed=seed, agents=agents, background=vehicles - agents)
@@ -196,7 +196,7 @@ def watching(vehicles: int, seed: int, say: Say) -> dict[str, Any]:
 
 
 def read_all(address: str, clients: int, seconds: float, pipe: Connection) -> None:
-    """Watch with so many clients and tell how many frames came."""
+    """Watch with a number of clients and send the number of frames received."""
     resource.setrlimit(
         resource.RLIMIT_NOFILE, (1024, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     )
@@ -224,7 +224,7 @@ async def _read(address: str, clients: int, seconds: float, pipe: Connection) ->
 
 
 def drawing(env: CavEnv, frames: list[WorldFrame], seconds: float) -> dict[str, Any]:
-    """Main-thread JavaScript of the page, with software GL: only the JavaScript counts."""
+    """Measure the page's main-thread JavaScript, with software GL, which does not count."""
     from playwright.sync_api import sync_playwright
 
     audience, server, encoder = served(env)
@@ -240,7 +240,7 @@ def drawing(env: CavEnv, frames: list[WorldFrame], seconds: float) -> dict[str, 
             audience.publish(encoder.publication(frames[sent % len(frames)]._replace(tick=sent)))
             sent += 1
             page.wait_for_timeout(1e3 / BROWSER_HZ)
-        told = json.loads(
+        times = json.loads(
             page.evaluate(
                 "JSON.stringify({draw: viewer.times, take: viewer.takes, calls: viewer.calls, "
                 "first: viewer.firstPicture, n: viewer.frame.count})"
@@ -249,11 +249,11 @@ def drawing(env: CavEnv, frames: list[WorldFrame], seconds: float) -> dict[str, 
         browser.close()
     return {
         "name": "page",
-        "ms": median(told["draw"]) + median(told["take"]),
-        "draw_ms": median(told["draw"]),
-        "take_ms": median(told["take"]),
-        "calls": told["calls"],
-        "first": told["first"],
+        "ms": median(times["draw"]) + median(times["take"]),
+        "draw_ms": median(times["draw"]),
+        "take_ms": median(times["take"]),
+        "calls": times["calls"],
+        "first": times["first"],
     }
 
 

@@ -1,8 +1,8 @@
-"""How much faster worlds are over several workers, what workers cost, and what the machine allows.
+"""Speedup by workers, the cost of workers, and the limit of the machine.
 
-The machine's ceiling is how much faster programs are side by side that share nothing. No number of
-workers can do better. It is less than the number of cores where cores share memory, caches or
-clocks, and where other programs run.
+The limit of the machine is the speedup of independent programs that run side by side. No number of
+workers can exceed it. It is less than the number of cores if cores share memory, caches or clocks,
+or if other programs run.
 """
 
 from __future__ import annotations
@@ -27,51 +27,51 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, WorkerError
 from cavmarl.core.machine import describe_hardware
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 
 WARM_STEPS = 20
-PINGS = 2000  # a turn
+PINGS = 2000  # per turn
 IDLE_S = 1.0
-START_S = 300.0  # that a program may take until its worlds can be stepped
+START_S = 300.0  # time limit for a program to start
 
 
 @dataclass(frozen=True)
 class Row:
-    """The same worlds over some number of workers."""
+    """The same worlds over a number of workers."""
 
-    workers: int  # how many; 0: all in the caller's process
-    made_s: float  # until they could be reset
-    step_ms: tuple[float, ...]  # of each turn, ms a step
-    busiest_ms: float | None  # processor time that the busiest worker took for a step, ms
+    workers: int  # number of workers; 0: all worlds in the caller's process
+    made_s: float  # time until the worlds could be reset
+    step_ms: tuple[float, ...]  # per turn, ms per step
+    busiest_ms: float | None  # processor time per step of the busiest worker, ms
 
 
 @dataclass(frozen=True)
 class WorkerSpeed:
-    """What was measured."""
+    """Result of `measure_workers`."""
 
-    env: str  # of which environment
-    worlds: int  # that were stepped together
-    steps: int  # of a turn
-    rows: tuple[Row, ...]  # no worker, one, and those that were asked for
-    barrier_us: tuple[float, ...]  # of empty commands to all workers: quantiles 5, 50, 95 and 99 %
-    idle_s: float  # processor time that idle workers took in a second, s
-    hardware: dict[str, Any]  # that it ran on
+    env: str  # name of the environment
+    worlds: int  # number of worlds
+    steps: int  # per turn
+    rows: tuple[Row, ...]  # without workers, with one, and with the requested number
+    barrier_us: tuple[float, ...]  # empty commands to all workers: quantiles 5, 50, 95 and 99 %
+    idle_s: float  # processor time of idle workers per second, s
+    hardware: dict[str, Any]  # hardware of the machine
 
     @property
     def ratio(self) -> float:
-        """How many times faster than one worker; median of the turns, each beside the other."""
+        """Speedup over one worker; median of the turns, compared pairwise."""
         return paired_ratio(self.rows[1].step_ms, self.rows[2].step_ms)
 
     @property
     def processor_ratio(self) -> float:
-        """The same by processor time of the busiest worker: what free cores would lead to."""
+        """The same by processor time of the busiest worker: the speedup with enough free cores."""
         one, many = self.rows[1].busiest_ms, self.rows[2].busiest_ms
         return math.nan if one is None or many is None else one / many
 
     @property
     def cost_of_one(self) -> float:
-        """What a step takes with one worker, over that without; median of the turns."""
+        """Time of a step with one worker over that without; median of the turns."""
         return paired_ratio(self.rows[1].step_ms, self.rows[0].step_ms)
 
     @property
@@ -88,10 +88,10 @@ def measure_workers(
     repeats: int = 7,
     say: Say = silent,
 ) -> WorkerSpeed:
-    """Step the same worlds without workers, with one, and with several, by turns.
+    """Step the same worlds without workers, with one, and with several, in turn.
 
-    The agents do what the built-in driver would; that is not timed. Observations are read where
-    they lie, as a trainer with tensors of the same memory does.
+    The built-in driver drives the agents and is not timed. Observations are read in place, as by a
+    trainer whose tensors share the memory.
     """
     if workers < 2 or steps < 1 or repeats < 1:
         raise ConfigError(
@@ -100,7 +100,7 @@ def measure_workers(
     measured: list[Measured] = []
     try:
         for count in (0, 1, workers):
-            say(f"making worlds over {count} workers")
+            say(f"creating worlds over {count} workers")
             measured.append(Measured(spec, count, num_envs=worlds, copy=False))
         pool = measured[-1].pool
         assert pool is not None
@@ -128,13 +128,13 @@ def _timed_s(call: Callable[[], object]) -> float:
 
 
 def drive_ms(vec: CavVectorEnv, steps: int) -> float:
-    """Milliseconds a step; what the built-in driver decides for agents is not timed."""
+    """Return ms per step; decisions of the built-in driver are not timed."""
     spent_s = sum(_timed_s(partial(vec.step, vec.suggest_actions())) for _ in range(steps))
     return 1000.0 * spent_s / steps
 
 
 class Measured:
-    """Worlds over some number of workers, reset and warm, and what their turns have taken."""
+    """Worlds over a number of workers, reset and warm, and the times of their turns."""
 
     def __init__(self, spec: WorldSpec, workers: int, **more: Any) -> None:
         began = time.perf_counter()
@@ -149,7 +149,7 @@ class Measured:
         drive_ms(self.vec, WARM_STEPS)
 
     def count_turn(self, steps: int) -> None:
-        """One that counts, and as many steps for the processor's time: to ask for it takes some."""
+        """Run a timed turn, then as many steps for the processor time, whose query is slow."""
         self._step_ms.append(drive_ms(self.vec, steps))
         for _ in range(steps):
             actions = self.vec.suggest_actions()
@@ -167,19 +167,19 @@ class Measured:
 
 @dataclass(frozen=True)
 class CoreCeiling:
-    """Programs of their own that step worlds, one at a time and all at once."""
+    """Independent programs that step worlds, one at a time and all at once."""
 
-    programs: int  # how many
-    alone_ms: tuple[float, ...]  # of each turn, ms a step of all worlds, one program after another
-    together_ms: tuple[float, ...]  # of each turn, ms a step of the slowest program while all run
+    programs: int  # number of programs
+    alone_ms: tuple[float, ...]  # per turn, ms per step of all worlds, one program after another
+    together_ms: tuple[float, ...]  # per turn, ms per step of the slowest program while all run
 
     @property
     def ratio(self) -> float:
-        """How many times faster all at once are; median of the turns."""
+        """Speedup of running all at once; median of the turns."""
         return paired_ratio(self.alone_ms, self.together_ms)
 
     def facts(self) -> dict[str, Any]:
-        """Return plain values, for a report."""
+        """Return plain values for a report."""
         return {**asdict(self), "ratio": self.ratio}
 
 
@@ -228,7 +228,7 @@ def measure_ceiling(
 
 
 def _turn(wires: list[Connection], steps: int) -> list[float]:
-    """Milliseconds a step of each program, all at once."""
+    """Return ms per step of each program, all at once."""
     for wire in wires:
         wire.send(steps)
     return [_hear(wire) for wire in wires]
@@ -240,14 +240,13 @@ def _hear(wire: Connection) -> float:
             return float(wire.recv())
     except EOFError as error:
         raise WorkerError(
-            "a program that steps worlds by itself has ended; what it printed stands on standard "
-            "error"
+            "an independent program has ended; see its output on standard error"
         ) from error
-    raise WorkerError(f"a program that steps worlds by itself said nothing for {START_S:g} s")
+    raise WorkerError(f"an independent program did not answer within {START_S:g} s")
 
 
 def _serve(wire: Connection, spec: WorldSpec, worlds: int, first: int) -> None:
-    """One program: as many steps as it is told, until the connection is closed."""
+    """Run one program: step as often as commanded, until the connection is closed."""
     vec = make_vec(spec.env, num_envs=worlds, copy=False, **spec.keywords)
     vec.reset(seed=spec.seed, options={"first_world": first})
     steps = WARM_STEPS

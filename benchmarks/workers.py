@@ -1,4 +1,4 @@
-"""Worlds without workers, with one and with several, and what the machine allows."""
+"""Worlds without workers, with one and with several, and the limit of the machine."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ def measure(
     env: OptionalEnvironment = "rush",
     worlds: Annotated[int, about("Number of parallel worlds.")] = 16,
     count: Annotated[int, about("Number of workers to compare with one worker.", "--workers")] = 2,
-    steps: Annotated[int, about("Steps in each turn.")] = 20,
-    repeats: Annotated[int, about("Turns of each number of workers.")] = 7,
+    steps: Annotated[int, about("Steps per turn.")] = 20,
+    repeats: Annotated[int, about("Turns per number of workers.")] = 7,
     at_least: AtLeast = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """The same worlds without workers, with one and with several; what an empty command costs."""
+    """Measure worlds without workers, with one and with several, and an empty command."""
     turns: dict[str, Any] = {"worlds": worlds, "steps": steps, "repeats": repeats}
     found = measure_workers(world, workers=count, say=say, **turns)
-    say("stepping worlds in programs of their own")
+    say("stepping worlds in independent programs")
     ceiling = measure_ceiling(world, programs=count, **turns)
     low, middle, high, highest = found.barrier_us
     notes = [
@@ -36,8 +36,8 @@ def measure(
         f"an empty command to all {count}: [bold]{middle:.1f}[/] µs "
         f"({low:.1f} / {high:.1f} / {highest:.1f}: 5, 95, 99 %); idle workers take "
         f"{found.idle_s:.1%} of a core",
-        f"{count} programs that share nothing, side by side: [bold]{ceiling.ratio:.2f}[/] times "
-        "one after the other: more this machine does not give",
+        f"{count} independent programs, side by side: [bold]{ceiling.ratio:.2f}[/] times "
+        "one after the other; this is the machine's limit",
     ]
     if found.is_crowded:
         notes.append("[yellow]note: more workers than cores[/]")
@@ -45,7 +45,7 @@ def measure(
         f"{found.env}: {found.worlds} worlds, turns of {found.steps} steps",
         {
             "workers": "workers",
-            "made in, s": "made_s:.2f",
+            "created in, s": "made_s:.2f",
             "step, ms: min": "low_ms:.2f",
             "median": "median_ms:.2f",
             "max": "high_ms:.2f",

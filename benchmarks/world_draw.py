@@ -1,7 +1,7 @@
-"""Worlds drawn by chance: a net, and a demand for it, as a function of a seed.
+"""Random worlds: a net and a demand, as a function of a seed.
 
-A draw says only which options netgenerate or netconvert get and what the demand is like; files are
-made of it by `world_files.py`.
+A draw contains only the options of netgenerate or netconvert and the properties of the demand;
+`world_files.py` creates the files.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from cavmarl.core.errors import ConfigError
 
 Drawn = TypeVar("Drawn")
 
-# Features that a draw may have; each can be left out by name. Kinds of nets:
+# Features of a draw, with their probabilities; each can be excluded by name. Kinds of nets:
 KINDS = {"grid": 0.36, "spider": 0.2, "random": 0.29, "cut": 0.15}
-# types of junctions (SUMO's names; zipper and unregulated give no order where ways cross),
+# types of junctions (SUMO's names; zipper and unregulated define no right of way where ways cross),
 JUNCTIONS = {
     "priority": 0.26,
     "right_before_left": 0.16,
@@ -27,20 +27,20 @@ JUNCTIONS = {
     "traffic_light": 0.24,
     "traffic_light_right_on_red": 0.09,
 }
-SIGNALS = {"static": 0.5, "actuated": 0.3, "delay_based": 0.2}  # how signals are switched,
-SHARES = {  # and what comes on top of a net
+SIGNALS = {"static": 0.5, "actuated": 0.3, "delay_based": 0.2}  # control of signals,
+SHARES = {  # and additional features of a net
     "turn_lanes": 0.2,
     "joined": 0.12,
     "perturbed": 0.2,
     "random_lanes": 0.2,
     "random_priority": 0.35,
     "one_way": 0.3,  # of random nets
-    "shared_track": 0.05,  # both directions on one lane's ground
+    "shared_track": 0.05,  # both directions share one lane's ground
     "turnarounds": 0.5,
     "lefthand": 0.12,
 }
 LEVELS = {"free": 150.0, "half": 380.0, "near_capacity": 700.0}  # vehicles/h into a junction
-# Shares of vehicle classes; cuts of real maps may close roads to all but cars.
+# Shares of vehicle classes; cuts of real maps may close roads to all classes but cars.
 MIXES = {
     "cars": {"passenger": 1.0},
     "vans": {"passenger": 0.8, "delivery": 0.2},
@@ -60,43 +60,43 @@ _LANES = (1, 1, 2, 2, 3, 4)
 
 @dataclass(frozen=True)
 class NetDraw:
-    """How a net is made."""
+    """The properties of a net."""
 
     kind: str  # of `KINDS`
-    options: tuple[str, ...]  # of netgenerate; of netconvert for a cut
-    length_m: float  # of a usual edge; of half the side of a cut
-    num_lanes: int  # at most, on netgenerate's edges
+    options: tuple[str, ...]  # of netgenerate, or of netconvert for a cut
+    length_m: float  # of a typical edge, or half the side of a cut
+    num_lanes: int  # upper bound on netgenerate's edges
 
 
 @dataclass(frozen=True)
 class DemandDraw:
-    """What drives on it."""
+    """The properties of a demand."""
 
-    junction_per_h: float  # vehicles an hour into a usual junction, on one lane
-    fringe: bool  # whether trips begin and end at the net's ends, where it has any
+    junction_per_h: float  # vehicles per hour into a typical junction, per lane
+    fringe: bool  # whether trips begin and end at the net's ends, if it has any
     shares: dict[str, float]  # of vehicle classes
-    departure: dict[str, str]  # how vehicles enter
+    departure: dict[str, str]  # attributes of departure
 
 
 @dataclass(frozen=True)
 class WorldDraw:
-    """One world."""
+    """One random world."""
 
-    seed: int  # that it was drawn from
-    features: tuple[str, ...]  # of `FEATURES`, which it has
+    seed: int  # seed of the draw
+    features: tuple[str, ...]  # its features, of `FEATURES`
     net: NetDraw
     demand: DemandDraw
 
 
 def draw_world(seed: int, without: Collection[str] = ()) -> WorldDraw:
-    """Draw a world; equal arguments give an equal one.
+    """Draw a world; equal arguments give an equal world.
 
     Args:
-        seed: of all that is drawn.
-        without: features that it must not have.
+        seed: seed of all draws.
+        without: features to exclude.
 
     Raises:
-        ConfigError: a feature that there is not, or no choice is left.
+        ConfigError: there is no such feature, or no choice is left.
     """
     check_features(without)
     chance = _Chance(seed, without)
@@ -115,15 +115,15 @@ def draw_world(seed: int, without: Collection[str] = ()) -> WorldDraw:
 
 
 def check_features(names: Collection[str]) -> None:
-    """Refuse names that are no features."""
+    """Refuse unknown features."""
     unknown = sorted(set(names) - FEATURES)
     if unknown:
         known = ", ".join(sorted(FEATURES))
-        raise ConfigError(f"--without {unknown[0]}: is no feature; there are {known}")
+        raise ConfigError(f"--without {unknown[0]}: unknown feature; must be of {known}")
 
 
 class _Chance:
-    """Draws, and remembers the features that came out."""
+    """Draws random values, and records the drawn features."""
 
     def __init__(self, seed: int, without: Collection[str]) -> None:
         self._random = np.random.default_rng(seed)
@@ -131,17 +131,17 @@ class _Chance:
         self.features: list[str] = []
 
     def one_of(self, shares: dict[str, float]) -> str:
-        """A feature, by its share among those that are not left out."""
+        """Draw a feature by its share among those that are not excluded."""
         left = {name: share for name, share in shares.items() if name not in self._without}
         if not left:
-            raise ConfigError(f"--without: leaves none of {', '.join(shares)}; name fewer")
+            raise ConfigError(f"--without: excludes all of {', '.join(shares)}; exclude fewer")
         weights = np.array(list(left.values()))
         chosen = list(left)[self._random.choice(len(left), p=weights / weights.sum())]
         self.features.append(chosen)
         return chosen
 
     def has(self, feature: str) -> bool:
-        """Whether a world has a feature of `SHARES`."""
+        """Return whether a world has a feature of `SHARES`."""
         drawn = bool(self._random.random() < SHARES[feature]) and feature not in self._without
         if drawn:
             self.features.append(feature)
@@ -154,12 +154,12 @@ class _Chance:
         return float(self._random.uniform(low, high))
 
     def whole(self, low: int, high: int) -> int:
-        """From the one to the other, both included."""
+        """Draw an integer within both bounds, inclusive."""
         return int(self._random.integers(low, high + 1))
 
 
 def _generated(chance: _Chance, kind: str) -> NetDraw:
-    """A net by netgenerate."""
+    """Draw a net by netgenerate."""
     limit_mps = chance.any_of(_SPEEDS_MPS)
     length_m = round(chance.between(80.0, 220.0) * max(1.0, limit_mps / 13.89), 1)
     words = {
@@ -233,7 +233,7 @@ def _junctions(chance: _Chance) -> list[str]:
 
 
 def _cut(chance: _Chance) -> NetDraw:
-    """A piece of a real map, with signals as netconvert plans them."""
+    """Draw a piece of a real map, with signals planned by netconvert."""
     words = ["--keep-edges.by-vclass=passenger", "--remove-edges.isolated=true"]
     words += ["--keep-edges.components=1", "--tls.rebuild=true"]
     words.append(f"--tls.default-type={chance.one_of(SIGNALS)}")

@@ -1,4 +1,4 @@
-"""The files of a drawn world: by netgenerate or netconvert, and randomTrips, of SUMO's wheel."""
+"""The files of a random world, by netgenerate, netconvert and randomTrips of SUMO's wheel."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 
 NET_FILE, ROUTES_FILE = "world.net.xml", "world.rou.xml"
-# Maps in the wheel's `tools/game` that a cut is made of: real cities, levels told by height.
+# Maps of real cities in the wheel's `tools/game` from which cuts are taken; levels by height.
 GAME_MAPS = ("kuehne/kuehne", "bs3d/bs", "fokr_bs_demo/fokr_bs", "DRT/osm", "fkk_in/ingolstadt")
-_DRAWN_TRIPS = 1500  # from which the departures are taken
-_LEAST_EDGES = 12  # of a cut; smaller ones are drawn again
+_DRAWN_TRIPS = 1500  # from which departures are taken
+_LEAST_EDGES = 12  # of a cut; smaller cuts are drawn again
 _CUTS = 20
-_END_PER_H = 600.0  # vehicles that a road into the net brings at most, so that they find room
+_END_PER_H = 600.0  # upper bound per road into the net, so that vehicles can enter
 _TOOL_S = 300.0
 
 
 def cut_maps(folder: Path | None) -> tuple[Path, ...]:
-    """The maps that cuts are made of: all below a folder, in the wheel if there is none.
+    """Return the maps for cuts: all below a folder, or those in the wheel.
 
     Raises ConfigError: the folder has no map.
     """
@@ -48,20 +48,20 @@ def cut_maps(folder: Path | None) -> tuple[Path, ...]:
 def make_files(
     draw: WorldDraw, folder: Path, seconds: int, maps: Sequence[Path]
 ) -> tuple[Path, Path]:
-    """Write net and routes of a world into a folder; the same draw gives the same traffic.
+    """Write net and routes of a world to a folder; the same draw gives the same traffic.
 
     Args:
         draw: the world.
-        folder: is made if it is not there.
-        seconds: over which vehicles depart.
-        maps: that a cut is made of.
+        folder: created if missing.
+        seconds: period of departures.
+        maps: maps for cuts.
 
     Returns:
-        The net and the routes.
+        the net and the routes.
 
     Raises:
-        ConfigError: a tool of SUMO's gives up.
-        MapError: a cut of a map cannot be driven.
+        ConfigError: a tool of SUMO fails.
+        MapError: a cut of a map has no drivable roads.
         MissingExtraError: SUMO is not installed.
     """
     net, routes = make_net(draw, folder, maps), folder / ROUTES_FILE
@@ -70,7 +70,7 @@ def make_files(
 
 
 def make_net(draw: WorldDraw, folder: Path, maps: Sequence[Path]) -> Path:
-    """Write the net of a world into a folder, as `make_files` does."""
+    """Write the net of a world to a folder, as in `make_files`."""
     folder.mkdir(parents=True, exist_ok=True)
     net = folder / NET_FILE
     if draw.net.kind == "cut":
@@ -83,7 +83,7 @@ def make_net(draw: WorldDraw, folder: Path, maps: Sequence[Path]) -> Path:
 
 
 def _cut(draw: WorldDraw, net: Path, maps: Sequence[Path]) -> None:
-    """Cut a square around a place on a road."""
+    """Cut a square around a position on a road."""
     random = np.random.default_rng([draw.seed, 1])
     for _ in range(_CUTS):
         source = map_file(maps[int(random.integers(len(maps)))])
@@ -95,17 +95,17 @@ def _cut(draw: WorldDraw, net: Path, maps: Sequence[Path]) -> None:
         try:
             build_network(source, net, options=options)
         except MapError:
-            continue  # nothing can be driven there
+            continue  # no drivable road
         if int((~load_network(net).edges["internal"]).sum()) >= _LEAST_EDGES:
             return
     raise MapError(f"{source}: {_CUTS} cuts of {2 * half:.0f} m have no roads; give larger maps")
 
 
 def _write_demand(draw: WorldDraw, net: Path, routes: Path, seconds: int) -> None:
-    """Routes by randomTrips, their departures by the flow that the draw asks for."""
+    """Write routes of randomTrips, with departures by the flow of the draw."""
     drawn = routes.with_name("drawn.rou.xml")
     network = load_network(net)
-    # Ends of roads only where there are enough of them: else all traffic is on two edges.
+    # Use ends of roads only if there are enough; otherwise all traffic would be on two edges.
     fringe = draw.demand.fringe and _num_ends(network) >= 4
     _run_tool(
         "tools/randomTrips.py",
@@ -125,7 +125,7 @@ def _write_demand(draw: WorldDraw, net: Path, routes: Path, seconds: int) -> Non
     for name in ("drawn.rou.xml", "drawn.rou.alt.xml", "trips.xml"):
         routes.with_name(name).unlink(missing_ok=True)
     if not found:
-        raise ConfigError(f"{net}: randomTrips finds no trip; draw another seed")
+        raise ConfigError(f"{net}: randomTrips found no trip; use another seed")
     gap_s = _gap_s(draw.demand, network, found)
     if fringe:
         gap_s = max(gap_s, 3600.0 / (_END_PER_H * _num_ends(network)))
@@ -133,7 +133,7 @@ def _write_demand(draw: WorldDraw, net: Path, routes: Path, seconds: int) -> Non
 
 
 def _num_ends(network: RoadNetwork) -> int:
-    """Number of junctions with one road."""
+    """Return the number of junctions with one road."""
     edges = network.edges[~network.edges["internal"]]
     junctions = np.concatenate([edges["from_junction"], edges["to_junction"]])
     ends = np.concatenate([edges["to_junction"], edges["from_junction"]])
@@ -142,12 +142,12 @@ def _num_ends(network: RoadNetwork) -> int:
 
 
 def _gap_s(demand: DemandDraw, network: RoadNetwork, found: Sequence[Element]) -> float:
-    """Seconds between two departures so that a usual junction gets the flow of the draw."""
+    """Return the gap between departures, s, at which a typical junction has the drawn flow."""
     edges = network.edges[~network.edges["internal"]]
     num_junctions = len(np.unique(edges["to_junction"])) - _num_ends(network)
     lanes = float(edges["num_lanes"].mean())
     passed = [len(str(route.get("edges")).split()) - 1 for one in found for route in one]
-    # Lanes of one road share what a junction lets through.
+    # Lanes of one road share the capacity of a junction.
     flow_per_h = demand.junction_per_h * lanes**0.5 * max(num_junctions, 1)
     gap_s: float = 3600.0 * max(float(np.mean(passed)), 1.0) / flow_per_h
     return gap_s
@@ -189,4 +189,4 @@ def _run_tool(tool: str, *options: str) -> None:
     )
     if done.returncode != 0:
         said = done.stderr.strip().splitlines()[-5:]
-        raise ConfigError(f"{tool} {' '.join(options)}: gave up: {' '.join(said)}")
+        raise ConfigError(f"{tool} {' '.join(options)}: failed: {' '.join(said)}")

@@ -1,4 +1,4 @@
-"""Cities in processes of their own, which step them when they are told to, and tell the times."""
+"""Cities in separate processes that step on command and report their times."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.backend_name import NODES, BackendName
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.placement.backend_name import NODES, BackendName
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 from cavmarl.verify.faulty_network import FaultyNetwork
 
 PER_JUNCTION = 25  # vehicles
 EDGE_M = 200
-FIRST_STEPS = 3  # of a world
-WARM_STEPS = 2  # of each turn, before those that count: others have had the cache
+FIRST_STEPS = 3  # after creation
+WARM_STEPS = 2  # unmeasured, per turn, because other worlds have used the cache
 PINGS = 40
-PING = bytes(1 << 14)  # about as long as what nodes tell each other in a tick
+PING = bytes(1 << 14)  # about the size of the nodes' messages in a tick
 LOCAL = "127.0.0.1"
 SERVES = "import sys; from benchmarks.world_processes import serve; serve(*sys.argv[1:])"
 
 
 class Turn(NamedTuple):
-    """What some steps of a world took."""
+    """Measurements of a number of steps of a world."""
 
-    tick_s: float  # by the clock
-    node_s: float  # time of the processor a tick, of the dearest node; undivided: of the process
-    caller_s: float  # the same of the caller
-    own: float  # vehicles of the dearest node
-    ghosts: float  # that it sees
-    crossings: float  # vehicles that have changed their node, a step
-    memory_bytes: float  # resident, of the largest process
-    latency_s: float  # that is added to each connection, as it was measured
+    tick_s: float  # wall time
+    node_s: float  # processor time per tick of the most expensive node; undivided: of the process
+    caller_s: float  # processor time per tick of the caller
+    own: float  # vehicles of the most expensive node
+    ghosts: float  # its ghosts
+    crossings: float  # vehicles that changed their node, per step
+    memory_bytes: float  # resident memory of the largest process
+    latency_s: float  # measured latency added to each connection
     ticks_per_step: float
 
 
 class WorldProcess:
-    """A city of so many vehicles: undivided in a process of its own, or over nodes."""
+    """A city of a number of vehicles: undivided in its own process, or over nodes."""
 
     def __init__(
         self,
@@ -60,12 +60,12 @@ class WorldProcess:
         vehicles: int,
         nodes: int = 0,  # 0: undivided
         latency_s: float = 0.0,  # added to each connection
-        is_realtime: bool = False,  # while it takes a turn
+        is_realtime: bool = False,  # during its turns
     ) -> None:
-        told = [str(net), str(vehicles), str(nodes), repr(latency_s), str(int(is_realtime))]
+        words = [str(net), str(vehicles), str(nodes), repr(latency_s), str(int(is_realtime))]
         self._process: subprocess.Popen[Any] = start_python(
-            ["-c", SERVES, *told],
-            env=huge_heap(),  # as nodes have it
+            ["-c", SERVES, *words],
+            env=huge_heap(),  # as for nodes
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -83,7 +83,7 @@ class WorldProcess:
         self._process.stdin.flush()
 
     def read(self) -> Turn:
-        """Wait for its end."""
+        """Wait for the turn's result."""
         return Turn(*json.loads(self._line()))
 
     def turn(self, steps: int) -> Turn:
@@ -94,7 +94,7 @@ class WorldProcess:
         assert self._process.stdout is not None
         line: str = self._process.stdout.readline()
         if not line:
-            raise ConfigError("a process of the benchmark has ended; see what it printed")
+            raise ConfigError("a process of the benchmark has ended; see its output")
         return line
 
     def close(self) -> None:
@@ -103,7 +103,7 @@ class WorldProcess:
 
 
 def make_city(folder: Path, vehicles: int) -> Path:
-    """A grid with room for so many."""
+    """Generate a grid with room for the vehicles."""
     require("sumo", "sumo")
     import sumo
 
@@ -118,7 +118,7 @@ def make_city(folder: Path, vehicles: int) -> Path:
 
 
 def serve(net: str, vehicles: str, nodes: str, latency_s: str, is_realtime: str) -> None:
-    """Have a world, and step it so often for each line that comes in; an empty one ends it."""
+    """Run a world: step as often as each input line says, until an empty line."""
     with _network(float(latency_s)) as network:
         world = _World(Path(net), int(vehicles), int(nodes), network, bool(int(is_realtime)))
         try:
@@ -201,14 +201,14 @@ class _World:
         )
 
     def _loads(self) -> tuple[Sequence[Any], int]:
-        """What nodes have done since this was asked last, and changes of owner since the start."""
+        """Return the nodes' loads since the last call, and changes of owner since the start."""
         if not isinstance(self._worlds, NodeWorlds):
             return (), 0
         return self._worlds.node_loads(), self._worlds.migrations
 
     @contextmanager
     def _priority(self) -> Iterator[None]:
-        """Real-time priority of this process and of its nodes, if it is asked for."""
+        """Give this process and its nodes real-time priority, if requested."""
         if not self._is_realtime:
             yield
             return
@@ -240,7 +240,7 @@ def _network(latency_s: float) -> Iterator[FaultyNetwork | None]:
 
 
 def _pinged(network: FaultyNetwork | None) -> float:
-    """Seconds from one end of a connection to the other, median; None: a straight one."""
+    """Return the median latency from one end of a connection to the other, s; None: no network."""
     with socket.create_server((LOCAL, 0)) as listener:
         place = listener.getsockname()
         with socket.create_connection(network.route(place) if network else place) as near:

@@ -1,4 +1,4 @@
-"""Ours beside SUMO in one drawn world, as a row of figures; and what many rows come to."""
+"""Comparison with SUMO in one random world as a row of figures, and summaries of many rows."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 
 Row = dict[str, Any]  # a line of worlds.jsonl
 
-# How far ours may be from SUMO's mean, as a share of it; delay also by seconds.
+# Tolerances as a share of SUMO's mean; delay also in seconds.
 SPEED_SHARE, COUNT_SHARE, DELAY_SHARE, DELAY_S = 0.15, 0.05, 0.25, 3.0
 LOCK_S = 120.0
 _SPREAD_OF = ("departed", "arrived", "mean_speed_mps", "mean_delay_s", "queue", "longest_lock_s")
 
 
 def row_of(draw: WorldDraw, found: TrafficComparison, of_map: Sequence[str] = ()) -> Row:
-    """What is kept of a comparison: all figures, and SUMO's of each of its seeds.
+    """Return the row of a comparison: all figures, and SUMO's per seed.
 
-    `of_map`: names of `map_features` that the net turned out to have.
+    `of_map`: names of `map_features` that the net has.
     """
     sumo = [asdict(figures) for figures in (found.sumo.figures, *found.sumo_others)]
     return {
@@ -38,32 +38,32 @@ def row_of(draw: WorldDraw, found: TrafficComparison, of_map: Sequence[str] = ()
 
 
 def failed_row(draw: WorldDraw, seconds: int, dt_s: float, error: Exception) -> Row:
-    """Of a world that could not be compared."""
+    """Return the row of a world that could not be compared."""
     own = {"seed": draw.seed, "features": list(draw.features), "seconds": seconds, "dt_s": dt_s}
     return own | {"error": f"{type(error).__name__}: {error}"}
 
 
 def deviation(row: Mapping[str, Any], figure: str) -> float | None:
-    """Ours over the mean of SUMO's seeds, less 1; None where SUMO has nothing to compare with."""
+    """Return the relative deviation from the mean of SUMO's seeds; None without a reference."""
     ours, theirs = row["ours"][figure], _known(row["sumo_spread"][figure])
     mean = sum(theirs) / len(theirs) if theirs else 0.0
     return ours / mean - 1.0 if ours is not None and mean else None
 
 
 def in_spread(row: Mapping[str, Any], figure: str) -> bool:
-    """Whether ours lies between the least and the most of SUMO's seeds."""
+    """Return whether the figure lies within the range of SUMO's seeds."""
     ours, theirs = row["ours"][figure], _known(row["sumo_spread"][figure])
     return ours is not None and bool(theirs) and min(theirs) <= ours <= max(theirs)
 
 
 def is_near(row: Mapping[str, Any], figure: str, share: float) -> bool:
-    """Whether ours is within a share of SUMO's mean, or within SUMO's own spread."""
+    """Return whether the figure is within a share of SUMO's mean, or within SUMO's range."""
     off = deviation(row, figure)
     return in_spread(row, figure) or (off is not None and abs(off) <= share)
 
 
 def is_delay_near(row: Mapping[str, Any]) -> bool:
-    """Whether the mean delay is within `DELAY_SHARE` or `DELAY_S` of SUMO's mean."""
+    """Return whether the mean delay is within `DELAY_SHARE` or `DELAY_S` of SUMO's mean."""
     ours, theirs = row["ours"]["mean_delay_s"], _known(row["sumo_spread"]["mean_delay_s"])
     if ours is None or not theirs:
         return ours is None and not theirs
@@ -72,13 +72,13 @@ def is_delay_near(row: Mapping[str, Any]) -> bool:
 
 
 def has_own_lock(row: Mapping[str, Any]) -> bool:
-    """Whether ours locks for longer than `LOCK_S` where SUMO does not with any of its seeds."""
+    """Return whether a lock lasts longer than `LOCK_S` that occurs with none of SUMO's seeds."""
     theirs = max(row["sumo_spread"]["longest_lock_s"])
     return bool(row["ours"]["longest_lock_s"] > LOCK_S >= theirs)
 
 
 def sumo_beside_itself(row: Mapping[str, Any]) -> list[Row]:
-    """A row for each of SUMO's seeds, which is in the place of ours, beside the others."""
+    """Return a row for each of SUMO's seeds, compared with its other seeds."""
     spread = row["sumo_spread"]
     return [
         {
@@ -90,7 +90,7 @@ def sumo_beside_itself(row: Mapping[str, Any]) -> list[Row]:
 
 
 def badness(row: Mapping[str, Any]) -> float:
-    """By what the worst worlds are chosen: failed, then contacts and locks, then mean speed."""
+    """Return the sort key of the worst worlds: failed, then contacts and locks, then mean speed."""
     if "error" in row:
         return 1e6
     off = deviation(row, "mean_speed_mps")
@@ -100,12 +100,12 @@ def badness(row: Mapping[str, Any]) -> float:
 
 
 def worst(rows: Sequence[Row], count: int) -> list[Row]:
-    """The rows that are farthest from SUMO, the worst first; of equal ones the smaller seed."""
+    """Return the rows farthest from SUMO, worst first; ties by the smaller seed."""
     return sorted(rows, key=lambda row: (-badness(row), row["seed"]))[:count]
 
 
 def summary(rows: Sequence[Row]) -> Row:
-    """The distribution over the worlds that could be compared."""
+    """Return the distribution over the worlds that could be compared."""
     good = [row for row in rows if "error" not in row]
     found: Row = {"worlds": len(rows), "failed": len(rows) - len(good)}
     if not good:
@@ -140,13 +140,13 @@ def summary(rows: Sequence[Row]) -> Row:
 
 
 def by_feature(rows: Sequence[Row]) -> dict[str, Row]:
-    """Feature → the summary of the worlds that have it."""
+    """Return the summary of the worlds with each feature, by feature."""
     names = sorted({name for row in rows for name in row["features"]})
     return {name: summary([row for row in rows if name in row["features"]]) for name in names}
 
 
 def comparable(rows: Sequence[Row]) -> list[Row]:
-    """The worlds in which ours is meant to be as SUMO: none has one of `MAP_FEATURES`."""
+    """Return the worlds that should match SUMO: those with none of `MAP_FEATURES`."""
     return [row for row in rows if MAP_FEATURES.isdisjoint(row["features"])]
 
 
@@ -155,7 +155,7 @@ def _known(values: Sequence[float | None]) -> list[float]:
 
 
 def _sizes(offs: Sequence[float]) -> Row:
-    """Median of deviations with and without their sign, and what 90 % of them stay below."""
+    """Return the median of signed and of absolute deviations, and their 90 % quantile."""
     if not offs:
         return {"median": None, "median_size": None, "size_90": None}
     sizes = np.abs(offs)

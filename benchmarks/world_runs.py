@@ -1,4 +1,4 @@
-"""Many drawn worlds, one after the other, in a folder that a run can be resumed in."""
+"""Many random worlds in sequence, in a folder from which a run can be resumed."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from cavmarl.render.topdown import WorldView
 from cavmarl.roads.cache import load_network
 
 ROWS_FILE, SETTINGS_FILE = "worlds.jsonl", "settings.json"
-KEPT = 10  # worlds whose files stay
+KEPT = 10  # number of worlds whose files are kept
 SUMO_SEEDS = 3
 
 
 @dataclass(frozen=True)
 class WorldSeries:
-    """Which worlds, and how they are run."""
+    """A series of worlds and its settings."""
 
-    out: Path  # the folder of the results
-    count: int  # worlds
-    first_seed: int  # they have the seeds from here on
-    seconds: int = 400  # simulated, by both
-    dt_s: float = 0.1  # step length of both
-    without: tuple[str, ...] = ()  # features that no world has
-    maps: Path | None = None  # folder of the maps that are cut; None: those in SUMO's wheel
+    out: Path  # folder of the results
+    count: int  # number of worlds
+    first_seed: int  # seeds are consecutive
+    seconds: int = 400  # simulated duration of both sides
+    dt_s: float = 0.1  # step length of both sides
+    without: tuple[str, ...] = ()  # features to exclude
+    maps: Path | None = None  # folder of maps to cut; None: those in SUMO's wheel
     cut_from: tuple[Path, ...] = field(default=(), init=False)
 
     def __post_init__(self) -> None:
@@ -51,7 +51,7 @@ class WorldSeries:
         object.__setattr__(self, "cut_from", cut_maps(self.maps))
 
     def settings(self) -> dict[str, Any]:
-        """What rows of one folder have in common."""
+        """Return the settings that rows of one folder share."""
         maps = None if self.maps is None else str(self.maps)
         own = {"seconds": self.seconds, "dt_s": self.dt_s, "without": sorted(self.without)}
         return own | {"maps": maps}
@@ -63,16 +63,17 @@ class WorldSeries:
 def run_worlds(
     job: WorldSeries, progress: Callable[[int, int], None] = lambda done, count: None
 ) -> list[Row]:
-    """Run the worlds that have no row yet; the rows of all that the job names, by seed.
+    """Run the worlds without a row; return the rows of the whole series, by seed.
 
-    A row is added to `worlds.jsonl` when its world is done. Files of the worst worlds so far stay.
+    A row is added to `worlds.jsonl` when its world is done. The files of the worst worlds so far
+    are kept.
 
     Args:
-        job: which.
-        progress: told how many worlds of how many are done.
+        job: the series.
+        progress: called with the numbers of completed and of all worlds.
 
     Raises:
-        ConfigError: the folder has rows with other settings, or a broken one.
+        ConfigError: the folder has rows with other settings, or an invalid row.
         MissingExtraError: SUMO, matplotlib or pygame is not installed.
     """
     require("matplotlib", "report")
@@ -82,7 +83,7 @@ def run_worlds(
         progress(done, job.count)
         if seed in rows:
             continue
-        rows[seed] = _run_world(job, seed)
+        rows[seed] = run_world(job, seed)
         with (job.out / ROWS_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(rows[seed]) + "\n")
         _drop_files(job.out, list(rows.values()))
@@ -91,9 +92,9 @@ def run_worlds(
 
 
 def read_rows(path: Path) -> Iterator[Row]:
-    """The rows of a file, none if it is not there.
+    """Yield the rows of a file, none if it does not exist.
 
-    Raises ConfigError: a line that is no row.
+    Raises ConfigError: a line is no row.
     """
     if not path.exists():
         return
@@ -102,12 +103,12 @@ def read_rows(path: Path) -> Iterator[Row]:
             row = json.loads(line)
             int(row["seed"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"{path}, line {number}: is no row: take the line out") from error
+            raise ConfigError(f"{path}, line {number}: not a valid row; remove the line") from error
         yield row
 
 
 def world_folder(out: Path, seed: int) -> Path:
-    """Where the files of a world are."""
+    """Return the folder of a world's files."""
     return out / f"world_{seed:06d}"
 
 
@@ -118,15 +119,16 @@ def _check_settings(job: WorldSeries) -> None:
         path.write_text(text + "\n", encoding="utf-8")
     elif path.read_text(encoding="utf-8").strip() != text:
         raise ConfigError(
-            f"{path}: has rows of other settings ({path.read_text(encoding='utf-8').strip()}): "
-            "name another --out"
+            f"{path}: has rows with other settings ({path.read_text(encoding='utf-8').strip()}): "
+            "choose another --out"
         )
 
 
-def _run_world(job: WorldSeries, seed: int) -> Row:
+def run_world(job: WorldSeries, seed: int) -> Row:
+    """Draw a world, run it here and in SUMO, and return its row."""
     draw = draw_world(seed, job.without)
     folder = world_folder(job.out, seed)
-    shutil.rmtree(folder, ignore_errors=True)  # of a run that was ended
+    shutil.rmtree(folder, ignore_errors=True)  # left by an interrupted run
     try:
         net, routes = make_files(draw, folder, job.seconds, job.cut_from)
         _write_commands(job, draw, folder)
@@ -146,7 +148,7 @@ def _run_world(job: WorldSeries, seed: int) -> Row:
 
 
 def _write_commands(job: WorldSeries, draw: WorldDraw, folder: Path) -> None:
-    """A README of what the world is, and how to run it again."""
+    """Write a README with the world's properties and the commands to run it again."""
     net, routes = folder / NET_FILE, folder / ROUTES_FILE
     words = ["cavmarl", "bench", "traffic", str(net), "--demand", str(routes)]
     words += [f"--seconds={job.seconds}", f"--dt={job.dt_s:g}", f"--seed={draw.seed}"]
@@ -174,7 +176,7 @@ def _draw_end(world: Simulation, path: Path) -> None:
 
 
 def _drop_files(out: Path, rows: Sequence[Row]) -> None:
-    """Leave the files of the worst worlds only."""
+    """Delete all files except those of the worst worlds."""
     kept: Collection[int] = {row["seed"] for row in worst(rows, KEPT)}
     for row in rows:
         if row["seed"] not in kept:

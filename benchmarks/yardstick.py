@@ -1,10 +1,10 @@
-"""How the built-in driver does in agents' seats: alone and among its kind, on any maps.
+"""The built-in driver in agents' seats, alone and in traffic, on any maps.
 
-Every trip counts, those that the end of the run cuts, too. A vehicle stands without a cause if it
-has stood for `STANDS_S`, its signal is not red, no other vehicle is near ahead of it or behind the
-junction, and none is, or has its rear, on a way that crosses its own, or comes to a line where it
-has to give way, as near as drivers announce themselves. What touches on ground that the map gives
-two roads is counted apart (`shared_ground`).
+Every trip counts, including those that the end of the run cuts off. A vehicle stands without a
+cause if it has stood for `STANDS_S`; its signal is not red; no other vehicle is close ahead or just
+behind the junction; no vehicle, or its rear, is on a path that crosses its own; and none approaches
+a line at which it must yield, within the distance of an announcement. Contacts on ground that the
+map gives to two roads are counted separately (`shared_ground`).
 """
 
 from __future__ import annotations
@@ -35,33 +35,33 @@ from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.maps.defects import LEVEL_M
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.render.ground import signal_codes
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.sumo_net.reader import map_name
 
-MOST_SHARE = 0.0005  # of the trips that may end off the road, and with a collision
+MOST_SHARE = 0.0005  # largest share of trips that may end off the road or in a collision
 STANDS_S = 120.0
-NEAR_AHEAD_M = 20.0  # another vehicle whose centre is so near ahead is a cause to stand
-AXIS_PLACES = 9  # of a vehicle, between which and those of another a touch is looked for
-NEAR_AXIS_M = 4.0  # nearer than that are the axes of two that touch
-TOGETHER = 100  # vehicles that are stepped at once, about
+NEAR_AHEAD_M = 20.0  # a vehicle whose centre is this close ahead is a cause to stand
+AXIS_PLACES = 9  # points on a vehicle's axis for finding contacts
+NEAR_AXIS_M = 4.0  # the axes of touching vehicles are closer than this
+TOGETHER = 100  # approximate number of vehicles stepped at once
 RECORDED = ("off_road", "collision", "wrong_way", "red_light")
-OF_TRIPS = (*RECORDED, "shared_ground")  # the last are collisions, counted apart
+OF_TRIPS = (*RECORDED, "shared_ground")  # the last are collisions, counted separately
 FAULTS = (*OF_TRIPS, "stands")
-HEADS = {"collision": "colli-\nsion"}  # all columns have room on a terminal of 80
-SHOWN = 12  # faults named below the table
+HEADS = {"collision": "colli-\nsion"}  # all columns fit a terminal of 80 characters
+SHOWN = 12  # number of faults listed below the table
 GREEN = [SIGNAL_STATES.index(letter) for letter in "gGoOs"] + [SIGNAL_NONE]
 
 
 @dataclass
 class Drive:
-    """What became of the trips of one driver on one map."""
+    """Results of the trips of one driver on one map."""
 
     trips: int = 0
     arrived: int = 0
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(FAULTS, 0))
-    faults: list[dict[str, Any]] = field(default_factory=list)  # where and when
+    faults: list[dict[str, Any]] = field(default_factory=list)  # position and time
 
     def add(self, other: Drive) -> None:
         self.trips += other.trips
@@ -88,22 +88,22 @@ def measure(
     maps: Annotated[
         list[str] | None, typer.Argument(help="Names, folders or map files of environments.")
     ] = None,
-    worlds: Annotated[int, about("Nets drawn by chance, besides.")] = 0,
-    first_seed: Annotated[int, about("They have the seeds from here on.")] = 0,
-    agents: Annotated[str, about("Agents at once, as 1,100.")] = "1,100",
-    models: Annotated[str, about("How they follow: IDM, Krauss or both.")] = "IDM,Krauss",
-    seconds: Annotated[int, about("Simulated seconds of each run.")] = 300,
+    worlds: Annotated[int, about("Number of additional random nets.")] = 0,
+    first_seed: Annotated[int, about("Seed of the first random net.")] = 0,
+    agents: Annotated[str, about("Comma-separated numbers of agents.")] = "1,100",
+    models: Annotated[str, about("Car-following models: IDM, Krauss or both.")] = "IDM,Krauss",
+    seconds: Annotated[int, about("Simulated seconds per run.")] = 300,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Trips of the built-in driver that end off the road, in a collision, or stand for ever."""
+    """Count trips of the built-in driver that end off the road, collide, or stand forever."""
     check_range(worlds=(worlds, 0, 10_000), seconds=(seconds, 1, 100_000))
     check_range(first_seed=(first_seed, 0, 10**9))
     crowds = numbers_of("--agents", agents)
     chosen = [name.strip() for name in models.split(",")]
     if not maps and not worlds:
-        raise ConfigError("no map: name some, or draw nets with --worlds")
-    named = _labels(maps or [])
+        raise ConfigError("no map: give maps, or draw nets with --worlds")
+    named = labels(maps or [])
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     sums = {(model, crowd): Drive() for model in chosen for crowd in crowds}
@@ -139,8 +139,8 @@ def measure(
     )
 
 
-def _labels(maps: Sequence[str]) -> dict[str, str]:
-    """A short name of each map: of a file its own without folders, where no other has the same."""
+def labels(maps: Sequence[str]) -> dict[str, str]:
+    """Return a short label of each map: the file's name, if it is unique."""
     short = {name: map_name(Path(name)) or name for name in maps}
     number = Counter(short.values())
     return {name: label if number[label] == 1 else name for name, label in short.items()}
@@ -149,7 +149,7 @@ def _labels(maps: Sequence[str]) -> dict[str, str]:
 def _maps(
     named: Mapping[str, str], seeds: Sequence[int], folder: Path
 ) -> Iterator[tuple[str, Callable[[], str]]]:
-    """Label and maker of each map."""
+    """Yield label and factory of each map."""
     for name, label in named.items():
         yield label, lambda name=name: name  # type: ignore[misc]
     cuts = cut_maps(None) if seeds else ()
@@ -167,7 +167,7 @@ def _told(name: str, model: str, agents: int, fault: dict[str, Any]) -> str:
 
 
 def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
-    """Let the built-in driver drive so many agents at once for some time."""
+    """Run the built-in driver in a number of seats for some time."""
     overrides = {
         "traffic.model": model,
         "population.mode": "respawn",
@@ -177,7 +177,7 @@ def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
     vec = CavVectorEnv(LocalWorlds(world, max(1, min(16, TOGETHER // (5 * agents)))))
     weights = np.array(vec.config.terms.weight_of_each)
     recorder = Recorder(vec.num_envs, vec.num_agents, vec.max_cycles, vec.step_s, weights)
-    watch, ground = _Standing(vec), _SharedGround(vec.network)
+    watch, ground = StandingVehicles(vec), SharedGround(vec.network)
     found = Drive()
     _, infos = vec.reset(seed=seed)
     running = np.ones(vec.num_envs, dtype=np.bool_)
@@ -219,8 +219,8 @@ def _place(vec: CavVectorEnv, what: str, world: int, row: np.void, step: int) ->
     }
 
 
-class _SharedGround:
-    """Which collisions are between two roads that a map draws on the same ground."""
+class SharedGround:
+    """Finds collisions between two roads that a map draws on the same ground."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network
@@ -230,11 +230,12 @@ class _SharedGround:
         return frozenset(shared_ground(self._network))
 
     def holds(self, row: np.void, rows: NDArray[np.void], dt: float) -> bool:
-        """Whether the vehicle that one is about to touch is on a lane that shares its ground.
+        """Return whether the vehicle about to be touched is on a lane that shares the ground.
 
-        `dt`: s until they touch, at most. It is the one to whose axis its own comes nearest. Where
-        none is near it has departed meanwhile: on the other lane, as on the same one it keeps off.
-        Inside a junction it counts as on the lanes that its own one leads from and to.
+        The other vehicle is the one with the nearest axis. `dt`: upper bound of the time until they
+        touch, s. If no vehicle is near, the other one has just entered, on the other lane, since a
+        vehicle does not enter too close on the same lane. Inside a junction, a vehicle counts as on
+        the lanes before and after it.
         """
         others = rows[rows["id"] != row["id"]]
         own_x, own_y = _axes(rows[rows["id"] == row["id"]], dt)
@@ -257,7 +258,7 @@ class _SharedGround:
 
 
 def _axes(rows: NDArray[np.void], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places from the rear to the front of vehicles, where they are after `dt`: (n, k) each."""
+    """Return points from rear to front of vehicles after `dt`: (n, k) each."""
     inset = 0.5 * (rows["length"] - rows["width"])
     along = (rows["speed"] * dt)[:, None] + inset[:, None] * np.linspace(-1.0, 1.0, AXIS_PLACES)
     x = rows["x"][:, None] + np.cos(rows["heading"])[:, None] * along
@@ -265,7 +266,7 @@ def _axes(rows: NDArray[np.void], dt: float) -> tuple[NDArray[np.float64], NDArr
     return x, y
 
 
-class _Standing:
+class StandingVehicles:
     """Finds vehicles that have stood for `STANDS_S` without a cause, each once."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
@@ -282,15 +283,16 @@ class _Standing:
             shown = signal_codes(self._vec.network, simulation.signal_phases(world))
             for i in long.tolist():
                 key = (world, int(rows[i]["id"]))
-                if key not in self._told and not self._has_cause(rows, i, shown):
+                if key not in self._told and not self.has_cause(rows, i, shown):
                     self._told.add(key)
                     yield world, rows[i]
 
-    def _has_cause(self, rows: NDArray[np.void], i: int, shown: NDArray[np.uint8]) -> bool:
+    def has_cause(self, rows: NDArray[np.void], i: int, shown: NDArray[np.uint8]) -> bool:
+        """Return whether vehicle `i` has a cause to stand; `shown`: the signal of each link."""
         row = rows[i]
         others = rows[np.arange(len(rows)) != i]
         lane = self._vec.network.lanes[row["lane"]]
-        inside = bool(lane["internal"])  # then a signal does not concern it any more
+        inside = bool(lane["internal"])  # then a signal no longer applies
         step = self._vec.simulation.plans[row["goal"], row["lane"]]
         link = int(lane["link"] if inside else step["link"])
         along_x, along_y = math.cos(row["heading"]), math.sin(row["heading"])
@@ -299,16 +301,16 @@ class _Standing:
         near = ahead & (np.hypot(to_x, to_y) < NEAR_AHEAD_M)
         if near.any() or (link >= 0 and not inside and shown[link] not in GREEN):
             return True
-        return link >= 0 and self._gives_way(others, link)
+        return link >= 0 and self.gives_way(others, link)
 
-    def _gives_way(self, others: NDArray[np.void], link: int) -> bool:
-        """Whether there is no room behind a link, or one comes that goes first."""
+    def gives_way(self, others: NDArray[np.void], link: int) -> bool:
+        """Return whether there is no room behind a link, or a vehicle with priority approaches."""
         network = self._vec.network
         lanes, target = network.lanes, network.links[link]
         if ((others["lane"] == target["to_lane"]) & (others["s"] < NEAR_AHEAD_M)).any():
             return True
         conflicts = network.conflicts[target["first_conflict"] :][: target["num_conflicts"]]
-        crosses = np.isin(lanes["link"][others["lane"]], conflicts["foe"])  # outside they have none
+        crosses = np.isin(lanes["link"][others["lane"]], conflicts["foe"])  # only inside junctions
         into = network.links["to_lane"][conflicts["foe"]]
         crosses |= np.isin(others["lane"], into) & (others["s"] < 0.5 * others["length"])
         first = network.links["from_lane"][conflicts["foe"][conflicts["must_yield"]]]

@@ -125,8 +125,8 @@ def demanding(write: Write, body: str, **more: str) -> CavEnv:
 @pytest.mark.parametrize(
     ("body", "error", "words"),
     [
-        (LOST, DemandError, ("lost", "another map")),
-        (LOST.replace("A0B0 lost", "a b c"), DemandError, ("3 edges", "another map")),
+        (LOST, DemandError, ("lost", "made for this map")),
+        (LOST.replace("A0B0 lost", "a b c"), DemandError, ("3 edges", "made for this map")),
         (
             '<vehicle id="v" depart="0"><route edges="A0B0 A1B1"/></vehicle>',
             RouteError,

@@ -94,8 +94,7 @@ CASES = {
     "grid of actions": Case("merge", {"action.kind": "grid"}),
     "team's rewards": Case("merge", {"terms.team_share": 0.4, "population.agents": 12}),
     "rewards of those near": Case(
-        "merge",
-        {"terms.team_share": 0.4, "terms.team_range_m": 40.0, "population.agents": 12},
+        "merge", {"terms.team_share": 0.4, "terms.team_range_m": 40.0, "population.agents": 12}
     ),
     "stacked frames": Case("grid4x4", {"sensors.stack": 4}, worlds=2),
     "all sensors": Case("grid4x4", SENSORS, steps=30),

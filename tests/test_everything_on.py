@@ -13,14 +13,16 @@ from cavmarl.sensors.registry import TYPES
 from cavmarl.verify.equivalence import verify_zones
 
 ABOVE: dict[str, Any] = {"z_m": 1.4, "yaw_deg": 30.0}
+TILTED: dict[str, Any] = {"x_m": -1.0, "y_m": 0.4, **ABOVE, "pitch_deg": -8.0, "roll_deg": 5.0}
 CAMERA: dict[str, Any] = {"rate_hz": 5, "width": 24, "height": 16, **ABOVE}
 RIG: dict[str, Any] = {
     "lidar": {"type": "lidar", "rate_hz": 5, "rays": 48, "noise": [0.02], "dropout": 0.1, **ABOVE},
-    "radar": {"type": "radar", "rate_hz": 5, "noise": [0.1], **ABOVE},
+    "layers": {"type": "lidar", "rate_hz": 2.5, "rays": 90, "layers": 8, **TILTED},
+    "radar": {"type": "radar", "rate_hz": 5, "noise": [0.2, 0.01, 0.1], "bias": [0.1], **ABOVE},
     "depth": {"type": "depth_camera", "noise": [0.05], **CAMERA},
-    "semantic": {"type": "semantic_camera", **CAMERA},
+    "semantic": {"type": "semantic_camera", **CAMERA, **TILTED},
     "rgb": {"type": "rgb_camera", **CAMERA},
-    "bev": {"type": "bev_grid", "rate_hz": 5},
+    "bev": {"type": "bev_grid", "rate_hz": 5, "cell_m": 1.0, "yaw_deg": 30.0},
     "gnss": {"type": "gnss", "rate_hz": 5, "noise": [1.0], "bias": [2.0]},
     "imu": {"type": "imu", "rate_hz": 50, "noise": [0.01], **ABOVE},
     "wheels": {"type": "odometry", "rate_hz": 2.5, "phase_ticks": 1},
@@ -42,11 +44,7 @@ EVERYTHING: dict[str, Any] = {
     "observation.mode": "sensors",
     "observation.kind": "dict",
 }
-CROWD = {
-    "population.mode": "respawn",
-    "population.agents": 4,
-    "population.background": 80,
-}
+CROWD = {"population.mode": "respawn", "population.agents": 4, "population.background": 80}
 
 
 def test_every_type_of_sensor_is_on() -> None:

@@ -8,39 +8,17 @@ import sys
 import types
 from pathlib import Path
 
-import gymnasium
-import pettingzoo
 import pytest
 
 import cavmarl
-from cavmarl.config import registry
 
 ROOT = Path(__file__).resolve().parents[1]
 
 LATE = (
-    "numba",
-    "torch",
-    "stable_baselines3",
-    "highway_env",
-    "libsumo",
-    "sumolib",
-    "sumo",
-    "pydantic",
-    "pygame",
-    "imageio",
-    "matplotlib",
-    "jinja2",
-    "typer",
-    "rich",
-    "fastapi",
-    "ray",
-    "psutil",
-    "torchrl",
-    "tensordict",
-    "benchmarl",
-    "pyarrow",
-    "mcap",
-)
+    "numba", "torch", "stable_baselines3", "highway_env", "libsumo", "sumolib", "sumo", "pydantic",
+    "pygame", "imageio", "matplotlib", "jinja2", "typer", "rich", "fastapi", "ray", "psutil",
+    "torchrl", "tensordict", "benchmarl", "pyarrow", "mcap",
+)  # fmt: skip
 
 PROBE = """
 import json, sys, time
@@ -121,32 +99,3 @@ def test_every_public_error_is_one_of_ours() -> None:
     ]
     assert len(errors) > 10
     assert all(issubclass(error, cavmarl.CavmarlError) for error in errors)
-
-
-def test_every_entry_has_its_ids() -> None:
-    names = list(registry.entries())
-    for name in names:
-        version = registry.load_config(name)[0].version
-        assert f"cavmarl/{name}-v{version}" in gymnasium.registry
-        assert f"cavmarl/{name}Agents-v{version}" in gymnasium.registry
-    ours = {spec for spec in gymnasium.registry if spec.startswith("cavmarl/")}
-    assert len(ours) == 4 * len(names), "and each with meta-actions"
-
-
-def test_the_ids_make_environments() -> None:
-    ego = gymnasium.make("cavmarl/ring-v5")
-    observation, _ = ego.reset(seed=0)
-    assert ego.observation_space.contains(observation)
-    assert ego.step(ego.action_space.sample())[0].shape == observation.shape
-    rows = gymnasium.make_vec("cavmarl/ringAgents-v5")
-    observations, _ = rows.reset(seed=0)
-    assert observations.shape == rows.observation_space.shape
-    ego.close()
-    rows.close()
-
-
-@pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="needs PettingZoo 1.27")
-def test_pettingzoo_makes_them_by_id() -> None:
-    env = pettingzoo.make("parallel", "cavmarl/ring-v5")
-    observations, _ = env.reset(seed=0)
-    assert list(observations) == env.unwrapped.possible_agents

@@ -1,18 +1,18 @@
-"""Training repeated with other seeds, and the drivers that came of it beside scripted ones.
+"""Training repeated with several seeds, and the resulting drivers compared with scripted ones.
 
     python train/five_seeds.py --config configs/train/merge.yaml
     python train/five_seeds.py --config configs/train/tasks.yaml --env intersection exit --seeds 0 1
 
-Trains with each seed (`ppo.py`, one core each), lets all drivers and the scripted ones
-drive the same episodes, which no training has seen, and writes into the folder: `table.md`,
-`result.json`, `curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with
-its own manifest. A seed that is trained already is not trained again, and one that was cut short
-goes on from its checkpoint. Trainings end with this program, however it ends.
+The program trains with each seed (`ppo.py`, one core each) and evaluates all drivers and the
+scripted ones on the same held-out episodes. It writes into the folder: `table.md`, `result.json`,
+`curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with its own
+manifest. Finished seeds are not trained again; interrupted ones resume from their checkpoints.
+Trainings end with this program, however it ends.
 
-Of the trained drivers the interval is that of the mean over training seeds; of a scripted one, that
-of the mean over evaluation runs; both 95 %, by Student's t, and of shares within 0 and 100 %.
-`alone` is `idm` without any other vehicle: the ceiling, as long as what is missing to it is not the
-driver's fault.
+The interval of the trained drivers is that of the mean over training seeds; the interval of a
+scripted driver is that of the mean over evaluation runs. Both are 95 % by Student's t, clipped to 0
+and 100 % for shares. `alone` is `idm` without any other vehicle: an upper bound, as long as other
+causes of failure are not the driver's fault.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from cavmarl.learning.options import run_to_end
 from cavmarl.policies.loading import driver_keys
 
 PROGRAM = Path(__file__).with_name("ppo.py")
-GOES_ON = "the same command goes on from the last checkpoints"
+GOES_ON = "the same command resumes from the last checkpoints"
 SCRIPTED = ("idm", "random_actions")
 ALONE = "alone"
 METRICS = {
@@ -52,7 +52,7 @@ METRICS = {
     "off_road": "off road, %",
     "red_light": "red light, %",
     "episode_return": "episode return",
-    "delay_s": "delay of an arrival, s",
+    "delay_s": "delay of arrivals, s",
 }
 JUDGED = ("success", "episode_return")
 PERCENT = frozenset(("success", "arrived", "collision", "off_road", "red_light"))
@@ -75,23 +75,31 @@ class Args:
 
 
 def parse_args(words: Sequence[str] | None = None) -> list[Args]:
-    """The settings that the command line asks for, of each environment."""
+    """Parse the command line into the settings for each environment."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, required=True, help="settings of ppo.py")
-    parser.add_argument("--env", nargs="+", help="one after the other; default: the config's")
-    parser.add_argument("--settings", default="", help="as of ppo.py; of the training alone")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of training")
-    parser.add_argument("--jobs", type=int, default=1, help="seeds that are trained side by side")
-    parser.add_argument("--episodes", type=int, default=64, help="of an evaluation run")
-    parser.add_argument("--repeats", type=int, default=5, help="evaluation runs")
-    parser.add_argument("--evaluation-seed", type=int, default=1000, help="of the first of them")
+    parser.add_argument("--env", nargs="+", help="environments [default: the config's]")
+    parser.add_argument(
+        "--settings", default="", help="settings as for ppo.py; used in training only"
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="training seeds"
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="number of seeds to train in parallel")
+    parser.add_argument("--episodes", type=int, default=64, help="episodes per evaluation run")
+    parser.add_argument("--repeats", type=int, default=5, help="number of evaluation runs")
+    parser.add_argument(
+        "--evaluation-seed", type=int, default=1000, help="seed of the first evaluation run"
+    )
     parser.add_argument("--out", type=Path, help="folder (default: runs/CONFIG_seeds)")
-    parser.add_argument("--others", nargs="*", default=[], help="more runs for the curves")
+    parser.add_argument("--others", nargs="*", default=[], help="additional runs to plot")
     given = vars(parser.parse_args(words))
     out = given["out"] or Path("runs") / f"{given['config'].stem}_seeds"
     envs = given["env"] or [env_of(given["config"])]
     if len(set(given["seeds"])) < 2 or given["repeats"] < 2 or given["jobs"] < 1:
-        raise ConfigError("--seeds and --repeats: an interval needs two; --jobs: at least 1")
+        raise ConfigError(
+            "--seeds and --repeats: must be at least 2 for an interval; --jobs: at least 1"
+        )
     return [
         Args(**given | {"env": env, "out": out if len(envs) == 1 else out / Path(env).stem})
         for env in envs
@@ -99,7 +107,7 @@ def parse_args(words: Sequence[str] | None = None) -> list[Args]:
 
 
 def env_of(config: Path) -> str:
-    """What the settings in a file train on."""
+    """Return the environment named in a file of settings."""
     settings = read_yaml(config)
     if not isinstance(settings, dict):
         raise ConfigError(f"{config}: must be a mapping of settings")
@@ -108,7 +116,7 @@ def env_of(config: Path) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """A metric of a driver: mean of its runs and the interval of that mean."""
+    """A metric of a driver: the mean of its runs, with an interval."""
 
     mean: float | None
     interval: Interval | None
@@ -116,7 +124,7 @@ class Row:
 
 
 def train(args: Args) -> dict[int, Path]:
-    """The folder of each seed's run: trained unless it is complete, gone on with if it is begun."""
+    """Train or resume each seed unless it is complete; return the folders of the runs by seed."""
     folders = {seed: args.out / f"seed_{seed}" for seed in args.seeds}
     missing = [seed for seed in args.seeds if not is_trained(folders[seed])]
     children = Children()
@@ -131,10 +139,10 @@ def train(args: Args) -> dict[int, Path]:
 
 
 def train_seed(args: Args, seed: int, children: Children) -> None:
-    """Train with a seed.
+    """Train with one seed.
 
     Raises:
-        ConfigError: it has failed.
+        ConfigError: the training has failed.
     """
     folder = args.out / f"seed_{seed}"
     if (folder / CHECKPOINT_FILE).exists():
@@ -150,9 +158,9 @@ def train_seed(args: Args, seed: int, children: Children) -> None:
 
 
 class Children:
-    """Processes that end with this one, however it ends, or when they are told to.
+    """Child processes that end with this process, or on request.
 
-    They are of sessions of their own: Ctrl-C is for this process.
+    They have their own sessions, so that Ctrl-C reaches only this process.
     """
 
     def __init__(self) -> None:
@@ -160,8 +168,8 @@ class Children:
         self._lock = Lock()
         self._are_to_end = False
 
-    def run(self, command: Sequence[str], said: str) -> int:
-        """Start one, say so and wait for it: how it has ended."""
+    def run(self, command: Sequence[str], announcement: str) -> int:
+        """Announce and run a child process; return its exit code."""
         with self._lock:
             if self._are_to_end:
                 return 0
@@ -169,14 +177,14 @@ class Children:
                 dying_with_parent(command), stdout=subprocess.DEVNULL, start_new_session=True
             )
             self._running.add(child)
-        print(f"{said}\n", end="", flush=True)  # one write: others say so at the same time
+        print(f"{announcement}\n", end="", flush=True)  # one write: threads print in parallel
         try:
             return child.wait()
         finally:
             self._running.discard(child)
 
     def end(self) -> None:
-        """End all, and start no others."""
+        """End all child processes, and start no more."""
         with self._lock:
             self._are_to_end = True
             for child in tuple(self._running):
@@ -184,14 +192,14 @@ class Children:
 
 
 def interval_of(means: NDArray[np.float64], are_shares: bool) -> Interval | None:
-    """Interval of the mean over training seeds; of shares (0 to 1) it stays within these."""
+    """Return the interval of the mean over training seeds; clipped to [0, 1] for shares."""
     return bounded_interval(means, 0.0) if are_shares else mean_interval(means)
 
 
 def summarise(
     report: EvaluationReport, alone: EvaluationReport, args: Args
 ) -> dict[str, dict[str, Row]]:
-    """Rows by driver and metric; the trained drivers are one. `alone` is a report of `idm`."""
+    """Return rows by driver and metric; trained drivers are merged. `alone`: a report of `idm`."""
     trained = [report[f"seed_{seed}"] for seed in args.seeds]
     found: dict[str, dict[str, Row]] = {"trained": {}}
     for metric in METRICS:
@@ -213,13 +221,13 @@ def summarise(
 
 
 def beats(rows: Mapping[str, Mapping[str, Row]], other: str, metric: str) -> bool:
-    """Whether the trained drivers' interval lies above another driver's."""
+    """Return whether the trained drivers' interval lies above that of another driver."""
     mine, theirs = rows["trained"][metric].interval, rows[other][metric].interval
     return mine is not None and theirs is not None and mine.low > theirs.high
 
 
 def table(rows: Mapping[str, Mapping[str, Row]], args: Args) -> str:
-    """The result as Markdown."""
+    """Format the result as Markdown."""
     count = len(args.seeds)
     lines = [
         f"`{args.env}`: {count} training seeds; {args.repeats} runs of {args.episodes} episodes.",
@@ -248,20 +256,20 @@ def _cell(row: Row, scale: float) -> str:
 
 
 def read_curve(folder: Path) -> dict[str, list[float]]:
-    """The columns of a run's progress.csv."""
+    """Read the columns of a run's progress.csv."""
     with (folder / "progress.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     return {name: [float(row[name]) for row in rows] for name in rows[0]}
 
 
 def draw_curves(path: Path, folders: Sequence[Path], others: Sequence[Path], title: str) -> None:
-    """Learning curves of all seeds, one line each, and of other runs."""
+    """Plot the learning curves of all seeds and of other runs."""
     require("matplotlib", "report")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 3.2), layout="constrained")
     axes = figure.subplots(1, 2)
-    shown = {"success": "trips that arrive", "trip_return": "return of a trip"}
+    shown = {"success": "share of trips that arrive", "trip_return": "return per trip"}
     for axis, (column, label) in zip(axes, shown.items(), strict=True):
         for k, folder in enumerate((*folders, *others)):
             curve = read_curve(folder)
@@ -277,7 +285,7 @@ def draw_curves(path: Path, folders: Sequence[Path], others: Sequence[Path], tit
 
 
 def compare(args: Args) -> str:
-    """Train on an environment, evaluate, write; returns the table."""
+    """Train on an environment, evaluate, and write the results; return the table."""
     args.out.mkdir(parents=True, exist_ok=True)
     folders = train(args)
     drivers = {folder.name: folder for folder in folders.values()}
@@ -300,7 +308,7 @@ def compare(args: Args) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train, evaluate, write; 0: done, 2: wrong use, 130: interrupted."""
+    """Train, evaluate and write; return 0: done, 2: wrong usage, 130: interrupted."""
 
     def run() -> None:
         for args in parse_args(words):

@@ -1,12 +1,12 @@
-"""BenchMARL's algorithms on the same worlds: IPPO, MAPPO, and what else it has.
+"""BenchMARL's algorithms on cavmarl's worlds: IPPO, MAPPO and others.
 
     python train/ippo_benchmarl.py --env merge --updates 300
     python train/ippo_benchmarl.py --env town --algorithm mappo
 
-BenchMARL's algorithm, model and experiment, on `cavmarl.adapters.benchmarl_task`. The run's folder
-holds its tables (`ippo_merge_mlp…/…/scalars/*.csv`), the policy's weights as `policy.pt`, and
-`manifest.json`, which says what it was trained with. BenchMARL's networks are its own: other
-programs of ours do not read them.
+The program uses BenchMARL's algorithm, model and experiment on `cavmarl.adapters.benchmarl_task`.
+The run's folder has its tables (`ippo_merge_mlp…/…/scalars/*.csv`), the policy's weights as
+`policy.pt`, and `manifest.json` with the conditions of the training. Other programs of cavmarl
+cannot read BenchMARL's networks.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ class Args:
     program: ClassVar[str] = "ippo_benchmarl.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
-    algorithm: Annotated[str, "as BenchMARL calls it"] = "ippo"
-    num_worlds: Annotated[int, "worlds that are stepped together"] = 32
+    algorithm: Annotated[str, "algorithm, by BenchMARL's name"] = "ippo"
+    num_worlds: Annotated[int, "number of parallel worlds"] = 32
     seed: Annotated[int, "root of all random numbers"] = 0
-    updates: Annotated[int, "how often to collect and to learn"] = 100
-    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    updates: Annotated[int, "number of updates"] = 100
+    num_steps: Annotated[int, "steps per world and update"] = 128
     epochs: Annotated[int, "passes over the steps of an update"] = 4
-    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
-    learning_rate: Annotated[float, "of Adam"] = 1e-3
-    gamma: Annotated[float, "discount a step"] = 0.99
+    minibatches: Annotated[int, "minibatches per pass"] = 8
+    learning_rate: Annotated[float, "learning rate of Adam"] = 1e-3
+    gamma: Annotated[float, "discount per step"] = 0.99
     hidden: Annotated[int, "width of the two hidden layers"] = 64
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_benchmarl_SEED"] = ""
@@ -65,12 +65,12 @@ class Args:
 
     @property
     def folder(self) -> Path:
-        """Where this run lies."""
+        """The folder of this run."""
         return run_folder(self.runs, self.name, self.env, "benchmarl", self.seed)
 
 
 def make_experiment(args: Args) -> Experiment:
-    """BenchMARL's experiment on our worlds."""
+    """Create BenchMARL's experiment on cavmarl's worlds."""
     config = ExperimentConfig.get_from_yaml()
     config.sampling_device = config.train_device = config.buffer_device = "cpu"
     config.gamma, config.lr = args.gamma, args.learning_rate
@@ -100,12 +100,12 @@ def make_experiment(args: Args) -> Experiment:
 
 
 def train(args: Args) -> Path:
-    """Run the experiment to its last update; returns its folder.
+    """Run the experiment to its last update; return its folder.
 
     Raises:
-        CavmarlError: settings or an environment that cannot work.
+        CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more cost small networks more than they bring
+    torch.set_num_threads(1)  # more threads slow small networks down
     args.folder.mkdir(parents=True, exist_ok=True)
     experiment = make_experiment(args)
     with RunFolder(args, experiment.test_env.base_env.vec.worlds.world) as folder:
@@ -116,7 +116,7 @@ def train(args: Args) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; 0: trained, 2: wrong use."""
+    """Train; return 0: trained, 2: wrong usage."""
     return run_program(lambda: train(parse_settings(Args, words, __doc__)), "run: {folder}")
 
 

@@ -1,12 +1,13 @@
-"""TorchRL's PPO on the same worlds: one network shared by all agents (IPPO).
+"""TorchRL's PPO on cavmarl's worlds, with one network shared by all agents (IPPO).
 
     python train/ippo_torchrl.py --env merge --minutes 8
 
-TorchRL's collector, advantages and clipped loss, on `cavmarl.adapters.torchrl_env`; the network is
-ours. The run's folder holds it as `model.safetensors` and `config.json`, which
-`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ppo.py`,
-`manifest.json`, which says what it was trained with, and `checkpoint.pt`. `--resume FOLDER` goes on
-from that, in new episodes: TorchRL's collector keeps the state of its worlds to itself.
+The program uses TorchRL's collector, advantages and clipped loss on `cavmarl.adapters.torchrl_env`,
+with cavmarl's network. The run's folder has the network as `model.safetensors` and `config.json`,
+which `cavmarl evaluate --policy FOLDER` reads, `progress.csv` with the columns of `ppo.py`,
+`manifest.json` with the conditions of the training, and `checkpoint.pt`. `--resume FOLDER`
+continues from the checkpoint in new episodes, because TorchRL's collector does not expose the state
+of its worlds.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_pro
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.policies.network_files import NetworkConfig
 
-LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
+LEAST_DEVIATION = 0.02  # lower bound on an observation's scale, so that constants are not amplified
 OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (
     (GROUP, name) for name in ("observation", "mask", "action", "log_prob", "state_value")
 )
@@ -49,18 +50,18 @@ class Args:
     program: ClassVar[str] = "ippo_torchrl.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
-    num_worlds: Annotated[int, "worlds that are stepped together"] = 32
+    num_worlds: Annotated[int, "number of parallel worlds"] = 32
     seed: Annotated[int, "root of all random numbers"] = 0
     total_agent_steps: Annotated[int, "decisions to learn from"] = 4_000_000
-    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
-    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    minutes: Annotated[float, "stop after this time; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps per world and update"] = 128
     epochs: Annotated[int, "passes over the decisions of an update"] = 4
-    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
-    learning_rate: Annotated[float, "of Adam, falling to 0"] = 1e-3
-    gamma: Annotated[float, "discount a step"] = 0.99
-    gae_lambda: Annotated[float, "discount of the advantages' later terms"] = 0.95
+    minibatches: Annotated[int, "minibatches per pass"] = 8
+    learning_rate: Annotated[float, "learning rate of Adam, annealed to 0"] = 1e-3
+    gamma: Annotated[float, "discount per step"] = 0.99
+    gae_lambda: Annotated[float, "lambda of generalised advantage estimation"] = 0.95
     hidden: Annotated[int, "width of the two hidden layers"] = 64
-    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
+    initial_std: Annotated[float, "initial standard deviation of continuous actions"] = 0.3
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_torchrl_SEED"] = ""
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
@@ -72,16 +73,16 @@ class Args:
 
     @property
     def folder(self) -> Path:
-        """Where this run lies."""
+        """The folder of this run."""
         name = (self.name, self.env, "torchrl", self.seed)
         return run_folder(self.runs, *name, resume=self.resume)
 
 
 class Policy(nn.Module):
-    """The policy of a network as TorchRL's distributions take it: means and deviations, or logits.
+    """A network's policy in the form of TorchRL's distributions: means and deviations, or logits.
 
     Args:
-        network: whose policy it is.
+        network: the network.
     """
 
     def __init__(self, network: ActorCritic) -> None:
@@ -89,7 +90,7 @@ class Policy(nn.Module):
         self.network = network
 
     def forward(self, observations: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """Of observations (…, D)."""
+        """Compute the parameters for observations (…, D)."""
         output: Tensor = self.network(observations)
         if not self.network.continuous:
             return output
@@ -97,10 +98,10 @@ class Policy(nn.Module):
 
 
 class Value(nn.Module):
-    """The value function of a network, with TorchRL's last axis of 1.
+    """A network's value function, with TorchRL's last axis of size 1.
 
     Args:
-        network: whose value function it is.
+        network: the network.
     """
 
     def __init__(self, network: ActorCritic) -> None:
@@ -108,12 +109,12 @@ class Value(nn.Module):
         self.network = network
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Of observations (…, D)."""
+        """Compute the values of observations (…, D)."""
         return self.network.value(observations).unsqueeze(-1)
 
 
 def make_actor(network: ActorCritic) -> ProbabilisticActor:
-    """The policy that all agents of a batch of worlds share."""
+    """Create the policy that all agents of a batch of worlds share."""
     names = ("loc", "scale") if network.continuous else ("logits",)
     numbers = {name: (GROUP, name) for name in names}
     return ProbabilisticActor(
@@ -129,18 +130,18 @@ def make_actor(network: ActorCritic) -> ProbabilisticActor:
 
 
 def rows_of(batch: TensorDict) -> TensorDict:
-    """The (W, T) steps of worlds as (W · A, T) steps of agents."""
+    """Convert the (W, T) steps of worlds to (W · A, T) steps of agents."""
     agents = batch[MASK].shape
     steps = TensorDict({GROUP: batch[GROUP], "next": {GROUP: batch["next", GROUP]}}, agents)
     return steps.transpose(1, 2).reshape(-1, agents[1])
 
 
 class Learner:
-    """Takes batches of steps and improves the network by them.
+    """Improves the network by batches of steps.
 
     Args:
-        network: shared by all agents.
-        args: of the run.
+        network: network shared by all agents.
+        args: settings of the run.
     """
 
     def __init__(self, network: ActorCritic, args: Args) -> None:
@@ -156,16 +157,16 @@ class Learner:
         self._optimizer = torch.optim.Adam(network.parameters(), eps=1e-5)
 
     def save(self) -> Parts:
-        """The network and its optimiser."""
+        """Return the states of the network and its optimiser."""
         return {"network": self._network.state_dict(), "optimizer": self._optimizer.state_dict()}
 
     def load(self, saved: Parts) -> None:
-        """Go on from what `save` gave."""
+        """Restore the state returned by `save`."""
         self._network.load_state_dict(saved["network"])
         self._optimizer.load_state_dict(saved["optimizer"])
 
     def update(self, batch: TensorDict, left: float) -> int:
-        """Learn from (W, T) steps; `left` is the share of the run to come. How many decisions."""
+        """Learn from (W, T) steps; return the number of decisions. `left`: remaining share."""
         rows = rows_of(batch)
         with torch.no_grad():
             self._advantages(rows)
@@ -187,10 +188,10 @@ class Learner:
 
 
 class Curve:
-    """Writes a line for every update. Trips that the horizon cut do not count.
+    """Writes a line per update. Trips cut by the horizon do not count.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
     """
 
     def __init__(self, folder: RunFolder) -> None:
@@ -201,11 +202,11 @@ class Curve:
         self.updates = folder.began.updates
 
     def save(self) -> Parts:
-        """The last trips; those under way are not gone on with."""
+        """Return the last trips; unfinished trips are not saved."""
         return {"ended": list(self._ended), "trips": self._trips}
 
     def load(self, saved: Parts) -> None:
-        """Go on from what `save` gave."""
+        """Restore the state returned by `save`."""
         self._ended.extend(saved["ended"])
         self._trips = saved["trips"]
 
@@ -228,7 +229,7 @@ class Curve:
 
 
 def make_worlds(args: Args) -> CavTorchRLEnv:
-    """The worlds to learn in; what a normal distribution gives beyond ±1 is clipped there."""
+    """Create the training worlds, which clip normally distributed actions to ±1."""
     worlds = CavTorchRLEnv(
         args.env,
         num_envs=args.num_worlds,
@@ -243,7 +244,7 @@ def make_worlds(args: Args) -> CavTorchRLEnv:
 
 
 def make_network(args: Args, worlds: CavTorchRLEnv) -> tuple[ActorCritic, NetworkConfig]:
-    """A network that scales observations as its own first steps show them."""
+    """Create a network that scales observations by statistics of its own first steps."""
     env = load_config(args.env)[0]
     config = NetworkConfig(
         environment=env.name,
@@ -263,12 +264,12 @@ def make_network(args: Args, worlds: CavTorchRLEnv) -> tuple[ActorCritic, Networ
 
 
 def train(args: Args) -> Path:
-    """Run PPO until its decisions or its minutes are used up; returns the folder of the run.
+    """Run PPO until the decisions or minutes are used up; return the folder of the run.
 
     Raises:
-        CavmarlError: settings or an environment that cannot work.
+        CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more cost small networks more than they bring
+    torch.set_num_threads(1)  # more threads slow small networks down
     torch.manual_seed(args.seed)
     worlds = make_worlds(args)
     network, config = make_network(args, worlds)
@@ -280,10 +281,10 @@ def train(args: Args) -> Path:
 
 
 def learn(args: Args, folder: RunFolder, worlds: CavTorchRLEnv, network: ActorCritic) -> int:
-    """Improve the network by steps of the worlds; how many decisions of the run there are."""
+    """Improve the network by steps of the worlds; return the run's number of decisions."""
     learner, curve = Learner(network, args), Curve(folder)
     decisions = folder.began.agent_steps
-    if folder.began.parts:  # the collector keeps its worlds to itself: they begin new episodes
+    if folder.began.parts:  # the collector's worlds cannot be restored: they begin new episodes
         worlds.set_seed(args.seed + curve.updates)
     frames = args.num_worlds * args.num_steps
     collector = Collector(worlds, learner.actor, frames_per_batch=frames, total_frames=-1)
@@ -309,7 +310,7 @@ def learn(args: Args, folder: RunFolder, worlds: CavTorchRLEnv, network: ActorCr
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; 0: trained, 2: wrong use."""
+    """Train; return 0: trained, 2: wrong usage."""
     return run_program(lambda: train(parse_run(Args, words, __doc__)))
 
 

@@ -1,12 +1,12 @@
-"""What messages are worth: drivers that learnt with and without them, on the blind junction.
+"""The value of messages: drivers that learnt with and without them, on the blind junction.
 
     python train/messages.py
 
-Trains both arms with each seed as `five_seeds.py` does, `on` with all messages and `off` with none
-(`v2x.channel.loss=1`: observations keep their shape), and lets them drive the same episodes, `on`
-with more and more loss. Writes into the folder: `table.md`, `result.json`, `loss.svg` and the runs.
-All intervals are 95 %, by Student's t over the training seeds, of shares within 0 and 100 %; the
-arms are paired by seed.
+The program trains two arms with each seed, as `five_seeds.py` does: `on` with all messages and
+`off` with none (`v2x.channel.loss=1`, so that observations keep their shape). Both drive the same
+episodes, `on` also with increasing loss. The folder gets `table.md`, `result.json`, `loss.svg` and
+the runs. All intervals are 95 % by Student's t over the training seeds, clipped to 0 and 100 % for
+shares; the arms are paired by seed.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 METRICS = {
     "collision": ("collision, % of trips", 100.0),
     "success": ("success, % of trips", 100.0),
-    "delay_s": ("delay of an arrival, s", 1.0),
+    "delay_s": ("delay of arrivals, s", 1.0),
 }
 Figures = Mapping[str, NDArray[np.float64]]  # by metric, (seeds,)
 
 
 def drive(args: Args, folders: Mapping[int, Path], loss: float, out: Path) -> Figures:
-    """What the drivers of an arm reach where so many messages are lost."""
+    """Return the results of an arm's drivers with a given loss of messages."""
     drivers = {folder.name: folder for folder in folders.values()}
     report = evaluate(
         args.env,
@@ -55,7 +55,7 @@ def drive(args: Args, folders: Mapping[int, Path], loss: float, out: Path) -> Fi
 
 
 def row(values: NDArray[np.float64], percent: bool = False) -> Row:
-    """Mean and interval of one value a seed (S,); `percent`: these are shares, from 0 to 100."""
+    """Return mean and interval of one value per seed (S,); `percent`: shares from 0 to 100."""
     found = interval_of(values / 100.0 if percent else values, percent)
     if found and percent:
         found = Interval(100.0 * found.low, 100.0 * found.high)
@@ -63,9 +63,9 @@ def row(values: NDArray[np.float64], percent: bool = False) -> Row:
 
 
 def table(arms: Mapping[str, Figures], args: Args) -> str:
-    """The result as Markdown."""
+    """Format the result as Markdown."""
     lines = [
-        f"`{args.env}`: {len(args.seeds)} training seeds an arm; {args.repeats} runs of "
+        f"`{args.env}`: {len(args.seeds)} training seeds per arm; {args.repeats} runs of "
         f"{args.episodes} episodes.",
         "",
         "| | " + " | ".join(title for title, _ in METRICS.values()) + " |",
@@ -80,7 +80,7 @@ def table(arms: Mapping[str, Figures], args: Args) -> str:
 
 
 def _cell(found: Row) -> str:
-    if found.mean is None or np.isnan(found.mean):  # without an arrival there is no delay
+    if found.mean is None or np.isnan(found.mean):  # there is no delay without an arrival
         return "-"
     interval = "" if found.interval is None else _ends(found.interval)
     return f"{found.mean:.2f}{interval}"
@@ -91,7 +91,7 @@ def _ends(interval: Interval) -> str:
 
 
 def draw(path: Path, curve: Mapping[float, Figures], off: Figures) -> None:
-    """Collisions and delay over loss: each seed, the mean, and the mean without messages."""
+    """Plot collisions and delay over loss: each seed, the mean, and the mean without messages."""
     require("matplotlib", "report")
     from matplotlib.figure import Figure
 
@@ -110,7 +110,7 @@ def draw(path: Path, curve: Mapping[float, Figures], off: Figures) -> None:
 
 
 def compare(args: Args) -> str:
-    """Train both arms, evaluate, write; returns the table."""
+    """Train both arms, evaluate, and write the results; return the table."""
     arms = {"on": 0.0, "off": 1.0}
     given = [args.settings] if args.settings else []
     folders = {
@@ -134,7 +134,7 @@ def compare(args: Args) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train, evaluate, write; 0: done, 2: wrong use, 130: interrupted."""
+    """Train, evaluate and write; return 0: done, 2: wrong usage, 130: interrupted."""
     given = list(sys.argv[1:] if words is None else words)
     if "--config" not in given:
         given += ["--config", str(Path(__file__).parents[1] / "configs/train/blind_junction.yaml")]

@@ -5,7 +5,7 @@
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
 From top to bottom: settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
-the update; `Run`, which takes turns (Schulman et al. 2017; de Witt et al. 2020;
+the update; `Run`, which alternates both (Schulman et al. 2017; de Witt et al. 2020;
 docs/guides/train.md).
 """
 
@@ -36,7 +36,7 @@ from cavmarl.learning.observation_norm import Scales
 from cavmarl.learning.opponents import Opponents
 from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.parallel.local_worlds import kept_elsewhere
+from cavmarl.parallel.worlds.local_worlds import kept_elsewhere
 from cavmarl.policies.loading import driver_keys, policy_files
 from cavmarl.policies.network_files import NetworkConfig
 
@@ -52,48 +52,48 @@ class Args:
     program: ClassVar[str] = "ppo.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
-    agents: Annotated[int, "agents a world; 0: as the environment says"] = 0
-    background: Annotated[int, "background vehicles a world; -1: as the environment says"] = -1
-    num_envs: Annotated[int, "worlds that are stepped together"] = 16
-    settings: Annotated[str, "other keys of the environment: KEY=VALUE, by commas"] = ""
-    zones: Annotated[int, "zones a world; 0: as the environment says"] = 0
-    backend: Annotated[str, "where the worlds run: local, processes:N, nodes:N, ray:N, …"] = ""
+    agents: Annotated[int, "agents per world; 0: the environment's"] = 0
+    background: Annotated[int, "background vehicles per world; -1: the environment's"] = -1
+    num_envs: Annotated[int, "number of parallel worlds"] = 16
+    settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
+    zones: Annotated[int, "zones per world; 0: the environment's"] = 0
+    backend: Annotated[str, "place of the worlds: local, processes:N, nodes:N, ray:N, …"] = ""
     workers: Annotated[int, "short form: N for --backend processes:N; 0: see --backend"] = 0
     seed: Annotated[int, "root of all random numbers"] = 0
     total_agent_steps: Annotated[int, "decisions to learn from"] = 4_000_000
-    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
-    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    minutes: Annotated[float, "stop after this time; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps per world and update"] = 128
     epochs: Annotated[int, "passes over the decisions of an update"] = 4
-    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
-    keep: Annotated[float, "share of the decisions learnt from, of the largest advantages"] = 1.0
-    learning_rate: Annotated[float, "of Adam, at the start"] = 1e-3
-    anneal: Annotated[bool, "let the learning rate fall to 0 at the end"] = True
-    gamma: Annotated[float, "discount a step"] = 0.99
-    gae_lambda: Annotated[float, "of generalised advantage estimation"] = 0.95
-    clip: Annotated[float, "how far the ratio of probabilities may leave 1"] = 0.2
-    entropy_weight: Annotated[float, "of the entropy in the loss"] = 0.0
-    value_weight: Annotated[float, "of the value loss"] = 0.5
-    imitate: Annotated[str, "driver that is imitated at first; empty: the built-in one"] = ""
-    imitation_weight: Annotated[float, "of the distance to that driver, at the start"] = 0.0
-    imitation_share: Annotated[float, "share of the run in which that weight falls to 0"] = 0.1
-    start: Annotated[str, "driver whose weights, form, sensors and actions it has at first"] = ""
-    end_at_red: Annotated[bool, "expect nothing after running a red light, as at a crash"] = False
-    opponents: Annotated[str, "drivers of some seats, not learnt from: names, by commas"] = ""
-    opponent_share: Annotated[float, "share of the seats that each opponent drives"] = 0.1
-    max_gradient_norm: Annotated[float, "longer gradients are shortened"] = 0.5
-    throttle_std: Annotated[float, "standard deviation of throttle at first; not --start's"] = 0.3
-    steering_std: Annotated[float, "standard deviation of steering at first; not --start's"] = 0.1
-    mappo: Annotated[bool, "the critic sees the state of the whole world"] = False
-    hidden: Annotated[int, "width of the two hidden layers; not --start's"] = 128
-    shared: Annotated[bool, "one body with LayerNorm for actor and critic; not --start's"] = False
-    residual: Annotated[bool, "it adds its actions to the built-in driver's; not --start's"] = False
-    threads: Annotated[int, "of torch"] = 1
-    device: Annotated[str, "where the network is: cpu, or cuda on a machine with a GPU"] = "cpu"
+    minibatches: Annotated[int, "minibatches per pass"] = 8
+    keep: Annotated[float, "share of decisions to learn from, by largest advantage"] = 1.0
+    learning_rate: Annotated[float, "initial learning rate of Adam"] = 1e-3
+    anneal: Annotated[bool, "anneal the learning rate to 0"] = True
+    gamma: Annotated[float, "discount per step"] = 0.99
+    gae_lambda: Annotated[float, "lambda of generalised advantage estimation"] = 0.95
+    clip: Annotated[float, "largest change of the probability ratio"] = 0.2
+    entropy_weight: Annotated[float, "weight of the entropy in the loss"] = 0.0
+    value_weight: Annotated[float, "weight of the value loss"] = 0.5
+    imitate: Annotated[str, "driver to imitate at first; empty: the built-in one"] = ""
+    imitation_weight: Annotated[float, "initial weight of the distance to that driver"] = 0.0
+    imitation_share: Annotated[float, "share of the run in which this weight falls to 0"] = 0.1
+    start: Annotated[str, "driver to start from: weights, form, sensors and actions"] = ""
+    end_at_red: Annotated[bool, "end returns at a red light, as at a crash"] = False
+    opponents: Annotated[str, "drivers of some seats, not learnt from; comma-separated"] = ""
+    opponent_share: Annotated[float, "share of the seats of each opponent"] = 0.1
+    max_gradient_norm: Annotated[float, "largest norm of a gradient; longer ones are clipped"] = 0.5
+    throttle_std: Annotated[float, "initial standard deviation of throttle; without --start"] = 0.3
+    steering_std: Annotated[float, "initial standard deviation of steering; without --start"] = 0.1
+    mappo: Annotated[bool, "let the critic see the state of the whole world"] = False
+    hidden: Annotated[int, "width of the two hidden layers; without --start"] = 128
+    shared: Annotated[bool, "one body with LayerNorm for both heads; without --start"] = False
+    residual: Annotated[bool, "add actions to the built-in driver's; without --start"] = False
+    threads: Annotated[int, "threads of torch"] = 1
+    device: Annotated[str, "device of the network: cpu, or cuda with a GPU"] = "cpu"
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_ALGORITHM_SEED"] = ""
     resume: Annotated[str, options.RESUME] = ""
-    tensorboard: Annotated[bool, "write TensorBoard's files"] = False
+    tensorboard: Annotated[bool, "write files for TensorBoard"] = False
 
     def __post_init__(self) -> None:
         ones = "num_envs total_agent_steps num_steps epochs minibatches hidden threads"
@@ -105,9 +105,9 @@ class Args:
         options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
         options.check_device(self.device)
         if self.residual and self.imitation_weight:
-            raise ConfigError("--residual: not with --imitation-weight; it begins as that driver")
+            raise ConfigError("--residual: not with --imitation-weight; it starts as that driver")
         if self.shared and self.mappo:
-            raise ConfigError("--shared: not with --mappo, whose critic sees more than actors do")
+            raise ConfigError("--shared: not with --mappo, whose critic has other inputs")
 
     @property
     def folder(self) -> Path:
@@ -117,23 +117,23 @@ class Args:
 
 @dataclass
 class Batch:
-    """What one round of steps brought; T steps, W worlds, A agents."""
+    """The data of one collection; T steps, W worlds, A agents."""
 
     observations: Tensor  # (T, W, A, D)
-    states: Tensor  # (T, W, S) of the worlds; S is 0 where the critic does not see them
+    states: Tensor  # (T, W, S) states of worlds; S is 0 if the critic does not see them
     actions: Tensor  # (T, W, A, …) as sampled
-    log_probs: Tensor  # (T, W, A) of them
+    log_probs: Tensor  # (T, W, A) of the actions
     values: Tensor  # (T, W, A)
     rewards: Tensor  # (T, W, A)
-    acted: Tensor  # (T, W, A) which entries are decisions of the network
-    next_values: Tensor  # (T, W, A) what was to be expected after the step; 0 where a vehicle ended
-    goes_on: Tensor  # (T, W, A) whether entry t + 1 is of the same vehicle and episode
-    suggested: Tensor | None = None  # (T, W, A, …) the imitated driver's, while it is imitated
+    acted: Tensor  # (T, W, A) whether the entry is a decision of the network
+    next_values: Tensor  # (T, W, A) value after the step; 0 where a vehicle ended
+    goes_on: Tensor  # (T, W, A) whether entry t + 1 has the same vehicle and episode
+    suggested: Tensor | None = None  # (T, W, A, …) actions of the imitated driver, if any
 
     def advantages(self, gamma: float, gae_lambda: float) -> Tensor:
-        """(T, W, A) generalised advantage estimates (Schulman et al. 2016); 0 where no agent acted.
+        """Return (T, W, A) generalised advantages (Schulman et al. 2016); 0 where no agent acted.
 
-        The sums go along the way of one vehicle: they begin anew where `goes_on` is False.
+        The sums run along the trip of one vehicle and restart where `goes_on` is False.
         """
         deltas = self.rewards + gamma * self.next_values - self.values
         decay = gamma * gae_lambda * self.goes_on
@@ -146,10 +146,13 @@ class Batch:
 
 
 class Collector:
-    """Drives the worlds with a network and keeps what comes of it, with the time that it took.
+    """Drives the worlds with a network and stores the data, with the times.
 
-    If the critic sees their states, worlds begin anew in the next step: the last state of an
-    episode is gone when they do so in the same.
+    If the critic sees states, worlds restart in the next step: otherwise, the last state of an
+    episode would be overwritten.
+
+    Attributes:
+        opponents: drive some of the vehicles; nothing is learnt from these.
     """
 
     def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
@@ -157,17 +160,17 @@ class Collector:
         self.trips = Trips(vec.num_envs, vec.num_agents)
         self.times = PhaseTimes(PHASES)
         self._mask = vec.reset(seed=seed)[1]["mask"]
-        self._observations = torch.from_numpy(vec.worlds.arrays.observations)  # worlds write here
-        self._opponents = Opponents(args.opponents, vec, args.opponent_share, args.seed)
-        self._suggest = self._opponents.example(args.imitate)
+        self._observations = torch.from_numpy(vec.worlds.arrays.observations)  # shared
+        self.opponents = Opponents(args.opponents, vec, args.opponent_share, args.seed)
+        self._suggest = self.opponents.example(args.imitate)
 
     @torch.inference_mode()
     def collect(self, with_suggested: bool) -> Batch:
-        """Some steps of all worlds, on request with what the imitated driver would do."""
+        """Step all worlds; on request, also store the imitated driver's actions."""
         simulated_s = self.vec.simulated_s
         with self.times.rest("transfer"):
             batch = self._empty(with_suggested)
-            self._opponents.begin()
+            self.opponents.begin()
             for t in range(self._args.num_steps):
                 self._step(batch, t)
             self._expect(batch)
@@ -191,7 +194,7 @@ class Collector:
             )
 
     def _step(self, batch: Batch, t: int) -> None:
-        """Let the network decide, and write down what is entry `t` of a batch."""
+        """Let the network decide, and fill entry `t` of a batch."""
         if batch.suggested is not None:
             with self.times.of("simulation"):
                 batch.suggested[t] = self._suggest(self._observations, self._mask)
@@ -201,24 +204,24 @@ class Collector:
             actions, batch.log_probs[t] = self.network.draw(output)
             batch.values[t], batch.actions[t] = values, actions
             given = self.network.given(actions, batch.observations[t]).cpu().numpy()
-        self._opponents.act(self._observations.numpy(), self._mask, given)
+        self.opponents.act(self._observations.numpy(), self._mask, given)
         _, reward, ended, cut, infos = self.vec.step(given)
         if self._args.end_at_red:
             ended = ended | (infos["terms"][..., RED_LIGHT] > 0.0)
-        ours, self._mask = self._opponents.absent, infos["mask"]
+        ours, self._mask = self.opponents.absent, infos["mask"]
         acted = infos["acted"] & ours
         batch.rewards[t] = torch.from_numpy(reward)
         batch.acted[t] = torch.from_numpy(acted)
         batch.goes_on[t] = torch.from_numpy(acted & self._mask & ~ended & ~cut)
         if len((rows := (cut & ~ended).nonzero())[0]):
             last = torch.from_numpy(infos["final_observations"][rows]).to(self._device)
-            # What the built-in driver would have done there is not known: 0.
+            # The built-in driver's action in the last observation is unknown; use 0.
             last = nn.functional.pad(last, (0, len(self.network.mean) - last.shape[1]))
             batch.next_values[t][rows] = self.network.value(last, self._look()[rows[0]])
         self.trips.add(reward, infos["vehicle_done"] & ours, cut, infos["terms"])
 
     def _expect(self, batch: Batch) -> None:
-        """What was to be expected after each step of a vehicle that goes on."""
+        """Set the value after each step of a vehicle that continues."""
         seen = self._seen()
         with self.times.of("inference"):
             after = self._heads(seen.to(self._device), self._look())[1]
@@ -226,7 +229,7 @@ class Collector:
         batch.next_values = torch.where(batch.goes_on, following, batch.next_values)
 
     def _seen(self) -> Tensor:
-        """(W, A, D) what is observed now; `residual`: with the action of the built-in driver."""
+        """Return (W, A, D) observations; if `residual`, with the built-in driver's action."""
         if not self.network.residual:
             return self._observations
         with self.times.of("simulation"):
@@ -234,18 +237,18 @@ class Collector:
         return torch.cat([self._observations, proposed], dim=-1)
 
     def _heads(self, observations: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
-        """What the network says of all seats, (W, A, …) and (W, A)."""
+        """Return the network's outputs for all seats, (W, A, …) and (W, A)."""
         each = states[:, None].expand(*observations.shape[:2], states.shape[1])
         return self.network.heads(self.network.normal(observations), each)
 
     def _look(self) -> Tensor:
-        """States (W, S) of the worlds; S is 0 where the critic does not see them."""
+        """Return the states (W, S) of the worlds; S is 0 if the critic does not see them."""
         if not self.network.state_size:
             return torch.zeros((self.vec.num_envs, 0), device=self._device)
         return torch.from_numpy(self.vec.state()).to(self._device)
 
     def save(self) -> Parts:
-        """Where worlds and trips stand."""
+        """Return the state of worlds and trips."""
         kept: Parts = {"trips": self.trips.save()}
         if not kept_elsewhere(self.vec.config):
             kept["worlds"] = tensor_of(self.vec.save_state())
@@ -253,7 +256,7 @@ class Collector:
         return kept
 
     def load(self, saved: Parts) -> None:
-        """Go on from what `save` gave; worlds that it could not save have begun new episodes."""
+        """Restore the state returned by `save`; worlds without a saved state begin new episodes."""
         self.trips.load(saved["trips"])
         if "worlds" in saved:
             self.vec.load_state(bytes_of(saved["worlds"]))
@@ -269,12 +272,12 @@ class Learner:
         self.scales = Scales(network)
 
     def imitation_weight(self, left: float) -> float:
-        """How much the imitated driver's example counts with `left` of the run to go."""
+        """Return the imitation weight with a share `left` of the run remaining."""
         args = self._args
         return args.imitation_weight * max(1.0 - (1.0 - left) / args.imitation_share, 0.0)
 
     def update(self, batch: Batch, left: float) -> dict[str, float]:
-        """Learn from the decisions of a batch; `left` is the share of the run that is left."""
+        """Learn from the decisions of a batch; `left` is the remaining share of the run."""
         args, network = self._args, self.network
         share = left if args.anneal else 1.0
         for group in self.optimizer.param_groups:
@@ -290,7 +293,7 @@ class Learner:
         for _ in range(args.epochs):
             order = chosen[torch.randperm(len(chosen), device=chosen.device)]
             for rows in order.tensor_split(args.minibatches):
-                if rows.numel() < 2:  # one decision has no advantage over others
+                if rows.numel() < 2:  # the advantage of a single decision is undefined
                     continue
                 states = batch.states.flatten(0, 1)
                 seen = network.normal(of(batch.observations, rows))
@@ -323,7 +326,7 @@ class Learner:
         return dict(zip(NUMBERS, means.tolist(), strict=True))
 
     def _filtered(self, advantages: Tensor, acted: Tensor, all_of_them: bool) -> Tensor:
-        """Rows to learn from: small advantages teach little (Cusumano-Towner et al. 2025)."""
+        """Return the rows to learn from, by large advantages (Cusumano-Towner et al. 2025)."""
         if all_of_them or self._args.keep == 1.0:
             return acted
         size = advantages[acted].abs()
@@ -341,7 +344,7 @@ class Learner:
 
 
 class Run:
-    """A run of PPO: where it stands and how it goes on."""
+    """A run of PPO: its state and its main loop."""
 
     def __init__(self, args: Args, vec: CavVectorEnv, folder: RunFolder) -> None:
         self.args, self.vec, self.folder = args, vec, folder
@@ -365,20 +368,20 @@ class Run:
             self.learner.scales.start(self.config, policy_files(args.start)[0].parent)
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
         if not folder.began.parts:
-            self.save()  # a run that is killed early begins from here
+            self.save()  # a run that is killed early restarts from here
         if parts := folder.resume():
             self.learner.load(parts["learner"])
             self.collector.load(parts["collector"])
 
     def done(self) -> float:
-        """The share of the run that is over, by decisions or by the clock."""
+        """The completed share of the run, by decisions or by time."""
         done = self.agent_steps / self.args.total_agent_steps
         if self.args.minutes:
             done = max(done, self.folder.seconds / (60.0 * self.args.minutes))
         return min(done, 1.0)
 
     def update(self) -> dict[str, float]:
-        """Collect, learn, and log the numbers, which are returned."""
+        """Collect, learn and log; return the logged numbers."""
         started, left, collector = time.perf_counter(), 1.0 - self.done(), self.collector
         collector.times.clear()
         batch = collector.collect(self.learner.imitation_weight(left) > 0.0)
@@ -399,7 +402,7 @@ class Run:
         return row
 
     def save(self) -> None:
-        """A checkpoint of what is now; and the driver."""
+        """Write a checkpoint and the driver."""
         parts = {"learner": self.learner.save(), "collector": self.collector.save()}
         self.folder.save(self.agent_steps, self.updates, parts)
         self.folder.save_driver(self.network, replace(self.config, agent_steps=self.agent_steps))
@@ -407,7 +410,7 @@ class Run:
 
 @contextmanager
 def opened(args: Args) -> Iterator[Run]:
-    """A run in its worlds and its folder, which are closed at the end."""
+    """Open a run with its worlds and its folder, and close them at the end."""
     args = options.with_form_of(args, args.start)
     own = driver_keys(args.start) if args.start else {}
     vec = make_vec(
@@ -430,7 +433,7 @@ def opened(args: Args) -> Iterator[Run]:
 
 
 def train(args: Args, console: Console) -> Path:
-    """Run PPO until its decisions or its minutes are used up; returns the folder of the run."""
+    """Run PPO until the decisions or minutes are used up; return the folder of the run."""
     with opened(args) as run, progress_bar(console) as bar:
         if run.vec.plans:
             console.print(run.vec.plan_text(), highlight=False)
@@ -445,7 +448,7 @@ def train(args: Args, console: Console) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; 0: trained, 2: wrong use."""
+    """Train; return 0: trained, 2: wrong usage."""
     return options.run_program(lambda: train(parse_run(Args, words, __doc__), Console()))
 
 

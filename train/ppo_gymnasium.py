@@ -1,12 +1,12 @@
-"""PPO in one loop on Gymnasium's vector form, in the manner of CleanRL.
+"""PPO in a single loop on Gymnasium's vector API, in the style of CleanRL.
 
     python train/ppo_gymnasium.py --env merge --minutes 8
 
-Every agent is a row of `gymnasium.make_vec`; rows begin anew in the next step, so that what follows
-a row's last step is its last observation. The run's folder holds the driver (`model.safetensors`
-and `config.json`, which `cavmarl evaluate --policy FOLDER` takes), `progress.csv` with the columns
-of `ppo.py`, `manifest.json`, which says what it was trained with, and `checkpoint.pt`, from
-which `--resume FOLDER` goes on bit for bit.
+Every agent is a row of `gymnasium.make_vec`; rows restart in the next step, so the observation
+after a row's last step is its final one. The run's folder has the driver (`model.safetensors` and
+`config.json`, which `cavmarl evaluate --policy FOLDER` reads), `progress.csv` with the columns of
+`ppo.py`, `manifest.json` with the conditions of the training, and `checkpoint.pt`, from which
+`--resume FOLDER` continues bit for bit.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ class Args:
     program: ClassVar[str] = "ppo_gymnasium.py"
 
     env: Annotated[str, "environment: the name of an entry"] = "merge"
-    num_envs: Annotated[int, "rows, so agents of all worlds"] = 512
-    num_worlds: Annotated[int, "worlds that they are in"] = 32
+    num_envs: Annotated[int, "number of rows: agents of all worlds"] = 512
+    num_worlds: Annotated[int, "number of parallel worlds"] = 32
     seed: Annotated[int, "root of all random numbers"] = 0
     total_agent_steps: Annotated[int, "decisions to learn from"] = 4_000_000
-    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
-    num_steps: Annotated[int, "steps of every row between two updates"] = 128
+    minutes: Annotated[float, "stop after this time; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps per row and update"] = 128
     epochs: Annotated[int, "passes over the decisions of an update"] = 4
-    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
-    learning_rate: Annotated[float, "of Adam, falling to 0"] = 1e-3
-    gamma: Annotated[float, "discount a step"] = 0.99
-    gae_lambda: Annotated[float, "discount of the advantages' later terms"] = 0.95
-    clip: Annotated[float, "how far a probability may move, as a share"] = 0.2
+    minibatches: Annotated[int, "minibatches per pass"] = 8
+    learning_rate: Annotated[float, "learning rate of Adam, annealed to 0"] = 1e-3
+    gamma: Annotated[float, "discount per step"] = 0.99
+    gae_lambda: Annotated[float, "lambda of generalised advantage estimation"] = 0.95
+    clip: Annotated[float, "largest change of the probability ratio"] = 0.2
     hidden: Annotated[int, "width of the two hidden layers"] = 64
-    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
+    initial_std: Annotated[float, "initial standard deviation of continuous actions"] = 0.3
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_gymnasium_SEED"] = ""
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
@@ -67,17 +67,17 @@ class Args:
 
     @property
     def folder(self) -> Path:
-        """Where this run lies."""
+        """The folder of this run."""
         name = (self.name, self.env, "gymnasium", self.seed)
         return run_folder(self.runs, *name, resume=self.resume)
 
 
 def make_rows(args: Args) -> Any:
-    """The rows, with their observations normalised and their trips recorded."""
+    """Create the rows, with wrappers that normalise observations and record trips."""
     begin = f"cavmarl/{args.env}Agents-v"
     name = next((known for known in gymnasium.registry if known.startswith(begin)), "")
     if not name:
-        raise ConfigError(f"--env {args.env}: no entry of that name; `cavmarl list` shows them")
+        raise ConfigError(f"--env {args.env}: unknown environment; `cavmarl list` shows all names")
     rows = gymnasium.make_vec(
         name,
         num_envs=args.num_envs,
@@ -91,13 +91,13 @@ class Learner:
     """Collects steps of all rows and improves the network by them.
 
     Args:
-        rows: what `make_rows` made.
-        network: shared by all rows.
-        args: of the run.
+        rows: rows from `make_rows`.
+        network: network shared by all rows.
+        args: settings of the run.
 
     Attributes:
-        trips: (return, arrived) of the last ones; those that the horizon cut do not count.
-        num_trips: how many there were.
+        trips: (return, arrived) of the last trips; trips cut by the horizon do not count.
+        num_trips: number of trips so far.
     """
 
     def __init__(self, rows: Any, network: ActorCritic, args: Args) -> None:
@@ -110,7 +110,7 @@ class Learner:
         self.num_trips = 0
 
     def save(self) -> Parts:
-        """All that later updates depend on, but for torch's random numbers."""
+        """Return the state that later updates depend on, except torch's random numbers."""
         seen = self._rows.obs_rms
         return {
             "network": self._network.state_dict(),
@@ -125,7 +125,7 @@ class Learner:
         }
 
     def load(self, saved: Parts) -> None:
-        """Go on from what `save` gave."""
+        """Restore the state returned by `save`."""
         self._network.load_state_dict(saved["network"])
         self._optimizer.load_state_dict(saved["optimizer"])
         self._observations, self._active = saved["observations"], saved["active"]
@@ -139,12 +139,12 @@ class Learner:
             array[:] = saved["recorded"][name].numpy()
 
     def _recorded(self) -> dict[str, NDArray[Any]]:
-        """What the wrapper that records trips has of those under way."""
+        """Return the trip recorder's data of unfinished trips."""
         names = ("episode_returns", "episode_lengths", "prev_dones")
         return {name: getattr(self._rows.env, name) for name in names}
 
     def update(self, left: float) -> int:
-        """Collect and learn; `left` is the share of the run to come. How many decisions."""
+        """Collect and learn; return the number of decisions. `left`: remaining share of the run."""
         with torch.inference_mode():
             steps = self._collect()
         active = steps.pop("active")
@@ -158,7 +158,7 @@ class Learner:
         return count
 
     def _collect(self) -> dict[str, Tensor]:
-        """Arrays (steps, rows, …), with the advantages and the returns to learn."""
+        """Return arrays (steps, rows, …), with advantages and returns."""
         kept: list[dict[str, Tensor]] = []
         for _ in range(self._args.num_steps):
             actions, log_probs = self._network.sample(self._observations)
@@ -172,7 +172,7 @@ class Learner:
                     "log_probs": log_probs,
                     "active": self._active,
                     "values": self._network.value(before),
-                    # The last observation of a row that ended, so also a cut trip's to go on from.
+                    # final observations are included, so that the value of a cut trip is known
                     "next_values": self._network.value(self._observations),
                     "rewards": torch.from_numpy(rewards.copy()),
                     "ended": torch.from_numpy(ended.copy()),
@@ -188,7 +188,7 @@ class Learner:
         return self._with_advantages(steps)
 
     def _with_advantages(self, steps: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Generalised advantage estimates (Schulman et al. 2016), from the last step backwards."""
+        """Add generalised advantages (Schulman et al. 2016), from the last step backwards."""
         after = steps["next_values"] * ~steps["ended"]
         surprises = steps["rewards"] + self._args.gamma * after - steps["values"]
         kept = self._args.gamma * self._args.gae_lambda * ~steps["over"]
@@ -214,19 +214,19 @@ class Learner:
 
 
 def save_driver(folder: RunFolder, network: ActorCritic, config: NetworkConfig, rows: Any) -> None:
-    """Save the network with the wrapper's normalisation, which it did not see, as its own."""
+    """Save the network, including the normalisation that the wrapper has applied."""
     network.mean.copy_(torch.from_numpy(rows.obs_rms.mean))
     network.deviation.copy_(torch.from_numpy(np.sqrt(rows.obs_rms.var + rows.epsilon)))
     folder.save_driver(network, config)
 
 
 def train(args: Args) -> Path:
-    """Run PPO until its decisions or its minutes are used up; returns the folder of the run.
+    """Run PPO until the decisions or minutes are used up; return the folder of the run.
 
     Raises:
-        CavmarlError: settings or an environment that cannot work.
+        CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more cost small networks more than they bring
+    torch.set_num_threads(1)  # more threads slow small networks down
     torch.manual_seed(args.seed)
     rows = make_rows(args)
     env = rows.unwrapped.vec.config
@@ -260,7 +260,7 @@ def train(args: Args) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; 0: trained, 2: wrong use."""
+    """Train; return 0: trained, 2: wrong usage."""
     return run_program(lambda: train(parse_run(Args, words, __doc__)))
 
 

@@ -1,11 +1,11 @@
-"""RLlib's PPO (its new API stack) on the same worlds, with one network shared by all agents.
+"""RLlib's PPO (new API stack) on cavmarl's worlds, with one network shared by all agents.
 
     python train/ppo_rllib.py --env merge --num-runners 2 --minutes 8
 
-RLlib's algorithm, env runners and learner, on `cavmarl.adapters.rllib_env`; the network is ours, as
-an `RLModule`. The run's folder holds it as `model.safetensors` and `config.json`, which
-`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ppo.py`, and
-`manifest.json`, which says what it was trained with.
+The program uses RLlib's algorithm, env runners and learner on `cavmarl.adapters.rllib_env`, with
+cavmarl's network as an `RLModule`. The run's folder has the network as `model.safetensors` and
+`config.json`, which `cavmarl evaluate --policy FOLDER` reads, `progress.csv` with the columns of
+`ppo.py`, and `manifest.json` with the conditions of the training.
 """
 
 from __future__ import annotations
@@ -50,18 +50,18 @@ class Args:
     program: ClassVar[str] = "ppo_rllib.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
-    num_runners: Annotated[int, "processes that step worlds; 0: this one does"] = 0
-    num_worlds: Annotated[int, "worlds of each runner"] = 4
+    num_runners: Annotated[int, "processes that step worlds; 0: this process"] = 0
+    num_worlds: Annotated[int, "worlds per runner"] = 4
     seed: Annotated[int, "root of all random numbers"] = 0
     total_agent_steps: Annotated[int, "decisions to learn from"] = 1_000_000
-    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
-    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    minutes: Annotated[float, "stop after this time; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps per world and update"] = 128
     epochs: Annotated[int, "passes over the decisions of an update"] = 4
-    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
-    learning_rate: Annotated[float, "of Adam"] = 5e-4
-    gamma: Annotated[float, "discount a step"] = 0.99
+    minibatches: Annotated[int, "minibatches per pass"] = 8
+    learning_rate: Annotated[float, "learning rate of Adam"] = 5e-4
+    gamma: Annotated[float, "discount per step"] = 0.99
     hidden: Annotated[int, "width of the two hidden layers"] = 64
-    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
+    initial_std: Annotated[float, "initial standard deviation of continuous actions"] = 0.3
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_rllib_SEED"] = ""
 
@@ -71,17 +71,17 @@ class Args:
 
     @property
     def folder(self) -> Path:
-        """Where this run lies."""
+        """The folder of this run."""
         return run_folder(self.runs, self.name, self.env, "rllib", self.seed)
 
 
 class Driver(TorchRLModule, ValueFunctionAPI):  # type: ignore[misc] # RLlib is not typed
-    """Our network, as RLlib's algorithms call it."""
+    """cavmarl's network as an RLlib module."""
 
     network: ActorCritic
 
     def setup(self) -> None:
-        """Make the network of `model_config`."""
+        """Create the network of `model_config`."""
         deviation = self.model_config["initial_std"]
         self.network = ActorCritic(self.model_config["network"], (deviation, deviation))
 
@@ -92,15 +92,15 @@ class Driver(TorchRLModule, ValueFunctionAPI):  # type: ignore[misc] # RLlib is 
         return {Columns.ACTION_DIST_INPUTS: output}
 
     def compute_values(self, batch: Mapping[str, Tensor], embeddings: Any = None) -> Tensor:
-        """Expected returns (N,)."""
+        """Return expected returns (N,)."""
         return self.network.value(batch[Columns.OBS])
 
 
 class Trips(RLlibCallback):  # type: ignore[misc] # RLlib is not typed
-    """Tells RLlib's metrics how trips end. Those that the horizon cut do not count."""
+    """Adds the results of trips to RLlib's metrics. Trips cut by the horizon do not count."""
 
     def on_episode_step(self, *, episode: Any, metrics_logger: Any, **_: Any) -> None:
-        """Add each agent's reward, and its trip if that has ended."""
+        """Add each agent's reward, and its trip if it has ended."""
         returns = episode.custom_data.setdefault("returns", defaultdict(float))
         infos = episode.get_infos(-1)
         for agent, reward in episode.get_rewards(-1).items():
@@ -113,7 +113,7 @@ class Trips(RLlibCallback):  # type: ignore[misc] # RLlib is not typed
 
 
 def make_algorithm(args: Args, network: NetworkConfig) -> PPO:
-    """RLlib's PPO on our worlds."""
+    """Create RLlib's PPO on cavmarl's worlds."""
     runners = max(args.num_runners, 1)
     world_steps = args.num_steps * args.num_worlds * runners
     decisions = world_steps * parallel_env(args.env).config.population.agents
@@ -143,7 +143,7 @@ def make_algorithm(args: Args, network: NetworkConfig) -> PPO:
             grad_clip=0.5,
             grad_clip_by="global_norm",
             train_batch_size_per_learner=world_steps,
-            # Of decisions, though the batch is counted in steps of worlds and bounds it.
+            # In decisions, although the batch is counted in world steps, which are the upper limit.
             minibatch_size=min(max(decisions // args.minibatches, 2), world_steps),
             num_epochs=args.epochs,
         )
@@ -155,12 +155,12 @@ def make_algorithm(args: Args, network: NetworkConfig) -> PPO:
 
 
 def train(args: Args) -> Path:
-    """Run PPO until its decisions or its minutes are used up; returns the folder of the run.
+    """Run PPO until the decisions or minutes are used up; return the folder of the run.
 
     Raises:
-        CavmarlError: settings or an environment that cannot work.
+        CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more cost small networks more than they bring
+    torch.set_num_threads(1)  # more threads slow small networks down
     world = parallel_env(args.env, overrides={"observation.kind": "flat"})
     env = world.config
     network = NetworkConfig(
@@ -195,7 +195,7 @@ def train(args: Args) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; 0: trained, 2: wrong use."""
+    """Train; return 0: trained, 2: wrong usage."""
     return run_program(lambda: train(parse_settings(Args, words, __doc__)))
 
 

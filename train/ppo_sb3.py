@@ -1,12 +1,12 @@
-"""PPO of stable-baselines3 on the same worlds: every agent seat is one of its environments.
+"""stable-baselines3's PPO on cavmarl's worlds: every agent seat is one of its environments.
 
     python train/ppo_sb3.py --env merge --minutes 8
 
-The library's own PPO, learning rate, batches and network; what is ours is the view of the worlds
-(`cavmarl.adapters.sb3_vec_env`). The run's folder holds stable-baselines3's `model.zip`,
-`progress.csv` with the columns of `ppo.py`, and the same network as `model.safetensors` and
-`config.json`, which `cavmarl evaluate --policy FOLDER` takes; `manifest.json` says what it was
-trained with. From `checkpoint.pt`, `--resume FOLDER` goes on bit for bit.
+The program uses the library's own PPO, learning rate, batches and network; only the adapter
+(`cavmarl.adapters.sb3_vec_env`) is cavmarl's. The run's folder has stable-baselines3's `model.zip`,
+`progress.csv` with the columns of `ppo.py`, the same network as `model.safetensors` and
+`config.json`, which `cavmarl evaluate --policy FOLDER` reads, and `manifest.json` with the
+conditions of the training. `--resume FOLDER` continues bit for bit from `checkpoint.pt`.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ class Args:
     program: ClassVar[str] = "ppo_sb3.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
-    num_worlds: Annotated[int, "worlds that are stepped together"] = 32
+    num_worlds: Annotated[int, "number of parallel worlds"] = 32
     seed: Annotated[int, "root of all random numbers"] = 0
-    total_agent_steps: Annotated[int, "decisions to learn from, waiting seats included"] = 4_000_000
-    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
-    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    total_agent_steps: Annotated[int, "decisions to learn from, with waiting seats"] = 4_000_000
+    minutes: Annotated[float, "stop after this time; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps per world and update"] = 128
     epochs: Annotated[int, "passes over the decisions of an update"] = 4
-    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
-    learning_rate: Annotated[float, "of Adam, falling to 0"] = 1e-3
-    gamma: Annotated[float, "discount a step"] = 0.99
+    minibatches: Annotated[int, "minibatches per pass"] = 8
+    learning_rate: Annotated[float, "learning rate of Adam, annealed to 0"] = 1e-3
+    gamma: Annotated[float, "discount per step"] = 0.99
     hidden: Annotated[int, "width of the two hidden layers"] = 64
-    initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
+    initial_std: Annotated[float, "initial standard deviation of continuous actions"] = 0.3
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_sb3_SEED"] = ""
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
@@ -66,15 +66,15 @@ class Args:
 
     @property
     def folder(self) -> Path:
-        """Where this run lies."""
+        """The folder of this run."""
         name = (self.name, self.env, "sb3", self.seed)
         return run_folder(self.runs, *name, resume=self.resume)
 
 
 class Curve(BaseCallback):
-    """Writes a line for every update, and checkpoints, and stops the run when its time is over.
+    """Writes a line per update and checkpoints; stops the run after its time.
 
-    Trips that the horizon cut count neither here nor in `ppo.py`.
+    Trips cut by the horizon do not count, as in `ppo.py`.
     """
 
     def __init__(self, folder: RunFolder, minutes: float) -> None:
@@ -86,7 +86,7 @@ class Curve(BaseCallback):
         self._updates = folder.began.updates
 
     def load(self, saved: Parts) -> None:
-        """Go on from a checkpoint."""
+        """Restore a checkpoint."""
         self._ended.extend(saved["ended"])
         self._decisions, self._trips = saved["decisions"], saved["trips"]
 
@@ -112,7 +112,7 @@ class Curve(BaseCallback):
                 self._ended.append((info["episode"]["r"], info["is_success"]))
                 self._trips += 1
         in_time = self._folder.has_time(self._minutes)
-        if not in_time:  # the library leaves here, before it has noted what it sees now
+        if not in_time:  # the library returns here, before it stores the present observation
             self.model._last_obs = self.locals["new_obs"]
             self.model._last_episode_starts = self.locals["dones"]
         return in_time
@@ -127,7 +127,7 @@ class Curve(BaseCallback):
 
 
 def state_of(model: Any) -> Parts:
-    """All that the library's next update depends on, but for random numbers."""
+    """Return the state that the next update depends on, except random numbers."""
     worlds, seen = model.env, model.env.obs_rms
     return {
         "parameters": model.get_parameters(),
@@ -142,7 +142,7 @@ def state_of(model: Any) -> Parts:
 
 
 def put_state(model: Any, saved: Parts) -> None:
-    """Let a new model go on from what `state_of` gave."""
+    """Restore the state returned by `state_of` in a new model."""
     worlds, seen = model.env, model.env.obs_rms
     model.set_parameters(saved["parameters"])
     model.num_timesteps = saved["timesteps"]
@@ -156,7 +156,7 @@ def put_state(model: Any, saved: Parts) -> None:
 
 
 def make_model(args: Args) -> tuple[PPO, VecNormalize]:
-    """The library's PPO on our rows."""
+    """Create the library's PPO on cavmarl's rows."""
     rows = CavSb3VecEnv(args.env, num_worlds=args.num_worlds)
     worlds = VecNormalize(VecMonitor(rows), norm_reward=False, clip_obs=MAX_DEVIATIONS)
     model = PPO(
@@ -178,7 +178,7 @@ def make_model(args: Args) -> tuple[PPO, VecNormalize]:
 
 
 def save_driver(args: Args, folder: RunFolder, model: PPO, worlds: VecNormalize) -> None:
-    """The library's network as one of ours, which is built alike: the seats' driver."""
+    """Save the library's network as the seats' driver, in cavmarl's equivalent form."""
     env = load_config(args.env)[0]
     config = NetworkConfig(
         environment=env.name,
@@ -211,12 +211,12 @@ def save_driver(args: Args, folder: RunFolder, model: PPO, worlds: VecNormalize)
 
 
 def train(args: Args) -> Path:
-    """Run PPO until its decisions or its minutes are used up; returns the folder of the run.
+    """Run PPO until the decisions or minutes are used up; return the folder of the run.
 
     Raises:
-        CavmarlError: settings or an environment that cannot work.
+        CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more cost small networks more than they bring
+    torch.set_num_threads(1)  # more threads slow small networks down
     model, worlds = make_model(args)
     stepped = worlds.get_attr("worlds")[0]
     with RunFolder(args, stepped.world, stepped.plans) as folder:
@@ -234,7 +234,7 @@ def train(args: Args) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; 0: trained, 2: wrong use."""
+    """Train; return 0: trained, 2: wrong usage."""
     return run_program(lambda: train(parse_run(Args, words, __doc__)))
 
 

@@ -1,4 +1,4 @@
-"""Which worker hosts which shard: load scores, costs of shards, plans.
+"""The assignment of shards to workers: load scores, costs of shards, plans.
 
-Pure arithmetic; `parallel` measures for it and carries its plans out.
+Pure arithmetic; `parallel` measures the inputs and carries out the plans.
 """

@@ -1,4 +1,4 @@
-"""Shards of all worlds to workers: a first plan, and what moves later."""
+"""Assigns the shards of all worlds to workers: the first plan, and later moves."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.balance.shard_placement import Placement, Workers
 
 
 def workers_of(problem: Problem) -> tuple[Workers, tuple[Rejection, ...]]:
-    """Those that answer, and why which ones are given nothing."""
+    """Return the workers that answer, and the reasons for which workers are excluded."""
     candidates: Sequence[Candidate] = problem.snapshot.workers
     rejections = find_rejections(candidates, problem.rule.load)
     answering = [candidate for candidate in candidates if candidate.available]
@@ -22,13 +22,12 @@ def workers_of(problem: Problem) -> tuple[Workers, tuple[Rejection, ...]]:
 
 
 def assign(problem: Problem) -> tuple[Placement, str]:
-    """Place all shards, or move some of those that have a worker; and say how in a few words.
+    """Place all shards, or move some of them; return the placement and a short description.
 
-    Shards without one (none yet, or theirs does not answer) go where they are done first. Shards
-    with one move only if the slowest worker takes longer than a perfect division by more than the
-    tolerance, at most `max_moves` of them, and only if that is worth it: it saves the tolerance's
-    share of a tick, and its price in time. A worker that is excluded keeps what it has until
-    balance takes it away.
+    Shards without a worker (none yet, or it does not answer) go where they finish first. Other
+    shards move, at most `max_moves` of them, only if the slowest worker exceeds a perfect division
+    by more than the tolerance. The gain must exceed both the tolerance's share of a tick and the
+    price of the moves in time. An excluded worker keeps its shards until balancing moves them.
 
     Raises:
         NoAdmissibleWorkerError: there are shards to be placed and all workers are excluded.
@@ -49,7 +48,7 @@ def assign(problem: Problem) -> tuple[Placement, str]:
 
 
 def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
-    """Of several ways the one that keeps most neighbours together and is about as fast as any."""
+    """Return the placement with the fewest separated neighbours that is about as fast as any."""
     shards = range(len(problem.shards))
     nowhere = Placement(problem, workers, [-1 for _ in shards])
     if problem.in_row:
@@ -97,5 +96,5 @@ def _rebalance(placement: Placement, method: str) -> tuple[Placement, str]:
 
 
 def _slack_s(placement: Placement) -> float:
-    """What a worker's tick may be longer than a perfect division's while neighbours are sorted."""
+    """Return by how much a tick may exceed a perfect division to keep neighbours together."""
     return 0.5 * placement.problem.rule.tolerance * placement.fair_s

@@ -1,4 +1,4 @@
-"""`Plan`: which worker hosts which shard, and its inputs."""
+"""`Plan`: an assignment of shards to workers, with its inputs."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ VERSION = 1
 
 
 class ShardMove(NamedTuple):
-    """A shard that changes its worker."""
+    """A shard that moves to another worker."""
 
     world: int
     zone: int
-    source: int  # where it was
-    target: int  # where it goes
+    source: int  # worker before the move
+    target: int  # worker after the move
 
 
 class WorkerLoad(NamedTuple):
-    """What a plan makes of a worker that answers."""
+    """The load of an answering worker under a plan."""
 
     worker: int
-    score: float  # its LoadScore before
-    shards: int  # how many it hosts
-    load_s: float  # what they cost, seconds a tick
-    tick_s: float  # how long it takes for them beside what others use of it
+    score: float  # LoadScore before
+    shards: int  # number of hosted shards
+    load_s: float  # cost of its shards, s per tick
+    tick_s: float  # duration of its tick beside other programs
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A placement, reproducible: `make_plan(plan.problem) == plan`."""
+    """A reproducible placement: `make_plan(plan.problem) == plan`."""
 
-    problem: Problem  # what it follows from
+    problem: Problem  # the input of the plan
     homes: tuple[int, ...]  # worker of each shard, in the order of `problem.shards`
-    method: str  # how it was found, in words
+    method: str  # description of how it was found
 
     def __post_init__(self) -> None:
         answering = {one.worker for one in self.problem.snapshot.workers if one.available}
         if len(self.homes) != len(self.problem.shards) or not answering.issuperset(self.homes):
             raise ConfigError(
-                f"homes {self.homes}: must be one a shard of {len(self.problem.shards)}, among "
-                f"the workers that answer, {sorted(answering)}"
+                f"homes {self.homes}: there must be one for each of {len(self.problem.shards)} "
+                f"shards, among the workers that answer, {sorted(answering)}"
             )
 
     @cached_property
@@ -58,7 +58,7 @@ class Plan:
 
     @cached_property
     def placement(self) -> Placement:
-        """The same for calculations; workers by their place."""
+        """The placement for calculations; workers are given by their index."""
         workers, _ = workers_of(self.problem)
         return Placement(
             self.problem, workers, [workers.numbers.index(home) for home in self.homes]
@@ -66,12 +66,12 @@ class Plan:
 
     @property
     def imbalance(self) -> float:
-        """The slowest worker's tick over that of a perfect division."""
+        """The slowest worker's tick divided by that of a perfect division."""
         return self.placement.imbalance
 
     @property
     def moves(self) -> tuple[ShardMove, ...]:
-        """Shards that have another worker than before; of a first plan none."""
+        """Shards that change their worker; empty for a first plan."""
         present = self.problem.present or self.homes
         return tuple(
             ShardMove(shard.world, shard.zone, before, after)
@@ -80,7 +80,7 @@ class Plan:
         )
 
     def workers(self) -> tuple[WorkerLoad, ...]:
-        """All workers that answer, by number."""
+        """Return the loads of all workers that answer, by number."""
         placement = self.placement
         known = placement.workers
         return tuple(
@@ -95,7 +95,7 @@ class Plan:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON and the manifest; what follows from the rest is in it, too."""
+        """Return plain values for JSON and the manifest, including derived values."""
         problem = self.problem
         return {
             "schema": SCHEMA,
@@ -120,7 +120,7 @@ class Plan:
 
 
 def make_plan(problem: Problem) -> Plan:
-    """Place shards; the same problem gives the same plan, on every machine.
+    """Place the shards; equal problems give equal plans on every machine.
 
     Raises:
         NoAdmissibleWorkerError: there are shards to be placed and all workers are excluded.
@@ -131,5 +131,5 @@ def make_plan(problem: Problem) -> Plan:
 
 
 def replan(plan: Plan, snapshot: LoadSnapshot) -> Plan:
-    """The plan that follows from another snapshot, or from the same one again."""
+    """Return the plan for another snapshot, or for the same one again."""
     return make_plan(replace(plan.problem, snapshot=snapshot))

@@ -1,4 +1,4 @@
-"""`Balancer`: the plan of a run, from the first one on, round by round."""
+"""`Balancer`: keeps the plan of a run and updates it round by round."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from cavmarl.core.errors import ConfigError
 
 
 class Balancer:
-    """Keeps the plan, and what is known of the shards' costs.
+    """Keeps the plan and the measured costs of the shards.
 
     Attributes:
-        plan: the present one; each is made again from its own problem.
+        plan: the present plan; reproducible from its own problem.
 
     Raises:
         NoAdmissibleWorkerError: all workers are excluded.
@@ -24,7 +24,7 @@ class Balancer:
 
     def __init__(
         self,
-        # shards, neighbours, workers and rule; `equal_costs` where nothing is measured yet
+        # shards, neighbours, workers and rule; `equal_costs` before anything is measured
         first: Problem,
     ) -> None:
         self.plan: Plan = make_plan(first)
@@ -33,29 +33,29 @@ class Balancer:
 
     @property
     def costs(self) -> tuple[ShardCost, ...]:
-        """What shards cost by all measurements up to now."""
+        """Costs of the shards, averaged over all measurements."""
         return self._costs
 
     def measure(self, measured: Iterable[ShardCost]) -> None:
-        """Take in what all shards have cost lately, in any order."""
+        """Add the latest costs of all shards, in any order."""
         rows = sorted(measured)
         names = [(shard.world, shard.zone) for shard in rows]
         if names != [(shard.world, shard.zone) for shard in self.plan.problem.shards]:
-            raise ConfigError(f"measured shards {names}: must be those of the plan, each once")
+            raise ConfigError(f"measured shards {names}: must be the shards of the plan, each once")
         self._costs = self._smooth.update(rows)
 
     def round(
         self,
-        snapshot: LoadSnapshot,  # of the workers that there are now
+        snapshot: LoadSnapshot,  # of the present workers
         *,
-        costs: tuple[ShardCost, ...] | None = None,  # to go by; default: the measured ones
+        costs: tuple[ShardCost, ...] | None = None,  # default: the measured costs
         rule: BalanceRule | None = None,  # default: that of the present plan
     ) -> Plan:
-        """Move what has to be moved, and a few shards more if that is worth it.
+        """Make the next plan: place lost shards, and move a few others if it is worth it.
 
         Raises:
             NoAdmissibleWorkerError: a worker is lost, and all others are excluded.
-            ConfigError: more workers than shards, or a cost that is none.
+            ConfigError: there are more workers than shards, or a cost is invalid.
         """
         before = self.plan
         self.plan = make_plan(

@@ -1,4 +1,4 @@
-"""Shards in a row: each worker hosts a piece of it, and the ends of pieces slide."""
+"""Placement of shards in a row: each worker hosts one piece, and the ends of pieces move."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from cavmarl.core.errors import NoAdmissibleWorkerError
 
 
 def divide_row(
-    placement: Placement,  # it is changed, and returned
+    placement: Placement,  # changed and returned
 ) -> Placement:
-    """Cut the row into one piece a worker, as long as its speed; one shard at least."""
+    """Cut the row into one piece per worker, sized by its speed, with at least one shard."""
     problem, workers = placement.problem, placement.workers
     if not workers.is_open.all():
         rejections = find_rejections(problem.snapshot.workers, problem.rule.load)
         raise NoAdmissibleWorkerError(
-            f"{'; '.join(map(str, rejections))}: in a row each worker hosts one shard at least; "
+            f"{'; '.join(map(str, rejections))}: in a row each worker hosts at least one shard; "
             "use fewer workers, or wait until they are less busy",
             rejections,
         )
     costs = [shard.cost_s for shard in problem.shards]
-    costs = costs if any(costs) else [1.0 for _ in costs]  # nothing costs anything: all as much
+    costs = costs if any(costs) else [1.0 for _ in costs]  # without costs, all are equal
     ends = np.array([0.0, *accumulate(costs)])
     shares = np.cumsum(workers.speeds) / workers.speeds.sum()
     first, count = 0, len(workers)
@@ -39,16 +39,16 @@ def divide_row(
 
 
 def slide(
-    placement: Placement,  # it is changed, and returned
+    placement: Placement,  # changed and returned
     *,
     until_s: float,  # a makespan that is good enough
     max_moves: int,  # of shards
 ) -> Placement:
-    """Let the slowest worker's piece become shorter, again and again.
+    """Shorten the piece of the slowest worker repeatedly.
 
-    It gives the shard at one of its ends to the worker beside it; that one may give one on to the
-    next, and so forth, until all of them take less long than the slowest took. Of these changes
-    the one after which they take least is made, of equal ones the one that moves fewer shards.
+    The slowest worker gives the shard at one of its ends to the adjacent worker. This worker may
+    pass one on to the next, and so on, until all are faster than the slowest was. The change with
+    the shortest makespan is made; on a tie, the one that moves fewer shards.
     """
     left = max_moves
     while left > 0 and placement.makespan_s > until_s:
@@ -73,12 +73,12 @@ def slide(
 
 
 def _towards(source: int, step: int, count: int) -> range:
-    """Workers that would give one on, from the source to the last but one in that direction."""
+    """Return the workers that may give a shard on in a direction, from `source` on."""
     return range(source, count - 1) if step > 0 else range(source, 0, -1)
 
 
 def _give(placement: Placement, homes: list[int], giver: int, step: int) -> bool:
-    """Give the shard at one end of a piece to the next worker; False: that cannot be."""
+    """Give the shard at one end of a piece to the next worker; return whether this is allowed."""
     taker = giver + step
     if homes.count(giver) < 2 or not placement.workers.is_open[taker]:
         return False

@@ -1,4 +1,4 @@
-"""Measured costs without their noise."""
+"""Smoothing of measured costs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class SmoothCosts:
 
     def __init__(
         self,
-        # weight of the newest measurement; the first one of a shard counts whole
+        # weight of the newest measurement; the first one of a shard counts fully
         newest: float = NEWEST,
     ) -> None:
         if not 0.0 < newest <= 1.0:
@@ -24,7 +24,7 @@ class SmoothCosts:
         self._mean_s: dict[tuple[int, int], float] = {}
 
     def update(self, measured: Iterable[ShardCost]) -> tuple[ShardCost, ...]:
-        """Take in one round of measurements; the means of its shards."""
+        """Add one round of measurements and return the means of its shards."""
         means = []
         for shard in measured:
             name = (shard.world, shard.zone)

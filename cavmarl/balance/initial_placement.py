@@ -7,19 +7,19 @@ from collections.abc import Iterable, Sequence
 
 from cavmarl.balance.shard_placement import Placement
 
-HALVINGS = 60  # of an interval: more than a float can tell
+HALVINGS = 60  # halvings of an interval, to beyond the precision of a float
 
 
 def spread(
-    placement: Placement,  # it is changed, and returned
-    groups: Iterable[Sequence[int]],  # of shards that stay together
+    placement: Placement,  # changed and returned
+    groups: Iterable[Sequence[int]],  # groups of shards that stay together
 ) -> Placement:
-    """Give each group, the costliest first, to the worker that would be through with it first.
+    """Give each group, the costliest first, to the worker that would finish it first.
 
-    LPT: at most 4/3 - 1/(3m) times the least makespan for m equal workers (Graham, SIAM J. Appl.
+    LPT: at most 4/3 - 1/(3m) times the minimum makespan for m equal workers (Graham, SIAM J. Appl.
     Math. 17, 1969), at most twice with different speeds (Gonzalez, Ibarra, Sahni, SIAM J. Comput.
-    6, 1977). Of equal workers the one with fewer shards wins, then the lower score, then the lower
-    number.
+    6, 1977). On a tie, the worker with fewer shards is chosen, then the lower score, then the
+    lower number.
     """
     workers, shards = placement.workers, placement.problem.shards
     loads = placement.loads_s().tolist()
@@ -41,14 +41,13 @@ def spread(
 
 
 def string(
-    placement: Placement,  # it is changed, and returned
+    placement: Placement,  # changed and returned
 ) -> Placement:
-    """Divide the row of all shards, by world and zone, into one piece a worker.
+    """Divide the row of all shards, by world and zone, into one piece per worker.
 
-    Zones of a bisection that follow each other are neighbours, so pieces hold together. Of all such
-    divisions it is one of the least makespan: the limit is halved in, and each worker takes as many
-    as it can within the limit (chains on chains; Pinar and Aykanat, J. Parallel Distrib. Comput.
-    64, 2004).
+    Consecutive zones of a bisection are neighbours, so pieces are connected. The division has the
+    minimum makespan: the limit is found by bisection, and each worker takes as many shards as fit
+    into the limit (chains on chains; Pinar and Aykanat, J. Parallel Distrib. Comput. 64, 2004).
     """
     low, high = 0.0, _longest_s(placement)
     homes = _within(placement, high)
@@ -64,14 +63,14 @@ def string(
 
 
 def _longest_s(placement: Placement) -> float:
-    """A limit within which the slowest worker alone could take all."""
+    """Return a limit within which the slowest worker alone could take all shards."""
     workers = placement.workers
     slowest = float(workers.speeds[workers.is_open].min())
     return 2.0 * math.fsum(shard.cost_s for shard in placement.problem.shards) / slowest
 
 
 def _within(placement: Placement, limit_s: float) -> list[int] | None:
-    """The pieces where no worker takes longer than the limit; None: they are not enough."""
+    """Return pieces whose workers all keep the limit; None if shards remain."""
     workers = placement.workers
     homes: list[int] = []
     able = iter([worker for worker, is_open in enumerate(workers.is_open) if is_open])

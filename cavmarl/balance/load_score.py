@@ -1,12 +1,12 @@
-"""LoadScore: ranks workers by load, and excludes overloaded ones.
+"""`LoadScore`: ranks workers by load, and excludes overloaded workers.
 
     LoadScore_i = 0.6 CPU_i + 0.2 RAM_i + 0.2 GPU_i       eq. (1)
     worker*     = arg min LoadScore_i over the admissible   eq. (2)
 
 after "Distributed CARLA architecture for multi-agent CAV simulation: design and preliminary
-multi-GPU evaluation", section 3.5. A worker that uses one resource above its threshold (CPU 0.85,
-RAM 0.90, GPU 0.95) is excluded before scoring, so that free resources cannot
-hide a critical one. All utilisations are shares from 0 to 1.
+multi-GPU evaluation", section 3.5. A worker that uses a resource above its threshold (CPU 0.85,
+RAM 0.90, GPU 0.95) is excluded before scoring, so that free resources cannot hide a critical one.
+All utilisations are shares from 0 to 1.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from typing import Literal, NamedTuple
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 RESOURCES = ("cpu", "ram", "gpu")
-WEIGHTS = (0.6, 0.2, 0.2)  # empirical in the paper; the processor carries nearly everything
+WEIGHTS = (0.6, 0.2, 0.2)  # empirical in the paper: the processor carries most of the load
 THRESHOLDS = (0.85, 0.90, 0.95)
 UNAVAILABLE = "unavailable"
-SUM_ERROR = 1e-9  # of weights that are decimal fractions
+SUM_ERROR = 1e-9  # tolerance for the sum of decimal weights
 
 Outcome = Literal[
     "lowest score",
@@ -34,22 +34,22 @@ Outcome = Literal[
 
 
 def _check_share(name: str, value: float) -> None:
-    if not 0.0 <= value <= 1.0:  # NaN is not, either
-        cure = f"; percent? use {value / 100.0:g}" if 1.0 < value <= 100.0 else ""
+    if not 0.0 <= value <= 1.0:  # NaN fails this check, too
+        cure = f"; if this is a percentage, use {value / 100.0:g}" if 1.0 < value <= 100.0 else ""
         raise ConfigError(f"{name} = {value}: must be a share from 0 to 1{cure}")
 
 
 @dataclass(frozen=True)
 class Utilisation:
-    """How much of each resource is in use, as shares of it.
+    """The used share of each resource.
 
     Raises:
-        ConfigError: a value outside of [0, 1], or none.
+        ConfigError: a value is outside [0, 1].
     """
 
-    cpu: float  # of the processors
-    ram: float  # of the memory
-    gpu: float = 0.0  # of the GPU; 0 where there is none
+    cpu: float  # share of the processors
+    ram: float  # share of the memory
+    gpu: float = 0.0  # share of the GPU; 0 without a GPU
 
     def __post_init__(self) -> None:
         for name in RESOURCES:
@@ -58,13 +58,13 @@ class Utilisation:
 
 @dataclass(frozen=True)
 class LoadRule:
-    """How workers are scored and which ones are excluded."""
+    """How workers are scored and excluded."""
 
-    # of CPU, RAM and GPU in the score; they add up to 1
+    # weights of CPU, RAM and GPU in the score; they add up to 1
     weights: tuple[float, float, float] = WEIGHTS
-    # a worker that uses more is excluded; one that uses as much is not
+    # a worker that uses more than a threshold is excluded; equality is allowed
     thresholds: tuple[float, float, float] = THRESHOLDS
-    # a preferred worker is kept while its score is at most this above the best one
+    # maximum excess of a preferred worker's score over the lowest score
     margin: float = 0.05
 
     def __post_init__(self) -> None:
@@ -78,15 +78,15 @@ class LoadRule:
             _check_share(f"threshold {name}", threshold)
         if load_score(Utilisation(*self.thresholds), self.weights) >= 1.0:
             raise ConfigError(
-                f"thresholds {self.thresholds}: a worker may be used up and still be admissible; "
-                "lower one that has a weight"
+                f"thresholds {self.thresholds}: a worker without free resources is admissible; "
+                "lower a threshold that has a weight"
             )
         if not (math.isfinite(self.margin) and self.margin >= 0.0):
-            raise ConfigError(f"margin = {self.margin}: must be a number from 0 up")
+            raise ConfigError(f"margin = {self.margin}: must be a number of at least 0")
 
 
 def load_score(use: Utilisation, weights: tuple[float, float, float] = WEIGHTS) -> float:
-    """Eq. (1): from 0, where all is free, to 1, where all is used."""
+    """Return eq. (1): from 0, if all is free, to 1, if all is used."""
     pairs = zip(weights, (use.cpu, use.ram, use.gpu), strict=True)
     return math.fsum(weight * share for weight, share in pairs)
 
@@ -99,19 +99,19 @@ class Candidate:
     """A worker that could be chosen."""
 
     worker: int
-    use: Utilisation  # what is used of its resources
-    # how many shards it has; of two with the same score the one with fewer is chosen
+    use: Utilisation  # used shares of its resources
+    # number of its shards; on equal scores, the worker with fewer is chosen
     hosted: int = 0
-    available: bool = True  # whether it answers, and what is known of it is recent
+    available: bool = True  # whether it answers and its data are recent
 
 
 class Rejection(NamedTuple):
-    """Why a worker is not asked."""
+    """The reason why a worker is excluded."""
 
     worker: int
     resource: str  # `cpu`, `ram`, `gpu` or `unavailable`
-    value: float | None  # the share in use; None: it is not available
-    threshold: float | None  # what the value is above; None: it is not available
+    value: float | None  # the used share; None: the worker is not available
+    threshold: float | None  # the threshold that is exceeded; None: the worker is not available
 
     def __str__(self) -> str:
         if self.value is None:
@@ -121,25 +121,25 @@ class Rejection(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """The worker that `select` chose and why."""
+    """The worker chosen by `select`, and the reason."""
 
     worker: int
-    preferred: int | None  # the one asked for, if any
-    outcome: Outcome  # why it is this one
-    scores: tuple[tuple[int, float], ...]  # (worker, LoadScore) of all admissible ones, by worker
-    # of the others, by worker; one for each resource that is too busy
+    preferred: int | None  # the requested worker, if any
+    outcome: Outcome  # the reason for the choice
+    scores: tuple[tuple[int, float], ...]  # (worker, LoadScore), admissible ones by worker
+    # of the excluded workers, by worker; one for each resource above its threshold
     rejections: tuple[Rejection, ...]
 
     @property
     def redirected(self) -> bool:
-        """Whether another one was asked for."""
+        """Whether another worker was requested."""
         return self.preferred not in (None, self.worker)
 
 
 def find_rejections(
     candidates: Iterable[Candidate], rule: LoadRule = DEFAULT_RULE
 ) -> tuple[Rejection, ...]:
-    """Why which workers are excluded, by worker; a value at its threshold is no reason."""
+    """Return why workers are excluded, by worker; a value at its threshold is allowed."""
     found: list[Rejection] = []
     for candidate in sorted(candidates, key=lambda one: one.worker):
         if not candidate.available:
@@ -155,17 +155,17 @@ def find_rejections(
 def admissible(
     candidates: Sequence[Candidate], rejections: Sequence[Rejection]
 ) -> tuple[Candidate, ...]:
-    """Those without a reason against them, by worker."""
+    """Return the workers without a rejection, by worker."""
     numbers = [candidate.worker for candidate in candidates]
     if len(set(numbers)) != len(numbers):
-        raise ConfigError(f"workers {sorted(numbers)}: one of them is named twice")
+        raise ConfigError(f"workers {sorted(numbers)}: each must be named once")
     out = {rejection.worker for rejection in rejections}
     left = [candidate for candidate in candidates if candidate.worker not in out]
     if not left:
-        said = "; ".join(map(str, rejections)) or "there are no workers"
+        reasons = "; ".join(map(str, rejections)) or "there are no workers"
         raise NoAdmissibleWorkerError(
-            f"no admissible worker: {said}. Wait until they are less busy, add workers, or raise "
-            "the thresholds",
+            f"no admissible worker: {reasons}. Wait until they are less busy, add workers, or "
+            "raise the thresholds",
             tuple(rejections),
         )
     return tuple(sorted(left, key=lambda one: one.worker))
@@ -173,21 +173,21 @@ def admissible(
 
 def select(
     candidates: Sequence[Candidate],  # all workers
-    # weights, thresholds, and how much worse a preferred worker may be
+    # weights, thresholds, and the margin of a preferred worker
     rule: LoadRule = DEFAULT_RULE,
-    preferred: int | None = None,  # a worker kept while it is admissible and within the margin
+    preferred: int | None = None,  # chosen if it is admissible and within the margin
 ) -> Selection:
-    """The admissible worker of the lowest score, or the preferred one if it is about as good.
+    """Return the admissible worker with the lowest score, or the preferred one if about as good.
 
-    Of equal scores the one that hosts fewer shards wins, then the lower number: the order of
-    `candidates` never counts.
+    On equal scores, the worker that hosts fewer shards is chosen, then the one with the lower
+    number. The order of `candidates` has no effect.
 
     Raises:
-        NoAdmissibleWorkerError: all are excluded; the error holds every reason.
+        NoAdmissibleWorkerError: all are excluded; the error contains all reasons.
     """
     known = {candidate.worker for candidate in candidates}
     if preferred is not None and preferred not in known:
-        raise ConfigError(f"preferred worker {preferred}: there are {sorted(known)}")
+        raise ConfigError(f"preferred worker {preferred}: must be one of {sorted(known)}")
     rejections = find_rejections(candidates, rule)
     left = admissible(candidates, rejections)
     scores = {candidate.worker: load_score(candidate.use, rule.weights) for candidate in left}

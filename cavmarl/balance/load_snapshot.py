@@ -1,7 +1,7 @@
-"""`LoadSnapshot`: each worker's resource use at one time.
+"""`LoadSnapshot`: the resource use of each worker at one time.
 
-A placement depends on live readings only through a snapshot: kept in a manifest, it gives the same
-plan again. `probe` takes one of this machine.
+A placement depends on live measurements only through a snapshot: a snapshot stored in a manifest
+gives the same plan again. `probe` takes a snapshot of this machine.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ class LoadSnapshot:
     """Utilisation of all workers."""
 
     workers: tuple[Candidate, ...]  # by number; at least one
-    gpu_source: str  # what told the use of GPUs; `none`: there is none, and it counts as 0
-    origin: str  # where the shares come from, in words: `measured`, `supposed idle`, `generated`
+    gpu_source: str  # source of the use of GPUs; `none`: there is no GPU, and its use counts as 0
+    origin: str  # source of the shares: `measured`, `supposed idle`, `generated`
 
     def __post_init__(self) -> None:
         numbers = [candidate.worker for candidate in self.workers]
         if not numbers:
             raise ConfigError("a snapshot of no workers: there must be at least one")
         if len(set(numbers)) != len(numbers):
-            raise ConfigError(f"workers {sorted(numbers)}: one of them is named twice")
+            raise ConfigError(f"workers {sorted(numbers)}: each must be named once")
         ordered = sorted(self.workers, key=lambda one: one.worker)
         object.__setattr__(self, "workers", tuple(ordered))
 
@@ -38,7 +38,7 @@ class LoadSnapshot:
 
 
 def idle_snapshot(count: int) -> LoadSnapshot:
-    """Workers 0 to `count` - 1 of which nothing is in use."""
+    """Return a snapshot of idle workers 0 to `count` - 1."""
     idle = Utilisation(0.0, 0.0)
     workers = tuple(Candidate(worker, idle) for worker in range(count))
     return LoadSnapshot(workers, NO_GPU, SUPPOSED_IDLE)

@@ -11,23 +11,23 @@ from cavmarl.balance.problem import Problem
 from cavmarl.balance.shard_placement import Placement
 
 Floats = NDArray[np.float64]
-LEAST_GAIN = 1e-9  # of a tick: below it sums may differ by rounding
-MOVES_A_SHARD = 4  # a limit that is not met: every change makes the slowest pair faster
+LEAST_GAIN = 1e-9  # share of a tick; smaller differences may be rounding
+MOVES_A_SHARD = 4  # safety limit, not reached: every change speeds up the slowest pair
 
 
 def refine(
-    placement: Placement,  # it is changed, and returned
+    placement: Placement,  # changed and returned
     *,
     until_s: float = 0.0,  # a makespan that is good enough
-    # of all changes that help and are worse than the best by no more than this, the one that tears
-    # fewest neighbours apart is made
+    # of all changes that help and are at most this worse than the best, the one that separates the
+    # fewest neighbours is made
     slack_s: float = 0.0,
-    max_moves: int | None = None,  # of shards; a swap is two. None: as many as help
+    max_moves: int | None = None,  # maximum number of shards; a swap counts as two. None: no limit
 ) -> Placement:
-    """Move one shard off the slowest worker, or swap it for one of another, as long as that helps.
+    """Move a shard off the slowest worker, or swap it for one of another, while that helps.
 
-    A change helps if both workers then take less long than the slowest took. Nothing is moved to
-    a worker that is excluded, and none is left without a shard if the rule says so.
+    A change helps if both workers are then faster than the slowest was. No shard moves to an
+    excluded worker, and no worker loses its last shard if the rule says so.
     """
     left = MOVES_A_SHARD * len(placement.homes) if max_moves is None else max_moves
     touching = _touching(placement.problem)
@@ -44,7 +44,7 @@ def refine(
 
 
 def _touching(problem: Problem) -> NDArray[np.int64]:
-    """(n, n) 1 where two shards are neighbours."""
+    """Return (n, n) 1 where two shards are neighbours."""
     touching = np.zeros((len(problem.shards), len(problem.shards)), dtype=np.int64)
     for a, b in problem.pairs:
         touching[a, b] = touching[b, a] = 1
@@ -54,7 +54,7 @@ def _touching(problem: Problem) -> NDArray[np.int64]:
 def _best_change(
     placement: Placement, touching: NDArray[np.int64], slack_s: float, *, may_swap: bool
 ) -> tuple[int, int | None, int] | None:
-    """(shard of the slowest worker, its swap partner, its new worker); None: none helps."""
+    """Return (shard of the slowest worker, its swap partner, its new worker), or None."""
     workers = placement.workers
     homes, count = np.array(placement.homes), len(workers)
     costs = np.array([shard.cost_s for shard in placement.problem.shards])
@@ -64,7 +64,7 @@ def _best_change(
     others = np.flatnonzero(homes != source)
     if not (may_swap and workers.is_open[source]):
         others = others[:0]
-    # What comes back: nothing, from each worker, or one of the others.
+    # What comes back: nothing, for each worker, or one of the other shards.
     targets = np.concatenate([np.arange(count), homes[others]])
     back = np.concatenate([np.zeros(count), costs[others]])
     change = costs[own][:, None] - back[None, :]
@@ -89,17 +89,17 @@ def _best_change(
 
 def _more_cut(
     near: NDArray[np.int64],  # (n, m) neighbours of each shard on each worker
-    touching: NDArray[np.int64],  # (n, n) which shards are neighbours
+    touching: NDArray[np.int64],  # (n, n) 1 where two shards are neighbours
     own: NDArray[np.int64],  # shards of the source
-    others: NDArray[np.int64],  # those that may be swapped for; they are the last columns
-    source: int,  # the worker that gives
-    targets: NDArray[np.int64],  # the worker that takes, column by column
+    others: NDArray[np.int64],  # shards to swap for; they are the last columns
+    source: int,  # the giving worker
+    targets: NDArray[np.int64],  # the receiving worker of each column
 ) -> NDArray[np.int64]:
-    """How many more pairs of neighbours each change cuts, (own, targets)."""
+    """Return how many more pairs of neighbours each change separates, (own, targets)."""
     cut = near[own, source][:, None] - near[own][:, targets]
     first = len(targets) - len(others)
     homes = targets[first:]
     cut[:, first:] += (near[others, homes] - near[others, source])[None, :]
-    # Two neighbours that change places stay apart.
+    # Two neighbours that change places stay separated.
     cut[:, first:] += 2 * touching[np.ix_(own, others)]
     return np.asarray(cut)

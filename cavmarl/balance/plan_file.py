@@ -1,4 +1,4 @@
-"""Plans and snapshots from JSON: what `to_dict` of them has written, checked value by value."""
+"""Reading plans and snapshots from JSON written by `to_dict`, with all values checked."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.core.errors import ConfigError
 
-# Of a manifest: the plans when the run began, and those when it ended.
+# Keys of a manifest: the plans at the start and at the end of the run.
 PLACEMENT, PLACEMENT_AT_END = "placement", "placement_at_end"
 
-LARGEST = 1 << 53  # whole numbers beyond it are not whole in every reader of JSON
-LONGEST = 40  # letters of a wrong value in a message
+LARGEST = 1 << 53  # larger integers are not exact in every JSON reader
+LONGEST = 40  # maximum number of characters of a wrong value in a message
 
 
 def read_plan(path: Path) -> Plan:
     plans = read_plans(path)
     if len(plans) != 1:
-        raise ConfigError(f"{path}: {len(plans)} plans, of which one is needed")
+        raise ConfigError(f"{path}: has {len(plans)} plans; give a file with one plan")
     return plans[0]
 
 
 def read_plans(path: Path) -> list[Plan]:
-    """The plan of a file, or those of a manifest: when the run began, then when it ended."""
+    """Return the plan of a file, or the plans of a manifest: at the start, then at the end."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); make the plan anew") from error
+        raise ConfigError(f"{path}: cannot be read ({error}); make the plan again") from error
     try:
         if not isinstance(document, dict) or PLACEMENT not in document:
             return [plan_from_dict(document)]
@@ -42,19 +42,19 @@ def read_plans(path: Path) -> list[Plan]:
             for row in _list(document.get(name, []), name)
         ]
         if not rows:
-            raise ConfigError("a manifest of a run without workers: there is no plan")
+            raise ConfigError("the manifest has no plan, as its run had no workers")
         return [plan_from_dict(row) for row in rows]
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
 
 def plan_from_dict(document: Mapping[str, Any]) -> Plan:
-    """The plan of a document; what follows from the rest is not read."""
+    """Return the plan of a document; derived values are not read."""
     if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
         raise ConfigError(f"not a plan: there is no schema '{SCHEMA}'")
     if document.get("version") != VERSION:
         raise ConfigError(
-            f"a plan of version {document.get('version')!r}, but this cavmarl reads {VERSION}"
+            f"a plan of version {document.get('version')!r}, but cavmarl reads version {VERSION}"
         )
     get = document.get
     shards = [_table(row, "shard") for row in _list(get("shards"), "shards")]
@@ -80,7 +80,7 @@ def plan_from_dict(document: Mapping[str, Any]) -> Plan:
 
 
 def snapshot_from_dict(document: Mapping[str, Any]) -> LoadSnapshot:
-    """The snapshot of a document. Raises ConfigError: a key is missing, or a value is none."""
+    """Return the snapshot of a document. Raises ConfigError: a key or a value is invalid."""
     rows = _list(document.get("workers"), "workers")
     return LoadSnapshot(
         workers=tuple(_candidate(_table(row, "worker")) for row in rows),
@@ -150,7 +150,7 @@ def _truth(value: object, name: str) -> bool:
 
 def _whole(value: object, name: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LARGEST:
-        raise _none(name, value, "a whole number from 0 up")
+        raise _none(name, value, "a whole number of at least 0")
     return value
 
 
@@ -165,6 +165,6 @@ def _real(value: object, name: str) -> float:
 
 
 def _none(name: str, value: object, needed: str) -> ConfigError:
-    said = repr(value)
-    shown = said if len(said) <= LONGEST else f"{said[:LONGEST]}…"
+    text = repr(value)
+    shown = text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
     return ConfigError(f"not a plan: {name} is {shown}, must be {needed}")

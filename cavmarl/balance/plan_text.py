@@ -1,4 +1,4 @@
-"""A plan as a table to read."""
+"""A plan as text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEFT = len(HEADINGS) - 1  # the last column is text
 
 
 def describe_plan(plan: Plan) -> str:
-    """Lines without a last line break: the whole, each worker, excluded ones, moves."""
+    """Return lines for a terminal: the summary, each worker, excluded workers, moves."""
     problem, placement = plan.problem, plan.placement
     snapshot = problem.snapshot
     costs = [shard.cost_s for shard in problem.shards]
@@ -57,7 +57,7 @@ def _is_measured(plan: Plan) -> bool:
 
 
 def _cost(plan: Plan, cost_s: float) -> str:
-    """In ms where it was measured; of supposed costs only their ratios mean something."""
+    """Format a measured cost in ms, another cost without a unit, as only its ratios count."""
     return f"{1e3 * cost_s if _is_measured(plan) else cost_s:.3f}"
 
 
@@ -87,7 +87,7 @@ def _rows(plan: Plan) -> Iterable[tuple[str, ...]]:
 
 
 def _named(names: Sequence[tuple[int, int]]) -> str:
-    """`0: 0-3 5; 1: 0`: zones of each world, runs as ranges."""
+    """Format zones of each world, runs as ranges: `0: 0-3 5; 1: 0`."""
     worlds = []
     for world, members in groupby(names, lambda name: name[0]):
         worlds.append(f"{world}: {_runs([zone for _, zone in members])}")
@@ -95,7 +95,7 @@ def _named(names: Sequence[tuple[int, int]]) -> str:
 
 
 def _runs(numbers: Sequence[int]) -> str:
-    """`0-3 5`: numbers that follow each other as ranges."""
+    """Format numbers, runs as ranges: `0-3 5`."""
     runs = [
         [number for _, number in run]
         for _, run in groupby(enumerate(numbers), lambda entry: entry[1] - entry[0])

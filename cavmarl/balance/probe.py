@@ -1,4 +1,4 @@
-"""Measures what other programs use of this machine, worker by worker."""
+"""Measures what other programs use of this machine, for each worker."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from cavmarl.core.errors import ConfigError
 
 MEASURED = "measured"
 INTERVAL_S = 0.2
-SHORTEST_S = 0.01  # a tick of the system's clocks
+SHORTEST_S = 0.01  # one tick of the system's clocks
 GPU_TOOL = "nvidia-smi"
 GPU_QUERY = ("--query-gpu=utilization.gpu", "--format=csv,noheader,nounits")
 
 
 def take_snapshot(
-    # number → process id; None: not started yet, it will run where this process may
+    # number → process id; None: not started yet, it will run on this process's cores
     workers: Mapping[int, int | None],
-    interval_s: float = INTERVAL_S,  # for how long; this call takes as long
+    interval_s: float = INTERVAL_S,  # duration of the measurement and of this call
 ) -> LoadSnapshot:
-    """Watch the machine for `interval_s` and say how busy each worker's part of it is."""
+    """Measure for `interval_s` how busy other programs keep each worker's part of the machine."""
     if not interval_s > 0.0:
         raise ConfigError(f"interval_s = {interval_s}: must be above 0")
     watch = Watch(workers)
@@ -35,12 +35,12 @@ def take_snapshot(
 
 
 class Watch:
-    """The machine from now on, until it is read.
+    """A measurement of the machine from its construction until it is read.
 
-    A worker's CPU is the mean use of the cores that its process may run on, less what it, the
-    other workers and this process have used there: what a run computes for itself is no reason to
-    take shards away. RAM is the machine's, and GPU that of its busiest one by `nvidia-smi`;
-    without that it is 0 and `gpu_source` is `none`.
+    A worker's CPU use is the mean use of the cores that its process may run on, less the use by
+    this process and all workers: a run's own computation is no reason to move shards away. RAM is
+    that of the machine. GPU is that of its busiest GPU by `nvidia-smi`; without `nvidia-smi` it
+    is 0 and `gpu_source` is `none`.
     """
 
     def __init__(self, workers: Mapping[int, int | None]) -> None:
@@ -51,7 +51,7 @@ class Watch:
         self._before = _busy_s()
 
     def snapshot(self) -> LoadSnapshot:
-        """How busy others kept each worker's part of the machine. Raises ConfigError: no worker."""
+        """Return the use by other programs since the start. Raises ConfigError: no worker."""
         elapsed_s = max(time.perf_counter() - self._began_s, SHORTEST_S)
         foreign = [
             (after - before) / elapsed_s
@@ -73,10 +73,10 @@ class Watch:
 
 
 class _Watched:
-    """A process, or the room for one, from now on.
+    """The processor time of a process from the construction on.
 
     Attributes:
-        cores: that it may run on.
+        cores: cores that it may run on.
     """
 
     def __init__(self, pid: int | None) -> None:
@@ -85,12 +85,12 @@ class _Watched:
         self.cores = _cores(0 if pid is None or self._began_s is None else pid)
 
     def used_s(self) -> float | None:
-        """Processor time since then; None: it is gone."""
+        """Return the processor time since the start; None: the process has ended."""
         ended_s = self._own_s()
         return None if ended_s is None or self._began_s is None else ended_s - self._began_s
 
     def _own_s(self) -> float | None:
-        """Processor time up to now; None: there is no such process."""
+        """Return the total processor time; None: there is no such process."""
         if self._pid is None:
             return 0.0
         try:
@@ -108,14 +108,14 @@ def _busy_s() -> list[float]:
 
 
 def _cores(pid: int) -> list[int]:
-    """Where a process may run; 0 is this one."""
+    """Return the cores on which a process may run; 0 is this process."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(pid))
     return list(range(os.cpu_count() or 1))
 
 
 def busiest_gpu() -> tuple[float, str]:
-    """The share of the busiest GPU's time that is in use, and its source."""
+    """Return the used share of the busiest GPU's time, and the source."""
     tool = shutil.which(GPU_TOOL)
     if tool is None:
         return 0.0, NO_GPU

@@ -14,19 +14,19 @@ from cavmarl.core.errors import ConfigError
 
 MEASURED_COSTS = "measured"
 
-MAX_COST_S = 1e6  # of a tick: sums stay finite
+MAX_COST_S = 1e6  # per tick; keeps sums finite
 
 
 class ShardCost(NamedTuple):
-    """What one shard costs."""
+    """The cost of one shard."""
 
     world: int
     zone: int
-    cost_s: float  # seconds a tick, on an otherwise idle processor
+    cost_s: float  # s per tick on an otherwise idle processor
 
 
 def equal_costs(worlds: int, zones: int) -> tuple[ShardCost, ...]:
-    """Shards of which nothing has been measured: each counts as much as another."""
+    """Return equal costs for all shards, for use before anything has been measured."""
     return tuple(ShardCost(world, zone, 1.0) for world in range(worlds) for zone in range(zones))
 
 
@@ -35,22 +35,22 @@ class BalanceRule:
     """When shards move, and how many at once."""
 
     load: LoadRule = field(default_factory=LoadRule)  # how workers are scored and excluded
-    # while the slowest worker takes at most this share longer than a perfect division would,
-    # nothing moves; a round that gains less than this is not made; and so much may be given up to
-    # keep neighbours together
+    # as a share of a perfect division's tick: no shard moves while the slowest worker exceeds it
+    # by no more; a round with a smaller gain is not made; and this much may be given up to keep
+    # neighbours together
     tolerance: float = 0.1
-    # shards that change their worker in one round, those of lost workers not counted
+    # maximum number of shards per round, without those of lost workers
     max_moves: int = 4
-    move_s: float = 0.01  # what a move costs, once
-    # a round is made only if it saves the workers together that much in so many ticks
+    move_s: float = 0.01  # s, cost of one move
+    # a round is made only if all workers together save its cost within this many ticks
     payback_ticks: int = 1000
-    keeps_one: bool = False  # a worker's last shard stays with it, or is swapped
+    keeps_one: bool = False  # whether a worker's last shard may only be swapped
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "move_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise ConfigError(f"{name} = {value}: must be a number from 0 up")
+                raise ConfigError(f"{name} = {value}: must be a number of at least 0")
         for name in ("max_moves", "payback_ticks"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} = {getattr(self, name)}: must be at least 1")
@@ -58,18 +58,18 @@ class BalanceRule:
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything that a plan follows from; it is put in order, so that no order ever counts."""
+    """The complete input of a plan, sorted so that the order of arguments has no effect."""
 
-    shards: tuple[ShardCost, ...]  # of all worlds, by world and zone
-    neighbors: tuple[tuple[int, ...], ...]  # for each zone those that share a side with it
+    shards: tuple[ShardCost, ...]  # all worlds, sorted by world and zone
+    neighbors: tuple[tuple[int, ...], ...]  # zones that share a side with each zone
     snapshot: LoadSnapshot  # of the workers
-    rule: BalanceRule = field(default_factory=BalanceRule)  # when shards move
-    # worker of each shard now, in the order of `shards`; None: none is hosted yet
+    rule: BalanceRule = field(default_factory=BalanceRule)  # rules for moving shards
+    # present worker of each shard, in the order of `shards`; None: none is placed yet
     present: tuple[int, ...] | None = None
-    # the shards of a worker follow each other, workers by their numbers, each with one at least; so
-    # it is for worlds whose results lie in one array
+    # whether each worker hosts at least one shard and consecutive ones, in the order of workers;
+    # for worlds whose results lie in one array
     in_row: bool = False
-    # where costs come from; if it is not `measured`, they only compare shards
+    # source of the costs; unless it is `measured`, only their ratios count
     cost_source: str = MEASURED_COSTS
 
     def __post_init__(self) -> None:
@@ -78,23 +78,24 @@ class Problem:
         workers = len(self.snapshot.workers)
         if workers > len(self.shards):
             raise ConfigError(
-                f"{workers} workers for {len(self.shards)} shards: use at most as many workers as "
+                f"{workers} workers for {len(self.shards)} shards; use at most as many workers as "
                 "there are shards, or more zones or worlds"
             )
         if self.present is not None and len(self.present) != len(self.shards):
             raise ConfigError(
-                f"{len(self.present)} present workers of {len(self.shards)} shards: name one each"
+                f"{len(self.present)} present workers of {len(self.shards)} shards; "
+                "give one for each shard"
             )
         order = sorted(range(len(self.shards)), key=lambda n: self.shards[n])
         object.__setattr__(self, "shards", tuple(self.shards[n] for n in order))
         if self.present is not None:
             object.__setattr__(self, "present", tuple(self.present[n] for n in order))
         if self.in_row and list(self.present or ()) != sorted(self.present or ()):
-            raise ConfigError(f"present workers {self.present}: must be in a row, by number")
+            raise ConfigError(f"present workers {self.present}: must be ascending")
 
     @cached_property
     def pairs(self) -> tuple[tuple[int, int], ...]:
-        """Shards, by their place in `shards`, whose zones share a side in one world."""
+        """Pairs of shards, by index in `shards`, whose zones share a side in one world."""
         place = {(shard.world, shard.zone): n for n, shard in enumerate(self.shards)}
         return tuple(
             sorted(
@@ -118,9 +119,9 @@ def _check_shards(shards: Sequence[ShardCost], zones: int) -> None:
     for shard in shards:
         if not 0 <= shard.zone < zones:
             raise ConfigError(
-                f"world {shard.world}, zone {shard.zone}: there are neighbours of {zones} zones"
+                f"world {shard.world}, zone {shard.zone}: the zone must be below {zones}"
             )
-        if not 0.0 <= shard.cost_s <= MAX_COST_S:  # NaN is not, either
+        if not 0.0 <= shard.cost_s <= MAX_COST_S:  # NaN fails this check, too
             raise ConfigError(
                 f"world {shard.world}, zone {shard.zone}: cost_s = {shard.cost_s}: must be "
                 f"seconds from 0 to {MAX_COST_S:g}; measure it again"
@@ -132,5 +133,5 @@ def _check_neighbors(neighbors: Sequence[Sequence[int]]) -> None:
         for other in row:
             if not (0 <= other < len(neighbors) and zone in neighbors[other] and zone != other):
                 raise ConfigError(
-                    f"zone {zone} names {other} as its neighbour, which does not name it"
+                    f"zone {zone} names {other} as its neighbour, but {other} does not name {zone}"
                 )

@@ -1,9 +1,9 @@
-"""`Placement`: shards on workers, and how long each worker takes for a tick.
+"""`Placement`: shards on workers, and the resulting duration of each worker's tick.
 
-A worker of which the share S (its LoadScore) is taken by others has the speed 1 - S: shards that
-cost `load` seconds take it load / (1 - S). With nothing placed yet that is least where LoadScore
-is: eq. (2). The slowest worker sets the pace of all; how many times as long it takes as a perfect
-division would is the imbalance.
+A worker with LoadScore S, the share taken by other programs, has the speed 1 - S: shards that cost
+`load` seconds take it load / (1 - S). Before anything is placed, this is shortest where LoadScore
+is lowest: eq. (2). The slowest worker determines the pace of all. Its tick divided by that of a
+perfect division is the imbalance.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from cavmarl.balance.load_score import Candidate, Rejection, load_score
 from cavmarl.balance.problem import Problem
 
 Floats = NDArray[np.float64]
-MIN_SPEED = 0.01  # of a worker that has nothing left: it is slow, not endless
+MIN_SPEED = 0.01  # minimum speed of a fully used worker, which keeps its tick finite
 
 
 class Workers:
-    """The workers that answer, in the order of their numbers.
+    """The workers that answer, by number.
 
     Attributes:
         scores: their LoadScores.
-        speeds: what is left of each.
-        is_open: which ones may be given shards.
+        speeds: free share of each worker.
+        is_open: whether each worker may receive shards.
     """
 
     def __init__(
         self,
-        candidates: Sequence[Candidate],  # them
-        rejections: Sequence[Rejection],  # why some of them are given nothing more
+        candidates: Sequence[Candidate],  # the workers
+        rejections: Sequence[Rejection],  # reasons why workers are excluded
         weights: tuple[float, float, float],  # of the score
     ) -> None:
-        self.numbers = tuple(candidate.worker for candidate in candidates)  # of the workers
+        self.numbers = tuple(candidate.worker for candidate in candidates)  # numbers of the workers
         self.scores = tuple(load_score(candidate.use, weights) for candidate in candidates)
         self.speeds: Floats = np.maximum(1.0 - np.array(self.scores), MIN_SPEED)
         rejected = {rejection.worker for rejection in rejections}
@@ -47,13 +47,13 @@ class Workers:
 
 
 class Placement:
-    """Which shard is on which worker."""
+    """An assignment of shards to workers."""
 
     def __init__(
         self,
         problem: Problem,  # the shards
-        workers: Workers,  # those that can host them
-        homes: Iterable[int],  # place in `workers` of each shard's one; -1: it has none yet
+        workers: Workers,  # workers that can host the shards
+        homes: Iterable[int],  # index in `workers` of each shard's worker; -1: none yet
     ) -> None:
         self.problem = problem
         self.workers = workers
@@ -66,15 +66,15 @@ class Placement:
         return [shard for shard, home in enumerate(self.homes) if home == worker]
 
     def load_s(self, worker: int) -> float:
-        """What its shards cost, added exactly: no order counts."""
+        """Return the cost of the worker's shards; the exact sum does not depend on order."""
         return math.fsum(self.problem.shards[shard].cost_s for shard in self.on(worker))
 
     def loads_s(self) -> Floats:
-        """`load_s` of all workers, (m,)."""
+        """Return `load_s` of all workers, (m,)."""
         return np.array([self.load_s(worker) for worker in range(len(self.workers))])
 
     def ticks_s(self) -> Floats:
-        """How long each worker takes for a tick, (m,)."""
+        """Return the duration of each worker's tick, (m,)."""
         return np.asarray(self.loads_s() / self.workers.speeds)
 
     @property
@@ -83,14 +83,14 @@ class Placement:
 
     @property
     def fair_s(self) -> float:
-        """How long all would take if shards could be divided at will among the admissible."""
+        """Duration of a tick if shards could be divided freely among the admissible workers."""
         workers = self.workers
         able = workers.speeds[workers.is_open] if workers.is_open.any() else workers.speeds
         return math.fsum(shard.cost_s for shard in self.problem.shards) / math.fsum(able.tolist())
 
     @property
     def imbalance(self) -> float:
-        """`makespan_s` over `fair_s`; 1 where nothing costs anything."""
+        """`makespan_s` divided by `fair_s`; 1 if nothing costs anything."""
         return self.makespan_s / self.fair_s if self.fair_s else 1.0
 
     @property
@@ -98,5 +98,5 @@ class Placement:
         return sum(self.homes[a] != self.homes[b] for a, b in self.problem.pairs)
 
     def excess_s(self) -> float:
-        """By how much workers take longer than a perfect division would, summed over them."""
+        """Return the sum of the workers' excess over a perfect division's tick."""
         return math.fsum(np.maximum(self.ticks_s() - self.fair_s, 0.0).tolist())

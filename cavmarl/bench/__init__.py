@@ -1,4 +1,4 @@
-"""What `cavmarl bench` measures; other measurements are in `benchmarks/` beside the package.
+"""The measurements of `cavmarl bench`; others are in `benchmarks/` outside the package.
 
-It stands on `evaluate` and is run by `cli`.
+The package uses `evaluate` and is run by `cli`.
 """

@@ -1,8 +1,8 @@
-"""What all benchmarks share: reports, sides that take turns, medians, checks of numbers.
+"""Common parts of benchmarks: reports, alternating measurements, statistics, validation.
 
-A benchmark returns a `BenchmarkReport`, which prints its tables and becomes the JSON of `--json`.
-All sides of a comparison are measured once a turn, one after the other, so that what else the
-machine does falls on all of them. `benchmarks/`, beside the package, is built on this, too.
+A benchmark returns a `BenchmarkReport`, which prints its tables and is the JSON of `--json`. All
+sides of a comparison are measured in turn, so that other load on the machine affects all of them.
+The programs in `benchmarks/` use this module too.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ Taken = TypeVar("Taken")
 
 
 def silent(text: str) -> None:
-    """A `say` that prints nothing."""
+    """Print nothing; a `say` for silent runs."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """What the turns of one side came to: least, median, most."""
+    """The least, median and largest result of one side."""
 
     low: float
     median: float
@@ -44,7 +44,7 @@ class Spread:
 
 
 def spread(values: Iterable[float]) -> Spread:
-    """Least, median and most."""
+    """Return the least, median and largest value."""
     found = tuple(values)
     return Spread(min(found), median(found), max(found))
 
@@ -54,13 +54,13 @@ class BenchmarkReport:
     """The result of a benchmark.
 
     Attributes:
-        title: of the table.
-        columns: head of a column → `key` or `key:format` of the rows, left to right. The first
-            column is text.
-        rows: one a side, with all that was measured of it.
-        notes: lines below the tables; they may have rich's markup.
+        title: title of the table.
+        columns: column head → `key` or `key:format` of the rows, left to right. The first column is
+            text.
+        rows: one row per side, with all its measurements.
+        notes: lines below the tables, with rich markup.
         facts: figures that belong to no row.
-        holds: whether a bound that was asked for was kept; if not, the exit code is 1.
+        holds: whether the requested bound holds; if not, the exit code is 1.
         caption: a line below the table.
         tables: further tables; their figures are in `facts`.
     """
@@ -101,14 +101,14 @@ def _cell(row: Mapping[str, Any], shown: str) -> str:
 
 
 def is_kept(at_least: float | None, ratio: float | None) -> bool:
-    """Return whether a ratio keeps the bound of `--at-least`; without a bound or ratio: yes."""
+    """Return whether a ratio meets the bound of `--at-least`; True without a bound or a ratio."""
     return at_least is None or ratio is None or ratio >= at_least
 
 
 def take_turns(
     sides: Mapping[Key, Callable[[], Taken]], repeats: int, say: Say = silent
 ) -> dict[Key, tuple[Taken, ...]]:
-    """Call every side once a turn, all sides one after the other; what each turn took, by side."""
+    """Call each side once per turn, one after another, and return the results by side."""
     found: dict[Key, list[Taken]] = {name: [] for name in sides}
     for turn in range(1, repeats + 1):
         say(f"measuring, {turn} of {repeats}")
@@ -118,15 +118,15 @@ def take_turns(
 
 
 def paired_ratio(ones: Sequence[float], others: Sequence[float]) -> float:
-    """Median over the turns of one side's figure over the other's of the same turn."""
+    """Return the median of the ratios of two sides, turn by turn."""
     return median(one / other for one, other in zip(ones, others, strict=True))
 
 
 def paired_interval(ones: Sequence[float], others: Sequence[float]) -> tuple[float, float]:
-    """One side's figure over the other's of the same turn: their mean, and half of its interval.
+    """Return the mean ratio of two sides, turn by turn, and half of its confidence interval.
 
-    A geometric mean without the outer tenths, and an interval of 95 %: two standard errors, of
-    Yuen's (1974) estimate. Of a single turn the interval is infinite.
+    The mean is geometric, without the outer tenths. The interval of 95 % is two standard errors, by
+    Yuen's (1974) estimate; for a single turn it is infinite.
     """
     logs = sorted(math.log(one / other) for one, other in zip(ones, others, strict=True))
     cut = len(logs) // 10
@@ -141,7 +141,7 @@ def paired_interval(ones: Sequence[float], others: Sequence[float]) -> tuple[flo
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Keep this process on one core, where the system can."""
+    """Keep this process on one core, if the system supports it."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -154,7 +154,7 @@ def one_core() -> Iterator[None]:
 
 
 def check_range(**limits: tuple[float, float, float]) -> None:
-    """Refuse numbers that are not from the second to the third of their limits."""
+    """Refuse numbers below the second or above the third value of their limits."""
     for name, (value, least, most) in limits.items():
         if not least <= value <= most:
             bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:.15g}"
@@ -162,22 +162,22 @@ def check_range(**limits: tuple[float, float, float]) -> None:
 
 
 def check_positive(option: str, value: float | None) -> None:
-    """Refuse a bound that nothing can be measured against; None: there is no bound."""
+    """Refuse a bound that is not positive; None: there is no bound."""
     if value is not None and not 0.0 < value < math.inf:
         raise ConfigError(f"{option} {value:g}: must be a number above 0")
 
 
 def numbers_of(option: str, text: str) -> list[int]:
-    """The whole numbers of an option such as `--zones 1,4,9`."""
+    """Parse an option with comma-separated whole numbers, such as `--zones 1,4,9`."""
     try:
         return [int(word) for word in text.split(",")]
     except ValueError:
-        raise ConfigError(f"{option} {text}: must be whole numbers with commas between") from None
+        raise ConfigError(f"{option} {text}: must be comma-separated whole numbers") from None
 
 
 @contextmanager
 def measuring(console: Console) -> Iterator[Say]:
-    """A line of what is measured; where that is `3 of 7`, with a bar and the time left."""
+    """Show the current measurement; a text like `3 of 7` adds a bar and the remaining time."""
     with progress_bar(console) as bar:
         task = bar.add_task("", total=None)
 
@@ -195,11 +195,11 @@ def make_table(
     rows: Iterable[Sequence[str] | None],
     caption: str | None = None,
 ) -> Table:
-    """A table whose first column is text and whose others are numbers; row None: a line between.
+    """Build a table whose first column is text and the others numbers; a row None is a line.
 
-    Where the terminal is too narrow, the text is folded and the numbers stay whole.
+    On a narrow terminal, text is wrapped and numbers stay whole.
     """
-    close = (0, 1, 0, 0)  # so that ten columns have room on a terminal of 80
+    close = (0, 1, 0, 0)  # fits ten columns on a terminal of 80 characters
     table = Table(
         title=escape(title), caption=caption, box=SIMPLE_HEAD, pad_edge=False, padding=close
     )

@@ -1,4 +1,4 @@
-"""highway-env's worlds over processes, with every agent a row of a stable-baselines3 `VecEnv`."""
+"""highway-env's worlds in processes, with every agent as a row of a stable-baselines3 `VecEnv`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from cavmarl.core.errors import require
 
 
 class HighwayRows(VecEnvWrapper):
-    """Each controlled vehicle is a row; the rows of a world end together, and are paid alike.
+    """Each controlled vehicle is a row; rows of one world end together and have equal rewards.
 
-    A world is a process; it has no other vehicles, and begins anew after `horizon_s`. `observation`
-    is as highway-env's settings say it.
+    Each world runs in its own process, has no other vehicles, and restarts after `horizon_s`.
+    `observation` has highway-env's settings.
     """
 
     def __init__(
@@ -36,10 +36,10 @@ class HighwayRows(VecEnvWrapper):
         )
         self._agents = agents
         self.num_envs = worlds * agents
-        self.simulated_s = 0.0  # of all steps, with what goes between the processes
+        self.simulated_s = 0.0  # total of all steps, including communication between processes
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin all worlds; observations (W · A, D)."""
+        """Restart all worlds; return observations (W · A, D)."""
         return self._rows(self.venv.reset())
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -51,13 +51,13 @@ class HighwayRows(VecEnvWrapper):
         observations, rewards, done, infos = self.venv.step_wait()
         self.simulated_s += time.perf_counter() - self._began
         each = self._agents
-        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        row_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done).tolist():
             info = infos[world]
             cut = {"TimeLimit.truncated": info["TimeLimit.truncated"]}
             for k, last in enumerate(info["terminal_observation"]):
-                told[world * each + k] = {"terminal_observation": last, **cut}
-        return self._rows(observations), rewards.repeat(each), done.repeat(each), told
+                row_infos[world * each + k] = {"terminal_observation": last, **cut}
+        return self._rows(observations), rewards.repeat(each), done.repeat(each), row_infos
 
     def _rows(self, observations: Any) -> NDArray[np.float32]:
         rows: NDArray[np.float32] = observations.reshape(self.num_envs, -1)
@@ -68,7 +68,7 @@ class _World(gymnasium.Env[Any, Any]):
     """One world of highway-env, with one array for all agents."""
 
     def __init__(self, agents: int, observation: dict[str, Any], horizon_s: float) -> None:
-        require("highway_env", "bench")  # in a process of its own: it registers the world
+        require("highway_env", "bench")  # registers the environment in this process
         self._env = highway_env(agents, observation)
         self._env.configure({"duration": horizon_s})
         size = self._stack(self._env.reset(seed=0)[0]).shape

@@ -1,8 +1,7 @@
-"""The same road with the same vehicles on both sides of a comparison: ours and highway-env's.
+"""Equal worlds for both sides of a comparison: cavmarl's and highway-env's.
 
-N controlled vehicles stand on a straight road of four lanes, as densely as highway-env sets them
-out; the road is else empty. All keep to the meta-action IDLE, at 20 Hz with 10 decisions a
-second.
+N controlled vehicles stand on a straight road of four lanes at highway-env's initial density; there
+is no other traffic. All vehicles use the meta-action IDLE, at 20 Hz with 10 decisions per second.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ SPEED_MPS = 30.0
 RUN_OUT_M = 1500.0
 IDLE = 1
 
-# What ours observe beside themselves and the next signal. Theirs have no neighbours with the lidar,
-# no route, and four neighbours by default.
+# Sensors of cavmarl in addition to ego and signal. highway-env has no neighbours with the lidar, no
+# route, and four neighbours by default.
 LIDAR: dict[str, Any] = {
     "sensors.route.points": 0,
     "sensors.neighbors.count": NEIGHBORS,
@@ -40,7 +39,7 @@ THEIR_RAW_KINEMATICS = {"type": "Kinematics", "normalize": False}
 
 
 def overrides(sensors: dict[str, Any], agents: int) -> dict[str, Any]:
-    """What to set of a world of ours on `straight_road`."""
+    """Return the overrides for a cavmarl world on `straight_road`."""
     return {
         "clock.sim_dt_s": 1.0 / SIM_HZ,
         "clock.ctrl_dt_s": 1.0 / CONTROL_HZ,
@@ -53,7 +52,7 @@ def overrides(sensors: dict[str, Any], agents: int) -> dict[str, Any]:
 
 
 def highway_env(agents: int, observation: dict[str, Any]) -> Any:
-    """highway-env's own highway with that many controlled vehicles, stepped once."""
+    """Create highway-env's own highway with `agents` controlled vehicles, stepped once."""
     gymnasium = require("gymnasium", "bench")
     config = {
         "controlled_vehicles": agents,
@@ -73,16 +72,16 @@ def highway_env(agents: int, observation: dict[str, Any]) -> Any:
 
 
 def length_m(env: Any) -> float:
-    """How much of the road highway-env has set its vehicles out on, and a gap a lane."""
+    """Return the length of highway-env's occupied road, plus one gap per lane."""
     along = [vehicle.position[0] for vehicle in env.controlled_vehicles]
     return float(max(along) - min(along)) + LANES * 10.0
 
 
 def straight_road(folder: Path, road_m: float) -> Path:
-    """Write a SUMO net: a straight `road`, and an `end` that is not reached in a measurement."""
+    """Write a SUMO net: a straight `road`, and an `end` that no vehicle reaches."""
     whole_m = road_m + RUN_OUT_M
 
-    # Of the lanes' centres; lane 0 is the rightmost, driving to the east.
+    # Centres of the lanes; lane 0 is the rightmost one, and the road goes east.
     ys = [f"{(k - LANES) * LANE_WIDTH_M:.2f}" for k in range(LANES)]
 
     def lanes(edge: str, begin_m: float, end_m: float) -> str:

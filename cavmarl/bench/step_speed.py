@@ -1,6 +1,6 @@
-"""How fast a step is next to highway-env's, on the same road with the same number of vehicles.
+"""Speed of a step compared with highway-env, on the same road with the same number of vehicles.
 
-Times are those of the processor that this process had, on one core.
+Times are processor times of this process, on one core.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 
 __all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed", "one_core"]
 
-OUR_STEPS = 100  # from a fresh reset: no vehicle reaches the end of the road
+OUR_STEPS = 100  # from a fresh reset; no vehicle reaches the end of the road
 THEIR_STEPS = 10
-MORE = 10  # times as many agents, on a road as many times as long
+MORE = 10  # factor of agents and of road length in the larger world
 MAX_AGENTS = 1000
 
-# sensors, side, times as many agents, whether worlds are batched
+# sensors, side, factor of agents, whether worlds are batched
 OURS = (
     ("lidar", "batched", 1, True),
     ("lidar", "single", 1, False),
@@ -58,17 +58,17 @@ THEIRS = (
 class Row:
     """One way to step one kind of world."""
 
-    sensors: str  # `lidar` (and neighbours) or `kinematics`
+    sensors: str  # `lidar` (with neighbours) or `kinematics`
     side: str  # `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`
-    agents: int  # controlled vehicles a world
-    worlds: int  # stepped together
-    low: float  # agent-steps a second, the slowest turn
-    median: float  # over the turns
-    high: float  # the fastest turn
+    agents: int  # controlled vehicles per world
+    worlds: int  # worlds stepped together
+    low: float  # agent-steps per second, slowest turn
+    median: float  # median of the turns
+    high: float  # fastest turn
 
     @property
     def agent_step_s(self) -> float:
-        """Seconds an agent-step takes, by the median."""
+        """Median time of an agent-step, s."""
         return 1.0 / self.median
 
 
@@ -76,39 +76,40 @@ class Row:
 class StepSpeed:
     """Result of the comparison."""
 
-    road_m: float  # length of the road that `agents` vehicles were set out on, on both sides
-    repeats: int  # turns
-    rows: tuple[Row, ...]  # what was measured
-    ratio: float  # with a lidar, `batched` over `highway_env`
-    ratio_kinematics: float  # without, `batched` over `highway_env`'s default observation
-    ratio_kinematics_raw: float  # the same over its observation without normalisation
-    cost_of_more: float  # of an agent among `MORE` times as many, over what it costs `batched`
-    dict_us: float  # what the dict API adds for each agent and step to `single`, in µs
+    road_m: float  # length of the road of `agents` vehicles, on both sides
+    repeats: int  # number of turns
+    rows: tuple[Row, ...]  # all measurements
+    ratio: float  # `batched` over `highway_env`, with lidar
+    ratio_kinematics: float  # `batched` over `highway_env`, with its default observation
+    ratio_kinematics_raw: float  # the same, with its observation without normalisation
+    cost_of_more: float  # cost per agent with `MORE` times as many agents, over that of `batched`
+    dict_us: float  # cost of the dict API per agent and step, over `single`, in µs
 
 
 def measure_step_speed(
     agents: int = 100, worlds: int = 16, repeats: int = 5, progress: Say = silent
 ) -> StepSpeed:
-    """Measure by turns on one core, kernels warm."""
+    """Measure all sides in turn on one core, with warm kernels."""
     check_range(agents=(agents, 1, MAX_AGENTS), worlds=(worlds, 1, 1024), repeats=(repeats, 1, 100))
     require("highway_env", "bench")
     with one_core(), tempfile.TemporaryDirectory() as folder:
-        progress("making highway-env's worlds")
+        progress("creating highway-env's worlds")
         theirs = {(sensors, side): highway_env(agents, seen) for sensors, side, seen in THEIRS}
         road_m = max(map(length_m, theirs.values()))
-        progress("making our worlds on that road")
-        sides = _our_sides(Path(folder), road_m, agents, worlds)
+        progress("creating cavmarl's worlds on that road")
+        sides = our_sides(Path(folder), road_m, agents, worlds)
         for key, env in theirs.items():
-            sides[key] = (agents, 1, partial(_their_rate, env, agents))
+            sides[key] = (agents, 1, partial(their_rate, env, agents))
         turns = take_turns({key: rate for key, (_, _, rate) in sides.items()}, repeats, progress)
     rows = []
     for (sensors, side), (count, together, _) in sides.items():
         rates = spread(turns[sensors, side])
         rows.append(Row(sensors, side, count, together, rates.low, rates.median, rates.high))
-    return _compare(road_m, repeats, rows)
+    return compare(road_m, repeats, rows)
 
 
-def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
+def compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
+    """Compute the ratios of the median rates."""
     found = {(row.sensors, row.side): row for row in rows}
 
     def ratio(sensors: str, one: str, other: str) -> float:
@@ -127,10 +128,10 @@ def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
     )
 
 
-def _our_sides(
+def our_sides(
     folder: Path, road_m: float, agents: int, worlds: int
 ) -> dict[tuple[str, str], tuple[int, int, Callable[[], float]]]:
-    """Agents, worlds and rate of each of ours, stepped twice before anything is measured."""
+    """Return agents, worlds and rate of each cavmarl side, stepped twice before measuring."""
     sides: dict[tuple[str, str], tuple[int, int, Callable[[], float]]] = {}
     for sensors, side, times, is_batched in OURS:
         count, together = times * agents, worlds if is_batched else 1
@@ -141,17 +142,17 @@ def _our_sides(
             background=0,
             overrides=overrides(LIDAR if sensors == "lidar" else KINEMATICS, count),
         )
-        _batched_rate(vec, 2)
-        sides[sensors, side] = (count, together, partial(_batched_rate, vec))
+        batched_rate(vec, 2)
+        sides[sensors, side] = (count, together, partial(batched_rate, vec))
     road = straight_road(folder, road_m)
     env = parallel_env(road, agents=agents, background=0, overrides=overrides(KINEMATICS, agents))
-    _dicts_rate(env, 2)
-    sides["kinematics", "dicts"] = (agents, 1, partial(_dicts_rate, env))
+    dicts_rate(env, 2)
+    sides["kinematics", "dicts"] = (agents, 1, partial(dicts_rate, env))
     return sides
 
 
-def _batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
-    """Agent-steps a second from a fresh reset, which is not timed."""
+def batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
+    """Return agent-steps per second from a fresh reset, which is not timed."""
     vec.reset(seed=0)
     actions = np.full((vec.num_envs, vec.num_agents), np.int64(IDLE))
     decisions = 0
@@ -161,8 +162,8 @@ def _batched_rate(vec: CavVectorEnv, steps: int = OUR_STEPS) -> float:
     return decisions / (time.process_time() - began)
 
 
-def _dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
-    """The same through PettingZoo's dicts; agents that have ended are left out from then on."""
+def dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
+    """Return the rate through PettingZoo's dicts; agents that have ended are left out."""
     env.reset(seed=0)
     actions = dict.fromkeys(env.agents, IDLE)
     decisions = 0
@@ -176,7 +177,8 @@ def _dicts_rate(env: CavEnv, steps: int = OUR_STEPS) -> float:
     return decisions / (time.process_time() - began)
 
 
-def _their_rate(env: Any, agents: int) -> float:
+def their_rate(env: Any, agents: int) -> float:
+    """Return the agent-steps per second of highway-env from a fresh reset, which is not timed."""
     env.reset(seed=0)
     actions = (IDLE,) * agents
     began = time.process_time()

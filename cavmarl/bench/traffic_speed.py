@@ -1,7 +1,7 @@
-"""How fast a tick of traffic is, next to libsumo's: same map, demand, step length; no output.
+"""Speed of a traffic tick compared with libsumo: same map, demand and step length; no output.
 
-Both sides run the demand up to the same second, then take turns of the same simulated length, ours
-in this process and SUMO in one of its own, on the same core.
+Both sides run the demand up to the same second, then take turns of equal simulated length on the
+same core: cavmarl in this process, SUMO in a separate one.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ TURN_S = 10
 
 @dataclass(frozen=True)
 class TrafficSpeed:
-    """Result of the comparison; rates are vehicle-steps a second of the processor's time."""
+    """Result of the comparison; rates are vehicle-steps per second of processor time."""
 
     map_name: str  # the map's name
-    dt_s: float  # step length of both
+    dt_s: float  # step length of both sides
     after_s: int  # simulated seconds before the first turn
-    repeats: int  # turns of each
-    our_vehicles: float  # mean number in our world over all turns
-    sumo_vehicles: float  # the same in SUMO's
-    ours: Spread  # our rates
-    sumo: Spread  # libsumo's
-    ratio: float  # of the medians, ours over libsumo's
+    repeats: int  # turns of each side
+    our_vehicles: float  # mean number in cavmarl's world over all turns
+    sumo_vehicles: float  # mean number in SUMO's world
+    ours: Spread  # rates of cavmarl
+    sumo: Spread  # rates of libsumo
+    ratio: float  # cavmarl's median over libsumo's
 
 
 @dataclass(frozen=True)
@@ -66,21 +66,21 @@ def measure_traffic_speed(
     repeats: int = 5,
     progress: Say = silent,
 ) -> TrafficSpeed:
-    """Measure by turns on one core."""
+    """Measure both sides in turn on one core."""
     check_range(after=(after_s, 1, 3600), repeats=(repeats, 1, 100))
     path = find_map(map_name)
     job = SumoJob(path, read_input(demand), after_s, dt_s, seed)
     warm, steps = round(after_s / dt_s), round(TURN_S / dt_s)
     with one_core(), tempfile.TemporaryDirectory() as folder, sumo_process(job) as sumo:
-        # Ours first: it names file and line of what neither can drive.
+        # cavmarl first, since its errors name file and line of unsupported demand.
         simulation = make_world(path, demand, after_s + repeats * TURN_S, seed, dt_s)
         progress(f"SUMO's first {after_s} s")
         sumo.submit(load_sumo, job, folder).result()
         sumo.submit(turn_of_sumo, warm).result()
-        progress(f"our first {after_s} s")
-        _our_turn(simulation, warm)
+        progress(f"cavmarl's first {after_s} s")
+        our_turn(simulation, warm)
         sides: dict[str, Callable[[], Turn]] = {
-            "ours": partial(_our_turn, simulation, steps),
+            "ours": partial(our_turn, simulation, steps),
             "sumo": lambda: sumo.submit(turn_of_sumo, steps).result(),
         }
         turns = take_turns(sides, repeats, progress)
@@ -88,7 +88,7 @@ def measure_traffic_speed(
         name: spread(turn.vehicle_steps / turn.cpu_s for turn in own) for name, own in turns.items()
     }
     if not rates["sumo"].median > 0.0:
-        raise ConfigError(f"no vehicle drives after {after_s} s: another --after, or more demand")
+        raise ConfigError(f"no vehicle drives after {after_s} s: change --after, or add demand")
     our_vehicles, sumo_vehicles = (
         sum(turn.vehicle_steps for turn in turns[name]) / (repeats * steps) for name in sides
     )
@@ -105,13 +105,14 @@ def measure_traffic_speed(
 
 
 def _timed(steps: int, step: Callable[[], int]) -> Turn:
-    """A turn of so many steps; `step` returns how many vehicles it has moved."""
+    """Time a number of steps; `step` returns the number of moved vehicles."""
     began, began_s = time.perf_counter(), time.process_time()
     vehicle_steps = sum(step() for _ in range(steps))
     return Turn(vehicle_steps, time.process_time() - began_s, time.perf_counter() - began)
 
 
-def _our_turn(simulation: Simulation, steps: int) -> Turn:
+def our_turn(simulation: Simulation, steps: int) -> Turn:
+    """Time some steps of a world."""
     commands = idle_commands(simulation)
 
     def step() -> int:
@@ -127,7 +128,7 @@ def load_sumo(job: SumoJob, folder: str) -> None:
 
 
 def turn_of_sumo(steps: int) -> Turn:
-    """Steps of the SUMO that is loaded in this process."""
+    """Run steps of the SUMO that is loaded in this process."""
     libsumo = require("libsumo", "sumo")
 
     def step() -> int:

@@ -1,8 +1,9 @@
-"""How fast PPO is from end to end, next to stable-baselines3's on highway-env.
+"""End-to-end speed of PPO compared with stable-baselines3 on highway-env.
 
-Both learn on two cores with the same network, observation (highway-env's `Kinematics`), actions,
-number of vehicles, batch, minibatches and epochs; the same road, 20 Hz and 10 decisions a second,
-new episodes after 40 s. Each has a process a core for its worlds, and one thread of torch.
+Both sides learn on two cores with the same network, observation (highway-env's `Kinematics`),
+actions, number of vehicles, batch, minibatches and epochs, on the same road, at 20 Hz with 10
+decisions per second and new episodes after 40 s. Each side has one process per core for its worlds,
+and one thread of torch.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 _Update = tuple[int, dict[str, float]]
 
 HORIZON_S = 40.0
-OUR_STEPS = 32  # of a world between two updates
+OUR_STEPS = 32  # per world between two updates
 EPOCHS = 4
 MINIBATCHES = 8
 HIDDEN = 64
@@ -69,36 +70,36 @@ OUR_SENSORS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class TrainingRow:
-    """One side."""
+    """Measurements of one side."""
 
-    name: str  # `cavmarl` or `stable_baselines3`; `cavmarl_recipe` with what we learn best with
-    worlds: int  # stepped together
-    decisions: int  # of an update
-    rates: tuple[float, ...]  # agent-steps a second of each turn: one update, learning among it
-    # of the time, by phase; theirs of `simulation` is with what goes between the processes
+    name: str  # `cavmarl`, `stable_baselines3`, or `cavmarl_recipe` with the recommended settings
+    worlds: int  # worlds stepped together
+    decisions: int  # per update
+    rates: tuple[float, ...]  # agent-steps per second of each turn: one update, including learning
+    # shares of time by phase; highway-env's `simulation` includes communication
     shares: dict[str, float]
 
 
 @dataclass(frozen=True)
 class TrainingSpeed:
-    """What was measured: two kinds of benchmark, whose numbers are never mixed."""
+    """Results of two kinds of benchmark, whose numbers must not be mixed."""
 
-    agents: int  # of a world
-    workers: int  # of each side
-    numbers: int  # in an observation
-    recipe_numbers: int  # in one of our own recipe
-    end_to_end: tuple[TrainingRow, ...]  # PPO, collecting and learning
-    stepping: tuple[float, ...]  # agent-steps a second of our worlds and sensors alone, by turns
-    hardware: dict[str, Any]  # that it ran on
+    agents: int  # per world
+    workers: int  # per side
+    numbers: int  # size of an observation
+    recipe_numbers: int  # size of an observation with the recommended settings
+    end_to_end: tuple[TrainingRow, ...]  # PPO, including collection and learning
+    stepping: tuple[float, ...]  # agent-steps per second of worlds and sensors alone, by turn
+    hardware: dict[str, Any]  # hardware of the machine
 
     @property
     def ratio(self) -> float:
-        """How many times as many agent-steps a second as theirs; median of the turns."""
+        """Ratio of agent-steps per second to stable-baselines3; median of the turns."""
         return self._over("cavmarl", "stable_baselines3")
 
     @property
     def recipe_rate(self) -> float:
-        """Agent-steps a second of our own recipe; median of the turns."""
+        """Agent-steps per second with the recommended settings; median of the turns."""
         (row,) = (row for row in self.end_to_end if row.name == "cavmarl_recipe")
         return median(row.rates)
 
@@ -111,7 +112,7 @@ class TrainingSpeed:
         return paired_ratio(rates[one], rates[other])
 
     def facts(self) -> dict[str, Any]:
-        """Return plain values, for a report: all but the rows of `end_to_end`."""
+        """Return plain values for a report: all but the rows of `end_to_end`."""
         return {
             "agents": self.agents,
             "workers": self.workers,
@@ -130,12 +131,12 @@ class TrainingSpeed:
 def measure_training(
     agents: int = 20, worlds: int = 16, workers: int = 2, repeats: int = 3, say: Say = silent
 ) -> TrainingSpeed:
-    """Update by turns, after an update of each that does not count."""
+    """Update both sides in turn, after one update of each that is not measured."""
     check_range(
         agents=(agents, 1, math.inf), workers=(workers, 1, math.inf), repeats=(repeats, 1, math.inf)
     )
     if worlds % workers:
-        raise ConfigError(f"{worlds} worlds over {workers} workers: must be the same for each")
+        raise ConfigError(f"{worlds} worlds over {workers} workers: must divide evenly")
     needs = {"torch": "train", "highway_env": "bench", "stable_baselines3": "train"}
     for module, extra in needs.items():
         require(module, extra)
@@ -145,12 +146,12 @@ def measure_training(
 
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        say("starting theirs")
+        say("starting stable-baselines3")
         rows = HighwayRows(workers, agents, THEIR_KINEMATICS, HORIZON_S)
         stack.callback(rows.close)
         theirs = _theirs(rows, workers, OUR_STEPS * worlds // workers)
         settings = _settings(folder, agents, worlds, workers)
-        say("starting ours")
+        say("starting cavmarl")
         plain = stack.enter_context(opened(settings))
         other = stack.enter_context(opened(_recipe(folder, settings)))
         sides = [_ours("cavmarl", plain), _ours("cavmarl_recipe", other), theirs]
@@ -169,18 +170,18 @@ def measure_training(
 
 @cache
 def training_program() -> Any:
-    """`train/ppo.py` as a module: a file that is read, for `train` is no package."""
+    """Load `train/ppo.py` as a module from its file, since `train` is no package."""
     spec = importlib.util.spec_from_file_location("ppo", programs()["ppo"])
     if spec is None or spec.loader is None:
         raise ConfigError("train/ppo.py: cannot be read as a module")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
+    sys.modules[spec.name] = module  # dataclasses look up their module
     spec.loader.exec_module(module)
     return module
 
 
 def _recipe(folder: Path, settings: Any) -> Any:
-    """The same road with what we learn best with: see docs/guides/train.md."""
+    """Return settings of the same road as recommended in docs/guides/train.md."""
     entry = yaml.safe_load((folder / "env.yaml").read_text(encoding="utf-8"))
     for key, value in RECIPE_KEYS.items():
         shadow(entry, key, value)
@@ -216,7 +217,7 @@ def _settings(folder: Path, agents: int, worlds: int, workers: int) -> Any:
 
 
 class _Side:
-    """A side of the comparison: what its updates brought, and where their time went.
+    """A side of the comparison: the results and the timing of its updates.
 
     `update` collects and learns; it returns decisions and seconds by phase.
     """
@@ -284,7 +285,7 @@ def _theirs(rows: HighwayRows, worlds: int, num_steps: int) -> _Side:
 
 
 def _watch() -> Any:
-    """A callback of stable-baselines3 that notes when everything is collected."""
+    """Return a stable-baselines3 callback that records when the collection ends."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Watch(BaseCallback):
@@ -300,7 +301,7 @@ def _watch() -> Any:
 
 
 def _stepping(run: Any) -> float:
-    """Agent-steps a second of the worlds of a run, all agents keeping to one action."""
+    """Return agent-steps per second of a run's worlds, with all agents repeating one action."""
     vec = run.vec
     actions = np.ones((vec.num_envs, vec.num_agents), dtype=np.int64)
     decisions = 0

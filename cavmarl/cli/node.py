@@ -143,10 +143,10 @@ def node(
 
 def _join(join: str, key_file: Path, wait_s: float) -> NoReturn:
     """Host zones until the caller ends, then exit."""
-    from cavmarl.parallel.backend_name import read_address
-    from cavmarl.parallel.nodes.newcomers import ANYONE
+    from cavmarl.parallel.nodes.joining_nodes import ANYONE
     from cavmarl.parallel.nodes.node_process import run_node
     from cavmarl.parallel.nodes.node_starters import read_key
+    from cavmarl.parallel.placement.backend_name import read_address
 
     place, key = read_address(join), read_key(key_file)
     until_s = time.monotonic() + wait_s

@@ -1,8 +1,8 @@
-"""The height and the pitch of a vehicle over a whole drive, from GNSS, IMU and odometry.
+"""Height and pitch of a vehicle over a whole drive, from GNSS, IMU and odometry.
 
-A Kalman filter forwards and a smoother backwards (Rauch, Tung, Striebel, 1965) over height, speed
-and pitch: the force along the body less what speeds the vehicle up is gravity's part, which tells
-the pitch; the pitch and the speed tell how the height changes, and GNSS holds it.
+A Kalman filter and a backward smoother (Rauch, Tung, Striebel, 1965) over height, speed and pitch.
+The force along the body less the acceleration is the share of gravity, which gives the pitch. Pitch
+and speed give the change of the height, and GNSS keeps the height from drifting.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
 
-_DRIFT = (0.02, 0.3, 0.02)  # a square root of a second: m, m/s, rad
+_DRIFT = (0.02, 0.3, 0.02)  # per square root of a second: m, m/s, rad
 _FIRST = (3.0, 1.0, 0.1)
 
 
@@ -22,22 +22,22 @@ _FIRST = (3.0, 1.0, 0.1)
 class HeightTrack:
     """The readings of one drive, step by step."""
 
-    gnss_m: float  # standard deviations: of a GNSS height, of a speed
+    gnss_m: float  # standard deviations of a GNSS height and of a speed
     speed_mps: float
     _steps: list[tuple[float, float, float | None, float | None]] = field(default_factory=list)
 
     def add(
         self, elapsed_s: float, force_mps2: float, speed_mps: float | None, height_m: float | None
     ) -> None:
-        """One step: since the last one, along the body, by the wheels, by GNSS; None: no sample."""
+        """Add a step: force along the body, speed by wheels, height by GNSS; None: no sample."""
         self._steps.append((elapsed_s, force_mps2, speed_mps, height_m))
 
     def smoothed(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Height in m and pitch in rad, positive uphill, of each step."""
+        """Return height in m and pitch in rad, positive uphill, of each step."""
         heights = [step[3] for step in self._steps if step[3] is not None]
         state = np.array([heights[0] if heights else 0.0, self._steps[0][2] or 0.0, 0.0])
         spread = np.diag(_FIRST) ** 2
-        before, after = [], []  # state and spread, predicted and corrected
+        before, after = [], []  # (state, spread), predicted and corrected
         slopes = []
         for elapsed_s, force, speed, height in self._steps:
             slope = np.array(

@@ -1,6 +1,6 @@
-"""A point-cloud map made by driving: lidar frames placed by the stack's own GNSS, IMU and odometry.
+"""A point-cloud map from driving: lidar frames placed by the stack's GNSS, IMU and odometry.
 
-Nothing of the world's truth goes into the cloud; it is used to say how far off the poses were.
+The true poses are not used for the cloud, but only to report the error of the estimated poses.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ SURVEY_RIG: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 
-_SETTLED_S = 5.0  # of a drive, before its frames are used: the filter finds its heading
-_STANDS_MPS = 0.3  # a vehicle that stands sees nothing new
-_FRAMES_HELD = 200  # before the cloud is thinned out
+_SETTLED_S = 5.0  # start of a drive whose frames are skipped while the filter finds its heading
+_STANDS_MPS = 0.3  # a vehicle slower than this sees nothing new
+_FRAMES_HELD = 200  # frames collected before the cloud is thinned
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a survey has found, and how well its poses were known."""
+    """The cloud of a survey, and the errors of its poses."""
 
     cloud: Cloud  # in the frame of the map
     frames: int
     drives: int
-    off_m: Points  # (n,) how far each frame's pose was from the truth, in the plane
+    off_m: Points  # (n,) horizontal error of each frame's pose
     off_height_m: Points
     off_heading_rad: Points
 
 
 @dataclass
 class _Drive:
-    """One vehicle from its first fix to its end."""
+    """The drive of one vehicle from its first fix to its end."""
 
     vehicle_id: int
     begun_s: float
@@ -70,12 +70,12 @@ class _Drive:
 
 
 class Surveyor:
-    """Drives the vehicles of some worlds and keeps what their lidars see.
+    """Drives the vehicles of some worlds and collects their lidar echoes.
 
-    `env`: with `SURVEY_RIG`, one vehicle a world. `range_m`: of the echoes that are kept.
+    `env`: with `SURVEY_RIG` and one vehicle per world. `range_m`: maximum range of used echoes.
     `voxel_m`: one point is kept in each cube with this side.
 
-    Raises ConfigError: there is no lidar of several layers, or no GNSS.
+    Raises ConfigError: there is no lidar with several layers, or no GNSS.
     """
 
     def __init__(self, env: CavVectorEnv, range_m: float, voxel_m: float) -> None:
@@ -86,26 +86,26 @@ class Surveyor:
         lidars = [one for one in sensors if one.type == "lidar" and one.settings["layers"] > 1]
         if not lidars:
             raise ConfigError(
-                "a survey needs a lidar of several layers: mount one under `rig`, as {roof: {type: "
-                "lidar, rate_hz: 5, layers: 16, z_m: 1.6}}"
+                "a survey needs a lidar with several layers; mount one under `rig`, as {roof: "
+                "{type: lidar, rate_hz: 5, layers: 16, z_m: 1.6}}"
             )
         self._lidar: StackSensor = lidars[0]
         self._by_type = {sensor.type: sensor for sensor in sensors}
         self._step_s = welcome.dt_s * welcome.ticks_per_step
         self._vehicle: Vehicle = vehicle_of(HdMap(env.network), sensors, self._step_s)
         if self._vehicle.geodesy is None:
-            raise ConfigError("a survey needs a gnss under `rig`")
+            raise ConfigError("a survey needs a gnss; mount one under `rig`")
         self._drives: list[_Drive | None] = [None] * len(env.worlds.arrays.mask)
         self._parts: list[Points] = []
         self._off: list[tuple[float, float, float]] = []
         self._frames = self._ended = self._read = 0
 
     def run(self, steps: int, told: Callable[[int], None] = lambda step: None) -> Survey:
-        """So many steps of all worlds; `told`: called after each."""
+        """Run all worlds for a number of steps; `told` is called after each step."""
         env = self._env
         for step in range(steps):
             for world in range(len(self._drives)):
-                self._look(world)
+                self._read_sensors(world)
             env.step(env.suggest_actions())
             told(step + 1)
         for world in range(len(self._drives)):
@@ -116,13 +116,13 @@ class Surveyor:
         named = Cloud(f"survey of '{env.network.name}'", cloud, counts)
         return Survey(named, self._frames, self._ended, off[:, 0], off[:, 1], off[:, 2])
 
-    def _look(self, world: int) -> None:
-        """Take in what one world's vehicle has sensed in the last step."""
+    def _read_sensors(self, world: int) -> None:
+        """Add the sensor samples of one world's vehicle from the last step."""
         env = self._env
         tick = int(env.worlds.ticks()[world])
-        sight = sight_of(*take_snapshot(env, [0], SnapshotTime(0, 0, tick, False), world))
-        view = sight.snapshot.vehicles.get(env.possible_agents[0])
-        time_s = sight.snapshot.time_s
+        seen = sight_of(*take_snapshot(env, [0], SnapshotTime(0, 0, tick, False), world))
+        view = seen.snapshot.vehicles.get(env.possible_agents[0])
+        time_s = seen.snapshot.time_s
         drive = self._drives[world]
         if drive is not None and (view is None or view.vehicle_id != drive.vehicle_id):
             self._end(world)
@@ -132,7 +132,7 @@ class Surveyor:
             drive = None
         if view is None:
             return
-        readings = sight.sensors[env.possible_agents[0]]
+        readings = seen.sensors[env.possible_agents[0]]
         if drive is None:
             drive = self._drives[world] = self._begin(view.vehicle_id, time_s)
         mission = Mission(0, view.vclass, view.length_m, view.width_m)
@@ -176,7 +176,7 @@ class Surveyor:
         drive.steps += 1
 
     def _end(self, world: int) -> None:
-        """Place the frames of a drive that is over."""
+        """Add the frames of a finished drive to the cloud."""
         drive, self._drives[world] = self._drives[world], None
         if drive is None or not drive.frames:
             return

@@ -1,4 +1,4 @@
-"""A surveyed cloud beside the surface of the map that it was made in."""
+"""Comparison of a surveyed cloud with the surface of the map that it was made on."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from cavmarl.roads.network import RoadNetwork
 
 Points = NDArray[np.float64]
 
-_ON_LANE_M = 0.4  # in the plane, from a place of a lane
-_HIGH_M = 0.5  # above the road: no ground
-_WALL_M = 2.0  # farther from a wall, a point is something else
-_SEEN_M = 0.5  # a place of a lane has a point that near
+_ON_LANE_M = 0.4  # maximum horizontal distance of a point on a lane from the lane's surface
+_HIGH_M = 0.5  # above the road; higher points are not ground
+_WALL_M = 2.0  # points farther from a wall belong to other objects
+_SEEN_M = 0.5  # a place on a lane is covered if a point is this near
 _MARGIN_M = 1.0
-_SAMPLED_M = 0.5  # of the map's surface
+_SAMPLED_M = 0.5  # spacing of samples on the map's surface
 
 
 @dataclass(frozen=True)
 class SurveyFit:
-    """How far a cloud is from a map's surface; all in m."""
+    """The distance of a cloud from a map's surface; in m."""
 
-    height_rmse_m: float  # of points on lanes, from the lane
+    height_rmse_m: float  # of points on lanes, vertical
     height_median_m: float
     wall_rmse_m: float | None  # of points near walls, across the wall; None: there are none
     wall_median_m: float | None
-    seen_share: float  # of the lanes around the cloud
+    seen_share: float  # covered share of the lanes around the cloud
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
 def fit_survey(cloud: Cloud, network: RoadNetwork) -> tuple[SurveyFit, Comparison]:
-    """Measure a cloud in the map's frame against the map, as it is: nothing is aligned.
+    """Compare a cloud in the map's frame with the map, without alignment.
 
-    Ground beside lanes, which the map has not, is left out and counted.
+    Points on the ground beside lanes, which the map does not have, are left out and counted.
 
-    Raises MapError: nothing of the cloud lies on the map.
+    Raises MapError: no point of the cloud lies on the map.
     """
     gicp: Any = require("small_gicp", "maps")
     plane = cloud.points[:, :2]
@@ -58,7 +58,7 @@ def fit_survey(cloud: Cloud, network: RoadNetwork) -> tuple[SurveyFit, Compariso
     ground = (np.asarray(squares) < _ON_LANE_M**2) & ~high
     kept = cloud.kept(cloud.points[ground | high], "ground beside lanes")
     if not ground.any() or len(kept.points) < FEWEST_POINTS:
-        raise MapError(f"{cloud.name}: has no ground on the lanes of '{network.name}': drive on")
+        raise MapError(f"{cloud.name}: has no ground on '{network.name}'; survey more steps")
     wall_m = _across_walls(network, box, spacing_m, cloud.points[high])
     seen = nearest_distances(lanes, kept.points) < _SEEN_M
     fit = SurveyFit(
@@ -72,7 +72,7 @@ def fit_survey(cloud: Cloud, network: RoadNetwork) -> tuple[SurveyFit, Compariso
 
 
 def _across_walls(network: RoadNetwork, box: Any, spacing_m: float, points: Points) -> Points:
-    """Distances of points to walls, across these, without sign."""
+    """Return absolute distances of points from walls, perpendicular to the wall."""
     if not len(network.walls) or not len(points):
         return np.zeros(0)
     whole = map_surface(network, box, spacing_m)[0].points

@@ -1,13 +1,13 @@
 """`TimeMaster` alone advances the time of an environment; `TimeFollower` reads it.
 
-The integer tick is the truth, and time = tick · Δt: after 5,000 ticks of 50 ms it is exactly 250.0.
-A master takes the place of the environment's worlds, so that from then on no other caller steps or
-resets them; an environment without a master pays nothing for that. Followers come and go while the
-world runs. What one of them does when it ticks by itself, which made the world of the
-co-simulation paper advance 1.92 times as fast as its master, is refused, ignored or, to show the
-fault, obeyed; each is counted, and what has passed the master by is noticed before his next step.
+Time is an integer number of ticks, and time = tick · Δt: after 5,000 ticks of 50 ms it is exactly
+250.0. A master replaces the environment's worlds by a guard, so that no other caller can step or
+reset them. Without a master there is no overhead. Followers may join and leave while the world
+runs. In the co-simulation paper, a follower's own ticks made the world advance 1.92 times as fast
+as its master. Here, a follower's own tick is refused, ignored, or, to reproduce the fault, obeyed;
+all are counted. Ticks without the master are detected before its next step.
 
-A `Pacer` paces steps on the wall clock; simulated time does not depend on it.
+A `Pacer` paces steps by the wall clock; simulated time does not depend on it.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ from cavmarl.shards.shard import Commands
 
 
 class Pacer(Protocol):
-    """Says when the next step may begin."""
+    """Determines when the next step may begin."""
 
     def wait(self, elapsed_s: float) -> None:
-        """Return when the step may begin that starts after `elapsed_s` of simulated time."""
+        """Wait until the step may begin that starts after `elapsed_s` of simulated time."""
         ...
 
 
 class Unpaced:
-    """A step begins as soon as the one before has ended."""
+    """Begins each step as soon as the previous one has ended."""
 
     def wait(self, elapsed_s: float) -> None:
-        """Go on at once."""
+        """Return at once."""
 
 
 @dataclass(frozen=True)
 class Lateness:
-    """How late steps began, by the wall clock."""
+    """The delay of steps, by the wall clock."""
 
-    steps: int  # that have begun
-    # of these, that could not begin when they were due, because what went before took too long
+    steps: int  # number of steps
+    # number of steps that began after they were due, because earlier ones took too long
     late: int
-    mean_wall_s: float  # how long after they were due all of them began, on average
-    worst_wall_s: float  # the same, of the worst
+    mean_wall_s: float  # mean delay of all steps
+    worst_wall_s: float  # maximum delay
 
 
 class RealTime:
-    """Simulated time goes on `factor` times as fast as the wall clock, or slower if it has to.
+    """Runs simulated time at `factor` times the wall clock, or slower if necessary.
 
-    A step is due at a fixed time after the first one began, so that lateness is made up for and
-    does not add up.
+    A step is due at a fixed time after the first one began, so that delays are caught up and do not
+    accumulate.
 
-    `factor`: seconds of simulated time a second. `now`: the wall clock in seconds. `sleep`: waits
-    so many seconds.
+    `factor`: simulated seconds per second. `now`: the wall clock in seconds. `sleep`: waits for a
+    number of seconds.
 
-    Raises ConfigError: a factor that is no number above 0.
+    Raises ConfigError: the factor is not a finite number above 0.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class RealTime:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         if not 0.0 < factor < float("inf"):
-            raise ConfigError(f"pacing by {factor}: must be a number above 0, as 1 or 2.5")
+            raise ConfigError(f"pacing by {factor}: must be a number above 0, such as 1 or 2.5")
         self._factor = factor
         self._now, self._sleep = now, sleep
         self._origin: float | None = None
@@ -102,10 +102,10 @@ class RealTime:
 
 
 class Stepwise:
-    """Each step waits for permission.
+    """Waits for permission before each step.
 
     Args:
-        ask: called with the simulated time in seconds before each step; the step begins when it
+        ask: called with the simulated time in seconds before each step, which begins when it
             returns.
     """
 
@@ -146,32 +146,32 @@ class Steppable(Protocol):
 
 
 class ClockEvent(NamedTuple):
-    """Something about time that should not have been."""
+    """A fault of the time."""
 
-    tick: int  # the master's when it was noticed
-    # `own_tick`: a follower wanted to tick; `drift`: a world is not where its master left it
+    tick: int  # the master's tick at detection
+    # `own_tick`: a follower tried to tick; `drift`: a world was advanced without its master
     kind: Literal["own_tick", "drift"]
-    follower: str  # its name; unknown for a drift
-    ticks: int  # by how many the world has gone on, or would have
+    follower: str  # its name; empty for a drift
+    ticks: int  # number of ticks by which the world was or would have been advanced
 
 
 @dataclass
 class TimeFollower:
     """Reads the master's clock, in this process or at the other end of a socket."""
 
-    master: TimeMaster  # whose clock it reads
+    master: TimeMaster  # the master of the clock
     name: str
-    since_tick: int  # the master's when it has joined
-    own_ticks: int = 0  # how often it has wanted to tick by itself
+    since_tick: int  # the master's tick at joining
+    own_ticks: int = 0  # number of its own ticks
 
     @property
     def time_s(self) -> float:
         return self.master.time_s
 
     def tick(self) -> bool:
-        """Try to advance the world; whether it has advanced.
+        """Try to advance the world; return whether it has advanced.
 
-        Raises ClockError: the master refuses; see `TimeMaster`; it is no follower any more.
+        Raises ClockError: the master refuses, see `TimeMaster`; or the follower has left.
         """
         self.master.check_follower(self)
         self.own_ticks += 1
@@ -181,8 +181,8 @@ class TimeFollower:
         self.master.let_go(self)
 
 
-class _Mastered:
-    """Stands for an environment's worlds: steps and resets them for their master only."""
+class _GuardedWorlds:
+    """Guards an environment's worlds: only their master can step and reset them."""
 
     def __init__(self, worlds: _Worlds, master: TimeMaster) -> None:
         self.worlds = worlds
@@ -207,24 +207,24 @@ class TimeMaster:
     Args:
         env: a `CavEnv` or a `CavVectorEnv`; until `release` only `TimeMaster.step` and
             `TimeMaster.reset` step and reset it.
-        pacer: how fast by the wall clock; None: as fast as it goes.
-        own_ticks: what becomes of a follower's own tick: `refuse`: an error where it was called;
-            `ignore`: nothing happens; `obey`: the world really goes on, with the controls of the
-            last step. That is the fault of the unprotected co-simulation.
-        on_drift: what becomes of a world that is not where the master has left it: `error`, before
-            the next step; `record`: an event, and it goes on from there.
-        trace: notes the phases of each step; of worlds in this process only.
+        pacer: pace by the wall clock; None: as fast as possible.
+        own_ticks: handling of a follower's own tick: `refuse`: raise an error in the follower's
+            call; `ignore`: do nothing; `obey`: advance the world with the controls of the last
+            step, which is the fault of the unprotected co-simulation.
+        on_drift: handling of a world that another caller has advanced: `error`: raise an error
+            before the next step; `record`: record an event and continue.
+        trace: records the phases of each step; only for worlds in this process.
 
     Attributes:
-        tick: ticks by this master; no reset sets it back.
-        events: the first ones; of those that follow only the counts are kept.
-        own_ticks: how often all followers wanted to tick by themselves.
-        drifts: how often a world was not where the master had left it.
-        drift_ticks: by how many ticks the first world has gone on without the master.
+        tick: ticks by this master; not changed by resets.
+        events: the first events; later ones are only counted.
+        own_ticks: number of all followers' own ticks.
+        drifts: number of detected drifts.
+        drift_ticks: number of ticks by which the first world was advanced without the master.
 
     Raises:
-        ClockError: the environment has a master.
-        ConfigError: a trace of worlds in other processes.
+        ClockError: the environment already has a master.
+        ConfigError: a trace is given for worlds in other processes.
     """
 
     def __init__(
@@ -236,10 +236,10 @@ class TimeMaster:
         on_drift: Literal["error", "record"] = "error",
         trace: StepTrace | None = None,
     ) -> None:
-        if isinstance(env.worlds, _Mastered):
+        if isinstance(env.worlds, _GuardedWorlds):
             raise ClockError(
-                "this environment has a time master already: follow it (TimeMaster.follow), or let "
-                "it go first (TimeMaster.release)"
+                "this environment has a time master already; follow it (TimeMaster.follow), or "
+                "release it first (TimeMaster.release)"
             )
         self.env = env
         self.dt_s = env.config.clock.sim_dt_s
@@ -256,7 +256,7 @@ class TimeMaster:
         if trace is not None:
             worlds.simulation.trace(trace.around, trace.note)
         self._left = worlds.ticks()
-        self._mastered = env.worlds = _Mastered(worlds, self)
+        self._guard = env.worlds = _GuardedWorlds(worlds, self)
 
     @property
     def time_s(self) -> float:
@@ -265,14 +265,14 @@ class TimeMaster:
     @property
     def world_ticks(self) -> NDArray[np.int64]:
         """(W,) ticks of each world since its reset, made by any caller."""
-        return self._mine().ticks()
+        return self._guarded_worlds().ticks()
 
     @property
     def followers(self) -> tuple[TimeFollower, ...]:
         return tuple(self._followers)
 
     def follow(self, name: str) -> TimeFollower:
-        """Add a follower from now on; nothing of the world changes by it."""
+        """Add a follower; this does not change the world."""
         follower = TimeFollower(self, name, self.tick)
         self._followers.append(follower)
         return follower
@@ -281,63 +281,63 @@ class TimeMaster:
         self._followers.remove(follower)
 
     def step(self, actions: Any) -> Any:
-        """Advance the environment by one step; returns what its `step` returns.
+        """Advance the environment by one step; return the result of its `step`.
 
-        Raises ClockError: a world is not where the last step has left it.
+        Raises ClockError: another caller has advanced a world.
         """
         with self._turn():
             return self.env.step(actions)
 
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> Any:
-        """Begin an episode; returns what the environment's `reset` returns."""
+        """Begin an episode; return the result of the environment's `reset`."""
         with self._turn():
             return self.env.reset(seed=seed, options=None if options is None else dict(options))
 
     def release(self) -> None:
-        """Be master no longer: the environment can be stepped as before."""
-        self.env.worlds = self._mine()
+        """Release the environment, which can then be stepped without a master."""
+        self.env.worlds = self._guarded_worlds()
         self._followers.clear()
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
-        self._mine()
+        self._guarded_worlds()
         self._is_turn = True
         try:
             yield
         finally:
             self._is_turn = False
 
-    def _mine(self) -> _Worlds:
-        """The worlds behind the guard.
+    def _guarded_worlds(self) -> _Worlds:
+        """Return the guarded worlds.
 
-        Raises ClockError: they have been let go.
+        Raises ClockError: they have been released.
         """
-        if self.env.worlds is not self._mastered:
-            raise ClockError("this master has been released: make another TimeMaster")
-        worlds: _Worlds = self._mastered.worlds
+        if self.env.worlds is not self._guard:
+            raise ClockError("this master has been released; make another TimeMaster")
+        worlds: _Worlds = self._guard.worlds
         return worlds
 
     def check_turn(self, what: str) -> None:
-        """Refuse a caller that is not the master.
+        """Check that the caller is the master.
 
         Raises ClockError: `what` was called on the environment itself.
         """
         if not self._is_turn:
             raise ClockError(
-                f"{what}() of an environment that has a time master: call TimeMaster.{what}(), or "
-                "let the environment go first (TimeMaster.release)"
+                f"{what}() of an environment that has a time master; call TimeMaster.{what}(), or "
+                "release the environment first (TimeMaster.release)"
             )
 
     def check_follower(self, follower: TimeFollower) -> None:
-        """Refuse a follower that does not follow any more.
+        """Check that a follower still follows.
 
         Raises ClockError: it has left, or the master was released.
         """
         if follower not in self._followers:
-            raise ClockError(f"'{follower.name}' follows no more: join again (TimeMaster.follow)")
+            raise ClockError(f"'{follower.name}' no longer follows; join again (TimeMaster.follow)")
 
     def advance(self, worlds: _Worlds, commands: Commands) -> None:
-        """One step of the worlds: look for drift, wait for its time, step, count."""
+        """Check for drift, wait for the pacer, step the worlds, and count the ticks."""
         self.look_for_drift()
         self._pacer.wait(self.time_s)
         if self._trace is not None:
@@ -348,16 +348,16 @@ class TimeMaster:
         self.tick += self._per_step
 
     def set_back(self, worlds: _Worlds) -> None:
-        """Worlds have begun anew, by the master."""
+        """Store the ticks of worlds that the master has reset."""
         self._left = worlds.ticks()
         self._last = None
 
     def look_for_drift(self) -> None:
-        """Notice worlds that are not where the last step has left them.
+        """Detect worlds that another caller has advanced since the last step.
 
         Raises ClockError: there are some, and `on_drift` is `error`.
         """
-        found = self._mine().ticks()
+        found = self._guarded_worlds().ticks()
         if (found == self._left).all():
             return
         (drifted,) = np.nonzero(found != self._left)
@@ -370,12 +370,12 @@ class TimeMaster:
         if self._on_drift == "error":
             raise ClockError(
                 f"world {world} is at tick {found[world]}, but its time master left it at "
-                f"{left[world]}: another caller ticks it; let that follow the master, or ask for "
-                "on_drift = record"
+                f"{left[world]}: another caller ticks it; let that caller follow the master, or "
+                "set on_drift = record"
             )
 
     def tick_for(self, follower: TimeFollower) -> bool:
-        """A follower wants to tick by itself; whether the world has advanced.
+        """Handle a follower's own tick; return whether the world has advanced.
 
         Raises ClockError: `own_ticks` is `refuse`.
         """
@@ -383,12 +383,12 @@ class TimeMaster:
         self._keep(ClockEvent(self.tick, "own_tick", follower.name, self._per_step))
         if self._answer == "refuse":
             raise ClockError(
-                f"follower '{follower.name}' ticks by itself at {self.time_s:g} s: only the time "
-                "master ticks; switch its own ticks off, or ask for own_ticks = ignore"
+                f"follower '{follower.name}' ticks by itself at {self.time_s:g} s, but only the "
+                "time master may tick; switch its own ticks off, or set own_ticks = ignore"
             )
         if self._answer == "ignore" or self._last is None:
             return False
-        self._mine().step(self._last)
+        self._guarded_worlds().step(self._last)
         return True
 
     def _keep(self, event: ClockEvent) -> None:

@@ -42,7 +42,7 @@ BODY = SweptBody(HALF_M, 0.5 * WIDTH_M + 0.25)
 TICKS_S = (0.05, 0.1)  # the longer a tick, the further out a car drives
 SETTLE_M = 20.0  # additional start distance, so that the car arrives at the speed of the bend
 MOST_POSES = 2000
-FORMAT = "steered-3"  # change it when the rows of the same map change
+FORMAT = "steered-4"  # change it when the rows of the same map change
 
 
 def load_steered(path: str | Path) -> RoadNetwork:

@@ -255,5 +255,5 @@ class KinematicShard:
 
 
 def _plain(array: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Return records as bytes, which `np.savez` can save without pickles."""
+    """Return records as bytes, which NumPy can save without pickles."""
     return array.view(np.uint8) if array.dtype.names else array

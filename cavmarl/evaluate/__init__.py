@@ -1,4 +1,4 @@
-"""Evaluation: seeded runs, what they say about policies, and what they were made with."""
+"""Evaluation: seeded runs, reports about policies, and the provenance of results."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""A baseline for a map: chance, the built-in driver, a trained one, and what an oracle could do.
+"""Baselines for a map: random actions, the built-in driver, a trained driver and an oracle.
 
-All drive the same trips under the rules of one environment, on another map. The oracle is the
-built-in driver alone on the road: nothing is in its way, so no driver among others does better for
-long. What is missing to it is what traffic costs.
+All drive the same trips under the rules of one environment on another map. The oracle is the
+built-in
+driver alone on the road. As nothing hinders it, it bounds what a driver in traffic can reach; the
+difference to it is the cost of traffic.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from cavmarl.evaluate.metrics import KM_PER_INFRACTION, METRICS, Metric
 from cavmarl.evaluate.provenance.manifest import write_text
 from cavmarl.evaluate.report import EvaluationReport, Found
 
-RULES = "cities"  # the environment whose rules hold, and whose driver drives
+RULES = "cities"  # the environment whose rules and trained driver are used
 GENERALIST = "cities_ippo"
 ORACLE = "oracle"
-AMONG, ALONE = "among", "alone"  # folders of the results
+AMONG, ALONE = "among", "alone"  # subfolders of the results
 FIGURES = (
     "success",
     "collision",
@@ -50,19 +51,20 @@ def run_baseline(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> dict[str, EvaluationReport]:
-    """Evaluate `random_actions`, `idm` and a trained driver among others, and `idm` alone.
+    """Evaluate `random_actions`, `idm` and a trained driver in traffic, and `idm` alone.
 
     Args:
-        where: a map file, or an environment, whose maps are taken.
-        out: folder of the results, `among` and `alone` in it.
+        where: a map file, or an environment whose maps are used.
+        out: folder of the results; it gets the subfolders `among` and `alone`.
         policy: the trained driver.
-        agents: of each world; None: as many as the rules say.
-        background: likewise.
-        episodes: of each driver among others; alone it drives as many for each agent, up to 64.
+        agents: number of agents in each world; None: as configured by the environment.
+        background: number of background vehicles; None: as configured by the environment.
+        episodes: episodes of each driver in traffic; alone it drives one per agent and episode, up
+            to 64.
         seed: of the episodes.
         progress: as in `evaluate`.
 
-    Raises as `evaluate`: of a map that cannot be driven, or a driver that does not fit.
+    Raises the errors of `evaluate`, for example for a map that cannot be driven.
     """
     config, base_dir = load_config(where)
     maps = [str(path) for path in resolve_maps(config, base_dir)]
@@ -80,7 +82,7 @@ def run_baseline(
 
 
 def baseline_rows(found: Mapping[str, EvaluationReport]) -> dict[str, list[Found]]:
-    """Of each driver, the oracle last, its `FIGURES`."""
+    """Return the `FIGURES` of each driver, with the oracle last."""
     return {
         name: [driver[figure] for figure in FIGURES]
         for part in (AMONG, ALONE)
@@ -89,15 +91,15 @@ def baseline_rows(found: Mapping[str, EvaluationReport]) -> dict[str, list[Found
 
 
 def figures() -> Sequence[Metric]:
-    """The metrics of a row of `baseline_rows`."""
+    """Return the metrics of a row of `baseline_rows`."""
     by_name = {metric.name: metric for metric in METRICS}
     return [by_name[name] for name in FIGURES]
 
 
 def write_baseline(folder: Path, found: Mapping[str, EvaluationReport], path: Path) -> None:
-    """Write what `run_baseline` left in a folder as one page, which asks no server for anything.
+    """Write the results of `run_baseline` as one self-contained page.
 
-    Raises MissingExtraError: matplotlib or Jinja2 is not installed.
+    Raises MissingExtraError if matplotlib or Jinja2 is not installed.
     """
     require("matplotlib", "report")
     jinja2 = require("jinja2", "report")
@@ -128,7 +130,7 @@ def write_baseline(folder: Path, found: Mapping[str, EvaluationReport], path: Pa
 
 
 def _texts(row: Sequence[Found]) -> list[tuple[str, str]]:
-    """Mean and interval of each figure."""
+    """Return mean and interval of each figure as texts."""
     return [
         (
             "-" if one.mean is None else f"{metric.scale * one.mean:.2f}",

@@ -1,4 +1,4 @@
-"""Terms of agents by zone, near borders and inside: an effect of borders would show there."""
+"""Reward terms of agents near zone borders and inside zones, to reveal effects of borders."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from cavmarl.config.terms import TERMS
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-NEAR_M = 25.0  # of another zone: a vehicle is near its border
+NEAR_M = 25.0  # distance to another zone below which a vehicle is near a border
 PLACES = ("inside", "near border")
-PER_HOUR = ("collision", "off_road", "red_light", "wrong_way", "arrival")  # of driving
-PER_STEP = ("jerk", "ttc_risk", "speeding", "delay")  # means of the terms
+PER_HOUR = ("collision", "off_road", "red_light", "wrong_way", "arrival")  # hours of driving
+PER_STEP = ("jerk", "ttc_risk", "speeding", "delay")  # means of terms
 
 
 class BorderTerms:
-    """Sums over the steps of agents, by zone and by how near they are to a border.
+    """Sums over the steps of agents, by zone and by distance to a border.
 
     Attributes:
-        step_s: seconds a step.
-        steps: (Z, 2) of agents, inside and near a border.
-        sums: (Z, 2, T) of each term over them.
+        step_s: length of a step in s.
+        steps: (Z, 2) number of agent steps, inside and near a border.
+        sums: (Z, 2, T) sum of each term over these steps.
     """
 
     def __init__(self, partition: ZonePartition, step_s: float) -> None:
@@ -38,12 +38,12 @@ class BorderTerms:
         acted: NDArray[np.bool_],
         terms: NDArray[np.float32],
     ) -> None:
-        """Take in a step.
+        """Add a step.
 
         Args:
-            places_m: (W, A, 2) of agents before it.
-            acted: (W, A) which count.
-            terms: (W, A, T) of the step, registered ones last.
+            places_m: (W, A, 2) places of the agents before the step.
+            acted: (W, A) which agents count.
+            terms: (W, A, T) terms of the step, registered ones last.
         """
         if self._partition.count == 1 or not acted.any():
             return
@@ -59,7 +59,7 @@ class BorderTerms:
 
 
 def place_rows(parts: Iterable[BorderTerms]) -> list[dict[str, Any]]:
-    """What the parts of a policy come to: of all zones together (-1) and of each.
+    """Return the table of a policy: all zones together (-1), and each zone.
 
     Returns:
         Rows of `zone`, `place`, `agent_hours`, `<term>_per_h` of events and mean `<term>`s; None

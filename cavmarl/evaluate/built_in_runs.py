@@ -1,4 +1,4 @@
-"""Makes worlds divided into any number of zones, with the built-in driver for all agents."""
+"""Worlds with any number of zones in which the built-in driver drives all agents."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from cavmarl.evaluate.traffic.native_side import load_demand
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.partition.zone_file import named_zones
 
-TICK_S = 0.1  # of a world of demand
-UNDIVIDED = "bisection"  # of one zone: all layouts are the same
+TICK_S = 0.1  # tick of a world with demand, in s
+UNDIVIDED = "bisection"  # with one zone, all layouts are equal
 
 
 class DrivenWorld:
-    """A world whose agents do what the built-in driver would."""
+    """A world whose agents act as the built-in driver does."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -39,7 +39,7 @@ class DrivenWorld:
         return self._decoder.from_array(self._decoder.encode(raw), acting)
 
     def step(self, commands: Commands) -> None:
-        """One step; agents whose trip has ended are gone after it."""
+        """Take one step; agents whose trip has ended are removed afterwards."""
         self.simulation.step(commands)
         if self._num_agents:
             self.simulation.retire_agents()
@@ -53,14 +53,14 @@ def world_maker(
     seconds: int,
     **keys: Unpack[WorldKeys],
 ) -> Callable[[int], Simulation]:
-    """What makes the same world in k zones, reset.
+    """Return a function that makes the same world with k zones, already reset.
 
     Args:
         env: as in `make_vec`, like the other keywords.
-        demand: what drives on its map instead of the environment's vehicles, ticks of `TICK_S`.
-        layout: how zones are cut, or a zone file.
-        seconds: how long the world is needed.
-        keys: of the world; with `demand` numbers of vehicles are not read.
+        demand: demand that replaces the environment's vehicles, with ticks of `TICK_S`.
+        layout: shape of the zones, or a zone file.
+        seconds: length of the episode in s.
+        keys: of the world; with `demand`, numbers of vehicles are ignored.
     """
     spec = WorldSpec.of(env, **keys)
     if demand:

@@ -1,4 +1,4 @@
-"""What is noted after each step: places and near misses of agents, and counts of messages."""
+"""Recording of places and near misses of agents, and of message counts, after each step."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from cavmarl.roads.network import RoadNetwork
 
 
 def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
-    """(num_conflicts,) the row of the same area as seen from the foe's path, -1 where paths merge.
+    """Return (num_conflicts,) the row of the same area on the foe's path, -1 where paths merge.
 
-    A vehicle that follows another out of a merge shares its lane from then on: that is following,
-    which time to collision measures, and no encroachment.
+    After a merge both vehicles share a lane. That is following, which time to collision measures,
+    and not
+    an encroachment.
     """
     links, conflicts = network.links, network.conflicts
     link = np.repeat(np.arange(len(links)), links["num_conflicts"])
@@ -30,7 +31,7 @@ def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
 
 
 class EncounterWatch:
-    """Writes places and least post-encroachment times of the agents into a recorder."""
+    """Records places and least post-encroachment times of agents."""
 
     def __init__(self, vec: CavVectorEnv, recorder: Recorder) -> None:
         self._vec = vec
@@ -46,7 +47,7 @@ class EncounterWatch:
         locate_agents(worlds.rows, worlds.num_owned, self._recorder.places_m)
 
     def encounters(self, now_s: float, running: NDArray[np.bool_], mask: NDArray[np.bool_]) -> None:
-        """Take in the traffic after a step, in the `running` worlds (W,); `mask` (W, A) drives."""
+        """Record a step of the `running` worlds (W,); `mask` (W, A) marks agents that drive."""
         if not self._mirror.size:
             return
         worlds = self._vec.simulation.worlds
@@ -67,14 +68,14 @@ class EncounterWatch:
 
 
 class MessageRecord:
-    """Keeps the counts of each world up to the last step before its episode is over, if any."""
+    """Keeps the message counts of each world up to the last step of its episode."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
         self._bus = vec.simulation.messages if vec.config.v2x.enabled else None
         self._values = np.full((vec.num_envs, len(MESSAGE_COLUMNS)), np.nan)
 
     def add(self, running: NDArray[np.bool_]) -> None:
-        """Note the worlds (W,) whose episode goes on."""
+        """Record the worlds (W,) whose episode continues."""
         if self._bus is None:
             return
         for world in np.flatnonzero(running).tolist():
@@ -82,6 +83,6 @@ class MessageRecord:
             self._values[world] = [found[name] for name in MESSAGE_COLUMNS]
 
     def write(self, episodes: NDArray[np.void]) -> None:
-        """Fill the columns of EPISODE (n,), of the first n worlds; NaN: there are no messages."""
+        """Fill the message columns of the first n worlds in EPISODE (n,); NaN: no messages."""
         for column, name in enumerate(MESSAGE_COLUMNS):
             episodes[name] = self._values[: len(episodes), column]

@@ -1,4 +1,4 @@
-"""Running the episodes of one run: worlds that are stepped together, a part of them at a time."""
+"""The episodes of one run: worlds are stepped together, in parts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cavmarl.evaluate.run_extras import RunWatch, recording_path
 from cavmarl.evaluate.stuck_trips import StandingWatch
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
 from cavmarl.evaluate.transfer_rows import TransferRecorder
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.policies.loading import load_policy
 from cavmarl.policies.policy import Policy
 from cavmarl.recordings.extra_tables import RecordOptions
@@ -33,56 +33,58 @@ from cavmarl.zones.partition.zone_statistics import imbalance
 
 MAX_VEHICLES = 100_000  # of the worlds that are stepped together
 MAX_WORLDS = 128
-TRACK_S = 0.5  # between the points of a track
-TIMED_TICKS = 16  # of so many ticks one is timed, zone by zone
+TRACK_S = 0.5  # between two points of a track
+TIMED_TICKS = 16  # one of this many ticks is timed zone by zone
 
-Progress = Callable[[str, int, int], None]  # policy, steps done, most steps there can be
+Progress = Callable[
+    [str, int, int], None
+]  # called with policy, steps done, maximum number of steps
 Watcher = Callable[[CavVectorEnv], Callable[[], None]]
 """Is given the worlds of a run; what it returns is called after each reset and step of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeJob(WorldSpec):
-    """One run: some policies, each over the same episodes; the seed is the policies', too."""
+    """One run of some policies over the same episodes; the seed also seeds the policies."""
 
-    policies: Mapping[str, str]  # as in `load_policy`, by the name that results have
-    episodes: int  # how many; episode e is the first one of world e of the seed
-    run: int = 0  # its number
-    runs: int = 1  # how many there are
-    record: RecordOptions | None = None  # of recordings; None: nothing is recorded
-    failures: int = 0  # how many failed trips are kept of each policy
+    policies: Mapping[str, str]  # as in `load_policy`, by name in the results
+    episodes: int  # number of episodes; episode e is the first one of world e of the seed
+    run: int = 0  # number of this run
+    runs: int = 1  # number of runs
+    record: RecordOptions | None = None  # options of recordings; None: no recording
+    failures: int = 0  # number of failed trips kept for each policy
 
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast a run went; not repeatable."""
+    """Speed of a run; it is not reproducible."""
 
     step_ms: float  # milliseconds of simulation for one step of one world
     policy_ms: float  # milliseconds of the policy for one step of one world
     agent_steps_per_s: float  # decisions a second, simulation and policy
-    worlds: int  # how many were stepped together
-    # of divided worlds: the slowest zone's part of a tick over the mean of all zones, by the
-    # processor's time, all worlds together; None: not measured
+    worlds: int  # number of worlds stepped together
+    # time of the slowest zone in a tick over the mean of all zones, by the
+    # processor time of all worlds; None: not measured
     zone_time_imbalance: float | None = None
 
 
 @dataclass(frozen=True)
 class RunData:
-    """What a policy did in one run."""
+    """The data of a policy from one run."""
 
     trips: NDArray[np.void]  # TRIP records of all trips
     episodes: NDArray[np.void]  # EPISODE records
     tracks: NDArray[np.void]  # TRACK records of the agents of the first episode
-    speed: Speed  # how fast it ran
-    # TRANSFER records of the changes of owner; none in undivided worlds
+    speed: Speed  # speed of the run
+    # TRANSFER records; empty for undivided worlds
     transfers: NDArray[np.void]
-    transfer_counts: Mapping[str, int]  # of a `TransferLog`, summed over the episodes
-    failures: Sequence[Failure] = ()  # trips that were no success, as far as they are kept
+    transfer_counts: Mapping[str, int]  # counts of a `TransferLog`, summed over the episodes
+    failures: Sequence[Failure] = ()  # failed trips that are kept
     borders: Sequence[BorderTerms] = ()  # terms by zone and place
 
 
 def worlds_at_once(episodes: int, vehicles: int) -> int:
-    """How many worlds are stepped together: few enough for flat memory, and even parts."""
+    """Return how many worlds to step together: bounded memory, parts of equal size."""
     most = max(1, min(MAX_WORLDS, MAX_VEHICLES // max(vehicles, 1)))
     return math.ceil(episodes / math.ceil(episodes / most))
 
@@ -145,14 +147,14 @@ def _drive(
 
 
 def derived_seed(seed: int, number: int) -> int:
-    """The seed of a further run, or of a policy in a further part; that of the first is `seed`."""
+    """Return the seed of a further run or part; the first one has `seed` itself."""
     if number == 0:
         return seed
     return int(np.random.SeedSequence((seed, number)).generate_state(1, np.uint64)[0]) >> 1
 
 
 class _Part:
-    """The episodes of the worlds that are stepped together; the first `count` of them count."""
+    """The episodes of the worlds stepped together; the first `count` of them count."""
 
     def __init__(self, vec: CavVectorEnv, seen: RunWatch, count: int, *, tracked: bool) -> None:
         self._vec = vec
@@ -164,7 +166,7 @@ class _Part:
             vec.max_cycles,
             vec.step_s,
             np.array(vec.config.terms.weight_of_each),
-            # A trip that has a horizon of its own and arrives is in time.
+            # A trip with its own horizon that arrives is in time.
             math.inf if vec.config.traffic.trip_horizon else SLOWEST,
         )
         self._watch = EncounterWatch(vec, self._recorder)
@@ -191,7 +193,7 @@ class _Part:
         policy_seed: int,
         step_done: Callable[[int, int], None],
     ) -> None:
-        """Drive until every world that counts has been through its episode."""
+        """Drive until each counting world has finished its episode."""
         vec = self._vec
         observations, infos = vec.reset(seed=seed, options={"first_world": first})
         driver.reset(policy_seed)
@@ -215,7 +217,7 @@ class _Part:
             between = time.perf_counter()
             observations, rewards, _, _, infos = vec.step(actions)
             after = time.perf_counter()
-            if steps:  # the first step loads or compiles what the others use
+            if steps:  # the first step loads or compiles the kernels
                 self.policy_s += between - before
                 self.simulation_s += after - between
                 self.decisions += int(infos["acted"].sum())
@@ -251,7 +253,7 @@ class _Part:
 
 
 class _Imbalance:
-    """How unevenly vehicles are shared out among zones, world by world."""
+    """Imbalance of vehicles over zones, world by world."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
         self._simulation = vec.simulation
@@ -260,18 +262,18 @@ class _Imbalance:
         self._steps = np.zeros(vec.num_envs, dtype=np.int64)
 
     def add(self, running: NDArray[np.bool_]) -> None:
-        """Before a step of the worlds (W,) that are in their episode."""
+        """Sample the running worlds (W,) before a step."""
         if self._is_divided:
             self._sums[running] += self._simulation.zones.loads().imbalance()[running]
             self._steps[running] += 1
 
     def means(self) -> NDArray[np.float64]:
-        """(W,) over the steps; NaN of undivided worlds."""
+        """Return (W,) means over the steps; NaN for undivided worlds."""
         return np.where(self._steps > 0, self._sums / np.maximum(self._steps, 1), np.nan)
 
 
 def _zone_clock(vec: CavVectorEnv) -> ShardClock | None:
-    """Times the zones of divided worlds; None of undivided ones."""
+    """Return a clock for the zones of divided worlds, or None."""
     if vec.simulation.partition.count == 1:
         return None
     return vec.simulation.zones.measure_costs(TIMED_TICKS)

@@ -1,4 +1,4 @@
-"""`evaluate`: seeded runs of some policies, on record from before the first step."""
+"""`evaluate`: seeded runs of policies, with a manifest written before the first step."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ from cavmarl.evaluate.tables import (
 from cavmarl.evaluate.transfer_rows import transfers_of
 from cavmarl.handoff.coordinator.coordinator_setup import journal_path
 from cavmarl.ownership.transfer_summary import TransferSummary
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.policies.loading import load_policy
 from cavmarl.recordings.extra_tables import RecordOptions
 
@@ -97,34 +97,37 @@ def evaluate(
     watcher: Watcher | None = None,
     **keys: Unpack[WorldKeys],
 ) -> EvaluationReport:
-    """Let policies drive `repeats` runs of `episodes` seeded episodes, each counted once.
+    """Evaluate policies in `repeats` runs of `episodes` seeded episodes.
 
-    All policies meet the same episodes: episode e of a run is the first one of world e of its seed.
-    If the trained drivers among them need the same sensors, the worlds get these sensors.
-    Two or more runs are driven in fresh processes, one after the other.
+    All policies drive the same episodes: episode e of a run is the first one of world e of its
+    seed. If
+    the trained drivers among the policies need the same sensors, the worlds get these sensors. Two
+    or more
+    runs are driven in new processes, one after the other.
 
     Args:
-        env: as in `make_vec`, like the other keywords that are not explained here.
-        policies: as in `load_policy`: one, several, or names for them in the results.
-        episodes: of each run.
-        repeats: independent runs.
-        out: folder for manifest and raw results; None keeps nothing but the report.
-        record: a new folder for recordings, or `RecordOptions`; their worlds are episodes; with
-            several policies or runs, in subfolders POLICY/run-N (docs/guides/recordings.md).
-        failures: how many failed trips the page `failures.html` in `out` shows; 0: there is none.
-        progress: called after every step of a run with the policy's name, the steps that it has
-            done in this run, and the most there can be.
-        watcher: given the worlds, which are stepped together; what it returns is called after each
-            reset and step, and does not count as time of the worlds. Of one run only.
-        keys: of the world; the seed is that of the first run, from which the others' follow.
+        env: as in `make_vec`, like the keywords that are not listed here.
+        policies: as in `load_policy`: one, several, or a mapping from names in the results.
+        episodes: number of episodes of each run.
+        repeats: number of independent runs.
+        out: folder for manifest and raw results; None: only the report is returned.
+        record: a new folder for recordings, or `RecordOptions`; worlds of a recording are episodes;
+            with several policies or runs, recordings are in subfolders POLICY/run-N
+            (docs/guides/recordings.md).
+        failures: number of failed trips on the page `failures.html` in `out`; 0: no page.
+        progress: called after every step of a run with the policy's name, the steps done in this
+            run, and the maximum number of steps.
+        watcher: called with the worlds that are stepped together; it returns a function that is
+            called after each reset and step, outside of the measured time. With one run only.
+        keys: of the world; the seed is that of the first run and determines the others.
 
     Raises:
-        ConfigError: a number or a key that cannot work, an override that contradicts a trained
-            driver, or `out` cannot be made.
-        PolicyError: a policy cannot be loaded or does not fit, two have one name, or two trained
-            drivers need different sensors.
-        ManifestError: `out` holds results already.
-        JournalError: a journal is there already.
+        ConfigError: a wrong number or key, an override that contradicts a trained driver, or `out`
+            cannot be created.
+        PolicyError: a policy cannot be loaded or does not fit, two have the same name, or two
+            trained drivers need different sensors.
+        ManifestError: `out` already holds results.
+        JournalError: a journal exists already.
         RecordingError: `record` cannot be written.
         MissingExtraError: `record` without pyarrow, `failures` without Jinja2.
     """
@@ -156,9 +159,9 @@ def evaluate(
 
 
 def _record_options(record: RecordOptions | str | Path | None) -> RecordOptions | None:
-    """Return the options with an absolute path, as a manifest tells it.
+    """Return the options with an absolute path, as the manifest states it.
 
-    Refuse early what no recording can be made in.
+    Raises an error before the run if no recording can be made there.
     """
     if record is None:
         return None
@@ -166,15 +169,15 @@ def _record_options(record: RecordOptions | str | Path | None) -> RecordOptions 
     options = RecordOptions.of(record)
     path = Path(options.path).absolute()
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        raise RecordingError(f"{options.path}: there is something already; give a new folder")
+        raise RecordingError(f"{options.path}: the folder is not empty; name a new folder")
     return options.at(str(path))
 
 
 def load_report(folder: Path) -> EvaluationReport:
-    """The report of the results in a folder, made anew from its raw tables.
+    """Return the report of a results folder, recomputed from its raw tables.
 
     Raises:
-        ManifestError: no closed manifest, or results that it does not know.
+        ManifestError: the manifest is missing or open, or a result is not listed in it.
     """
     manifest = read_evaluation(folder)
     speeds = json.loads((folder / SPEED_FILE).read_text(encoding="utf-8"))
@@ -183,22 +186,22 @@ def load_report(folder: Path) -> EvaluationReport:
 
 
 def read_evaluation(folder: Path) -> dict[str, Any]:
-    """The closed manifest of an evaluation whose metrics are those of this version.
+    """Return the closed manifest of an evaluation with the metrics of this version.
 
-    Raises ManifestError: none, an open one, results that it does not know, or other metrics.
+    Raises ManifestError if it is missing or open, if a result is not listed, or for other metrics.
     """
     manifest = read_closed(folder)
     version = manifest.get("metrics_version", 1)
     if version != METRICS_VERSION:
         raise ManifestError(
             f"{folder}: its metrics are of version {version}, those of this cavmarl of version "
-            f"{METRICS_VERSION}; figures of different versions are not compared: evaluate again"
+            f"{METRICS_VERSION}; figures of different versions cannot be compared: evaluate again"
         )
     return manifest
 
 
 def load_tables(folder: Path) -> dict[str, tuple[Rows, Rows]]:
-    """TRIP and EPISODE records by policy; raises as `load_report`."""
+    """Return TRIP and EPISODE records by policy; raises as `load_report`."""
     names = read_evaluation(folder)["policies"]
     trips = read_table(folder / TRIPS_FILE, TRIP)
     episodes = read_table(folder / EPISODES_FILE, EPISODE)
@@ -206,14 +209,17 @@ def load_tables(folder: Path) -> dict[str, tuple[Rows, Rows]]:
 
 
 def load_tracks(folder: Path) -> dict[str, Rows]:
-    """TRACK records of the first episode by policy; raises as `load_report`."""
+    """Return TRACK records of the first episode by policy; raises as `load_report`."""
     names = read_closed(folder)["policies"]
     tracks = read_table(folder / TRACKS_FILE, TRACK)
     return {name: tracks.get(name, np.zeros(0, TRACK)) for name in names}
 
 
 def load_transfers(folder: Path) -> dict[str, TransferSummary]:
-    """What became of transfers, by policy; nothing of undivided worlds. Raises as `load_report`."""
+    """Return transfer summaries by policy, empty for undivided worlds.
+
+    Raises as `load_report`.
+    """
     manifest = read_closed(folder)
     if TRANSFERS_FILE not in manifest["results_sha256"]:
         return {}
@@ -227,7 +233,10 @@ def load_transfers(folder: Path) -> dict[str, TransferSummary]:
 
 
 def load_places(folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """What `place_rows` made, by policy; nothing of undivided worlds. Raises as `load_report`."""
+    """Return the rows of `place_rows` by policy, empty for undivided worlds.
+
+    Raises as `load_report`.
+    """
     if PLACES_FILE not in read_closed(folder)["results_sha256"]:
         return {}
     rows: dict[str, list[dict[str, Any]]] = json.loads(
@@ -237,14 +246,14 @@ def load_places(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def load_map(folder: Path) -> dict[str, Any]:
-    """What `map_outline` made; raises as `load_report`."""
+    """Return the outline written by `map_outline`; raises as `load_report`."""
     read_closed(folder)
     outline: dict[str, Any] = json.loads((folder / MAP_FILE).read_text(encoding="utf-8"))
     return outline
 
 
 def run_seeds(seed: int, repeats: int) -> list[int]:
-    """The seeds of the runs: the first is `seed`, the others are hashes of (seed, run)."""
+    """Return the seeds of the runs: `seed` first, then hashes of (seed, run)."""
     return [derived_seed(seed, run) for run in range(repeats)]
 
 
@@ -255,14 +264,16 @@ def _named(policies: Policies) -> dict[str, str]:
         given = [policies] if isinstance(policies, str | Path) else list(policies)
         named = {str(policy): str(policy) for policy in given}
         if len(named) < len(given):
-            raise PolicyError(f"policies {', '.join(map(str, given))}: one stands there twice")
+            raise PolicyError(
+                f"policies {', '.join(map(str, given))}: one is listed twice; list each once"
+            )
     if not named:
-        raise PolicyError("no policy: give at least one")
+        raise PolicyError("there is no policy: give at least one")
     return named
 
 
 def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJob], bool]:
-    """Refuse early what cannot work, then put everything on record.
+    """Check the job, then write the manifest.
 
     Returns the runs, and whether worlds have zones.
     """
@@ -276,7 +287,7 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made ({error.strerror or error})") from error
+        raise ConfigError(f"{folder}: cannot be created ({error.strerror or error})") from error
     worlds = worlds_at_once(job.episodes, config.population.agents + config.population.background)
     seeds = run_seeds(job.seed, repeats)
     jobs = _runs(job, seeds, config.zones.journal, worlds)
@@ -296,7 +307,7 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
 
 
 def _runs(job: EpisodeJob, seeds: list[int], journal: str, worlds: int) -> list[EpisodeJob]:
-    """The runs of a job, each with journals of its own: `run.jsonl`, `run.run-1.jsonl`."""
+    """Return the runs of a job; each has its own journals: `run.jsonl`, `run.run-1.jsonl`."""
     jobs = []
     for run, seed in enumerate(seeds):
         overrides = dict(job.overrides)
@@ -351,7 +362,7 @@ def _write_failures(folder: Path, job: EpisodeJob, results: list[RunData]) -> No
 
 
 def _deaf(policy: str, steps: int, most: int) -> None:
-    """Progress of which nothing is to be told."""
+    """Ignore the progress."""
 
 
 def _all(runs: Sequence[dict[str, RunData]], policy: str, table: str) -> Rows:

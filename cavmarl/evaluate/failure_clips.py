@@ -1,4 +1,4 @@
-"""Failed trips of an evaluation: why they failed, and the last ten seconds of what was around."""
+"""Failed trips of an evaluation: their causes, and their surroundings in the last ten seconds."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.sensors.sensed_shapes import Shape, observed_shapes
 
 CLIP_S = 10.0
-REACH_M = 70.0  # from where the trip ended: what a clip shows
-MOST_KEPT_BYTES = 256 << 20  # of observations
+REACH_M = 70.0  # radius around the end of the trip that a clip shows
+MOST_KEPT_BYTES = 256 << 20  # decimals of observations
 NO_SENSORS = "observes nothing that can be drawn"
 TOO_MANY = f"observations of ten seconds are more than {MOST_KEPT_BYTES >> 20} MB and were not kept"
 _DRAWN = ("rays", "links")  # kinds of shapes
 
-# Worst first.
+# Causes, worst first.
 FATES = ("collision", "off_road", "red_light", "wrong_way", "stood", "blocked", "out_of_time")
 CAUSES = (*FATES, "slow")
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A trip that was no success."""
+    """A failed trip."""
 
-    cause: str  # of `CAUSES`
-    severity: float  # the more the worse, among those of its cause: m/s, or s of delay
+    cause: str  # one of `CAUSES`
+    severity: float  # higher is worse within a cause: m/s, or s of delay
     trip: Mapping[str, Any]  # policy, run, seed, episode, agent, when and where it ended
-    clip: Mapping[str, Any]  # `vehicles` and `frames`, as `clip_of` makes them
+    clip: Mapping[str, Any]  # `vehicles` and `frames` from `clip_of`
 
 
 class FailureClips:
     """Keeps the last seconds of worlds, and the worst failures of each cause.
 
     Args:
-        most: how many failures are kept.
+        most: number of failures to keep.
         config: of the worlds.
-        about: what stands in each trip: policy, run, seed.
-        observations: (W, A, D) of their agents, as the last step left them.
+        about: values for each trip: policy, run, seed.
+        observations: (W, A, D) observations of the agents, as the last step wrote them.
     """
 
     def __init__(
@@ -61,26 +61,26 @@ class FailureClips:
         self._length = max(2, math.ceil(CLIP_S / step_s) + 1)
         self._observations = observations
         self._keeps = self._length * observations.nbytes <= MOST_KEPT_BYTES
-        # (frame, observations (A, D) if they are kept) of each world
+        # of each world (frame, observations (A, D) if kept)
         self._recent: dict[int, deque[tuple[WorldFrame, NDArray[np.float32] | None]]] = {}
         self.failures: list[Failure] = []
 
     def begin(self) -> None:
-        """Forget what was seen: the worlds begin other episodes."""
+        """Discard all frames when the worlds begin other episodes."""
         self._recent.clear()
 
     def add(self, frames: Iterable[WorldFrame]) -> None:
-        """Take the present moment of worlds."""
+        """Record the present moment of worlds."""
         for frame in frames:
             kept = self._recent.setdefault(frame.world, deque(maxlen=self._length))
             kept.append((frame, self._observations[frame.world].copy() if self._keeps else None))
 
     def take(self, trips: NDArray[np.void], first: int) -> None:
-        """Look at trips that have ended in the step after the last frames.
+        """Keep failed trips that ended in the step after the last frames.
 
         Args:
-            trips: TRIP (n,), `episode` is their world.
-            first: the episode of world 0.
+            trips: TRIP (n,); `episode` is their world.
+            first: episode of world 0.
         """
         for trip in trips[trips["counted"] & ~trips["success"]]:
             recent = list(self._recent.get(int(trip["episode"]), ()))
@@ -127,7 +127,7 @@ class FailureClips:
     def _sensed(
         self, frame: WorldFrame, kept: NDArray[np.float32] | None, agent: int, vehicle: int
     ) -> list[Shape]:
-        """What the agent observed at a moment, if it was in this vehicle: rays and others."""
+        """Return what the agent observed at a moment, if it was in this vehicle."""
         mine = frame.vehicles[frame.vehicles["id"] == vehicle]
         if kept is None or not len(mine) or int(mine["agent"][0]) != agent:
             return []
@@ -136,18 +136,18 @@ class FailureClips:
 
 
 def _rounded(shape: Shape) -> Shape:
-    """The same with places to the decimetre: a page has thousands."""
+    """Round places to decimetres, as a page has thousands of them."""
     names = {"rays": ("from", "ends"), "links": ("points",)}[shape["kind"]]
     return shape | {name: [round(value, 1) for value in shape[name]] for name in names}
 
 
 def cause_of(trip: np.void) -> str:
-    """Why a trip is no success, of `CAUSES`."""
+    """Return why a trip failed, one of `CAUSES`."""
     return next((cause for cause in FATES if trip[cause]), "slow")
 
 
 def worst(failures: Iterable[Failure], most: int) -> list[Failure]:
-    """The worst of each cause in turn, until there are `most`; by cause, worst first."""
+    """Return up to `most` failures, the worst of each cause in turn, sorted by cause."""
     every = sorted(failures, key=lambda failure: -failure.severity)
     by_cause = {cause: [one for one in every if one.cause == cause] for cause in CAUSES}
     chosen: dict[str, int] = dict.fromkeys(CAUSES, 0)
@@ -161,11 +161,11 @@ def worst(failures: Iterable[Failure], most: int) -> list[Failure]:
 
 
 def clip_of(frames: Sequence[WorldFrame], center: tuple[float, float]) -> dict[str, Any]:
-    """What frames show near a place, as numbers for a page.
+    """Return what frames show near a place, as numbers for a page.
 
     Returns:
-        `vehicles`: by id [length, width, agent]; `frames`: of each the tick and
-        [id, x, y, heading, speed, lights] of each vehicle; lights: 1 brakes, 2 left, 4 right.
+        `vehicles`: by id [length, width, agent]; `frames`: of each the tick and [id, x, y, heading,
+            speed, lights] of each vehicle; lights: 1 brakes, 2 left, 4 right.
     """
     vehicles: dict[str, list[float]] = {}
     shown = []

@@ -1,4 +1,4 @@
-"""The page of failed trips: one HTML file that asks no server and no other host for anything."""
+"""The page of failed trips: a self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def write_failures(
     """Write the worst failures as a page.
 
     Args:
-        path: the file.
-        failures: all that were kept.
-        most: how many are shown.
-        found: how many there were, with those that were not kept.
-        network: the map; lanes far from all of them are left out.
-        environment: for the title.
+        path: the file to write.
+        failures: the failures that were kept.
+        most: number of failures to show.
+        found: number of all failures, including those not kept.
+        network: the map; lanes far from all failures are left out.
+        environment: name for the title.
 
     Raises:
         MissingExtraError: Jinja2 is not installed.
@@ -67,7 +67,7 @@ def write_failures(
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
         (_HERE / "failures.html.j2").read_text(encoding="utf-8")
     )
-    # Names in the data may hold anything: `</script>` in one must not end the element.
+    # A name in the data may contain `</script>`, which must not end the element.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     page = template.render(
         environment=environment,
@@ -89,5 +89,5 @@ def _is_near(line: list[list[float]], centers: NDArray[np.float64]) -> bool:
 
 
 def _hash(text: str) -> str:
-    """What a content security policy names an inline element by."""
+    """Return the hash by which a content security policy admits an inline element."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -1,4 +1,4 @@
-"""Trips map by map, where an environment has several: the worst map counts."""
+"""Results by map, for environments with several maps."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 
 from cavmarl.evaluate.metrics import KM_PER_INFRACTION, METRICS, metric_values
 
-# What a row has of a map, beside its name and number of trips.
+# Metrics of a row, besides the map's name and number of trips.
 SHOWN = ("success", "collision", "off_road", "red_light", "stood", "blocked", KM_PER_INFRACTION)
 
 
 def rows_by_map(
     tables: Mapping[str, tuple[NDArray[np.void], NDArray[np.void]]], names: Sequence[str]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Of each policy a row a map, the worst first, by success; nothing where there is one map.
+    """Return for each policy one row per map, worst success first; nothing for one map.
 
-    `tables`: TRIP and EPISODE records. `names`: of the maps. Maps without trips that count are left
+    `tables`: TRIP and EPISODE records. `names`: names of the maps. Maps without counting trips are
+    left
     out.
     """
     if len(names) < 2:

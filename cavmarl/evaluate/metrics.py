@@ -1,4 +1,4 @@
-"""What is measured: the metrics of a report, each a column of trips or of episodes."""
+"""The metrics of a report. Each is a column of trips or of episodes."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ INFRACTIONS = ("collision", "off_road", "red_light", "wrong_way")
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of interest."""
+    """A metric."""
 
-    name: str  # its key in a report, and its column
-    label: str  # its name in tables
-    unit: str  # of the values times `scale`; empty for plain numbers
-    per: Per  # a run has one value for each of these
+    name: str  # key in a report, and name of the column
+    label: str  # name in tables
+    unit: str  # unit of the values times `scale`; empty for plain numbers
+    per: Per  # what a run has one value for: trips or episodes
     meaning: str  # one line
-    better: Better = None  # which way is better; None where neither is
-    share: bool = False  # the values are yes or no, and their mean is a share
-    bounded: bool = False  # the values lie from `least_value` to 1
-    arrived: bool = False  # only trips that arrived have a value
-    scale: float = 1.0  # values are shown times this
+    better: Better = None  # whether higher or lower is better; None: neither
+    share: bool = False  # values are yes or no, so their mean is a share
+    bounded: bool = False  # values are from `least_value` to 1
+    arrived: bool = False  # only arrived trips have a value
+    scale: float = 1.0  # factor for display
 
     @property
     def title(self) -> str:
@@ -113,7 +113,7 @@ METRICS = (
 def metric_values(
     metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void]
 ) -> NDArray[np.float64]:
-    """The values (N,) of a metric; NaN is no value. Of trips only those that count are read."""
+    """Return the values (N,) of a metric, NaN for none; only counting trips are used."""
     if metric.per == "episode":
         return np.asarray(episodes[metric.name], dtype=np.float64)
     rows = trips[trips["counted"]]
@@ -125,14 +125,14 @@ def metric_values(
 
 
 def _km_per_infraction(trips: NDArray[np.void]) -> NDArray[np.float64]:
-    """One value; none without trips."""
+    """Return one value; none without trips."""
     infractions = sum(int(trips[name].sum()) for name in INFRACTIONS)
     km = np.maximum(trips["distance_m"], 0.0).sum(keepdims=True) / 1000.0
     return np.asarray(km / max(infractions, 1), dtype=np.float64)[: len(trips)]
 
 
 def least_value(metric: Metric, trips: NDArray[np.void]) -> float:
-    """The least that a bounded metric can be of an episode with these trips, some of all runs."""
+    """Return the least possible value of a bounded metric for an episode with these trips."""
     if metric.name != "jain_speed":
         return 0.0
     counted = trips[trips["counted"]]

@@ -1,4 +1,4 @@
-"""Writes a report as one self-contained HTML file: tables, plots, the map, the manifest."""
+"""Writes a report as a self-contained HTML file: tables, plots, the map, the manifest."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOTHING = "-"
 
 
 def write_page(folder: Path, path: Path) -> None:
-    """Write the page of the results in a folder that `evaluate` left."""
+    """Write the page of a results folder of `evaluate`."""
     require("matplotlib", "report")
     jinja2 = require("jinja2", "report")
     report = load_report(folder)
@@ -60,7 +60,7 @@ def _content(folder: Path, report: EvaluationReport) -> dict[str, Any]:
 
 
 def _rows(report: EvaluationReport, *, rewards: bool) -> list[dict[str, Any]]:
-    """The metrics that any policy has a value of; parts of the return that are not all 0."""
+    """Return the metrics with a value for any policy; terms of the return must not all be 0."""
     rows = []
     for metric in METRICS:
         found = [policy[metric.name] for policy in report.policies.values()]
@@ -101,14 +101,14 @@ def _change(metric: Metric, found: PairedDifference) -> dict[str, str]:
 
 
 def _verdict(metric: Metric, found: PairedDifference) -> str:
-    """Better or worse where the interval leaves 0 out and one way is better; else nothing."""
+    """Return better or worse, or an empty text if the metric or the interval allows neither."""
     if not found.distinct or metric.better is None or found.mean is None:
         return ""
     return "better" if (found.mean > 0.0) == (metric.better == "more") else "worse"
 
 
 def _runs(report: EvaluationReport) -> list[dict[str, Any]]:
-    """Every run's own figures: one line a policy, metric and run."""
+    """Return the figures of each run: one row per policy, metric and run."""
     return [
         {
             "policy": name,
@@ -213,7 +213,7 @@ FIGURES = (
 
 
 def transfer_rows(report: EvaluationReport) -> list[dict[str, Any]]:
-    """Label, unit, meaning and cells of each figure; nothing of undivided worlds."""
+    """Return label, unit, meaning and cells of each figure; nothing for undivided worlds."""
     found = [policy.transfers for policy in report.policies.values()]
     if all(summary is None for summary in found):
         return []

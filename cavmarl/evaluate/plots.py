@@ -1,4 +1,4 @@
-"""The plots of a report as SVG text, drawn by matplotlib (the extra `report`)."""
+"""Plots of a report as SVG text, drawn by matplotlib (extra `report`)."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ SHOWN = (
 DISTRIBUTIONS = ("delay_s", "least_ttc_s", "least_pet_s", "mean_speed_mps")
 COLUMNS = 4
 WIDTH_IN = 11.0
-MAX_JUMP_M = 40.0  # between two points of one track; more is a new vehicle in the same seat
-MAX_RATIO = 5.0  # of a map's sides; longer ones are drawn wider than they are
+MAX_JUMP_M = 40.0  # longest distance in a track; a longer one means a new vehicle of the same agent
+MAX_RATIO = 5.0  # largest aspect ratio of a map's picture
 
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
@@ -68,12 +68,12 @@ STYLE: dict[Any, Any] = {
 
 
 def color_of(position: int) -> str:
-    """The colour of a policy by its place in a report."""
+    """Return the colour of a policy by its position in a report."""
     return POLICIES[position % len(POLICIES)]
 
 
 def plot_outcomes(report: EvaluationReport) -> str:
-    """How the trips ended: one bar a policy, mean of the runs."""
+    """Plot how trips ended: one bar per policy, mean of the runs."""
     with mpl.rc_context(STYLE):
         names = list(report.policies)
         figure, axes = _figure(0.9 + 0.36 * len(names))
@@ -95,7 +95,7 @@ def plot_outcomes(report: EvaluationReport) -> str:
 
 
 def plot_metrics(report: EvaluationReport) -> str:
-    """Mean and interval of the main metrics, and each run as a point."""
+    """Plot mean and interval of the main metrics, with a point per run."""
     metrics = [metric for metric in METRICS if metric.name in SHOWN]
     rows = -(-len(metrics) // COLUMNS)
     with mpl.rc_context(STYLE):
@@ -128,7 +128,7 @@ def _plot_metric(axes: Axes, metric: Metric, report: EvaluationReport) -> None:
 
 
 def plot_distributions(tables: Mapping[str, tuple[Rows, Rows]]) -> str:
-    """The spread of trips: share of them below each value, all runs together."""
+    """Plot the distribution of trips over all runs: share below each value."""
     spreads = {metric: _sorted_values(metric, tables) for metric in METRICS}
     drawn = [m for m in METRICS if m.name in DISTRIBUTIONS and any(v.size for v in spreads[m])]
     with mpl.rc_context(STYLE):
@@ -155,7 +155,7 @@ def _sorted_values(
 
 
 def plot_map(outline: Mapping[str, Any], tracks: Rows, trips: Rows, color: str) -> str:
-    """The roads, where the agents of one episode drove, and where trips of all runs ended badly."""
+    """Plot the roads, the tracks of one episode, and the places of failed trips of all runs."""
     min_x, min_y, max_x, max_y = outline["extent_m"]
     width, height = max(max_x - min_x, 1.0), max(max_y - min_y, 1.0)
     true_to_scale = 1.0 / MAX_RATIO < height / width < MAX_RATIO
@@ -197,7 +197,7 @@ def plot_map(outline: Mapping[str, Any], tracks: Rows, trips: Rows, color: str) 
 
 
 def _ways(tracks: Rows) -> list[NDArray[np.float64]]:
-    """Polylines (n, 2) of the agents, cut where a seat got a new vehicle."""
+    """Return polylines (n, 2) of the agents, split where an agent got a new vehicle."""
     rows = tracks[np.lexsort((tracks["time_s"], tracks["agent"]))]
     places = np.stack([rows["x_m"], rows["y_m"]], axis=1)
     jumps = np.hypot(*np.diff(places, axis=0).T) > MAX_JUMP_M
@@ -211,10 +211,10 @@ def _figure(height_in: float) -> tuple[Figure, Axes]:
 
 
 def _svg(figure: Figure) -> str:
-    """The figure as an <svg> element that may stand beside others on one page."""
+    """Return the figure as an <svg> element that can share a page with others."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
-    # Names of groups are the same in every figure; those that are referred to are hashes.
+    # Figures share names of groups; names that are referenced are hashes.
     return re.sub(r' id="[A-Za-z0-9.]+_\d+"', "", text)

@@ -1,4 +1,4 @@
-"""`Recorder`: follows the trips and episodes of worlds that are stepped together."""
+"""`Recorder`: records the trips and episodes of worlds that are stepped together."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from cavmarl.evaluate.statistics import gini_coefficient, jain_index
 from cavmarl.evaluate.tables import EPISODE, TRIP, reward_column
 from cavmarl.rewards.kernels.terms import TTC_HORIZON_S
 
-SHORT_TTC_S = 1.5  # below this a driver has no time left to react (Hayward 1972; SSAM)
-PET_HORIZON_S = 10.0  # a later pass after another is no encounter
-SLOWEST = 3.0  # times what the way takes at the limit: a success takes no longer
-STILL_S = 10.0  # a vehicle that has stood for so long when its trip is cut has not been under way
-MIN_DISTANCE_M = 1.0  # of a trip whose delay a kilometre is compared
+SHORT_TTC_S = 1.5  # below this, a driver has no time to react (Hayward 1972; SSAM)
+PET_HORIZON_S = 10.0  # a pass after a longer time is no encounter
+SLOWEST = 3.0  # longest duration of a success, as a multiple of the free travel time
+STILL_S = 10.0  # a vehicle that has stood this long when its trip is cut counts as standing
+MIN_DISTANCE_M = 1.0  # shortest trip whose delay per kilometre is compared
 JERK_UNIT_MPS3 = 10.0  # of the term `comfort`
 MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
 
@@ -22,13 +22,14 @@ _TERM = {name: k for k, name in enumerate(TERMS)}
 
 
 class Recorder:
-    """Follows W worlds with A agents through one episode each.
+    """Records W worlds with A agents through one episode each.
 
-    A trip counts if it began in the first half of its episode: so each had at least half an episode
-    to end, and which trips count does not depend on how they end.
+    A trip counts if it began in the first half of its episode. So each counting trip has at least
+    half an
+    episode to end, and which trips count does not depend on how they end.
 
-    `weights` (T,) are those of the terms in the reward. `slowest`: times what the way takes at the
-    limit, the longest that a success takes.
+    `weights` (T,) are the weights of the terms in the reward. `slowest` is the longest duration of
+    a success as a multiple of the free travel time.
     """
 
     def __init__(
@@ -56,10 +57,12 @@ class Recorder:
         self._world_terms = np.zeros((num_worlds, weights.size))
         self._world_rewards = np.zeros(num_worlds)
         self._trips: list[NDArray[np.void]] = []
-        self.least_pet_s = np.full(shape, np.inf)  # written by the watcher of junctions
-        self.places_m = np.full((*shape, 2), np.nan)  # likewise: before the step
-        self.still_s = np.zeros(shape)  # written by the watcher of standing vehicles
-        self.would_go = np.zeros(shape, dtype=np.bool_)  # likewise: the built-in driver, there
+        self.least_pet_s = np.full(shape, np.inf)  # written by `EncounterWatch`
+        self.places_m = np.full((*shape, 2), np.nan)  # written by `EncounterWatch` before the step
+        self.still_s = np.zeros(shape)  # written by `StandingWatch`
+        self.would_go = np.zeros(
+            shape, dtype=np.bool_
+        )  # written by `StandingWatch`: would the built-in driver stand there
         self.maps = np.zeros(num_worlds, dtype=np.int64)  # of each world
 
     def add(
@@ -72,16 +75,15 @@ class Recorder:
         over: NDArray[np.bool_],
         arrivals: NDArray[np.int64],
     ) -> NDArray[np.void]:
-        """Take in one step; the TRIP records of the trips that ended in it.
+        """Record one step and return the TRIP records of trips that ended in it.
 
         Args:
-            step: its number in the episode, from 0.
-            acted: (W, A) agents with a trip that this step is part of; none in worlds that are
-                through.
+            step: number of the step in the episode, from 0.
+            acted: (W, A) agents with a trip that this step is part of; none in finished worlds.
             rewards: (W, A).
             terms: (W, A, T).
-            done: (W, A) agents with a trip that ended in it.
-            over: (W,) worlds with an episode that ended in it, which cuts trips still under way.
+            done: (W, A) agents with a trip that ended in this step.
+            over: (W,) worlds with an episode that ended in this step, which cuts running trips.
             arrivals: (W,) vehicles that have arrived so far, agents included.
         """
         self._began[acted & (self._steps == 0)] = step
@@ -106,7 +108,7 @@ class Recorder:
         return rows
 
     def _close(self, ended: NDArray[np.bool_]) -> NDArray[np.void]:
-        """TRIP records of the trips that have ended, whose seats are free again."""
+        """Return TRIP records of ended trips, and free their slots."""
         world, agent = np.nonzero(ended)
         sums, steps = self._sums[ended], self._steps[ended]
         began = self._began[ended]
@@ -146,14 +148,14 @@ class Recorder:
         return rows
 
     def trips(self) -> NDArray[np.void]:
-        """TRIP (N,) of all trips that have ended, by episode, agent and time."""
+        """Return TRIP (N,) of all ended trips, sorted by episode, agent and time."""
         rows = np.concatenate([np.zeros(0, dtype=TRIP), *self._trips])
         return rows[np.lexsort((rows["began_s"], rows["agent"], rows["episode"]))]
 
     def episodes(self) -> NDArray[np.void]:
-        """EPISODE (W,) of all worlds; those that have not ended have a duration of 0.
+        """Return EPISODE (W,) of all worlds; an unfinished episode has a duration of 0.
 
-        Of zones and messages nothing is known here.
+        Values about zones and messages are filled in elsewhere.
         """
         rows = np.zeros(self._world_steps.size, dtype=EPISODE)
         for name in ("zone_imbalance", *MESSAGE_COLUMNS):

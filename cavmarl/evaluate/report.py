@@ -1,8 +1,10 @@
-"""`EvaluationReport`: what an evaluation found, as plain frozen values.
+"""`EvaluationReport`: the results of an evaluation as frozen values.
 
-Two things are kept apart. *Between runs*: each run has its own seed and gives one mean; the
-interval says where the mean of all such runs lies. *Within a run*: how trips or episodes of one run
-differ among themselves; it says nothing about another run.
+Two kinds of spread are kept apart. *Between runs*: each run has its own seed and gives one mean;
+the
+interval contains the mean of all such runs. *Within a run*: the spread of trips or episodes of one
+run
+says nothing about another run.
 """
 
 from __future__ import annotations
@@ -34,15 +36,15 @@ NO_INTERVAL = "not available: one run says nothing about the next; use --repeats
 class Found:
     """One metric of one policy."""
 
-    mean: float | None  # of the run means; None without data
+    mean: float | None  # mean of the run means; None without data
     # interval of that mean over independent runs; None with fewer than two runs that have the
     # metric, or if all have one value and it is no share
     between_run_ci95: Interval | None
-    within_run: tuple[Within, ...]  # each run's own mean and spread, in the order of the runs
+    within_run: tuple[Within, ...]  # mean and spread of each run
 
     @property
     def interval(self) -> Interval | None:
-        """Between runs if there are several, else Wilson's of the one run (shares only)."""
+        """The interval between several runs, or Wilson's interval of one run (shares only)."""
         if self.between_run_ci95 is not None or len(self.within_run) != 1:
             return self.between_run_ci95
         return self.within_run[0].wilson95
@@ -56,29 +58,29 @@ class Found:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """A policy minus the first one, run by run on the same seeds."""
+    """A policy minus the first one, paired by run on the same seeds."""
 
-    mean: float | None  # of the differences of run means; None without data
+    mean: float | None  # mean difference of run means; None without data
     # interval of that mean by Student's t for paired samples; None with fewer than two runs
     between_run_ci95: Interval | None
-    runs: tuple[float | None, ...]  # the differences; None where one of the two has no value
+    runs: tuple[float | None, ...]  # differences by run; None if a value is missing
 
     @property
     def distinct(self) -> bool:
-        """Whether the interval leaves 0 out."""
+        """Whether the interval excludes 0."""
         found = self.between_run_ci95
         return found is not None and not found.low <= 0.0 <= found.high
 
 
 @dataclass(frozen=True)
 class PolicyReport:
-    """Everything about one policy."""
+    """All results of one policy."""
 
-    trips: int  # that count, in all runs
+    trips: int  # number of counting trips in all runs
     metrics: Mapping[str, Found]  # by the names of `metrics.METRICS`
     # by metric, paired differences from the first policy; empty for itself
     minus_first: Mapping[str, PairedDifference]
-    speed: tuple[Speed, ...]  # of each run; not repeatable
+    speed: tuple[Speed, ...]  # speed of each run; not reproducible
     # between zones, in all runs; None in undivided worlds. Milliseconds are not repeatable.
     transfers: TransferSummary | None = None
 
@@ -88,14 +90,14 @@ class PolicyReport:
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """The results of some policies over the same episodes."""
+    """The results of policies over the same episodes."""
 
-    policies: Mapping[str, PolicyReport]  # by name, in the order in which they were given
+    policies: Mapping[str, PolicyReport]  # by name, in the given order
     repeats: int  # independent runs
     episodes: int  # of each run
     seeds: tuple[int, ...]  # of the runs
-    manifest: Mapping[str, Any]  # the closed manifest of the results
-    # of each policy what `rows_by_map` says; nothing where there is one map
+    manifest: Mapping[str, Any]  # closed manifest of the results
+    # rows of `rows_by_map` by policy; empty for one map
     by_map: Mapping[str, Sequence[Mapping[str, Any]]]
 
     def __getitem__(self, policy: str) -> PolicyReport:
@@ -122,9 +124,9 @@ def make_report(
     manifest: Mapping[str, Any],
     transfers: Mapping[str, TransferSummary],
 ) -> EvaluationReport:
-    """Reduce raw tables, by policy TRIP and EPISODE records of all runs, to a report.
+    """Return the report of raw tables: TRIP and EPISODE records of all runs, by policy.
 
-    `speeds` are of each run; `transfers` are those between zones, empty where worlds are undivided.
+    `speeds` has the speed of each run; `transfers` is empty for undivided worlds.
     """
     seeds = tuple(manifest["seeds"])
     found = {

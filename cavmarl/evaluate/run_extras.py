@@ -1,4 +1,4 @@
-"""What is kept of a run besides its results: a recording, clips of failed trips."""
+"""Recordings and clips of failed trips of a run."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from cavmarl.recordings.extra_tables import RecordOptions
 
 
 class RunWatch:
-    """Looks at the worlds of one policy in one run, part by part.
+    """Observes the worlds of one policy in one run, part by part.
 
     Args:
         vec: the worlds.
-        policy: its name in the results.
-        run: its number.
+        policy: name of the policy in the results.
+        run: number of the run.
         seed: of the run.
-        record: how it is recorded; None: it is not.
-        failures: how many failed trips are kept.
+        record: options of the recording; None: no recording.
+        failures: number of failed trips to keep.
         look: called at each moment of the worlds.
     """
 
@@ -53,7 +53,7 @@ class RunWatch:
         return () if self._clips is None else self._clips.failures
 
     def begin(self, first: int, running: NDArray[np.bool_]) -> None:
-        """After the reset of worlds; the first of them is in this episode."""
+        """Observe the worlds after a reset; the first of them is in this episode."""
         self._first = first
         if self._clips is not None:
             self._clips.begin()
@@ -62,12 +62,12 @@ class RunWatch:
     def step(
         self, running: NDArray[np.bool_], over: NDArray[np.bool_], trips: NDArray[np.void]
     ) -> None:
-        """After a step.
+        """Observe a step.
 
         Args:
-            running: (W,) worlds that were in their episode before it.
-            over: (W,) those whose episode ended in it: they show the next one already.
-            trips: TRIP (n,), those that ended in it.
+            running: (W,) worlds that were in their episode before the step.
+            over: (W,) worlds whose episode ended in the step; they show the next episode already.
+            trips: TRIP (n,) that ended in the step.
         """
         if self._clips is not None:
             self._clips.take(trips, self._first)
@@ -81,7 +81,7 @@ class RunWatch:
         frames = self._vec.world_frames(np.flatnonzero(chosen).tolist(), ghosts=True)
         if self._clips is not None:
             self._clips.add(frames)
-        if self._writer is not None:  # a world of the recording is an episode of the run
+        if self._writer is not None:  # each world of the recording is an episode of the run
             self._writer.add(frames, self._first)
 
     def close(self) -> None:
@@ -93,7 +93,7 @@ class RunWatch:
 def recording_path(
     record: RecordOptions | None, policy: str, run: int, is_only: bool
 ) -> RecordOptions | None:
-    """How one policy's run is recorded: at the path itself where there is no other."""
+    """Return the folder of one policy's run: the path itself if there is no other run."""
     if record is None or is_only:
         return record
     name = re.sub(r"[^\w.-]+", "_", policy).strip("._")

@@ -1,4 +1,4 @@
-"""What each shard of some worlds costs, by a clock on every zone's phases."""
+"""Measured costs of the shards of worlds, from a clock on every zone's phases."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ PARTS = 5
 
 @dataclass(frozen=True)
 class MeasuredRound:
-    """Some steps of one world."""
+    """Measured steps of one world."""
 
-    costs_s: NDArray[np.float64]  # (k,) seconds a tick of each zone
+    costs_s: NDArray[np.float64]  # (k,) seconds per tick of each zone
     ids: NDArray[np.int64]  # (n,) vehicles after the last step
-    places: NDArray[np.float64]  # (n, 2) where they are, m
-    agents: NDArray[np.bool_]  # (n,) which of them agents drive
+    places: NDArray[np.float64]  # (n, 2) places of the vehicles, m
+    agents: NDArray[np.bool_]  # (n,) whether an agent drives the vehicle
 
 
 @dataclass(frozen=True)
 class MeasuredWorlds:
-    """Worlds of one environment."""
+    """Measured worlds of one environment."""
 
     costs: tuple[ShardCost, ...]  # of their shards
-    # (n, 2) where the vehicles of all worlds are after the last step, m
+    # (n, 2) places of all vehicles after the last step, m
     places: NDArray[np.float64]
 
     def zone_costs_s(self) -> list[float]:
-        """What each zone costs in all worlds together, seconds a tick."""
+        """Return the costs of the zones, all worlds together, in seconds per tick."""
         zones = [shard.zone for shard in self.costs]
         sums: list[float] = np.bincount(zones, [shard.cost_s for shard in self.costs]).tolist()
         return sums
@@ -50,7 +50,7 @@ def measure_rounds(
     before: int,
     stepped: Callable[[], None] = lambda: None,
 ) -> Iterator[MeasuredRound]:
-    """Drive one world on from its reset and measure its zones; `stepped` after each step."""
+    """Drive one world from its reset and measure its zones; `stepped` is called per step."""
     for name, value in (("rounds", rounds), ("steps", steps), ("before", before)):
         if value < 1:
             raise ConfigError(f"{name} = {value}: must be at least 1")
@@ -83,10 +83,11 @@ def measure_shards(
     before: int,
     told: Callable[[int, int], None] = lambda done, total: None,
 ) -> MeasuredWorlds:
-    """Costs of all zones of the first `worlds` worlds of a seed, one world after the other.
+    """Return the costs of all zones of the first `worlds` worlds of a seed.
 
-    Of each zone the median of `PARTS` parts of the steps counts: what happens once, as a kernel
-    that is loaded, is no cost of a zone. `told` how many steps of how many are done.
+    The cost of a zone is the median of `PARTS` parts of the steps, so one-time work such as loading
+    a
+    kernel does not count. `told` is called with the steps done and the total.
     """
     if steps < PARTS:
         raise ConfigError(f"steps = {steps}: must be at least {PARTS}")

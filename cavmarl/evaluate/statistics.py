@@ -1,4 +1,4 @@
-"""What numbers add up to: intervals between runs, spread within one, shares, evenness."""
+"""Statistics: intervals between runs, spread within a run, shares, inequality."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cavmarl.core.math.elementary import atan, cos_sin
 
 Z_95 = 1.959963984540054
-TWO_SIDED = 0.975  # of the distribution lies below the upper end of a 95 % interval
-ROUNDING = 1e-12  # values that differ by less than this share of their size are one
+TWO_SIDED = 0.975  # share of the distribution below the upper end of a 95 % interval
+ROUNDING = 1e-12  # values that differ by less than this share are equal
 
 Values = NDArray[np.float64]
 
@@ -28,10 +28,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Within:
-    """The values of one run: what they are in the mean and how they differ among themselves."""
+    """Mean and spread of the values of one run."""
 
-    n: int  # how many trips or episodes
-    mean: float | None  # None without any
+    n: int  # number of trips or episodes
+    mean: float | None  # None without values
     # sample standard deviation; None with fewer than two. It is the spread of trips or episodes and
     # says nothing about how another run would come out.
     sd: float | None
@@ -39,7 +39,7 @@ class Within:
 
 
 def within_run(values: Values, *, share: bool) -> Within:
-    """Mean and spread of the values (N,) of one run; NaN is no value."""
+    """Return mean and spread of the values (N,) of one run; NaN counts as no value."""
     values = values[~np.isnan(values)]
     if not values.size:
         return Within(0, None, None, None)
@@ -50,10 +50,11 @@ def within_run(values: Values, *, share: bool) -> Within:
 
 
 def mean_interval(means: Values) -> Interval | None:
-    """Interval of the mean of independent runs (R,) by Student's t.
+    """Return the interval of the mean of independent runs (R,) by Student's t.
 
     mean ± t(0.975, R - 1) · sd / √R, where sd is that of the run means. None for fewer than two
-    runs, or if all have one value, which says nothing of how others spread.
+    runs, or if
+    all runs have the same value, which says nothing about the spread of other runs.
     """
     error = _error_of(means)
     if error == 0.0:
@@ -64,9 +65,10 @@ def mean_interval(means: Values) -> Interval | None:
 
 
 def bounded_interval(means: Values, least: float) -> Interval | None:
-    """`mean_interval` of values from `least` to 1, beyond which it does not reach.
+    """Return `mean_interval` for values from `least` to 1, limited to this range.
 
-    Wilson's with Student's t, and for the number of trips one that has the error of the run means.
+    It is Wilson's interval with Student's t, for the number of trips that gives the error of the
+    run means.
     """
     error = _error_of(means) / (1.0 - least) if least < 1.0 else 0.0
     if error == 0.0:
@@ -78,10 +80,11 @@ def bounded_interval(means: Values, least: float) -> Interval | None:
 
 
 def run_share_interval(shares: Values, total: int) -> Interval | None:
-    """Interval of the mean of shares (R,) of independent runs with so many trips in all.
+    """Return the interval of the mean of shares (R,) of independent runs.
 
-    The wider of two at each end: `bounded_interval`, and Wilson's of all trips, which runs that
-    happen to agree do not undercut. None for fewer than two runs.
+    Each end is the wider one of `bounded_interval` and Wilson's interval of all trips, so runs that
+    happen to
+    agree do not make it too narrow. None for fewer than two runs.
     """
     if shares.size < 2 or total == 0:
         return None
@@ -91,14 +94,14 @@ def run_share_interval(shares: Values, total: int) -> Interval | None:
 
 
 def _error_of(means: Values) -> float:
-    """Standard error of a mean of runs; 0 for fewer than two, or if they are one value."""
+    """Return the standard error of a mean of runs; 0 for fewer than two runs or equal values."""
     if means.size < 2 or float(np.ptp(means)) <= ROUNDING * float(np.abs(means).max()):
         return 0.0
     return float(means.std(ddof=1)) / math.sqrt(means.size)
 
 
 def share_interval(hits: int, total: int) -> Interval | None:
-    """Interval of a share by Wilson's score (1927); None without a total."""
+    """Return the interval of a share by Wilson's score (1927); None without a total."""
     return _wilson(hits / total, total, Z_95) if total else None
 
 
@@ -111,7 +114,7 @@ def _wilson(share: float, number: float, quantile: float) -> Interval:
 
 @cache
 def student_quantile(freedom: int) -> float:
-    """The 0.975 quantile of Student's t with a whole number of degrees of freedom, by bisection."""
+    """Return the 0.975 quantile of Student's t for whole degrees of freedom, by bisection."""
     low, high = 0.0, 16.0
     while high - low > 1e-12 * high:
         middle = 0.5 * (low + high)
@@ -123,7 +126,7 @@ def student_quantile(freedom: int) -> float:
 
 
 def _student_within(t: float, freedom: int) -> float:
-    """P(|T| < t): Abramowitz and Stegun 1964, 26.7.3 and 26.7.4."""
+    """Return P(|T| < t): Abramowitz and Stegun 1964, 26.7.3 and 26.7.4."""
     theta = atan(t / math.sqrt(freedom))
     cos, sin = cos_sin(theta)
     square = cos * cos
@@ -137,18 +140,18 @@ def _student_within(t: float, freedom: int) -> float:
 
 
 def jain_index(values: Values) -> float:
-    """Jain's fairness index (Jain, Chiu and Hawe 1984): (Σx)² / (n · Σx²).
+    """Return Jain's fairness index (Jain, Chiu and Hawe 1984): (Σx)² / (n · Σx²).
 
-    1 where all have the same, 1/n where one has all; NaN without values or where all are 0.
+    1 if all values are equal, 1/n if one has everything; NaN without values or if all are 0.
     """
     squares = values.size * float((values * values).sum())
     return float(values.sum()) ** 2 / squares if squares > 0.0 else math.nan
 
 
 def gini_coefficient(values: Values) -> float:
-    """Gini's coefficient (1912) of values ≥ 0: Σᵢ Σⱼ |xᵢ - xⱼ| / (2 n² · mean).
+    """Return Gini's coefficient (1912) of values ≥ 0: Σᵢ Σⱼ |xᵢ - xⱼ| / (2 n² · mean).
 
-    0 where all have the same, towards 1 where one has all; NaN without values or where all are 0.
+    0 if all values are equal, near 1 if one has everything; NaN without values or if all are 0.
     """
     total = float(values.sum())
     if total <= 0.0:

@@ -1,7 +1,8 @@
-"""Calls functions in processes of their own, which share nothing but the files on disk.
+"""Function calls in new processes that share only the files on disk.
 
-A call is pickled to a program's standard input; the program pickles what it tells and what it
-returns to standard output. Unlike `multiprocessing`, it does not run the caller's script again.
+A call is pickled to the standard input of a program, which pickles progress and the result to
+standard
+output. Unlike `multiprocessing`, this does not import the caller's script again.
 """
 
 from __future__ import annotations
@@ -30,11 +31,13 @@ def call_in_fresh_process(
     hear: Tell | None = None,
     began: Callable[[subprocess.Popen[bytes]], None] | None = None,
 ) -> Found:
-    """What `call(*given)` returns in a new interpreter, or raises on purpose.
+    """Return `call(*given)` from a new interpreter, or raise the CavmarlError that it raised.
 
-    With `hear`, `call` gets a last argument, too: what that is called with is told to `hear`. If
-    the process dies, an `EvaluationError` says `what` that was. `began` is given the process, for
-    another thread to end it.
+    With `hear`, `call` gets one more argument, a function whose argument is passed to `hear` here.
+    If the
+    process dies, an `EvaluationError` names `what` it did. `began` is called with the process, so
+    that
+    another thread can end it.
     """
     program = start_python(["-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert program.stdin is not None
@@ -66,13 +69,13 @@ def call_in_fresh_process(
 
 
 def told_error(kind: str, message: str) -> errors.CavmarlError:
-    """The error of another process; what it was made of, beside its words, has stayed there."""
+    """Return the error of another process; only its message was transferred."""
     found: type[errors.CavmarlError] = getattr(errors, kind)
     return found.__new__(found, message)
 
 
 def main() -> None:
-    """The program: a call from standard input."""
+    """Run the program: execute a call from standard input."""
     out, sys.stdout = sys.stdout.buffer, sys.stderr
     call, given, tells = pickle.load(sys.stdin.buffer)
     try:

@@ -15,12 +15,12 @@ from cavmarl.evaluate.report import EvaluationReport
 
 @dataclass(frozen=True)
 class Suite:
-    """What a suite drives: every map with every number of agents.
+    """The worlds of a suite: every map with every number of agents.
 
-    What is left out is as each environment says.
+    Values that are left out are as configured by each environment.
     """
 
-    maps: tuple[str, ...]  # names of environments, or map files below the folder of maps
+    maps: tuple[str, ...]  # names of environments, or map files in the folder of maps
     agents: tuple[int, ...] | None = None  # numbers of agents
     background: int | None = None  # background vehicles of every world
     horizon_s: float | None = None  # of every episode
@@ -29,7 +29,9 @@ class Suite:
         for name in ("maps", "agents"):
             values = getattr(self, name)
             if values is not None and (not values or len(set(values)) < len(values)):
-                raise ConfigError(f"{name} = {values!r}: must be at least one, and each once")
+                raise ConfigError(
+                    f"{name} = {values!r}: must not be empty or contain a value twice"
+                )
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class SuiteWorld:
 
     label: str  # its name in results, and its folder
     env: str  # as in `make_vec`
-    agents: int | None  # how many; None: as the environment says
+    agents: int | None  # number of agents; None: as configured by the environment
 
 
 def load_suite(path: Path) -> Suite:
@@ -48,7 +50,7 @@ def load_suite(path: Path) -> Suite:
 def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
     found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
     if len(found) < len(suite.maps):
-        raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")
+        raise ConfigError(f"maps = {suite.maps!r}: two maps have the same name; rename a file")
     if suite.agents is None:
         return [SuiteWorld(name, env, None) for name, env in found.items()]
     return [
@@ -83,11 +85,12 @@ def run_suite(
     seed: int,
     began: Callable[[SuiteWorld], None],
 ) -> dict[str, EvaluationReport]:
-    """Evaluate the policies in every world, each into its own folder of `out`.
+    """Evaluate the policies in every world, each in its own folder in `out`.
 
-    Where the suite says how many agents there are, they enter as long as the episode lasts
-    (respawn), so that their number holds. `began` is called before each world; policies, episodes,
-    repeats and seed are as in `evaluate`.
+    If the suite sets the number of agents, trips that end are replaced (respawn), so that the
+    number stays
+    the same. `began` is called before each world. Policies, episodes, repeats and seed are as in
+    `evaluate`.
     """
     reports = {}
     keys: dict[str, object] = {} if suite.agents is None else {"population.mode": "respawn"}

@@ -1,4 +1,4 @@
-"""The raw values of an evaluation as records, their CSV files, and the outline of the map."""
+"""Raw values of an evaluation as records, their CSV files, and the outline of the map."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 Rows = NDArray[np.void]
 
-METRICS_VERSION: Final = 2  # goes up whenever a column or a metric means something else
+METRICS_VERSION: Final = 2  # raise it whenever the meaning of a column or a metric changes
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
-TOLERANCE_M = 0.5  # that a line of the map may leave its lane's centre by
+TOLERANCE_M = 0.5  # largest deviation of an outline from the lane's centre
 
 
 def reward_column(term: str) -> str:
@@ -31,33 +31,33 @@ TRIP = np.dtype(
     [
         ("run", np.int64),
         ("episode", np.int64),
-        ("agent", np.int64),  # index of the agent that drove it
+        ("agent", np.int64),  # index of its agent
         ("map", np.int64),  # number of the map among those of the environment
         ("began_s", np.float64),  # time of the episode at its first decision
-        ("counted", np.bool_),  # began in the first half of its episode
-        ("arrived", np.bool_),  # how it ended: one of these four
+        ("counted", np.bool_),  # whether it began in the first half of its episode
+        ("arrived", np.bool_),  # how it ended: exactly one of these four
         ("collision", np.bool_),
         ("off_road", np.bool_),
-        ("unfinished", np.bool_),  # a horizon cut it: the episode's, or its own
+        ("unfinished", np.bool_),  # cut by the horizon of the episode or of the trip
         ("blocked", np.bool_),  # and how: it stood, and the built-in driver would have stood, too;
         ("stood", np.bool_),  # it stood, and the built-in driver would have driven;
         ("out_of_time", np.bool_),  # it was under way
         # arrived in time, without a red light and never the wrong way; in time is within SLOWEST
         # times the free time, where trips have no horizon of their own
         ("success", np.bool_),
-        ("red_light", np.bool_),  # whether it ever passed one
+        ("red_light", np.bool_),  # whether it ever entered a junction at red
         ("wrong_way", np.bool_),  # whether it ever drove against its lane
         ("reward", np.float64),  # sum over the trip
         ("duration_s", np.float64),  # from its first decision to its end
-        ("distance_m", np.float64),  # way made towards the goal
+        ("distance_m", np.float64),  # progress towards the goal
         ("mean_speed_mps", np.float64),  # of these two
-        ("delay_s", np.float64),  # time lost against driving at the limit
+        ("delay_s", np.float64),  # time lost compared with driving at the limit
         ("mean_jerk_mps3", np.float64),  # mean |jerk|
         ("mean_speeding", np.float64),  # mean speed above the limit, as a share of it
         ("least_ttc_s", np.float64),  # least time to collision; TTC_HORIZON_S: that and above
         ("short_ttc_share", np.float64),  # share of the trip with less than SHORT_TTC_S
         ("least_pet_s", np.float64),  # least post-encroachment time; NaN: none up to PET_HORIZON_S
-        ("end_x_m", np.float64),  # its last place but one step
+        ("end_x_m", np.float64),  # its place before its last step
         ("end_y_m", np.float64),
     ]
 )
@@ -67,16 +67,16 @@ EPISODE = np.dtype(
         ("run", np.int64),
         ("episode", np.int64),
         ("duration_s", np.float64),
-        ("trips", np.int64),  # that ended or were cut in it
+        ("trips", np.int64),  # number of trips that ended or were cut in it
         ("episode_return", np.float64),  # sum of rewards of an agent id, mean over the ids
         ("agent_arrivals_per_h", np.float64),  # of simulated time
         ("background_arrivals_per_h", np.float64),
         ("jain_speed", np.float64),  # of the mean speeds of its trips that count
         ("gini_delay", np.float64),  # of their delays a kilometre
         ("zone_imbalance", np.float64),  # max / mean of vehicles by zone; NaN: undivided
-        ("v2x_reception_ratio", np.float64),  # packets received over those in reach; NaN: no V2X
+        ("v2x_reception_ratio", np.float64),  # packets received over packets in range; NaN: no V2X
         ("v2x_latency_s", np.float64),  # mean, from sending to receiving
-        ("v2x_busy_ratio", np.float64),  # share of the time in which the air is busy
+        ("v2x_busy_ratio", np.float64),  # share of time in which the channel is busy
         *((reward_column(term), np.float64) for term in TERMS),  # that part of the return
     ]
 )
@@ -110,7 +110,7 @@ TRANSFER = np.dtype(
 
 
 def write_table(path: Path, tables: dict[str, Rows], dtype: np.dtype[np.void]) -> None:
-    """Write the records of several policies into one CSV file, the policy in the first column."""
+    """Write the records of several policies into one CSV file; the first column is the policy."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["policy", *_names(dtype)])
@@ -120,7 +120,7 @@ def write_table(path: Path, tables: dict[str, Rows], dtype: np.dtype[np.void]) -
 
 
 def read_table(path: Path, dtype: np.dtype[np.void]) -> dict[str, Rows]:
-    """What `write_table` wrote, policies in the order of their first rows."""
+    """Return the records of a CSV file by policy, in the order of their first rows."""
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.reader(file)
         next(reader)
@@ -135,7 +135,7 @@ def _names(dtype: np.dtype[np.void]) -> tuple[str, ...]:
 
 
 def _texts(column: NDArray[np.generic]) -> list[str]:
-    """Shortest texts that give the same numbers again; NaN is an empty cell."""
+    """Return the shortest texts that restore the same numbers; NaN is an empty cell."""
     if column.dtype == np.bool_:
         return ["1" if value else "0" for value in column.tolist()]
     return ["" if value != value else repr(value) for value in column.tolist()]
@@ -152,7 +152,7 @@ def _records(lines: Sequence[Sequence[str]], dtype: np.dtype[np.void]) -> Rows:
 
 
 def map_outline(network: RoadNetwork) -> dict[str, Any]:
-    """Centre lines of the lanes open to cars, in metres to a decimetre, and their mean width."""
+    """Return centre lines of car lanes in m, rounded to 0.1 m, and their mean width."""
     lanes = network.lanes
     open_lanes = np.flatnonzero(lanes["permissions"] & PASSENGER != 0)
     lines = [_simplified(network.lane_polyline(int(lane))[:, :2]) for lane in open_lanes]
@@ -165,7 +165,7 @@ def map_outline(network: RoadNetwork) -> dict[str, Any]:
 
 
 def _simplified(line: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A polyline (n, 2) without the points that it can do without (Douglas and Peucker 1973)."""
+    """Return a polyline (n, 2) without unnecessary points (Douglas and Peucker 1973)."""
     keep = np.zeros(len(line), dtype=np.bool_)
     keep[[0, -1]] = True
     stretches = [(0, len(line) - 1)]

@@ -1,4 +1,4 @@
-"""The transfers of the episodes of a run, as records."""
+"""Ownership transfers of the episodes of a run, as records."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from cavmarl.ownership.transfers import Transfer, TransferLog
 
 
 class TransferRecorder:
-    """Follows the worlds of an undivided or divided simulation through one episode of each."""
+    """Records the transfers of worlds through one episode each."""
 
     def __init__(self, logs: Sequence[TransferLog]) -> None:
-        self.counts: Counter[str] = Counter()  # sums of the logs' counts over the episodes
+        self.counts: Counter[str] = Counter()  # counts of the logs, summed over the episodes
         self._logs = tuple(logs)
         self._before = [Counter(log.counts) for log in logs]
         self._episodes = [log.episode for log in logs]
@@ -25,7 +25,7 @@ class TransferRecorder:
             log.take()
 
     def collect(self, worlds: Iterable[int], over: NDArray[np.bool_]) -> None:
-        """After a step: take the rows of worlds that were in it; `over` (W,) have ended."""
+        """Add the rows of a step of running worlds; episodes of `over` (W,) have ended."""
         if not self._logs:
             return
         for w in worlds:
@@ -38,7 +38,7 @@ class TransferRecorder:
                 self.counts.subtract(self._before[w])
 
     def records(self) -> NDArray[np.void]:
-        """TRANSFER (n,) in the order of worlds; `episode` is the world."""
+        """Return TRANSFER (n,) sorted by world; `episode` is the world."""
         rows = np.zeros(len(self._rows), TRANSFER)
         for n, (world, row) in enumerate(sorted(self._rows, key=lambda entry: entry[0])):
             values = row._replace(episode=world)

@@ -1,7 +1,7 @@
-"""The zoo: trained drivers that carry their results, and can be verified by driving again.
+"""The zoo: trained drivers with results that can be verified by driving again.
 
-An entry is the folder of a trained driver with a folder `result/` in it: a closed evaluation by
-`cavmarl evaluate`. To verify an entry is to drive the same episodes and to compare bytes.
+An entry is the folder of a trained driver with a folder `result/`: a closed evaluation of `cavmarl
+evaluate`. To verify an entry, the same episodes are driven again and the bytes compared.
 """
 
 from __future__ import annotations
@@ -37,33 +37,33 @@ from cavmarl.evaluate.provenance.manifest import hash_of_file
 from cavmarl.policies.loading import policy_files
 
 RESULT_FOLDER = "result"
-TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # the same each time they are made
+TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # files that are the same each time
 SHARES = ("success", "collision", "off_road", "red_light")
 
 
 @dataclass(frozen=True)
 class ZooEntry:
-    """A trained driver and what its result says."""
+    """A trained driver and its result."""
 
     name: str
     folder: Path
     weights_bytes: int
-    environment: str  # with its version, as `merge-v6`; empty: no result
+    environment: str  # with its version, for example `merge-v6`; empty: no result
     trips: int  # of the result
-    shares: Mapping[str, float]  # of trips, by a name of `SHARES`
-    refused: str = ""  # what is wrong with the entry, and its cure; the rest is empty then
+    shares: Mapping[str, float]  # shares of trips by the names of `SHARES`
+    refused: str = ""  # why the entry cannot be read, with the remedy; other fields are then empty
 
 
 @dataclass(frozen=True)
 class Verification:
-    """An entry's result beside that of driving the same episodes again.
+    """An entry's result compared with driving the same episodes again.
 
     Attributes:
         name: of the driver.
         expected: SHA-256 of each file of the result.
-        found: the same of the files that this run made.
-        expected_on: the processor that the result was made on.
-        found_on: the processor of this run.
+        found: SHA-256 of the files of this run.
+        expected_on: processor on which the result was made.
+        found_on: processor of this run.
     """
 
     name: str
@@ -74,20 +74,20 @@ class Verification:
 
     @property
     def differing(self) -> list[str]:
-        """Files whose bytes are not those of the result."""
+        """The files whose bytes differ from the result."""
         return [file for file, digest in self.expected.items() if self.found[file] != digest]
 
 
 @dataclass(frozen=True)
 class EntryJob:
-    """What a result was made of, so that it can be made again."""
+    """What is needed to repeat a result."""
 
     world: WorldSpec
     episodes: int
     repeats: int
 
     def drive(self, name: str, folder: Path, out: Path, progress: Progress | None = None) -> None:
-        """Evaluate the driver in a folder into the new folder `out`; tables hold its name."""
+        """Evaluate a driver into the new folder `out`; the tables contain its name."""
         evaluate(
             self.world,
             {name: folder},
@@ -106,13 +106,13 @@ class Cross:
     tables: Mapping[str, Mapping[str, NDArray[np.void]]]
 
     def share(self, driver: str, others: str, column: str) -> float | None:
-        """The share of a driver's counted trips among others; None: it had none."""
+        """Return the share of a driver's counting trips among others; None: it had none."""
         trips = self.tables[driver][others]
         return float(trips[column].mean()) if len(trips) else None
 
 
 def zoo_entries() -> list[ZooEntry]:
-    """The trained drivers that a name can mean, by name; one that cannot be read says why."""
+    """Return the named trained drivers; an unreadable one states the reason."""
     return [_told(name, path) for name, path in sorted(agent_entries().items()) if path.is_dir()]
 
 
@@ -124,13 +124,13 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
         progress: as in `evaluate`.
 
     Raises:
-        PolicyError: nothing of that name, or a driver that is not trained.
-        ManifestError: there is no result, or weights or world are not those it was made with.
+        PolicyError: there is no such driver, or it is not trained.
+        ManifestError: there is no result, or weights or world differ from those it was made with.
     """
     weights = policy_files(policy)
     folder = weights[0].parent
     if len(weights) < 2:
-        raise PolicyError(f"{policy}: is a script; the zoo has trained drivers only")
+        raise PolicyError(f"{policy}: is a script; the zoo contains only trained drivers")
     name = folder.name
     document = read_evaluation(folder / RESULT_FOLDER)
     job = entry_job(document, folder)
@@ -158,20 +158,21 @@ def cross(
     progress: Progress | None = None,
     **keys: Unpack[WorldKeys],
 ) -> Cross:
-    """Let each driver drive every other agent among each other driver's vehicles.
+    """Evaluate each driver among the vehicles of each other driver.
 
-    All pairs meet the same episodes. Agents with even numbers are the driver's, odd ones the
-    others'.
+    All pairs drive the same episodes. Agents with even numbers belong to the driver, odd ones to
+    the other
+    driver.
 
     Raises:
-        ConfigError: an environment with fewer than two agents.
-        PolicyError: a driver cannot be loaded or does not fit, or is named twice.
+        ConfigError: the environment has fewer than two agents.
+        PolicyError: a driver cannot be loaded, does not fit, or is named twice.
     """
     if len(set(policies)) < len(policies):
-        raise PolicyError(f"drivers {', '.join(policies)}: one stands there twice")
+        raise PolicyError(f"drivers {', '.join(policies)}: one is listed twice; list each once")
     spec = WorldSpec.of(env, **keys)
     if load_world(spec.env, **spec.keywords).config.population.num_ids < 2:
-        raise ConfigError(f"{spec.env}: has one agent; a matrix of drivers needs two or more")
+        raise ConfigError(f"{spec.env}: has one agent; a comparison of drivers needs two or more")
     pairs = {(a, b): a if a == b else f"{a}{TOGETHER}{b}" for a in policies for b in policies}
     with TemporaryDirectory() as room:
         out = Path(room) / "cross"
@@ -185,7 +186,7 @@ def cross(
     return Cross(tuple(policies), tables)
 
 
-# The map by its file: how it is read may change, and then the driving shows it.
+# Compare the map file only: a changed reader shows in the driving.
 _WORLD_KEYS = ("environment", "map_source_sha256", "demand_content_sha256")
 _KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
 
@@ -215,14 +216,14 @@ def _processor(hardware: Mapping[str, Any]) -> str:
 
 
 def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
-    """Return what the result of a driver's folder was made of.
+    """Return what is needed to repeat the result of a driver's folder.
 
     Args:
-        document: the manifest of the result.
+        document: manifest of the result.
         folder: of the driver.
 
     Raises:
-        ManifestError: the manifest does not say it.
+        ManifestError: the manifest does not contain it.
     """
     job = document.get("job")
     if not isinstance(job, dict) or not {"env", "episodes", *_KEYS} <= job.keys():
@@ -245,7 +246,7 @@ def _check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path]
 
 
 def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> None:
-    """Refuse a world that is not the result's; keys that are new or removed do not count."""
+    """Raise an error if the world is not the result's; new and removed keys do not count."""
     here = json.loads(json.dumps(describe_world(*load_world(spec.env, **spec.keywords))))
     there = document["world"]
     others = [key for key in _WORLD_KEYS if here[key] != there[key]]
@@ -260,7 +261,7 @@ def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> Non
 
 
 def _differing(key: str, there: Any, here: Any) -> Iterator[str]:
-    """Keys of a config that have another value, or none, in the config of today."""
+    """Return keys of a config that have another value, or none, in the present config."""
     if isinstance(there, dict) and isinstance(here, dict):
         for name, value in there.items():
             yield from _differing(f"{key}.{name}", value, here.get(name))

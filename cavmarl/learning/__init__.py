@@ -1,1 +1,1 @@
-"""What the training programs share: their options, PPO on batched worlds, runs and checkpoints."""
+"""Shared parts of the training programs: options, the network, logs, runs and checkpoints."""

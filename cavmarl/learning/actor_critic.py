@@ -1,4 +1,4 @@
-"""`ActorCritic`: the network that training programs learn, in torch, and how it is saved.
+"""`ActorCritic`: the torch network that training programs train, and how it is saved.
 
 A trained driver is evaluated without torch, see `cavmarl.policies.driver_network`.
 """
@@ -29,19 +29,19 @@ LOG_2_PI = math.log(2.0 * math.pi)
 
 
 class ActorCritic(nn.Module):
-    """A policy and a value function: small tanh networks, or two heads of one body with LayerNorm.
+    """A policy and a value function: two tanh networks, or two heads of one body with LayerNorm.
 
-    Both see observations less their `mean`, over their `deviation`: buffers that training fills and
-    a checkpoint keeps. With a `state_size` the value function is a central critic, which also sees
-    the state of the whole world (Yu et al. 2022).
+    Both get observations normalised by `mean` and `deviation`: buffers that training updates and
+    that are saved with the weights. With a `state_size` the value function is a central critic,
+    which also gets the state of the whole world (Yu et al. 2022).
 
-    Continuous actions are normal around the actor's output, with one learned deviation an action:
-    the environment gets them clipped to [-1, 1], learning the raw ones. Discrete actions are
-    categorical.
+    Continuous actions are normally distributed around the actor's output, with one learned
+    deviation per action. The environment gets them clipped to [-1, 1]; learning uses the unclipped
+    ones. Discrete actions are categorical.
 
     Args:
         config: sizes and kind of action.
-        initial_std: standard deviations of continuous actions before learning: throttle, steering.
+        initial_std: initial standard deviations of continuous actions: throttle, steering.
     """
 
     mean: Tensor
@@ -57,8 +57,7 @@ class ActorCritic(nn.Module):
         actions = config.num_outputs
         self.register_buffer("mean", torch.zeros(config.observation_size))
         self.register_buffer("deviation", torch.ones(config.observation_size))
-        # Small last weights: the first policy does nothing in particular (Andrychowicz et al.
-        # 2021).
+        # Small last weights: the first policy has no preference (Andrychowicz et al. 2021).
         size = config.observation_size
         self.body = _body((size, *config.hidden)) if config.shared else None
         self.actor: nn.Module
@@ -74,18 +73,18 @@ class ActorCritic(nn.Module):
 
     @property
     def parts(self) -> list[list[nn.Parameter]]:
-        """The weights whose gradients are shortened together."""
+        """The groups of weights whose gradients are clipped together."""
         if self.body is not None:
             return [list(self.parameters())]
         return [list(self.actor.parameters()), list(self.critic.parameters())]
 
     def normal(self, observations: Tensor) -> Tensor:
-        """Observations (…, D) less their mean, over their deviation."""
+        """Return observations (…, D) less their mean, divided by their deviation, and clipped."""
         normal: Tensor = (observations - self.mean) / self.deviation
         return normal.clamp_(-MAX_DEVIATIONS, MAX_DEVIATIONS)
 
     def heads(self, seen: Tensor, states: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """`forward` and `value` at once, of observations that are `normal` already."""
+        """Return `forward` and `value` for observations that are already `normal`."""
         if self.body is not None:
             seen = self.body(seen)
         judged = seen
@@ -94,22 +93,22 @@ class ActorCritic(nn.Module):
         return self.actor(seen), self.critic(judged).squeeze(-1)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """The policy's numbers: means (N, 2) of actions, or log-weights (N, choices)."""
+        """Return the policy's output: means (N, 2) of actions, or logits (N, choices)."""
         seen = self.normal(observations)
         output: Tensor = self.actor(seen if self.body is None else self.body(seen))
         return output
 
     def value(self, observations: Tensor, states: Tensor | None = None) -> Tensor:
-        """Expected return (N,) of observations (N, D), for a central critic in states (N, S)."""
+        """Return values (N,) of observations (N, D); a central critic also needs states (N, S)."""
         return self.heads(self.normal(observations), states)[1]
 
     def best(self, observations: Tensor) -> Tensor:
-        """The most likely actions: (N, 2) within [-1, 1], or (N,) choices."""
+        """Return the most likely actions: (N, 2) within [-1, 1], or (N,) choices."""
         output = self.forward(observations)
         return self.given(output if self.continuous else output.argmax(-1), observations)
 
     def given(self, actions: Tensor, observations: Tensor) -> Tensor:
-        """What the environment gets for actions (…) as sampled, after observations (…, D)."""
+        """Return the environment's actions for sampled actions (…) and observations (…, D)."""
         if not self.continuous:
             return actions
         if self.residual:
@@ -118,25 +117,25 @@ class ActorCritic(nn.Module):
         return actions.clamp(-1.0, 1.0)
 
     def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
-        """Random actions, continuous ones not clipped, and their log probabilities (N,)."""
+        """Return random actions, continuous ones unclipped, and their log probabilities (N,)."""
         return self.draw(self.forward(observations))
 
     def draw(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """`sample`, of what `forward` gave."""
+        """Return `sample` for an output of `forward`."""
         noise = torch.empty_like(output)
         if self.continuous:
             actions = output + noise.normal_() * self.log_std.exp()
         else:
-            # The largest of log-weights plus Gumbel noise is a draw by these weights.
+            # The argmax of logits plus Gumbel noise is a sample of the distribution.
             actions = (output - noise.exponential_().log_()).argmax(-1)
         return actions, self._log_prob(output, actions)
 
     def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Log probabilities (N,) of what `sample` gave, and entropies (N,)."""
+        """Return log probabilities (N,) of sampled actions, and entropies (N,)."""
         return self.judge(self.forward(observations), actions)
 
     def judge(self, output: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """`evaluate`, of what `forward` gave."""
+        """Return `evaluate` for an output of `forward`."""
         if self.continuous:
             entropy = (0.5 + 0.5 * LOG_2_PI + self.log_std).sum().expand(output.shape[0])
             return self._log_prob(output, actions), entropy
@@ -145,7 +144,7 @@ class ActorCritic(nn.Module):
         return log_probs.gather(-1, actions.unsqueeze(-1)).squeeze(-1), entropy
 
     def distance(self, output: Tensor, actions: Tensor) -> Tensor:
-        """How far (N,) what `forward` gave is from actions: squares, or surprise at choices."""
+        """Return losses (N,) of `forward`'s output for actions: squares or cross-entropy."""
         if self.continuous:
             return (output - actions).square().sum(-1)
         return nn.functional.cross_entropy(output, actions, reduction="none")
@@ -158,7 +157,7 @@ class ActorCritic(nn.Module):
 
 
 def _perceptron(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
-    """Linear layers with tanh between them, orthogonal weights."""
+    """Return linear layers with tanh between them and orthogonal weights."""
     layers: list[nn.Module] = []
     last = len(sizes) - 2
     for k, (inputs, outputs) in enumerate(pairwise(sizes)):
@@ -168,7 +167,7 @@ def _perceptron(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
 
 
 def _body(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Linear layers, each with LayerNorm (Ba et al. 2016) and ReLU, orthogonal weights."""
+    """Return linear layers with LayerNorm (Ba et al. 2016) and ReLU, orthogonal weights."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(sizes):
         layers += [_linear(inputs, outputs, math.sqrt(2.0)), nn.LayerNorm(outputs), nn.ReLU()]
@@ -183,7 +182,7 @@ def _linear(inputs: int, outputs: int, gain: float) -> nn.Linear:
 
 
 def save_network(folder: Path, network: ActorCritic, config: NetworkConfig) -> None:
-    """Write weights and config into `folder`; an interrupted write leaves the old files whole."""
+    """Write weights and config into `folder`; an interrupted write leaves the old files intact."""
     folder.mkdir(parents=True, exist_ok=True)
     weights = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     write_whole(folder / WEIGHTS_FILE, save(weights))
@@ -192,7 +191,7 @@ def save_network(folder: Path, network: ActorCritic, config: NetworkConfig) -> N
 
 
 def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
-    """Read what `save_network` wrote, to train it further; raises as `read_network`."""
+    """Read a network written by `save_network`, for further training; raises as `read_network`."""
     weights, config = read_network(folder)
     network = ActorCritic(config)
     network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in weights.items()})

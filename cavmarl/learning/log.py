@@ -1,4 +1,4 @@
-"""The numbers of every update: as a table, for TensorBoard, and in words."""
+"""The metrics of every update: as a CSV table, for TensorBoard, and as text."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cavmarl.learning.checkpoint import Parts, writing
 CSV_FILE = "progress.csv"
 BOARD_FILES = "events.out.tfevents.*"
 
-WINDOW = 1000  # trips that a row's means are of
+WINDOW = 1000  # number of last trips that a row averages
 
 ENDS = ("arrival", "collision", "off_road", "red_light")
 COLUMNS = [TERMS.index(name) for name in ENDS]
@@ -36,7 +36,7 @@ def curve_row(
     trips: int,
     last: Collection[tuple[float, float]],
 ) -> dict[str, float]:
-    """What all programs log of an update: `last` are (return, arrived) of the last trips."""
+    """Return the metrics that all programs log; `last`: (return, arrived) of the last trips."""
     trip_return, success = np.array(list(last)).mean(axis=0).tolist() if last else (np.nan, np.nan)
     return {
         "updates": updates,
@@ -49,7 +49,7 @@ def curve_row(
 
 
 class Trips:
-    """Returns and ends of the last `WINDOW` trips, and those under way in W worlds, A agents."""
+    """Returns and ends of the last `WINDOW` trips, and the present trips of (W, A) agents."""
 
     def __init__(self, num_envs: int, num_agents: int) -> None:
         self._sums = np.zeros((num_envs, num_agents, 2))  # return, red lights run
@@ -59,7 +59,7 @@ class Trips:
     def add(
         self, rewards: NDArray[Any], done: NDArray[Any], cut: NDArray[Any], terms: NDArray[Any]
     ) -> None:
-        """Take in one step; `done` (W, A) ends trips, `cut` (W, A) forgets them."""
+        """Add one step; `done` (W, A) ends trips, `cut` (W, A) discards them."""
         self._sums[..., 0] += rewards
         self._sums[..., 1] += terms[..., COLUMNS[3]]
         if (gone := done | cut).any():
@@ -78,14 +78,14 @@ class Trips:
         self._count = saved["n"]
 
     def means(self) -> dict[str, float]:
-        """Of the last trips; and how many there have been."""
+        """Return the means of the last trips, and the number of all trips."""
         names = ("trip_return", "success", *ENDS[1:])
         columns = np.array(self._ended).mean(axis=0) if self._ended else np.full(5, np.nan)
         return {"trips": self._count, **dict(zip(names, columns.tolist(), strict=True))}
 
 
 class Log:
-    """Writes the numbers of every update to CSV, and to TensorBoard where asked for."""
+    """Writes the metrics of every update to CSV, and to TensorBoard if requested."""
 
     def __init__(self, folder: Path, tensorboard: bool = False) -> None:
         self._path = folder / CSV_FILE
@@ -110,7 +110,7 @@ class Log:
                     self._board.add_scalar(name, value, int(row["agent_steps"]))
 
     def sync(self) -> dict[str, int]:
-        """Have everything on the disk; the bytes of each file."""
+        """Flush everything to the disk and return the size of each file in bytes."""
         sizes = {}
         with writing(self._path):
             if self._board is not None:
@@ -122,7 +122,7 @@ class Log:
         return sizes
 
     def close(self) -> None:
-        """To be called once all is written: what a full disk has refused is not tried again."""
+        """Close the files; a write that a full disk has refused is not tried again."""
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):
@@ -131,7 +131,7 @@ class Log:
 
 
 def cut_logs(folder: Path, sizes: Mapping[str, int]) -> None:
-    """Let logs be what they were when `Log.sync` gave these sizes.
+    """Truncate the logs to the sizes that `Log.sync` returned.
 
     Raises:
         TrainingError: rows are missing.
@@ -144,8 +144,8 @@ def cut_logs(folder: Path, sizes: Mapping[str, int]) -> None:
     table = folder / CSV_FILE
     if not table.is_file() or table.stat().st_size < sizes[CSV_FILE]:
         raise TrainingError(
-            f"{table}: rows are missing that were there at the checkpoint: put a copy of it in its "
-            "place, or train anew under another --name"
+            f"{table}: rows written before the checkpoint are missing; restore a copy of it, or "
+            "train again under another --name"
         )
 
 
@@ -154,7 +154,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def progress_bar(console: Console) -> Progress:
-    """A bar over the run, with the numbers that say whether it learns."""
+    """Return a progress bar with the metrics that show learning."""
     return Progress(
         TextColumn("{task.percentage:3.0f} %"),
         BarColumn(bar_width=10),
@@ -167,7 +167,7 @@ def progress_bar(console: Console) -> Progress:
 
 
 def describe(row: dict[str, float]) -> str:
-    """What a person wants to see of an update: agent-steps, their rate, and the last trips."""
+    """Return a summary of an update: agent steps, their rate, and the last trips."""
     return (
         f"{row['agent_steps'] / 1e6:.2f} M at {row['agent_steps_per_s'] / 1e3:.0f} k/s · "
         f"return {row['trip_return']:.1f} · success {row['success']:.0%} · "

@@ -1,4 +1,4 @@
-"""`Scales`: how observations are brought to one scale, learnt beside the weights."""
+"""`Scales`: normalisation of observations, learned together with the weights."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.warm_start import begin_with
 from cavmarl.policies.network_files import NetworkConfig
 
-LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
+LEAST_DEVIATION = 0.02  # minimum, so that nearly constant observations are not amplified
 
 
 class Scales:
-    """Keeps the network's mean and deviation of observations: of all decisions of a run so far."""
+    """Updates the network's mean and deviation of observations over all decisions of a run."""
 
     def __init__(self, network: ActorCritic) -> None:
         self._network = network
@@ -24,12 +24,12 @@ class Scales:
         self._squares = torch.zeros_like(network.deviation)
 
     def start(self, config: NetworkConfig, folder: Path) -> None:
-        """Begin with the weights and the scales of a driver, see `begin_with`."""
+        """Start with the weights and the scales of a driver, see `begin_with`."""
         self._count = begin_with(self._network, config, folder)
         self._squares = self._network.deviation.square() * self._count
 
     def add(self, observations: Tensor) -> None:
-        """Take in the observations (N, D) of new decisions (Chan et al. 1979)."""
+        """Add the observations (N, D) of new decisions (Chan et al. 1979)."""
         network, new = self._network, len(observations)
         if new == 0:
             return

@@ -1,7 +1,7 @@
-"""The settings of a training program as options of its command line.
+"""The settings of a training program as command line options.
 
-A program's settings are one frozen dataclass; each field is an option, typed and described by its
-`Annotated[type, "text"]`.
+A program's settings are one frozen dataclass. Each field is an option; its type and help text come
+from `Annotated[type, "text"]`.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from cavmarl.core.errors import CavmarlError, ConfigError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-RESUME = "folder of a run to go on with; its settings hold but for the length"
+RESUME = "folder of a run to continue; its settings apply, except for its length"
 DRIVER = "driver: {folder}  (cavmarl evaluate ENV --policy {folder})"
 
 S = TypeVar("S", bound="DataclassInstance")
 
 
 def parse_settings(kind: type[S], words: Sequence[str] | None, text: str | None) -> S:
-    """The settings that the command line asks for.
+    """Parse the settings from the command line.
 
-    `--config FILE` is a YAML file of the same settings, which options shadow.
+    `--config FILE` is a YAML file of the same settings; options take precedence.
 
-    `words` are those of the command line; None: this process's. The first line of `text`, which
-    says what the program is, is shown.
+    `words`: arguments of the command line; None: this process's. `text`: its first line is shown
+    as the description of the program.
     """
     return settings_of(kind, given_options(kind, words, text))
 
@@ -39,7 +39,7 @@ def parse_settings(kind: type[S], words: Sequence[str] | None, text: str | None)
 def given_options(
     kind: type[DataclassInstance], words: Sequence[str] | None, text: str | None
 ) -> dict[str, Any]:
-    """Only what the command line says, by name; `config` is a file. Arguments as above."""
+    """Return only the given options, by name; `config` is a file. Arguments as above."""
     parser = argparse.ArgumentParser(
         description=(text or "").partition("\n")[0], argument_default=argparse.SUPPRESS
     )
@@ -83,29 +83,29 @@ def check_shares(settings: object, names: Iterable[str]) -> None:
 
 
 def check_device(name: str) -> None:
-    """Refuse what torch cannot compute on here; CPUs and NVIDIA's GPUs are supported."""
-    import torch  # of its extra; settings that name no device do without
+    """Check that torch can use the device; CPUs and NVIDIA GPUs are supported."""
+    import torch  # an extra; settings without a device do not need it
 
-    cure = "give cpu, or cuda on a machine with an NVIDIA GPU and a torch that is built for it"
+    cure = "give cpu, or cuda on a machine with an NVIDIA GPU and a torch build that supports it"
     if name.partition(":")[0] not in ("cpu", "cuda"):
-        raise ConfigError(f"--device {name}: no such device: {cure}")
+        raise ConfigError(f"--device {name}: unknown device; {cure}")
     try:
         torch.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
         reason = str(error).partition("\n")[0].rstrip(".")
-        raise ConfigError(f"--device {name}: cannot be used ({reason}): {cure}") from error
+        raise ConfigError(f"--device {name}: cannot be used ({reason}); {cure}") from error
 
 
 def with_form_of(args: S, start: str) -> S:
-    """Settings whose network has the form of a driver: `hidden`, `shared`, `residual`.
+    """Return settings with the network form of a driver: `hidden`, `shared`, `residual`.
 
-    `start`: its name or folder; empty: the settings as they are. Raises PolicyError: nothing of
-    that name, or no trained driver.
+    `start`: its name or folder; empty: the settings are returned unchanged. Raises PolicyError: the
+    driver does not exist, or is not a trained driver.
     """
     if not start:
         return args
     from cavmarl.policies.loading import policy_files
-    from cavmarl.policies.network_files import read_network  # as above
+    from cavmarl.policies.network_files import read_network  # an extra, as above
 
     form = read_network(policy_files(start)[0].parent)[1]
     own = {"hidden": form.hidden[0], "shared": form.shared, "residual": form.residual}
@@ -113,28 +113,28 @@ def with_form_of(args: S, start: str) -> S:
 
 
 def run_folder(runs: str, name: str, env: str, program: str, seed: int, resume: str = "") -> Path:
-    """Where a run lies: RUNS/NAME, without a name RUNS/ENV_PROGRAM_SEED; or RESUME."""
+    """Return the folder of a run: RUNS/NAME, or without a name RUNS/ENV_PROGRAM_SEED; or RESUME."""
     if resume:
         return Path(resume)
     stem = Path(env).name.split(".")[0]
     return Path(runs) / (name or f"{stem}_{program}_{seed}")
 
 
-def run_program(train: Callable[[], Path], said: str = DRIVER) -> int:
-    """Train, and say where that lies which `train` has made.
+def run_program(train: Callable[[], Path], message: str = DRIVER) -> int:
+    """Train, print the folder that `train` returns, and return the exit code.
 
-    0: trained, 2: wrong use, or what stands in the way; 130: interrupted.
+    0: trained; 2: wrong usage or an error; 130: interrupted.
     """
     return run_to_end(
-        lambda: print(said.format(folder=train())),
-        "--resume goes on from the last checkpoint",
+        lambda: print(message.format(folder=train())),
+        "use --resume to continue from the last checkpoint",
     )
 
 
 def run_to_end(act: Callable[[], None], goes_on: str) -> int:
-    """Do what a program is for; `goes_on` says how it goes on after Ctrl-C.
+    """Run `act` and return the exit code; `goes_on` is printed after Ctrl-C.
 
-    0: done, 2: wrong use, or what stands in the way; 130: interrupted.
+    0: done; 2: wrong usage or an error; 130: interrupted.
     """
     try:
         act()

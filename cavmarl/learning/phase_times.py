@@ -1,4 +1,4 @@
-"""`PhaseTimes`: what the seconds of an update went to."""
+"""`PhaseTimes`: how the time of an update is divided among phases."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ class PhaseTimes:
 
     @contextmanager
     def of(self, phase: str) -> Iterator[None]:
-        """The time of a block goes to this phase; not to be nested."""
+        """Add the time of a block to this phase; do not nest."""
         began = time.perf_counter()
         yield
         self.spent_s[phase] += time.perf_counter() - began
 
     @contextmanager
     def rest(self, phase: str) -> Iterator[None]:
-        """The time of a block goes to this phase, less what others get within it."""
+        """Add the time of a block to this phase, less the time of phases within it."""
         began, before_s = time.perf_counter(), sum(self.spent_s.values())
         yield
         others_s = sum(self.spent_s.values()) - before_s
         self.spent_s[phase] += time.perf_counter() - began - others_s
 
     def clear(self) -> None:
-        """Begin at 0."""
+        """Reset all times to 0."""
         self.spent_s = dict.fromkeys(self.spent_s, 0.0)

@@ -1,4 +1,4 @@
-"""`RunFolder`: what a run leaves behind, written by one process at a time and never overwritten."""
+"""`RunFolder`: the files of a run, written by one process at a time and never overwritten."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
     class RunSettings(DataclassInstance, Protocol):
-        """Settings of a program; those that it may lack: see `RunFolder`."""
+        """Settings of a program; `RunFolder` names the optional ones."""
 
         program: ClassVar[str]
 
@@ -57,10 +57,10 @@ if TYPE_CHECKING:
         def folder(self) -> Path: ...
 
 
-LOCK_FILE = ".lock"  # holds the number of the process that writes here, or did so last
+LOCK_FILE = ".lock"  # contains the id of the process that writes here or was the last to do so
 DRIVER_FILES = (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE)
 
-# Settings that a resumed run may be given anew.
+# Settings that may change when a run is resumed.
 CAN_CHANGE = frozenset(
     "total_agent_steps minutes resume threads device zones backend workers tensorboard "
     "checkpoint_updates".split()
@@ -70,7 +70,7 @@ S = TypeVar("S", bound="RunSettings")
 
 
 def parse_run(kind: type[S], words: Sequence[str] | None, text: str | None) -> S:
-    """As `options.parse_settings`; of a resumed run, the settings that it began with."""
+    """Parse settings as `options.parse_settings`; a resumed run keeps its own settings."""
     given = given_options(kind, words, text)
     if not given.get("resume"):
         return settings_of(kind, given)
@@ -81,21 +81,21 @@ def parse_run(kind: type[S], words: Sequence[str] | None, text: str | None) -> S
     folder = Path(given["resume"])
     state = read_checkpoint(folder)
     if state.program != kind.program:
-        raise ConfigError(f"--resume {folder}: is a run of {state.program}: go on with that one")
+        raise ConfigError(f"--resume {folder}: is a run of {state.program}; use that program")
     return replace(validate(kind, state.settings, CHECKPOINT_FILE), **given)
 
 
 class RunFolder:
-    """The folder of a run, from its first file to its last; one process has it at a time.
+    """The folder of a run, from its first file to its last, used by one process at a time.
 
     Args:
-        settings: of the run; if they have `resume` and it is not empty, the run goes on.
-        world: that it trains in.
-        plans: which worker hosts what.
+        settings: of the run; a non-empty `resume` continues the run.
+        world: the environment of the training.
+        plans: assignment of shards to workers.
 
     Raises:
-        TrainingError: another process writes there, a run has begun there that is not to go on, or
-            the one that is to go on cannot; or nothing can be written.
+        TrainingError: another process uses the folder, it contains a run and `resume` is empty,
+            the run cannot be resumed, or the folder cannot be written.
     """
 
     def __init__(
@@ -130,8 +130,8 @@ class RunFolder:
         state, settings = read_checkpoint(self.path), self._settings
         if state.environment != self._environment:
             raise TrainingError(
-                f"--resume {self.path}: the environment has changed since that run: put its files "
-                "back, or train anew under another --name"
+                f"--resume {self.path}: the environment has changed since that run; restore its "
+                "files, or train again under another --name"
             )
         if is_trained(self.path):
             total, minutes = (
@@ -153,9 +153,9 @@ class RunFolder:
         left += [] if can_go_on else [self.path / MANIFEST_FILE]
         table = self.path / CSV_FILE
         if any(path.exists() for path in left) or (table.exists() and table.stat().st_size):
-            cure = f"go on with it (--resume {self.path}), or " if can_go_on else ""
+            cure = f"continue it (--resume {self.path}), or " if can_go_on else ""
             raise TrainingError(
-                f"{self.path}: a run has begun here, which is not overwritten: {cure}give this one "
+                f"{self.path}: contains a run, which is not overwritten; {cure}give this run "
                 "another --name"
             )
 
@@ -165,17 +165,17 @@ class RunFolder:
 
     @property
     def seconds(self) -> float:
-        """That the run has taken, without those between its end and its going on."""
+        """Training time of the run, without breaks before it was resumed."""
         return self.began.seconds + time.perf_counter() - self._began_at
 
     def has_time(self, minutes: float) -> bool:
-        """Whether the run has taken less than these; 0: no limit."""
+        """Return whether the run has taken less than this time; 0: no limit."""
         return not minutes or self.seconds < 60.0 * minutes
 
     def resume(self) -> Parts:
-        """What `save` was given, with all random numbers as they were; empty: the run begins.
+        """Return the parts given to `save` and restore all random states; empty: a new run.
 
-        Its clock begins to run here.
+        Starts the clock of the run.
         """
         self._began_at = time.perf_counter()
         if self.began.random:
@@ -183,15 +183,15 @@ class RunFolder:
         return self.began.parts
 
     def is_due(self, updates: int) -> bool:
-        """Whether to save after so many updates, though the run goes on."""
+        """Return whether a checkpoint is due after this number of updates."""
         every: int = getattr(self._settings, "checkpoint_updates", 1)
         return updates % every == 0
 
     def save(self, agent_steps: int, updates: int, parts: Parts) -> None:
-        """Write a checkpoint in the place of the last one.
+        """Replace the checkpoint by a new one.
 
         Raises:
-            TrainingError: it cannot be written; the last one is whole.
+            TrainingError: it cannot be written; the previous one is intact.
         """
         settings = {**asdict(self._settings), "resume": ""}
         state = RunState(
@@ -209,18 +209,18 @@ class RunFolder:
             write_checkpoint(self.path, state)
 
     def save_driver(self, network: ActorCritic, config: NetworkConfig) -> None:
-        """Write the driver as it is, for others to read; a run does not go on from it."""
+        """Write the present driver for evaluation; runs are not resumed from it."""
         with writing(self.path / WEIGHTS_FILE):
             save_network(self.path, network, config)
 
     def end(self, files: Sequence[str] = DRIVER_FILES, plans: Sequence[Plan] = ()) -> Path:
-        """Close the manifest over what the run has left."""
+        """Complete the manifest with the files of the run."""
         with writing(self.path / MANIFEST_FILE):
             end_training(self.path, files, plans)
         return self.path
 
     def close(self) -> None:
-        """Let others write here."""
+        """Close the log and release the folder."""
         if "log" in vars(self):
             self.log.close()
         os.close(self._lock)
@@ -238,7 +238,7 @@ class RunFolder:
 
 
 def _locked(folder: Path) -> int:
-    """Descriptor of the lock, which goes with the process however that ends."""
+    """Lock the folder until this process ends in any way; return the lock's descriptor."""
     path = folder / LOCK_FILE
     lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
@@ -250,7 +250,7 @@ def _locked(folder: Path) -> int:
         pid = os.pread(lock, 20, 0).decode("ascii", "replace") or "unknown"
         os.close(lock)
         raise TrainingError(
-            f"{folder}: process {pid} trains here: wait until it has ended, end it (kill {pid}), "
+            f"{folder}: process {pid} trains here; wait until it has ended, end it (kill {pid}), "
             "or give this run another --name"
         ) from error
     except OSError:
@@ -260,7 +260,7 @@ def _locked(folder: Path) -> int:
 
 
 def _digest(world: World | Simulation) -> str:
-    """Of the environment but for what changes no result: its zones and workers."""
+    """Return a digest of the environment without zones and workers, which change no result."""
     config = asdict(world.config)
     for name in ("zones", "workers"):
         del config[name]

@@ -1,4 +1,4 @@
-"""`begin_with`: the weights of a driver, for a run whose sensors tell the same, or more."""
+"""`begin_with`: start a run with a driver's weights if the run observes the same or more."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ OF_OBSERVATIONS = (
     "body.0.weight",
     "actor.0.weight",
     "critic.0.weight",
-)  # tensors whose last axis begins with the numbers of an observation
+)  # tensors whose last axis begins with the elements of an observation
 
 
 def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int:
-    """Give a network the weights of a driver, and say from how many decisions these come.
+    """Copy the weights of a driver into a network; return how many decisions they come from.
 
-    What the driver does not observe has the weight 0 at first, so that the network decides as the
-    driver does.
+    Observations that the driver does not have get the weight 0, so that the network first decides
+    as the driver does.
 
     Args:
-        network: with weights of its own.
-        config: its form.
-        folder: of the driver.
+        network: the initialised network.
+        config: its configuration.
+        folder: folder of the driver.
 
     Raises:
-        PolicyError: it is not of that form, or observes what the run does not.
+        PolicyError: the driver has another form, or needs observations that the run does not have.
     """
     driver, its_config = load_network(folder)
     held = driver.state_dict()
@@ -49,20 +49,20 @@ def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int
 
 
 def _names(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
-    """Of each number of an observation: frames before the newest, sensor, feature."""
+    """Return for each element of an observation: frames before the newest, sensor, feature."""
     names, stack = feature_names(sensors), sensors.stack
     return [(stack - 1 - frame, *name) for frame in range(stack) for name in names]
 
 
 def _columns(driver: NetworkConfig, run: NetworkConfig, folder: Path) -> Tensor:
-    """Where in a run's observation each number of a driver's lies."""
+    """Return the index in a run's observation of each element of a driver's observation."""
     known = {name: k for k, name in enumerate(_names(run.sensors))}
     names = _names(driver.sensors)
     if missing := [name for name in names if name not in known]:
         _, sensor, feature = missing[0]
         raise PolicyError(
             f"--start {folder}: observes {len(missing)} numbers that this run does not, first "
-            f"'{feature}' of the sensor '{sensor}': leave its sensors on"
+            f"'{feature}' of the sensor '{sensor}'; leave its sensors on"
         )
     columns = [known[name] for name in names]
     if driver.residual:
@@ -73,7 +73,7 @@ def _columns(driver: NetworkConfig, run: NetworkConfig, folder: Path) -> Tensor:
 def _widened(
     held: dict[str, Tensor], wanted: dict[str, Tensor], columns: Tensor
 ) -> dict[str, Tensor]:
-    """A driver's tensors for longer observations; a state that a critic sees stays behind them."""
+    """Widen a driver's tensors to longer observations; a critic's state stays at the end."""
     found = dict(held)
     for name in held.keys() & wanted.keys() & set(OF_OBSERVATIONS):
         old, size = held[name], wanted[name].shape[-1]

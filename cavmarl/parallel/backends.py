@@ -1,4 +1,4 @@
-"""Where worlds run: backends by name, and how one is chosen."""
+"""Backends, which run worlds: their names, their registration and their choice."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from typing import Protocol
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.backend_name import (
+from cavmarl.parallel.nodes.node_groups import NodeGroups
+from cavmarl.parallel.nodes.node_starters import system_of
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.placement.backend_name import (
     LOCAL,
     NODES,
     OWN,
@@ -16,26 +19,23 @@ from cavmarl.parallel.backend_name import (
     BackendName,
     read_backend,
 )
-from cavmarl.parallel.nodes.node_groups import NodeGroups
-from cavmarl.parallel.nodes.node_starters import system_of
-from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.pooled_worlds import PooledWorlds
-from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
+from cavmarl.parallel.worlds.sensor_worker_setup import local_worlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 
 
 class MakeWorlds(Protocol):
-    """Makes worlds of a registered backend."""
+    """Makes the worlds of a registered backend."""
 
     def __call__(
         self,
-        world: World,  # what each is made of
-        base_dir: Path,  # the folder that its relative files start from
+        world: World,
+        base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
-        workers: int | None,  # N of `backend="name:N"`; None of `backend="name"`
-        in_next_step: bool,  # when worlds begin anew; see `SteppedWorlds`
+        workers: int | None,  # N of `backend="name:N"`, None for `backend="name"`
+        in_next_step: bool,  # when new episodes start; see `SteppedWorlds`
     ) -> SteppedWorlds:
-        """Return worlds that are stepped together."""
+        """Make worlds that are stepped together."""
         ...
 
 
@@ -43,17 +43,17 @@ _REGISTERED: dict[str, MakeWorlds] = {}
 
 
 def register_backend(name: str, make: MakeWorlds) -> None:
-    """Add a place where worlds run, which `backend` of `make_vec` and `parallel_env` can name.
+    """Add a backend, which the argument `backend` of `make_vec` and `parallel_env` can name.
 
     Args:
         name: of the backend.
-        make: makes worlds there; what they do must be what the worlds of this process do.
+        make: makes its worlds, which must behave like worlds of this process.
 
     Raises:
-        ConfigError: the name is taken or no name.
+        ConfigError: the name is not an identifier, or a backend of cavmarl has it.
     """
     if not name.isidentifier():
-        raise ConfigError(f"backend {name!r}: must be a name of letters, digits and _")
+        raise ConfigError(f"backend {name!r}: a name has letters, digits and _ only")
     if name in OWN:
         raise ConfigError(f"backend '{name}': one of cavmarl's own; take another name")
     _REGISTERED[name] = make
@@ -67,23 +67,23 @@ def find_backend(
 
 
 def shows_state(backend: BackendName) -> bool:
-    """Return whether this process can have the state of the worlds, to draw or record them."""
+    """Return whether this process can read the state of the worlds, to draw or record them."""
     return backend.kind in OWN
 
 
 def make_worlds(
-    world: World,  # what each is made of
-    base_dir: Path,  # the folder that its relative files start from
+    world: World,
+    base_dir: Path,  # folder of relative paths
     num_worlds: int,  # W
-    backend: BackendName,  # where they run
-    in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+    backend: BackendName,
+    in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
 ) -> SteppedWorlds:
     """Make worlds.
 
     Raises:
-        ConfigError: a setting that worlds of this backend cannot have.
-        MissingExtraError: a backend on Ray without Ray, or on MPI without mpi4py.
-        WorkerError: no process, no cluster, or no memory.
+        ConfigError: the backend does not support a setting.
+        MissingExtraError: Ray or mpi4py is not installed.
+        WorkerError: a process or cluster cannot be started, or there is not enough memory.
     """
     count = backend.count
     if backend.kind == LOCAL:
@@ -91,7 +91,7 @@ def make_worlds(
     if backend.kind == PROCESSES:
         return PooledWorlds(world, base_dir, num_worlds, count or 1, in_next_step)
     if backend.kind in (NODES, RAY):
-        # The pools of whole worlds have a thread each, and MPI is for one thread.
+        # Groups of whole worlds have a thread each, but MPI supports a single thread.
         by_zones = count == 1 or backend.is_mpi or backend.is_split(num_worlds)
         make = NodeWorlds if by_zones else NodeGroups
         system = system_of(backend)

@@ -1,4 +1,4 @@
 """Drivers for agents' vehicles, and the networks that trained drivers evaluate.
 
-Stands on `env`.
+Depends on `env`.
 """

@@ -42,7 +42,7 @@ class LayerTable:
     The weights of each layer begin with a cache line.
 
     Attributes:
-        width: numbers that the last layer gives.
+        width: number of outputs of the last layer.
     """
 
     def __init__(self, num_inputs: int) -> None:
@@ -58,7 +58,7 @@ class LayerTable:
         Args:
             kind: a constant of `kernels.inference`.
             weights: arrays in the order that the kind asks for.
-            width: numbers that the layer gives; 0: as many as it gets.
+            width: number of outputs of the layer; 0: as many as inputs.
         """
         inputs, self.width = self.width, width or self.width
         self._append(np.zeros(-self._num_weights % LINE_FLOATS, dtype=np.float32))
@@ -82,7 +82,7 @@ class LayerTable:
         return np.concatenate(self._weights, out=flat)
 
     def new_buffers(self) -> NDArray[np.float32]:
-        """Return what `evaluate_network` needs as buffers."""
+        """Return the buffers for `evaluate_network`."""
         return _aligned(NUM_BUFFERS * TILE_ROWS * self._widest)
 
 
@@ -104,7 +104,7 @@ class DriverNetwork:
 
     Args:
         weights: as `read_network` returns them.
-        config: what the network is.
+        config: the configuration of the network.
     """
 
     def __init__(self, weights: Weights, config: NetworkConfig) -> None:
@@ -114,7 +114,7 @@ class DriverNetwork:
         table.add(CLAMP, MAX_DEVIATIONS)
         add = _add_body if config.shared else _add_perceptron
         add(table, weights, config)
-        self._layers = table.layers()  # without what turns outputs into actions
+        self._layers = table.layers()  # without the conversion of outputs to actions
         if config.residual:
             table.add(RESIDUAL, RESIDUAL_PARTS)
         if config.action.kind == "continuous":
@@ -127,7 +127,7 @@ class DriverNetwork:
         self._choose = specialized(choose_largest)
 
     def outputs(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the actor's numbers: means (N, 2) of actions, or log-weights (N, choices).
+        """Return the actor's outputs: means (N, 2) of actions, or logits (N, choices).
 
         Args:
             observations: (N, D).

@@ -1,4 +1,4 @@
-"""Loading of policies: how a name or a path becomes a policy that drives in an environment.
+"""Loading of policies: a name or a path becomes a policy that drives in an environment.
 
 `agents/` holds the policies that come with cavmarl: `NAME.py` defines `make_policy(env)`; a folder
 holds the weights of a trained network. Both are files that are read, not modules that are imported.
@@ -32,18 +32,18 @@ from cavmarl.policies.shield import ShieldedPolicy
 
 
 def load_policy(policy: str | Path, env: Environment) -> Policy:
-    """Seat a policy in an environment.
+    """Load a policy for an environment.
 
     Args:
         policy: a name of `agents/`, a folder with model.safetensors and config.json, or a `.py`
-            file that defines `make_policy(env)`; several with `+` between them share the agents by
-            turns (`merge_ippo+idm`: agents 0, 2, … and agents 1, 3, …); `shielded:` before a driver
-            lets the built-in one act where that would brake harder.
-        env: a `CavEnv`, also wrapped, or a `CavVectorEnv`.
+            file that defines `make_policy(env)`. Policies joined by `+` share the agents in turn
+            (`merge_ippo+idm`: agents 0, 2, … and agents 1, 3, …). After `shielded:`, the built-in
+            driver acts instead of the policy whenever it would brake harder.
+        env: a `CavEnv`, possibly wrapped, or a `CavVectorEnv`.
 
     Raises:
-        PolicyError: nothing of that name, a broken file, or a network made for other observations
-            or actions than this environment's.
+        PolicyError: the policy does not exist, a file is broken, or a network was made for other
+            observations or actions than this environment's.
     """
     if isinstance(env, ParallelEnv):
         env = env.unwrapped
@@ -62,7 +62,7 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
 
 
 def policy_files(policy: str | Path) -> tuple[Path, ...]:
-    """The files that make a policy what it is: its script, or its weights and their description."""
+    """Return the files of a policy: its script, or its weights and their configuration."""
     if parts := shared_drivers(policy):
         return tuple(dict.fromkeys(file for part in parts for file in policy_files(part)))
     path = find_driver(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
@@ -71,19 +71,19 @@ def policy_files(policy: str | Path) -> tuple[Path, ...]:
     files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
     for file in files:
         if not file.is_file():
-            raise PolicyError(f"no {file.name} in {path}: not the folder of a trained driver")
+            raise PolicyError(f"no {file.name} in {path}; give the folder of a trained driver")
     return files
 
 
 def _load_script(path: Path, env: Environment) -> Policy:
-    """Run a `.py` file and let its `make_policy` seat the policy."""
+    """Run a `.py` file and let its `make_policy` make the policy."""
     spec = importlib.util.spec_from_file_location(f"cavmarl_policy_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise PolicyError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # the file is the user's: it may raise anything
+    except Exception as error:  # the user's file may raise any exception
         raise PolicyError(fault_in(path, error)) from error
     make_policy = getattr(module, "make_policy", None)
     if not inspect.isfunction(make_policy):
@@ -114,7 +114,7 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     if config.sensed != size:
         raise PolicyError(
             f"{name}: observes {config.sensed} numbers, but its sensors give {size} in "
-            "this version: train it again"
+            "this version; train it again"
         )
     return NetworkPolicy(env, network)
 
@@ -127,8 +127,8 @@ def _parts(keys: Iterable[str]) -> str:
 
 
 def driver_keys(policy: str | Path) -> dict[str, Any]:
-    """Return what a trained driver sees and does: overrides that make any environment fit for it.
+    """Return the overrides that give an environment a driver's sensors and actions.
 
-    Raises PolicyError: nothing of that name, or no trained driver.
+    Raises PolicyError: the driver does not exist, or is not a trained driver.
     """
     return form_of_driver(policy)

@@ -1,8 +1,8 @@
-"""The files of a trained driver: what its network is, and the weights.
+"""The files of a trained driver: the configuration of its network, and the weights.
 
 The folder of a driver holds `model.safetensors` (weights, no code) and `config.json` (a
-`NetworkConfig`). The configuration says which observations and actions the driver was trained with,
-so that an environment that does not fit is refused.
+`NetworkConfig`). The configuration contains the observations and actions of the training, so that
+an environment that does not fit is refused.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import ConfigError, PolicyError
 
 CONTINUOUS_ACTIONS = 2
-# A residual driver's own part of throttle and of steering: it keeps to the built-in driver's lanes.
+# A residual driver's share of throttle and steering; small, to stay in the built-in driver's lane.
 RESIDUAL_PARTS = (1.0, 0.1)
 MAX_LAYERS = 8
 MAX_WIDTH = 4096
 MAX_OBSERVATION_SIZE = 65_536
 MAX_STATE_SIZE = 1_048_576
-MAX_DEVIATIONS = 5.0  # observations further from the mean are cut
+MAX_DEVIATIONS = 5.0  # observations further from the mean are clipped
 
 Weights = Mapping[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """What a trained driver is and what it was made for.
+    """The configuration of a trained driver's network.
 
     Attributes:
-        environment: entry that it was trained on.
+        environment: name of the environment of the training.
         observation_size: numbers in one flat observation.
-        sensors: what those numbers are.
-        action: what its actions mean.
-        hidden: widths of the hidden layers, of the actor and of the critic.
-        seed: of its training.
-        agent_steps: decisions that it learned from.
-        state_size: numbers of the world's state that its critic sees beside the observation. The
-            driver itself never does.
-        shared: one body for actor and critic, of ReLU with LayerNorm; else each is a tanh network.
-        residual: what it does is added, by `RESIDUAL_PARTS`, to what the built-in driver would do,
-            which it observes last (residual learning: Silver et al. 2018, Johannink et al. 2019).
+        sensors: the sensors of the observation.
+        action: the kind of actions.
+        hidden: widths of the hidden layers of actor and critic.
+        seed: of the training.
+        agent_steps: number of decisions used for learning.
+        state_size: numbers of the world's state that the critic gets beside the observation; the
+            actor never gets them.
+        shared: one body with LayerNorm and ReLU for actor and critic; else each is a tanh network.
+        residual: the output, scaled by `RESIDUAL_PARTS`, is added to the built-in driver's action,
+            which is observed last (residual learning: Silver et al. 2018, Johannink et al. 2019).
     """
 
     environment: str
@@ -75,10 +75,10 @@ class NetworkConfig:
         if self.residual and self.action.kind != "continuous":
             raise ConfigError(
                 f"residual with action.kind = {self.action.kind}: choices cannot be added to the "
-                "built-in driver's; use action.kind = continuous"
+                "action of the built-in driver; use action.kind = continuous"
             )
         if self.shared and self.state_size:
-            raise ConfigError("shared: a critic that sees the world's state has a body of its own")
+            raise ConfigError("shared: not possible with state_size; set one of them")
         if not 0 <= self.state_size <= MAX_STATE_SIZE:
             raise ConfigError(f"state_size = {self.state_size}: must be from 0 to {MAX_STATE_SIZE}")
         if not 1 <= len(self.hidden) <= MAX_LAYERS or not all(
@@ -91,12 +91,12 @@ class NetworkConfig:
 
     @property
     def sensed(self) -> int:
-        """Numbers of an observation that its sensors give; the others are the built-in driver's."""
+        """Number of observed elements from sensors; the others are the built-in driver's action."""
         return self.observation_size - (CONTINUOUS_ACTIONS if self.residual else 0)
 
     @property
     def num_outputs(self) -> int:
-        """Numbers that the actor gives: one for each action or choice."""
+        """Number of outputs of the actor: one for each action or choice."""
         return self.action.choices or CONTINUOUS_ACTIONS
 
     @property
@@ -132,11 +132,11 @@ def read_network(folder: Path) -> tuple[Weights, NetworkConfig]:
 
     Raises:
         PolicyError: a file is missing or broken, the weights do not fit the configuration, or a
-            weight cannot be computed with.
+            weight is not finite.
     """
     for name in (WEIGHTS_FILE, CONFIG_FILE):
         if not (folder / name).is_file():
-            raise PolicyError(f"no {name} in {folder}: is this the folder of a trained driver?")
+            raise PolicyError(f"no {name} in {folder}; give the folder of a trained driver")
     config = _read_config(folder / CONFIG_FILE)
     path = folder / WEIGHTS_FILE
     weights = _read_weights(path, config)
@@ -149,7 +149,7 @@ def read_network(folder: Path) -> tuple[Weights, NetworkConfig]:
 
 
 def _read_weights(path: Path, config: NetworkConfig) -> dict[str, NDArray[np.float32]]:
-    """Read all tensors; their header is compared with the configuration before any is loaded."""
+    """Read all tensors; the header is checked against the configuration before loading."""
     try:
         with safe_open(path, framework="numpy") as file:
             names = list(file.keys())
@@ -165,7 +165,7 @@ def _read_weights(path: Path, config: NetworkConfig) -> dict[str, NDArray[np.flo
 def _misfits(
     held: Mapping[str, tuple[str, tuple[int, ...]]], config: NetworkConfig
 ) -> Iterator[str]:
-    """Yield what is wrong with the tensors of a file, each of a data type and a shape."""
+    """Yield how a file's tensors, each a data type and a shape, differ from `config`."""
     shapes = config.shapes
     for name, shape in shapes.items():
         if name not in held:
@@ -182,7 +182,7 @@ def _misfits(
 def _read_config(path: Path) -> NetworkConfig:
     try:
         raw: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:  # not all of JSON's are its own
+    except (OSError, ValueError, RecursionError) as error:  # JSON also raises errors of other types
         raise _unreadable(path, error) from error
     try:
         return validate(NetworkConfig, raw, str(path))
@@ -191,5 +191,5 @@ def _read_config(path: Path) -> NetworkConfig:
 
 
 def _unreadable(path: Path, error: Exception) -> PolicyError:
-    reason = error.strerror if isinstance(error, OSError) else None  # its text repeats the path
+    reason = error.strerror if isinstance(error, OSError) else None  # str(error) repeats the path
     return PolicyError(f"{path}: cannot be read ({reason or error})")

@@ -1,4 +1,4 @@
-"""Policies: what maps observations of agents to their actions."""
+"""Policies: map observations of agents to actions."""
 
 from __future__ import annotations
 
@@ -24,35 +24,35 @@ class Policy(ABC):
     """Drives the agents of one environment.
 
     Args:
-        env: where it drives; a `CavEnv` is driven by `act`, a `CavVectorEnv` by `act_batch`.
+        env: environment of the policy; `act` is for a `CavEnv`, `act_batch` for a `CavVectorEnv`.
     """
 
     def __init__(self, env: Environment) -> None:
         self.env = env
 
     def reset(self, seed: int | None = None) -> None:  # noqa: B027 - most have nothing to reset
-        """Begin anew; `seed` roots the random numbers of a policy that draws any."""
+        """Start a new episode; `seed` seeds the random numbers of policies that use them."""
 
     @abstractmethod
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Actions of all agents of all worlds.
+        """Return the actions of all agents of all worlds.
 
         Args:
             observations: (W, A, D) flat.
-            mask: (W, A) agents that act; the others' actions are not read.
+            mask: (W, A) agents that act; other actions are ignored.
 
         Returns:
             (W, A, 2) float32 within [-1, 1], or (W, A) int64 choices.
         """
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Actions of the agents of a `CavEnv`, from what its `reset` or `step` returned.
+        """Return the actions of a `CavEnv`'s agents for the observations of `reset` or `step`.
 
         Agents that have just left are among the observations and get no action.
         """
         env = self.env
         if not isinstance(env, CavEnv):
-            raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
+            raise PolicyError("act() needs a parallel_env; use act_batch() with a make_vec")
         index = {agent: k for k, agent in enumerate(env.possible_agents)}
         live = [agent for agent in env.agents if agent in observations]
         size = flat_observation_space(env.config).shape[0]
@@ -73,14 +73,14 @@ class Policy(ABC):
 
 
 class NetworkPolicy(Policy):
-    """A trained network, driving by its most likely actions."""
+    """A trained network that drives with its most likely actions."""
 
     def __init__(self, env: Environment, network: DriverNetwork) -> None:
         super().__init__(env)
         self.network = network
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """The network's most likely actions where `mask`, 0 elsewhere."""
+        """Return the network's most likely actions where `mask` is set, else 0."""
         if self.network.config.residual:
             proposed = built_in_actions(self.env, mask)
             observations = np.concatenate([observations, proposed], axis=-1)
@@ -91,19 +91,19 @@ class NetworkPolicy(Policy):
 
 
 class SharedPolicy(Policy):
-    """Several drivers in one world: agent k is driven by driver k modulo their number."""
+    """Several drivers in one world: agent k has driver k modulo the number of drivers."""
 
     def __init__(self, env: Environment, drivers: Sequence[Policy]) -> None:
         super().__init__(env)
         self.drivers = tuple(drivers)
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin anew, each driver with the same seed."""
+        """Start a new episode; all drivers get the same seed."""
         for driver in self.drivers:
             driver.reset(seed)
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Each driver's actions of its agents."""
+        """Return each driver's actions for its agents."""
         turn = np.arange(mask.shape[1]) % len(self.drivers)
         actions: NDArray[Any] | None = None
         for k, driver in enumerate(self.drivers):
@@ -117,13 +117,13 @@ class SharedPolicy(Policy):
 
 
 def built_in_actions(env: Environment, mask: NDArray[np.bool_]) -> NDArray[Any]:
-    """What the built-in driver would do: (W, A, …) as `Policy.act_batch` returns it, to be changed.
+    """Return the built-in driver's actions: a new array (W, A, …) as in `Policy.act_batch`.
 
-    `mask`: (W, A), for its form. Raises PolicyError: actions are numbers of choices.
+    `mask`: (W, A), defines the shape. Raises PolicyError: actions are discrete.
     """
     if env.config.action.kind != "continuous":
         raise PolicyError(
-            f"action.kind = {env.config.action.kind}: this driver gives throttle and steering; "
+            f"action.kind = {env.config.action.kind}: this driver needs throttle and steering; "
             "make the environment with overrides={'action.kind': 'continuous'}"
         )
     found = env.suggest_actions()

@@ -1,4 +1,4 @@
-"""`ShieldedPolicy`: a driver that the built-in one relieves where it would brake harder."""
+"""`ShieldedPolicy`: a driver replaced by the built-in driver where that brakes harder."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
 
 class ShieldedPolicy(Policy):
-    """Where the built-in driver would brake, and harder, its action is done and not the driver's.
+    """Uses the built-in driver's action wherever it brakes, and harder than the driver.
 
-    The built-in driver reads the world's state, not observations: results with a shield stand
-    apart from those of the driver alone.
+    The built-in driver reads the world's state, not observations. So results with a shield are not
+    comparable with results of the driver alone.
     """
 
     def __init__(self, env: Environment, driver: Policy) -> None:
@@ -22,13 +22,13 @@ class ShieldedPolicy(Policy):
         self.driver = driver
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin anew, as the driver does."""
+        """Start a new episode of the driver."""
         self.driver.reset(seed)
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """The driver's actions (W, A, 2), or the built-in driver's.
+        """Return the driver's actions (W, A, 2), or the built-in driver's where it brakes harder.
 
-        Raises PolicyError: actions are numbers of choices.
+        Raises PolicyError: actions are discrete.
         """
         safe = built_in_actions(self.env, mask)
         actions = self.driver.act_batch(observations, mask).copy()

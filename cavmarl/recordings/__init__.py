@@ -1,5 +1,5 @@
-"""Recordings of runs: frames into Parquet files while a run goes on, read again, exported.
+"""Recordings of runs: frames written to Parquet files during a run, read again, and exported.
 
-`env` records with it, the command line replays; it takes frames
-(`engine.world_frame`) and knows no world.
+`env` writes recordings, and the command line replays them. The package uses frames
+(`engine.world_frame`) only, not worlds.
 """

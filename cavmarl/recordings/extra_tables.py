@@ -1,7 +1,8 @@
-"""What a recording holds on request besides what can be seen: rows of one dtype, a table each.
+"""Optional tables of a recording: rows of one dtype per table.
 
-Rows begin with `tick`. A column of float32 with an axis becomes a list, any other with axes its
-bytes, objects text; `recording.json` tells the dtypes, so that rows are read as they were.
+Rows begin with `tick`. A float32 column with one axis is stored as a list, any other column with
+axes as bytes, and objects as text. `recording.json` has the dtypes, so rows are read back
+unchanged.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ KINDS = ("observations", "samples", "messages")
 
 @dataclass(frozen=True)
 class RecordOptions:
-    """What `record` may be in the place of a path.
+    """Options of `record`, as an alternative to a path.
 
     Attributes:
         path: a new folder.
-        include: of `observations`, `samples` and `messages` those that are recorded, too.
+        include: additional tables to record, of `observations`, `samples` and `messages`.
     """
 
     path: str | Path
@@ -39,11 +40,11 @@ class RecordOptions:
 
     @classmethod
     def of(cls, record: Self | str | Path) -> RecordOptions:
-        """As it is, or a path alone."""
+        """Return options as they are, or make them from a path."""
         return record if isinstance(record, RecordOptions) else cls(record)
 
     def at(self, path: str | Path) -> RecordOptions:
-        """The same at another path."""
+        """Return the same options with another path."""
         return RecordOptions(path, self.include)
 
 
@@ -55,7 +56,7 @@ class ExtraRows(NamedTuple):
 
 
 def extra_table(parts: Sequence[ExtraRows], dtype: np.dtype[Any]) -> Any:
-    """The rows of some frames as a table; those of a tick before the frame's reset, too."""
+    """Build a table of the rows of some frames, including rows from before the frame's reset."""
     pa = arrow()
     rows = np.concatenate([np.zeros(0, dtype), *(part.rows for part in parts)])
     counts = [len(part.rows) for part in parts]
@@ -79,9 +80,9 @@ def extra_table(parts: Sequence[ExtraRows], dtype: np.dtype[Any]) -> Any:
 
 
 def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArray[np.void]]:
-    """(episodes (n,), rows (n,)) of a table.
+    """Return (episodes (n,), rows (n,)) of a table.
 
-    Raises RecordingError: it is not of that dtype.
+    Raises RecordingError: the table has another dtype.
     """
     rows = np.zeros(table.num_rows, dtype)
     try:
@@ -103,9 +104,9 @@ def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArr
 
 
 def take_rows(extras: Mapping[str, NDArray[np.void]], episode: int, tick: int) -> Any:
-    """(table, `ExtraRows`) of a frame; rows of later ticks than its own are of the episode before.
+    """Yield (table, `ExtraRows`) of a frame; rows of later ticks belong to the previous episode.
 
-    They were sent in the step before the world began anew.
+    They were sent in the step in which the world restarted.
     """
     for name, rows in extras.items():
         late = rows["tick"] > tick

@@ -1,4 +1,4 @@
-"""`FrameMemory`: the memory of frames that are on disk, for frames to come."""
+"""`FrameMemory`: reuses the memory of frames that are already on disk."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from numpy.typing import NDArray
 
 from cavmarl.engine.world_frame import SEEN
 
-_SPARE = 64  # rows that a frame may have more than the one before
+_SPARE = 64  # additional rows, in case the next frame is larger
 
 
 class FrameMemory:
-    """Hands out rows of SEEN, and takes them back.
+    """Hands out rows of SEEN and takes them back.
 
-    Fresh pages cost a step more than the rows that are copied to them. One thread takes memory,
-    another gives it back.
+    Fresh memory pages cost more than copying the rows. One thread takes memory, another one gives
+    it back.
     """
 
     def __init__(self) -> None:
         self._free: list[NDArray[np.void]] = []
-        self._out: set[int] = set()  # ids of what is handed out, which frames keep alive
+        self._out: set[int] = set()  # ids of memory in use, which frames keep alive
 
     def take(self, count: int) -> NDArray[np.void]:
-        """SEEN (count,), with anything in it."""
+        """Return SEEN (count,) with undefined contents."""
         while self._free:
             found = self._free.pop()
             if len(found) >= count:
@@ -33,7 +33,7 @@ class FrameMemory:
         return found[:count]
 
     def give_back(self, rows: NDArray[np.void]) -> None:
-        """Rows that nothing reads any more; those of elsewhere are left alone."""
+        """Take back rows that are no longer read; ignore rows of other memory."""
         whole = rows.base
         if whole is not None and id(whole) in self._out:
             self._out.remove(id(whole))

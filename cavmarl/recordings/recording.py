@@ -1,4 +1,4 @@
-"""`Recording`: what `RecordingWriter` wrote, to read."""
+"""`Recording`: reads what `RecordingWriter` has written."""
 
 from __future__ import annotations
 
@@ -34,20 +34,21 @@ _INDEX = np.dtype([("episode", "<i4"), ("tick", "<i8"), ("part", "<i4"), ("row",
 
 
 class Recording:
-    """A recording; it is read part by part, as it is asked for.
+    """A recording, read part by part on demand.
 
-    One that is still written, or whose run was killed, has what was committed when it was opened.
+    If the recording is still being written, or its run was killed, it has the parts that were
+    committed when it was opened.
 
     Args:
-        path: the folder that `record` was given.
+        path: the folder that was given to `record`.
 
     Attributes:
-        path: likewise.
-        head: what it is.
-        worlds: their numbers.
+        path: the folder.
+        head: the contents of `recording.json`.
+        worlds: indices of its worlds.
 
     Raises:
-        RecordingError: no recording, a damaged one, or one of another version.
+        RecordingError: there is no recording, or it is damaged or of another version.
         MissingExtraError: pyarrow is not installed.
     """
 
@@ -62,27 +63,26 @@ class Recording:
         }
         self.worlds = sorted(self._parts)
         self._kept: tuple[Path | None, list[RecordedFrame]] = (None, [])
-        self._kept_extras: dict[str, tuple[Path, Any]] = {}  # by table: its part that was read last
+        self._kept_extras: dict[str, tuple[Path, Any]] = {}  # last read part by table
         self._indices: dict[int, NDArray[np.void]] = {}
 
     @classmethod
     def open(cls, path: str | Path) -> Recording:
-        """As the class itself."""
+        """Open a recording, like the class itself."""
         return cls(path)
 
     @property
     def is_whole(self) -> bool:
-        """Whether it was closed in order: False of one that is written, or whose run was killed."""
+        """Return whether the recording was closed; False while written, or if its run died."""
         return self.head.status == "closed"
 
     @property
     def manifest(self) -> Mapping[str, Any]:
-        """Of the run: its world, machine, packages and commit."""
+        """The manifest of the run: its world, machine, packages and commit."""
         return self.head.manifest
 
     @property
     def partition(self) -> ZonePartition:
-        """The zones."""
         return self.head.partition
 
     @cached_property
@@ -90,59 +90,59 @@ class Recording:
         """The map.
 
         Raises:
-            RecordingError: it is missing or damaged, or packed by another version.
+            RecordingError: the map is missing or damaged, or has the layout of another version.
         """
-        path, told = self.path / NETWORK_FILE, self.head.network
+        path, info = self.path / NETWORK_FILE, self.head.network
         try:
             content = path.read_bytes()
         except OSError as error:
             raise RecordingError(
-                f"{path}: the recording is without its map ({error.strerror or error}); put the "
+                f"{path}: the recording has no map ({error.strerror or error}); put the "
                 "file back, from another recording of the same map if need be"
             ) from error
-        if told["layout"] != network_layout():
+        if info["layout"] != network_layout():
             raise RecordingError(
-                f"{path}: the map is packed as layout {told['layout']}, but this version reads "
+                f"{path}: the map has layout {info['layout']}, but this version reads "
                 f"{network_layout()}; use the version of cavmarl that wrote it"
             )
-        whole = hashlib.sha256(content).hexdigest() == told["sha256"]
-        network = unpack_network(content, told["name"], told["source_sha256"]) if whole else None
+        whole = hashlib.sha256(content).hexdigest() == info["sha256"]
+        network = unpack_network(content, info["name"], info["source_sha256"]) if whole else None
         if network is None:
             raise RecordingError(
-                f"{path}: is not the map that {HEAD_FILE} tells of, or damaged; put the file "
+                f"{path}: is damaged, or not the map named in {HEAD_FILE}; put the file "
                 "back, from another recording of the same map if need be"
             )
         return network
 
     def episodes(self, world: int = 0) -> list[int]:
-        """The numbers of the episodes of a world, from 0."""
+        """Return the indices of a world's episodes, from 0."""
         return [int(number) for number in np.unique(self._index(world)["episode"])]
 
     def ticks(self, world: int = 0, episode: int = 0) -> list[int]:
-        """The ticks of an episode of which there are frames, in order."""
+        """Return the ticks of an episode that have frames, in order."""
         index = self._index(world)
         return [int(tick) for tick in index["tick"][index["episode"] == episode]]
 
     def frames(self, world: int = 0, episode: int | None = None) -> Iterator[WorldFrame]:
-        """All frames of a world, or of one episode, in order; equal to those that were recorded.
+        """Yield all frames of a world or of one episode, in order, as they were recorded.
 
         Raises:
-            RecordingError: no such world, or a part is missing or damaged.
+            RecordingError: there is no such world, or a part is missing or damaged.
         """
         for found in self.recorded(world):
             if episode is None or found.episode == episode:
                 yield found.frame
 
     def recorded(self, world: int = 0) -> Iterator[RecordedFrame]:
-        """All frames of a world with their episodes; raises as `frames`."""
+        """Yield all frames of a world with their episodes; raises as `frames`."""
         for path in self._paths(world):
             yield from self._read(path, world)
 
     def at(self, tick: int, world: int = 0, episode: int = 0) -> WorldFrame:
-        """The last frame of an episode that is not after a tick.
+        """Return the last frame of an episode at or before a tick.
 
         Raises:
-            RecordingError: there is none, or a part is missing or damaged.
+            RecordingError: there is no such frame, or a part is missing or damaged.
         """
         index = self._index(world)
         index = index[index["episode"] == episode]
@@ -150,27 +150,27 @@ class Recording:
         if place < 0:
             raise RecordingError(
                 f"{self.path}: no frame at tick {tick} of episode {episode} of world {world}; "
-                f"there are the episodes {self.episodes(world)}"
+                f"the episodes are {self.episodes(world)}"
             )
         found = index[place]
         return self._read(self._paths(world)[int(found["part"])], world)[int(found["row"])].frame
 
     def events(self, world: int = 0) -> Iterator[RecordedEvent]:
-        """What happened in a world, in order; raises as `frames`."""
+        """Yield the events of a world, in order; raises as `frames`."""
         for frames in self._paths(world):
             path = frames.parent.parent / "events" / frames.name
             yield from events_of(path, read_table(path))
 
     @property
     def extras(self) -> list[str]:
-        """Names of the tables that were recorded on request."""
+        """Return the names of the optional tables that were recorded."""
         return list(self.head.extras)
 
     def extra(self, table: str, world: int = 0, episode: int | None = None) -> NDArray[np.void]:
-        """All rows of a table on request, of one world; of one episode, or of all.
+        """Return all rows of an optional table, of one world and of one or all episodes.
 
         Raises:
-            RecordingError: it was not recorded, or a part is missing or damaged.
+            RecordingError: the table was not recorded, or a part is missing or damaged.
         """
         rows = [np.zeros(0, self._dtype(table))]
         for frames in self._paths(world):
@@ -179,10 +179,10 @@ class Recording:
         return np.concatenate(rows)
 
     def extra_at(self, table: str, tick: int, world: int = 0, episode: int = 0) -> Any:
-        """The rows (n,) of a table on request of one tick of which there is a frame.
+        """Return the rows (n,) of an optional table at one tick that has a frame.
 
         Raises:
-            RecordingError: it was not recorded, or a part is missing or damaged.
+            RecordingError: the table was not recorded, or a part is missing or damaged.
         """
         index = self._index(world)
         parts = index["part"][(index["episode"] == episode) & (index["tick"] == tick)]
@@ -202,7 +202,7 @@ class Recording:
         return dtype_of(columns)
 
     def _extra_of(self, table: str, frames: Path) -> tuple[Any, NDArray[np.void]]:
-        """(episodes, rows) of the table of a part; the last one that was read is kept."""
+        """Return (episodes, rows) of a part's table; the last part is cached."""
         dtype = self._dtype(table)
         path = frames.parent.parent / table / frames.name
         kept = self._kept_extras.get(table)
@@ -213,10 +213,10 @@ class Recording:
         return found
 
     def _paths(self, world: int) -> list[Path]:
-        """The committed parts of a world: the files of their frames."""
+        """Return the frame files of the committed parts of a world."""
         if world not in self._parts:
             there = ", ".join(map(str, self.worlds)) or "none: nothing was committed"
-            raise RecordingError(f"{self.path}: no world {world}; there are {there}")
+            raise RecordingError(f"{self.path}: no world {world}; the worlds are {there}")
         return self._parts[world]
 
     def _index(self, world: int) -> NDArray[np.void]:
@@ -236,7 +236,7 @@ class Recording:
         return self._indices[world]
 
     def _read(self, path: Path, world: int) -> list[RecordedFrame]:
-        """The frames of a part; the last one that was read is kept."""
+        """Return the frames of a part; the last part is cached."""
         if self._kept[0] != path:
             vehicles = read_table(path.parent.parent / "vehicles" / path.name)
             self._kept = path, frames_of(path, world, read_table(path), vehicles)
@@ -248,16 +248,16 @@ def _number(text: str) -> int | None:
 
 
 def _parts_of(folder: Path) -> list[Path]:
-    """The committed parts of a world, in order.
+    """Return the committed parts of a world, in order.
 
     Raises:
-        RecordingError: one in between is missing.
+        RecordingError: a part in between is missing.
     """
     paths = sorted(path for path in (folder / "frames").glob("*.parquet") if path.name[0] != ".")
     for number, path in enumerate(paths):
         if path.stem != f"{number:06d}":
             raise RecordingError(
-                f"{path.with_name(f'{number:06d}.parquet')}: is missing, though later parts are "
-                "there; restore it, or take the later ones away to read what is before"
+                f"{path.with_name(f'{number:06d}.parquet')}: is missing, although later parts "
+                "exist; restore it, or remove the later parts to read the earlier ones"
             )
     return paths

@@ -1,4 +1,4 @@
-"""Recordings as files of others: SUMO's floating car data, CSV, MCAP for Foxglove."""
+"""Export of recordings: SUMO's floating car data, CSV, and MCAP for Foxglove."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.roads.network import VEHICLE_CLASSES
 
 Track = Callable[[Iterator[WorldFrame]], Iterable[WorldFrame]]
-"""Is given the frames and hands them on, to show how far they are."""
+"""Wraps the iterator of frames, to show the progress."""
 Export = Callable[[Recording, Path, int, int, Track], int]
 _EVENT = "cavmarl.Event"
 
@@ -28,23 +28,23 @@ _EVENT = "cavmarl.Event"
 def write_fcd(
     recording: Recording, path: Path, world: int, episode: int, track: Track = iter
 ) -> int:
-    """Write SUMO's FCD output; x and y are the front bumper's, as SUMO has them.
+    """Write SUMO's FCD output; as in SUMO, x and y are those of the front bumper.
 
-    Angles are degrees clockwise from north, `pos` is where the front is along its lane.
+    Angles are degrees clockwise from north; `pos` is the front's position along its lane.
 
     Args:
-        recording: to be exported.
-        path: the file.
-        world: of the recording.
-        episode: of the world.
-        track: shows how far they are.
+        recording: the recording.
+        path: the file to write.
+        world: index of the world.
+        episode: index of the episode.
+        track: wraps the frames to show the progress.
 
     Returns:
-        How many frames it has.
+        the number of frames.
 
     Raises:
         ConfigError: the file cannot be written.
-        RecordingError: the recording cannot be read, or is without its map.
+        RecordingError: the recording cannot be read, or its map is missing.
     """
     network = recording.network
     count = 0
@@ -82,7 +82,7 @@ def _fcd_line(row: np.void, lane_ids: tuple[str, ...]) -> str:
 def write_csv(
     recording: Recording, path: Path, world: int, episode: int, track: Track = iter
 ) -> int:
-    """Write a line a vehicle and frame, numbers in full; the rest as of `write_fcd`."""
+    """Write one line per vehicle and frame, at full precision; see `write_fcd`."""
     names = SEEN.names or ()
     count = 0
     with _writing(path) as file:
@@ -100,7 +100,7 @@ def write_mcap(
 ) -> int:
     """Write MCAP with JSON messages: `/vehicles` as Foxglove's SceneUpdate, and `/events`.
 
-    Foxglove shows it in its 3D panel. The rest as of `write_fcd`.
+    Foxglove shows it in its 3D panel. See `write_fcd` for the arguments.
 
     Raises:
         MissingExtraError: mcap is not installed.
@@ -116,17 +116,17 @@ def write_mcap(
         writer = writer_module.Writer(file)
         writer.start(profile="", library="cavmarl")
         scene = _channel(writer, "/vehicles", "foxglove.SceneUpdate", _SCENE_SCHEMA)
-        told = _channel(writer, "/events", _EVENT, _EVENT_SCHEMA)
+        event_channel = _channel(writer, "/events", _EVENT, _EVENT_SCHEMA)
         for frame in track(recording.frames(world, episode)):
             now_ns = round(frame.time_s * 1e9)
-            _say(writer, scene, now_ns, _scene_update(frame, now_ns))
+            _write(writer, scene, now_ns, _scene_update(frame, now_ns))
             for event in events.pop(frame.tick, ()):
-                _say(writer, told, now_ns, event._asdict())
+                _write(writer, event_channel, now_ns, event._asdict())
             count += 1
-        for tick, late in sorted(events.items()):  # of a step whose last frame is not to be had
+        for tick, late in sorted(events.items()):  # of a step whose last frame is not recorded
             for event in late:
                 now_ns = round(tick * recording.head.sim_dt_s * 1e9)
-                _say(writer, told, now_ns, event._asdict())
+                _write(writer, event_channel, now_ns, event._asdict())
         writer.finish()
     return count
 
@@ -139,7 +139,7 @@ def _class_name(vclass: int) -> str:
 
 
 def _scene_update(frame: WorldFrame, now_ns: int) -> dict[str, Any]:
-    """Foxglove's SceneUpdate: a cube a vehicle, in the frame `map`; those that left are deleted."""
+    """Return Foxglove's SceneUpdate: a cube per vehicle in the frame `map`, and deletions."""
     stamp = {"sec": now_ns // 10**9, "nsec": now_ns % 10**9}
     still = {"sec": 0, "nsec": 0}
     entities = []
@@ -158,7 +158,7 @@ def _scene_update(frame: WorldFrame, now_ns: int) -> dict[str, Any]:
             "size": size,
             "color": {**color, "a": 1.0},
         }
-        told = {"speed": float(row["speed"]), "agent": int(row["agent"]), "zone": int(row["zone"])}
+        shown = {"speed": float(row["speed"]), "agent": int(row["agent"]), "zone": int(row["zone"])}
         entities.append(
             {
                 "timestamp": stamp,
@@ -166,11 +166,11 @@ def _scene_update(frame: WorldFrame, now_ns: int) -> dict[str, Any]:
                 "id": str(row["id"]),
                 "lifetime": still,
                 "frame_locked": False,
-                "metadata": [{"key": key, "value": str(value)} for key, value in told.items()],
+                "metadata": [{"key": key, "value": str(value)} for key, value in shown.items()],
                 "cubes": [cube],
             }
         )
-    deletions = [{"timestamp": stamp, "type": 1, "id": ""}]  # 1: all that was there before
+    deletions = [{"timestamp": stamp, "type": 1, "id": ""}]  # 1: delete all earlier entities
     return {"deletions": deletions, "entities": entities}
 
 
@@ -226,7 +226,7 @@ def _channel(writer: Any, topic: str, name: str, schema: dict[str, Any]) -> int:
     return int(writer.register_channel(topic=topic, message_encoding="json", schema_id=known))
 
 
-def _say(writer: Any, channel: int, now_ns: int, message: dict[str, Any]) -> None:
+def _write(writer: Any, channel: int, now_ns: int, message: dict[str, Any]) -> None:
     data = json.dumps(message).encode()
     writer.add_message(channel, log_time=now_ns, data=data, publish_time=now_ns)
 

@@ -1,14 +1,14 @@
-"""How a recording lies on disk: its files, its columns, frames as tables and back.
+"""The format of a recording on disk: its files, its columns, and frames as tables and back.
 
-    PATH/recording.json         what it is: version, manifest, zones; written first, closed last
-    PATH/network.bin            the map, as `roads.cache.pack_network` packs it
-    PATH/world-0/vehicles/      a row a vehicle and frame
-    PATH/world-0/events/        a row an event
-    PATH/world-0/frames/        a row a frame; its lists have signals, transfers and ghosts
-    PATH/world-0/observations/  and other tables on request, see `extra_tables`
+    PATH/recording.json         version, manifest, zones; written first, closed last
+    PATH/network.bin            the map, as packed by `roads.cache.pack_network`
+    PATH/world-0/vehicles/      one row per vehicle and frame
+    PATH/world-0/events/        one row per event
+    PATH/world-0/frames/        one row per frame, with lists of signals, transfers and ghosts
+    PATH/world-0/observations/  and other optional tables, see `extra_tables`
 
-Each of these folders has a file for each part, `000000.parquet` and so on. That in `frames/` is
-written last and commits the part: what lies beside it without one does not count.
+Each of these folders has one file per part: `000000.parquet` and so on. The file in `frames/` is
+written last and commits the part; other files of a part without it are ignored.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 FORMAT_VERSION = 2
 HEAD_FILE = "recording.json"
 NETWORK_FILE = "network.bin"
-TABLES = ("vehicles", "events", "frames")  # of every recording; the last one commits a part
+TABLES = ("vehicles", "events", "frames")  # in every recording; the last one commits a part
 
-ALIGNED = 64  # bytes, of columns in memory
-# Numbers that hardly repeat: their bytes are split into streams, which compress.
+ALIGNED = 64  # alignment of columns in memory, bytes
+# Numbers that rarely repeat: their bytes are split into streams, which compress better.
 _SPLIT = [name for name in SEEN.names or () if SEEN[name].kind == "f"]
 _OPTIONS: dict[str, Any] = {
     "compression": "lz4",
@@ -42,22 +42,22 @@ _OPTIONS: dict[str, Any] = {
     "use_byte_stream_split": _SPLIT,
     "write_statistics": False,
     "write_batch_size": 1 << 16,
-    "write_page_checksum": True,  # so that a damaged file is found when it is read
+    "write_page_checksum": True,  # detects damaged files when they are read
 }
 
 
-Columns = Sequence[Sequence[Any]]  # name, dtype and shape of each column, as JSON has them
+Columns = Sequence[Sequence[Any]]  # name, dtype and shape of each column, as in JSON
 
 
 class RecordedFrame(NamedTuple):
-    """A frame, and which episode of its world it belongs to."""
+    """A frame and the index of its episode."""
 
-    episode: int  # from 0, since the recording began
+    episode: int  # from 0, since the start of the recording
     frame: WorldFrame
 
 
 class RecordedEvent(NamedTuple):
-    """An event between two frames, and its episode."""
+    """An event between two frames, and the index of its episode."""
 
     episode: int
     event: FrameEvent
@@ -65,20 +65,20 @@ class RecordedEvent(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordingHead:
-    """What stands in `recording.json`."""
+    """The contents of `recording.json`."""
 
-    environment: str  # its name and version
-    sim_dt_s: float  # seconds a tick
-    step_s: float  # seconds from frame to frame, unless it says another
+    environment: str  # name and version
+    sim_dt_s: float  # seconds per tick
+    step_s: float  # seconds between frames, unless the frame has another time
     network: Mapping[str, str]  # name, source_sha256, layout, sha256 of the file
-    bounds: Sequence[float]  # of the zones, min_x, min_y, max_x, max_y in m
-    rects: Sequence[Sequence[float]]  # of each zone, likewise
+    bounds: Sequence[float]  # of all zones: min_x, min_y, max_x, max_y in m
+    rects: Sequence[Sequence[float]]  # of each zone: min_x, min_y, max_x, max_y in m
     halo_m: float
-    manifest: Mapping[str, Any]  # of the run
-    status: str = "open"  # "closed" when it was ended in order
-    # of tables on request, by name: name, dtype and shape of each column
+    manifest: Mapping[str, Any]  # manifest of the run
+    status: str = "open"  # "closed" after an orderly end
+    # optional tables by name: name, dtype and shape of each column
     extras: Mapping[str, Columns] = field(default_factory=dict)
-    features: Sequence[Sequence[str]] = ()  # sensor and name of each number observed, newest frame
+    features: Sequence[Sequence[str]] = ()  # sensor and name of each observed number, newest frame
     terms: Sequence[str] = ()  # names of the reward terms
     version: int = FORMAT_VERSION
 
@@ -95,26 +95,26 @@ class RecordingHead:
 
     @classmethod
     def read(cls, folder: Path) -> RecordingHead:
-        """Raises RecordingError: there is none, or it is damaged or of another version."""
+        """Read `recording.json`; raises RecordingError: missing, damaged or of another version."""
         path = folder / HEAD_FILE
         try:
             document = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            what = "an empty folder" if folder.is_dir() else "no folder"
+            kind = "an empty folder" if folder.is_dir() else "no folder"
             raise RecordingError(
-                f"{folder}: no {HEAD_FILE}; it is {what} or no recording: give the path that "
-                "`record` was given"
+                f"{folder}: no {HEAD_FILE}; it is {kind} or no recording: give the path that "
+                "was given to `record`"
             ) from None
         except (OSError, ValueError, RecursionError) as error:
             raise RecordingError(
                 f"{path}: cannot be read ({error}); restore it, or record the run again"
             ) from error
         if not isinstance(document, dict) or "cavmarl_recording" not in document:
-            raise RecordingError(f"{path}: does not belong to a recording; record the run again")
+            raise RecordingError(f"{path}: not the head of a recording; record the run again")
         version = document.pop("cavmarl_recording")
         if version != FORMAT_VERSION:
             raise RecordingError(
-                f"{path}: a recording of format {version!r}, but this version reads "
+                f"{path}: the recording has format {version!r}, but this version reads "
                 f"{FORMAT_VERSION}; use the version of cavmarl that wrote it"
             )
         try:
@@ -123,7 +123,7 @@ class RecordingHead:
             list(map(dtype_of, head.extras.values()))
             hash((head.network["sha256"], head.network["name"], head.network["source_sha256"]))
             if not (head.sim_dt_s > 0.0 and head.step_s > 0.0 and "world" in head.manifest):
-                raise ValueError("a key has no value")
+                raise ValueError("a key is missing")
         except Exception as error:
             raise RecordingError(
                 f"{path}: is damaged ({error}); restore it, or record the run again"
@@ -132,7 +132,7 @@ class RecordingHead:
 
 
 def columns_of(dtype: np.dtype[Any]) -> list[list[Any]]:
-    """A dtype as JSON."""
+    """Convert a dtype to JSON."""
     found = []
     for name in dtype.names or ():
         base, shape = dtype[name].base, list(dtype[name].shape)
@@ -141,17 +141,17 @@ def columns_of(dtype: np.dtype[Any]) -> list[list[Any]]:
 
 
 def dtype_of(columns: Columns) -> np.dtype[Any]:
-    """The dtype that `columns_of` told; raises ValueError or TypeError: it is none."""
+    """Convert JSON of `columns_of` to a dtype; raises ValueError or TypeError if invalid."""
     return np.dtype([(str(name), str(kind), tuple(shape)) for name, kind, shape in columns])
 
 
 def arrow() -> Any:
-    """pyarrow; raises MissingExtraError: it is not installed."""
+    """Return pyarrow; raises MissingExtraError: it is not installed."""
     return require("pyarrow", "record")
 
 
 def write_table(table: Any) -> bytes:
-    """A table as a Parquet file."""
+    """Serialize a table as a Parquet file."""
     pa, parquet = arrow(), require("pyarrow.parquet", "record")
     sink = pa.BufferOutputStream()
     split = [name for name in _SPLIT if name in table.column_names]
@@ -162,28 +162,28 @@ def write_table(table: Any) -> bytes:
 
 
 def read_table(path: Path) -> Any:
-    """The table of a part's file.
+    """Read the table in a part's file.
 
     Raises:
-        RecordingError: it is missing or damaged.
+        RecordingError: the file is missing or damaged.
     """
     parquet = require("pyarrow.parquet", "record")
     try:
         return parquet.read_table(path, page_checksum_verification=True, partitioning=None)
     except FileNotFoundError:
         raise RecordingError(
-            f"{path}: is missing, though its part was committed; restore it, or take the files "
-            "of that name and the later ones away to read what is before"
+            f"{path}: is missing, although its part was committed; restore it, or remove the files "
+            "with that name and the later ones to read the earlier parts"
         ) from None
-    except (OSError, ValueError, KeyError) as error:  # pyarrow's own are ValueErrors and OSErrors
+    except (OSError, ValueError, KeyError) as error:  # pyarrow's errors are derived from these
         raise damaged(path, str(error)) from error
 
 
 def damaged(path: Path, why: str) -> RecordingError:
-    """The error of a file that is not what was written."""
+    """Return the error for a damaged file."""
     return RecordingError(
-        f"{path}: is damaged ({why}); restore it, or take the files of that name and the later "
-        "ones away to read what is before"
+        f"{path}: is damaged ({why}); restore it, or remove the files with that name and the later "
+        "ones to read the earlier parts"
     )
 
 
@@ -196,13 +196,13 @@ def vehicle_table(frames: Sequence[RecordedFrame]) -> Any:
     }
     columns |= _columns_of(np.concatenate([one.frame.vehicles.view(np.uint8) for one in frames]))
     arrays = {name: pa.array(column) for name, column in columns.items()}
-    # Without nulls none of their bits is written: that takes a third of the time.
+    # A null-free schema writes no null bits, which would take a third of the time.
     fields = [pa.field(name, array.type, nullable=False) for name, array in arrays.items()]
     return pa.Table.from_arrays(list(arrays.values()), schema=pa.schema(fields))
 
 
 def _columns_of(raw: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    """The fields of the bytes of SEEN (n,) as arrays."""
+    """Split the bytes of SEEN (n,) into its fields."""
     sizes = np.array([SEEN[name].itemsize for name in SEEN.names or ()])
     count = len(raw) // SEEN.itemsize
     room = -(-sizes * count // ALIGNED) * ALIGNED
@@ -261,16 +261,17 @@ def event_table(events: Iterable[RecordedEvent]) -> Any:
 
 
 def frames_of(path: Path, world: int, table: Any, vehicles: Any) -> list[RecordedFrame]:
-    """The frames of a part, of its `frames` and `vehicles`.
+    """Return the frames of a part, from its tables `frames` and `vehicles`.
 
     Args:
-        path: of its `frames`, for errors.
-        world: its number.
+        path: the file of its `frames`, for errors.
+        world: index of the world.
         table: its `frames`.
         vehicles: its `vehicles`.
 
     Raises:
-        RecordingError: a column is missing or of another kind, or the two do not belong together.
+        RecordingError: a column is missing or of another type, or the tables do not belong
+            together.
     """
     try:
         rows = np.empty(vehicles.num_rows, dtype=SEEN)
@@ -281,7 +282,7 @@ def frames_of(path: Path, world: int, table: Any, vehicles: Any) -> list[Recorde
         counts = np.array([row["num_vehicles"] for row in found], dtype=np.int64)
         named = np.repeat(np.array([row["tick"] for row in found], dtype=np.int64), counts)
         if not np.array_equal(ticks, named):
-            raise ValueError("its vehicles are of other ticks")
+            raise ValueError("its vehicles have other ticks")
         ends = np.cumsum(counts)
         return [
             RecordedFrame(row["episode"], _frame(world, row, rows[end - count : end].copy()))
@@ -307,7 +308,7 @@ def _frame(world: int, row: Mapping[str, Any], vehicles: NDArray[np.void]) -> Wo
 
 
 def events_of(path: Path, table: Any) -> list[RecordedEvent]:
-    """The events of a part; errors as of `frames_of`."""
+    """Return the events of a part; raises as `frames_of`."""
     try:
         columns = [table.column(name).to_pylist() for name in ("episode", *FrameEvent._fields)]
     except KeyError as error:

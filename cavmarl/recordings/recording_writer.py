@@ -1,4 +1,4 @@
-"""`RecordingWriter`: frames to disk while a run goes on, in parts that are there whole or not."""
+"""`RecordingWriter`: writes frames to disk during a run, in parts that are committed atomically."""
 
 from __future__ import annotations
 
@@ -38,35 +38,34 @@ from cavmarl.roads.cache import network_layout, pack_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-COMMIT_S = 0.8  # of wall time from part to part, so that each is on disk within a second
-MOST_WAITING_BYTES = 256 << 20  # of frames that are not written yet; then `add` waits
+COMMIT_S = 0.8  # wall time between parts, so that each is on disk within a second
+MOST_WAITING_BYTES = 256 << 20  # of unwritten frames, above which `add` waits
 
 
 class RecordingWriter:
-    """Takes frames and writes them beside the run, in a thread.
+    """Takes frames and writes them in a thread, parallel to the run.
 
-    About once a second what has come is committed as a part. A process that is killed, or a machine
-    without power, leaves all parts that were committed. Without `close` the rest is written when
-    the process ends.
+    About once per second, the new frames are committed as a part. If the process is killed or power
+    fails, all committed parts remain. Without `close`, the rest is written when the process ends.
 
     Args:
-        path: a folder that is made; if it is there, it is empty.
+        path: a folder to create; it may exist if it is empty.
         environment: name and version.
-        network: the map, of which a copy is kept.
+        network: the map, which is copied into the recording.
         partition: the zones.
-        halo_m: how far they see over their borders.
-        sim_dt_s: seconds a tick.
-        step_s: seconds a step.
-        manifest: of the run, with the key `world`; numbers, text, lists and dicts.
-        extras: dtypes of the tables that are recorded on request, by name; `tick` is first.
-        features: sensor and name of each number that an agent observes, if that is recorded.
-        terms: names of the reward terms, likewise.
+        halo_m: sensing range of zones over their borders.
+        sim_dt_s: seconds per tick.
+        step_s: seconds per step.
+        manifest: manifest of the run, with the key `world`; numbers, text, lists and dicts.
+        extras: dtypes of the optional tables, by name; their first field is `tick`.
+        features: sensor and name of each observed number, if observations are recorded.
+        terms: names of the reward terms, if observations are recorded.
 
     Attributes:
-        memory: for frames; only this writer reads their rows.
+        memory: memory for frames; only this writer reads their rows.
 
     Raises:
-        RecordingError: there is something at `path`, or it cannot be written.
+        RecordingError: `path` exists and is not empty, or it cannot be written.
         MissingExtraError: pyarrow is not installed.
     """
 
@@ -109,21 +108,21 @@ class RecordingWriter:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             if any(self.path.iterdir()):
-                raise RecordingError(f"{path}: there is something already; give a new folder")
+                raise RecordingError(f"{path}: exists and is not empty; give a new folder")
             write_whole(self.path / NETWORK_FILE, packed)
             write_whole(self.path / HEAD_FILE, head.to_bytes())
         except OSError as error:
             raise _unwritable(self.path, error) from error
         self.memory = FrameMemory()
         self._sink = _Sink(self.path, head, dict(extras or {}), self.memory)
-        self._finish = weakref.finalize(self, self._sink.close)  # at the end of the process, too
+        self._finish = weakref.finalize(self, self._sink.close)  # also at the end of the process
 
     def add(self, frames: Iterable[WorldFrame], extras: Iterable[Extras] = ()) -> None:
-        """Take frames, one a world; a tick that is not after the last one begins an episode.
+        """Add one frame per world; a tick that is not after the last one begins an episode.
 
         Args:
-            frames: of worlds.
-            extras: of each frame the rows of tables on request, by name.
+            frames: frames of worlds.
+            extras: rows of the optional tables of each frame, by name.
 
         Raises:
             RecordingError: an earlier part could not be written.
@@ -133,7 +132,7 @@ class RecordingWriter:
         self._sink.add(list(zip(these, more or [none] * len(these), strict=True)))
 
     def close(self) -> None:
-        """Write what is left and mark the recording as whole.
+        """Write the remaining frames and mark the recording as closed.
 
         Raises:
             RecordingError: a part could not be written.
@@ -149,7 +148,7 @@ _Moment = tuple[WorldFrame, Extras]
 
 
 class _Sink:
-    """What the thread works on; it does not know the writer, so that one can go unseen."""
+    """The state of the writing thread; it does not keep the writer alive."""
 
     def __init__(
         self,
@@ -162,7 +161,7 @@ class _Sink:
         self._memory = memory
         self._head = head
         self._extras = extras
-        self._pid = os.getpid()  # forks have no such thread
+        self._pid = os.getpid()  # a forked process has no such thread
         self._waiting: list[_Moment] = []
         self._waiting_bytes = 0
         self._changed = threading.Condition()
@@ -181,7 +180,7 @@ class _Sink:
         with self._changed:
             self._waiting += moments
             self._waiting_bytes += size
-            if self._thread is None:  # not before: a process may fork until its worlds are made
+            if self._thread is None:  # started late: a process may fork until its worlds are made
                 self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
                 self._thread.start()
             if self._waiting_bytes > MOST_WAITING_BYTES:
@@ -217,7 +216,7 @@ class _Sink:
             due = time.monotonic() + COMMIT_S
             try:
                 self._commit(moments)
-            except Exception as error:  # it is raised where frames are added
+            except Exception as error:  # raised again in `add`
                 with self._changed:
                     self._error = error
                     self._changed.notify_all()
@@ -273,7 +272,7 @@ class _WorldParts:
         elif last is not None:
             found = events_between(last.frame, frame)
             self._events += (RecordedEvent(episode, event) for event in found)
-        if last is not None and not self._frames:  # it was committed, and is compared now
+        if last is not None and not self._frames:  # the last frame is committed; compare now
             self._memory.give_back(last.frame.vehicles)
         self._last = RecordedFrame(episode, frame)
         self._frames.append(self._last)
@@ -281,7 +280,7 @@ class _WorldParts:
             self._extras[name].append(rows)
 
     def _at_the_end(self, last: WorldFrame, first: WorldFrame) -> Iterator[FrameEvent]:
-        """What happened in the step that ended an episode; its last frame is not to be had."""
+        """Yield the events of an episode's last step, whose last frame is not available."""
         ended = first.ended["agent"]
         stay = last.vehicles[~np.isin(last.vehicles["agent"], ended) | (last.vehicles["agent"] < 0)]
         stay = stay.copy()
@@ -296,7 +295,7 @@ class _WorldParts:
         return events_between(last, over)
 
     def commit(self) -> None:
-        """Write a part, if there is anything in it; the frames are last and commit it."""
+        """Write a part, unless it is empty; its frames are written last and commit it."""
         if not self._frames:
             return
         tables = {
@@ -317,6 +316,6 @@ class _WorldParts:
 def _unwritable(path: Path, error: Exception) -> RecordingError:
     reason = error.strerror if isinstance(error, OSError) and error.strerror else error
     return RecordingError(
-        f"{path}: cannot be recorded there ({reason}); what was committed can be read; make room, "
+        f"{path}: cannot record there ({reason}); committed parts stay readable; free space, "
         "or record into another folder"
     )

@@ -1,4 +1,4 @@
-"""Pictures of a recording, with the renderer that draws worlds."""
+"""Pictures of a recording, drawn with the renderer of worlds."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class ReplayPictures:
     """Draws frames of a recording, into arrays or into a window.
 
     Args:
-        recording: whose frames are drawn.
-        ghosts_of: the zone whose sight and ghosts are outlined.
+        recording: the recording.
+        ghosts_of: zone whose sensing range and ghosts are outlined.
 
     Raises:
-        ConfigError: no zone of that number.
+        ConfigError: there is no zone with that index.
         MissingExtraError: pygame-ce is not installed.
-        RecordingError: the recording is without its map.
+        RecordingError: the map is missing.
     """
 
     def __init__(self, recording: Recording, ghosts_of: int | None = None) -> None:
@@ -38,16 +38,16 @@ class ReplayPictures:
         self._ghosts_of = ghosts_of
         count = self._partition.count
         if ghosts_of is not None and not (count > 1 and 0 <= ghosts_of < count):
-            raise ConfigError(f"ghosts_of = {ghosts_of}: it has the zones 0 to {count - 1}")
+            raise ConfigError(f"ghosts_of = {ghosts_of}: must be from 0 to {count - 1}")
         self._renderer = TopDownRenderer(recording.network)
         self.fps = max(1, round(1.0 / head.step_s))
 
     def picture(self, frame: WorldFrame) -> NDArray[np.uint8]:
-        """A frame as (height, width, 3)."""
+        """Draw a frame as (height, width, 3)."""
         return pixels(self._draw(frame))
 
     def show(self, frame: WorldFrame) -> bool:
-        """Show a frame in a window, at the pace of the run; False: a person has closed it."""
+        """Show a frame in a window, at the run's pace; return False if the user has closed it."""
         self._renderer.show(self._draw(frame), self._title, self.fps)
         return not self._renderer.closed_by_person
 
@@ -70,7 +70,7 @@ class ReplayPictures:
 
 
 def drawable(vehicles: NDArray[np.void]) -> NDArray[np.void]:
-    """SEEN rows as VEHICLE rows, as far as a picture asks for them."""
+    """Convert SEEN rows to the VEHICLE fields that pictures need."""
     rows = np.repeat(blank_vehicle(), len(vehicles))
     for name in _SHARED:
         rows[name] = vehicles[name]

@@ -1,4 +1,4 @@
-"""Pictures of worlds: frames, windows, videos.
+"""Rendering of worlds: frames, windows, videos.
 
-Reads the engine's rows; `env` and `evaluate` draw with it.
+The renderer reads rows of the engine; `env` and `evaluate` use it.
 """

@@ -1,6 +1,6 @@
-"""pygame, loaded late and quietly, and the one way in which we draw smooth polygons with it.
+"""The colours of all pictures, and drawing of smooth polygons with pygame, which is loaded late.
 
-With the colours of all pictures, red green blue: a quiet map, so that the agents stand out.
+Colours are (red, green, blue). The map has muted colours, so that agents stand out.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ LAND: Color = (235, 237, 230)
 BUILDING: Color = (216, 213, 206)
 KERB: Color = (205, 208, 200)
 ASPHALT: Color = (98, 107, 119)
-PATH: Color = (212, 211, 203)  # lanes that are closed to cars
+PATH: Color = (212, 211, 203)  # lanes closed to cars
 MARKING: Color = (214, 219, 224)
 CENTRE_LINE: Color = (226, 206, 150)
 
 BACKGROUND_CAR: Color = (186, 204, 225)
-ACTOR: Color = (250, 232, 120)  # follows a script
+ACTOR: Color = (250, 232, 120)  # scripted vehicle
 GLASS: Color = (48, 58, 72)
 HEADLIGHT: Color = (255, 250, 225)
 BRAKE: Color = (255, 56, 48)
 BLINKER: Color = (255, 178, 36)
 COLLIDED: Color = (222, 22, 34)
 
-# Alternating hues, so that agents with neighbouring numbers differ most.
+# Hues alternate, so that agents with neighbouring numbers differ most.
 AGENTS: tuple[Color, ...] = (
     (255, 127, 14),
     (30, 144, 255),
@@ -53,8 +53,8 @@ AGENTS: tuple[Color, ...] = (
     (205, 92, 190),
 )
 
-# Of zones and their vehicles; zones that touch seldom have the same. They are those of M. Okabe and
-# K. Ito, Color Universal Design (2008), which people with any colour vision can tell apart.
+# Colours of zones and of their vehicles; adjacent zones rarely share one. The palette is that of M.
+# Okabe and K. Ito, Color Universal Design (2008), which is distinguishable with any colour vision.
 ZONES: tuple[Color, ...] = (
     (0, 114, 178),
     (230, 159, 0),
@@ -65,7 +65,7 @@ ZONES: tuple[Color, ...] = (
     (240, 228, 66),
 )
 
-# By signal code, the positions in roads.network.SIGNAL_STATES = "rugGysoOY".
+# By signal code, the index in roads.network.SIGNAL_STATES = "rugGysoOY".
 SIGNALS: tuple[Color, ...] = (
     (232, 58, 52),
     (245, 132, 42),
@@ -92,22 +92,22 @@ def zone_color(zone: int) -> Color:
 
 
 def ink_on(color: Color) -> Color:
-    """Dark or light ink, whichever reads better (luma of ITU-R BT.601)."""
+    """Return the dark or the light ink, whichever has more contrast (luma of ITU-R BT.601)."""
     luma = 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
     return INK if luma > 140 else PANEL
 
 
 Part = tuple[Sequence[int], Sequence[Sequence[float]]]  # colour with alpha, corners in pixels
 
-# Stamps are drawn so many times larger, then reduced: edges move by fractions of a pixel.
+# Stamps are drawn at this multiple of their size, then reduced, for subpixel edges.
 STAMP_DETAIL = 4
-# Small letters of a font stand unevenly; reduced large ones do not.
+# Text is also drawn large and reduced, because small letters are set unevenly.
 TEXT_DETAIL = 4
 _QUIET = "PYGAME_HIDE_SUPPORT_PROMPT"
 
 
 def load_pygame() -> ModuleType:
-    """Pygame without the greeting that it prints; no window is opened and the environment is kept.
+    """Import pygame without its greeting; no window opens, and the process environment is kept.
 
     Raises MissingExtraError: pygame-ce is not installed.
     """
@@ -124,7 +124,7 @@ def load_pygame() -> ModuleType:
 
 @lru_cache(maxsize=256)
 def lettering(text: str, height_px: int, color: tuple[int, int, int]) -> Surface:
-    """A text in pygame's own font, the same on every machine; transparent around the letters."""
+    """Render text in pygame's own font, which is the same everywhere, without a background."""
     pygame = load_pygame()
     large = _font(height_px * TEXT_DETAIL).render(text, True, color)
     size = (math.ceil(large.get_width() / TEXT_DETAIL), math.ceil(large.get_height() / TEXT_DETAIL))
@@ -141,7 +141,7 @@ def _font(height_px: int) -> Font:
 
 
 def blank(size: tuple[int, int], *, transparent: bool = False) -> Surface:
-    """An off-screen surface of 32 bits; no display is needed."""
+    """Return an off-screen surface of 32 bits; no display is needed."""
     pygame = load_pygame()
     flags = pygame.SRCALPHA if transparent else 0
     surface: Surface = pygame.Surface(size, flags, 32)
@@ -149,17 +149,17 @@ def blank(size: tuple[int, int], *, transparent: bool = False) -> Surface:
 
 
 def pixels(surface: Surface) -> NDArray[np.uint8]:
-    """A picture as uint8 (height, width, 3), red green blue."""
+    """Return a surface's pixels as uint8 (height, width, 3) in red, green, blue."""
     data = load_pygame().image.tobytes(surface, "RGB")
     width, height = surface.get_size()
     return np.frombuffer(data, dtype=np.uint8).reshape(height, width, 3).copy()
 
 
 def stamp(target: Surface, parts: Sequence[Part]) -> None:
-    """Draw polygons over one another with smooth edges.
+    """Draw polygons one over another, with smooth edges.
 
-    `parts`: colours (red, green, blue, alpha; the first three already multiplied by alpha) and
-    corners in pixels of `target`, fractions allowed.
+    `parts`: colours (red, green, blue, alpha; premultiplied by alpha), and corners in pixels of
+    `target`, which may be fractional.
     """
     pygame = load_pygame()
     corners = [corner for _, polygon in parts for corner in polygon]
@@ -176,7 +176,7 @@ def stamp(target: Surface, parts: Sequence[Part]) -> None:
             color,
             [((x - left) * STAMP_DETAIL, (y - top) * STAMP_DETAIL) for x, y in polygon],
         )
-    # Averages of premultiplied colours are premultiplied colours: no dark seams at the edges.
+    # The average of premultiplied colours is premultiplied too, so edges have no dark seams.
     small = pygame.transform.smoothscale(large, (width, height))
     target.blit(small, (left, top), special_flags=pygame.BLEND_PREMULTIPLIED)
 
@@ -187,7 +187,7 @@ _WHITE = (255, 255, 255, 255)
 _SHADOW = (0, 0, 0, 50)
 
 RING_WIDTH_PX = 3.0
-CASING_PX = 1.3  # dark edges, so that a figure shows on any ground
+CASING_PX = 1.3  # width of dark edges, which show on any background
 HEAD_PX = 12.0  # from the ring to the tip
 
 
@@ -203,7 +203,7 @@ def disc(x: float, y: float, radius: float) -> list[Corner]:
 
 
 def bar(x: float, y: float, width: float, height: float) -> list[Corner]:
-    """A rectangle with its upper left corner at (x, y)."""
+    """Return a rectangle with its upper left corner at (x, y)."""
     return [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
 
 
@@ -228,7 +228,7 @@ def target(x: float, y: float, color: Color) -> list[Part]:
 
 
 def ring(x: float, y: float, radius: float, color: Color) -> list[Part]:
-    """A ring with dark edges that leaves what it surrounds uncovered."""
+    """Return a ring with dark edges that leaves its inside uncovered."""
     return [
         (opaque(INK), _annulus(x, y, radius - CASING_PX, radius + RING_WIDTH_PX + CASING_PX)),
         (opaque(color), _annulus(x, y, radius, radius + RING_WIDTH_PX)),
@@ -238,7 +238,7 @@ def ring(x: float, y: float, radius: float, color: Color) -> list[Part]:
 def pointer(
     x: float, y: float, radius: float, direction: tuple[float, float], color: Color
 ) -> list[Part]:
-    """A ring with a head that points away from it; `direction` has length 1, y down."""
+    """Return a ring with an arrow head pointing away; `direction` is a unit vector, y down."""
     ahead, aside = direction, (-direction[1], direction[0])
 
     def head(grown: float) -> list[Corner]:
@@ -254,6 +254,6 @@ def pointer(
 
 
 def _annulus(x: float, y: float, inner: float, outer: float) -> list[Corner]:
-    """Out around and back inside: one polygon, closed along a seam without width."""
+    """Return a ring as one polygon: around the outside and back inside, with a seam of no width."""
     there, back = disc(x, y, outer), disc(x, y, inner)
     return [*there, there[0], back[0], *reversed(back)]

@@ -36,10 +36,10 @@ from cavmarl.render.canvas import INK, PANEL
 if TYPE_CHECKING:
     from pygame import Surface
 
-WALKER_M = 1.0  # no vehicle of a script is so short
+WALKER_M = 1.0  # shorter scripted road users are pedestrians
 MIN_RADIUS_PX = 4.5
 CORNERS = 12
-DEPTH = 0.6  # of the shoulders, in parts of their width
+DEPTH = 0.6  # of the shoulders, as a share of their width
 HEAD = 0.5
 RIM_PX = 1.0
 COLLIDED_PX = 2.5
@@ -50,9 +50,9 @@ def is_walker(row: np.void) -> bool:
 
 
 def draw_walker(surface: Surface, row: np.void, center: list[float], scale: float) -> None:
-    """Paint a pedestrian, from far above larger than one is.
+    """Draw a pedestrian, enlarged at small scales.
 
-    `scale`: pixels a metre.
+    `scale`: pixels per metre.
     """
     half = max(0.5 * float(row["width"]) * scale, MIN_RADIUS_PX)
     heading = float(row["heading"])
@@ -80,9 +80,9 @@ def draw_walker(surface: Surface, row: np.void, center: list[float], scale: floa
     stamp(surface, parts)
 
 
-BRAKING_MPS2 = -1.0  # below this acceleration the brake lights are on
+BRAKING_MPS2 = -1.0  # the brake lights are on below this acceleration
 
-# Seen from far above, a car is drawn larger than it is.
+# Smallest size of a drawn car.
 MIN_LENGTH_PX = 8.0
 MIN_WIDTH_PX = 3.8
 AGENT_MIN_LENGTH_PX = 13.0
@@ -90,7 +90,7 @@ AGENT_MIN_WIDTH_PX = 6.4
 WIDTH_OF_DETAILS_PX = 5.0
 OUTLINE_PX = 1.6
 
-# Polygons of a car of half length and half width 1, nose at +x, left at +y.
+# Polygons of a car with half length 1 and half width 1; the nose is at x = 1, left is positive y.
 LEFT_SIDE = ((1.0, 0.5), (0.86, 0.92), (0.6, 1.0), (-0.88, 1.0), (-1.0, 0.8))
 BODY = (*LEFT_SIDE, *((x, -y) for x, y in reversed(LEFT_SIDE)))
 WINDSCREEN = ((0.42, 0.62), (0.42, -0.62), (0.12, -0.78), (0.12, 0.78))
@@ -105,7 +105,7 @@ Shape = tuple[tuple[float, float], ...]
 
 
 def in_view(vehicles: NDArray[np.void], camera: Viewport) -> NDArray[np.void]:
-    """The VEHICLE rows that a picture shows, background first, lower ones before higher ones."""
+    """Return the visible VEHICLE rows in drawing order: background first, then by height."""
     min_x, min_y, max_x, max_y = camera.bounds
     margin = max(float(vehicles["length"].max(initial=0.0)), MIN_LENGTH_PX / camera.scale)
     seen = vehicles[
@@ -118,11 +118,11 @@ def in_view(vehicles: NDArray[np.void], camera: Viewport) -> NDArray[np.void]:
 
 
 class Paint(NamedTuple):
-    """How a car is painted."""
+    """The paint of a car."""
 
-    body: Color  # its colour
-    rims: tuple[Color, ...] = ()  # colours of rims around it, the outer one first
-    lined: bool = False  # whether a thin light line surrounds it
+    body: Color  # colour of the body
+    rims: tuple[Color, ...] = ()  # colours of rims around the body, outermost first
+    lined: bool = False  # whether the body has a thin light outline
 
 
 def draw_cars(
@@ -131,11 +131,11 @@ def draw_cars(
     camera: Viewport,
     paints: Sequence[Paint] | None = None,
 ) -> None:
-    """Paint VEHICLE rows, later rows over earlier ones.
+    """Draw VEHICLE rows, later rows over earlier ones.
 
-    Brake lights shine below `BRAKING_MPS2`; a red outline is a vehicle that has collided.
+    Brake lights are on below `BRAKING_MPS2`; a red outline marks a collided vehicle.
 
-    `paints`: of each; by default agents have the colours of `agent_color`.
+    `paints`: paint of each row; by default, agents have the colours of `agent_color`.
     """
     if paints is None:
         paints = [_paint_of_driver(row) for row in vehicles]
@@ -160,7 +160,7 @@ def _draw_car(
     half_length = max(row["length"] * scale, AGENT_MIN_LENGTH_PX if is_agent else MIN_LENGTH_PX) / 2
     half_width = max(row["width"] * scale, AGENT_MIN_WIDTH_PX if is_agent else MIN_WIDTH_PX) / 2
     heading = float(row["heading"])
-    # Columns of the turn, y down.
+    # The columns of the rotation matrix, with y down.
     forward = np.cos(heading), -np.sin(heading)
     left = -np.sin(heading), -np.cos(heading)
 

@@ -1,6 +1,6 @@
-"""The still part of a picture: land, buildings, roads, markings.
+"""The static part of a picture: land, buildings, roads and markings.
 
-And stop lines in their signals' colours.
+Also the stop lines, in the colours of their signals.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
     from pygame import Surface
 
 KERB_M = 0.6
-# Pixels a metre from which markings are worth their ink.
+# Smallest scales, in pixels per metre, at which markings and arrows are drawn.
 SCALE_OF_MARKINGS = 0.9
 SCALE_OF_ARROWS = 2.5
 MARKING_M = 0.2
-SEAM_PX = 0.25  # lanes overlap by as much, so that no land shines through between them
+SEAM_PX = 0.25  # overlap of lanes, so that no land shows between them
 MIN_ROAD_PX = 1.6
 MIN_STOP_LINE_PX = 4.0
 
 
 def signal_codes(network: RoadNetwork, signal_phases: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """What each link's signal shows, (num_links,): positions in SIGNAL_STATES, or SIGNAL_NONE.
+    """Return the code shown at each link (num_links,): an index in SIGNAL_STATES, or SIGNAL_NONE.
 
-    `signal_phases`: (num_signals,) PHASE rows that are on.
+    `signal_phases`: (num_signals,) present PHASE rows.
     """
     codes = np.full(len(network.links), SIGNAL_NONE, dtype=np.uint8)
     signalled = np.flatnonzero(network.links["signal"] >= 0)
@@ -56,10 +56,10 @@ def signal_codes(network: RoadNetwork, signal_phases: NDArray[np.int32]) -> NDAr
 
 
 def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:
-    """Land, buildings, roads and markings as seen by `camera`.
+    """Draw land, buildings, roads and markings as seen by `camera`.
 
-    `shapes`: of the network. `detail`: drawn this many times larger, then reduced: the smoothness
-    of edges.
+    `shapes`: shapes of the network. `detail`: factor by which the picture is drawn larger and then
+    reduced, for smooth edges.
     """
     pygame = load_pygame()
     large = camera.enlarged(detail)
@@ -83,9 +83,9 @@ def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:
 def draw_stop_lines(
     surface: Surface, shapes: RoadShapes, codes: NDArray[np.uint8], camera: Viewport
 ) -> None:
-    """Paint each signalled link's part of the stop line.
+    """Draw the part of the stop line of each link with a signal.
 
-    `shapes`: of the network. `codes`: (num_links,) as from `signal_codes`.
+    `shapes`: shapes of the network. `codes`: (num_links,) from `signal_codes`.
     """
     links = np.flatnonzero(codes != SIGNAL_NONE)
     quads = camera.to_pixels(shapes.stop_lines[links])
@@ -98,12 +98,12 @@ def draw_stop_lines(
 
 
 def on_level(corners: NDArray[np.float64], level: int) -> NDArray[np.float64]:
-    """Those of the shapes (k, n, 3) that begin on a level."""
+    """Return the shapes (k, n, 3) that begin on a level."""
     return np.asarray(corners[level_of(corners[:, 0, 2]) == level])
 
 
 class _Painter:
-    """Draws many shapes of a kind on one surface, those in view only."""
+    """Draws many shapes of a kind on one surface, skipping those out of view."""
 
     def __init__(self, shapes: RoadShapes, camera: Viewport, surface: Surface, detail: int) -> None:
         self._pygame = load_pygame()
@@ -120,7 +120,7 @@ class _Painter:
         self._patches = [shapes.junctions[patch] for patch in patches]
 
     def roads(self, level: int, cars: bool, grown_m: float, color: Color) -> None:
-        """Lanes and junction insides of one level, each side wider by `grown_m`."""
+        """Draw the lanes and junction interiors of one level, wider by `grown_m` on each side."""
         shapes, scale = self._shapes, self._camera.scale
         grown_px = grown_m * scale
         if grown_m:
@@ -142,7 +142,7 @@ class _Painter:
                 self._patch(patch.outline, grown_px, color)
 
     def lines(self, level: int, pieces: NDArray[np.float64], color: Color) -> None:
-        """Straight lines (k, 2, 3) on asphalt; those thinner than a pixel are paler instead."""
+        """Draw straight lines (k, 2, 3) on asphalt; lines thinner than a pixel are drawn paler."""
         pixels = self._camera.to_pixels(self._in_sight(on_level(pieces, level)))
         width_px = MARKING_M * self._camera.scale / self._detail
         share = min(max(width_px, 0.3), 1.0)
@@ -153,7 +153,7 @@ class _Painter:
         self._bars(pixels[:, 0], pixels[:, 1], half_px, (ink[0], ink[1], ink[2]))
 
     def polygons(self, corners: NDArray[np.float64], color: Color) -> None:
-        """Polygons (k, n, 2 or more)."""
+        """Draw polygons (k, n, 2 or more)."""
         for polygon in self._camera.to_pixels(self._in_sight(corners)).tolist():
             self._pygame.draw.polygon(self._surface, color, polygon)
 

@@ -1,4 +1,4 @@
-"""What stands over the map: numbers of agents, destinations, the clock, the scale, the legend."""
+"""Overlays of a picture: agent numbers, destinations, clock, scale bar and legend."""
 
 from __future__ import annotations
 
@@ -49,15 +49,16 @@ _HEIGHT_PX = 10.0
 class Sample(NamedTuple):
     """An entry of the legend."""
 
-    text: str  # what it says
-    # its sample, `SWATCH_PX` wide, from the left end and the middle of its height
+    text: str  # label
+    # draws the symbol, `SWATCH_PX` wide, given its left end and vertical centre
     draw: Callable[[float, float], list[Part]]
 
 
 def samples_of_drivers(*, destinations: bool, actors: bool = False) -> list[Sample]:
-    """Of a picture in which agents have colours of their own.
+    """Return the legend of a picture in which agents have their own colours.
 
-    `destinations`: whether those of agents are shown. `actors`: whether any follows a script.
+    `destinations`: whether destinations of agents are shown. `actors`: whether there are scripted
+    vehicles.
     """
     samples = [Sample("agents", lambda x, y: _stripes([agent_color(k) for k in range(4)], x, y))]
     if destinations:
@@ -72,9 +73,9 @@ def samples_of_drivers(*, destinations: bool, actors: bool = False) -> list[Samp
 
 
 def samples_of_zones(count: int, ghosts_of: int | None) -> list[Sample]:
-    """Of a picture in which vehicles have the colours of their zones.
+    """Return the legend of a picture in which vehicles have the colours of their zones.
 
-    `ghosts_of`: the zone whose ghosts are outlined, if one is.
+    `ghosts_of`: the zone whose ghosts are outlined, if any.
     """
     owners = [zone_color(zone) for zone in range(min(count, 4))]
     samples = [Sample("vehicles by owner", lambda x, y: _stripes(owners, x, y))]
@@ -112,7 +113,7 @@ PANEL_ALPHA = 225
 TITLE_PX = 23
 TEXT_PX = 17
 LABEL_PX = 15
-SCALE_OF_LABELS_ON_CARS = 8.0  # pixels a metre: a car is wider than its number
+SCALE_OF_LABELS_ON_CARS = 8.0  # pixels per metre from which a car is wider than its number
 SCALE_BAR_PX = 140
 
 
@@ -122,20 +123,20 @@ def clock_text(seconds: float) -> str:
 
 
 def scale_bar_m(scale: float) -> float:
-    """The longest 1, 2 or 5 times a power of ten metres that fits the bar's room."""
+    """Return the longest 1, 2 or 5 times a power of ten metres that fits the scale bar."""
     room = SCALE_BAR_PX / scale
     power = 10.0 ** math.floor(math.log10(room))
     return power * max(step for step in (1, 2, 5) if step * power <= room)
 
 
 class Overlay:
-    """Writes on pictures; keeps the agents' labels."""
+    """Draws overlays on pictures; caches the agents' labels."""
 
     def __init__(self) -> None:
         self._labels: dict[int, Surface] = {}
 
     def agents(self, surface: Surface, vehicles: NDArray[np.void], camera: Viewport) -> None:
-        """The agents' numbers, above their vehicles, or on them from near."""
+        """Draw the agents' numbers: above their vehicles, or on them in close-ups."""
         rows = vehicles[vehicles["agent"] >= 0]
         centers = camera.to_pixels(np.stack([rows["x"], rows["y"]], axis=1))
         for agent, center in zip(rows["agent"].tolist(), centers.tolist(), strict=True):
@@ -152,12 +153,12 @@ class Overlay:
         places: NDArray[np.float64],
         camera: Viewport,
     ) -> None:
-        """A ring in the agent's colour at each destination, (n, 2) metres."""
+        """Draw a ring in the agent's colour at each destination, (n, 2) metres."""
         for agent, (x, y) in zip(agents.tolist(), camera.to_pixels(places).tolist(), strict=True):
             stamp(surface, target(x, y, agent_color(agent)))
 
     def title(self, surface: Surface, title: str, note: str) -> None:
-        """A panel at the upper left: a title, and a quieter note under it."""
+        """Draw a panel at the upper left with a title and, below it, a less prominent note."""
         lines = [lettering(title, TITLE_PX, INK)] if title else []
         if note:
             lines.append(lettering(note, TEXT_PX, MUTED_INK))
@@ -172,7 +173,7 @@ class Overlay:
             top += line.get_height() + 5
 
     def scale_bar(self, surface: Surface, camera: Viewport) -> None:
-        """A bar of round length at the lower left."""
+        """Draw a scale bar of round length at the lower left."""
         pygame = load_pygame()
         length_m = scale_bar_m(camera.scale)
         length_px = round(length_m * camera.scale)
@@ -187,7 +188,7 @@ class Overlay:
             pygame.draw.rect(surface, INK, (x, bottom - 6, 2, 6))
 
     def legend(self, surface: Surface, samples: Sequence[Sample]) -> None:
-        """What the colours mean, at the lower right."""
+        """Draw the legend at the lower right."""
         texts = [lettering(sample.text, TEXT_PX, INK) for sample in samples]
         width = sum(SWATCH_PX + 6 + text.get_width() for text in texts) + 12 * (len(texts) - 1)
         height = texts[0].get_height()

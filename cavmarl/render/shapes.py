@@ -1,6 +1,6 @@
-"""What a map looks like from above, as plain arrays in metres: surfaces, markings, stop lines.
+"""The geometry of a map as plain arrays in metres: surfaces, markings, stop lines.
 
-Made once per network; no drawing here.
+Shapes are computed once per network; nothing is drawn here.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ MIN_LANE_M = 25.0
 STROKE_M = 0.22
 HEAD_M = 1.1
 HEAD_WIDTH_M = 0.75
-# Ahead and to the left of the arrow's foot, m: where branches begin and where their heads are.
+# Metres ahead and left of the arrow's foot: start of the branches, and base of their heads.
 FORK = (1.1, 0.0)
 TIPS = {"s": (3.6, 0.0), "l": (1.9, 0.6), "r": (1.9, -0.6)}
 BRANCHES = {"s": "s", "l": "l", "L": "l", "r": "r", "R": "r"}
 
 
 def lane_arrows(network: RoadNetwork) -> Points:
-    """Quadrilaterals (k, 4, 3) in metres, the parts of all arrows; on roads of several lanes."""
+    """Return the parts of all arrows (k, 4, 3) in metres, on roads with several lanes."""
     lanes, links = network.lanes, network.links
     parts = [np.zeros((0, 4, 3))]
     wide = network.edges["num_lanes"][lanes["edge"]] > 1
@@ -53,7 +53,7 @@ def _place(network: RoadNetwork, lane: np.void, s: float) -> tuple[Points, Point
 
 
 def _arrow(branches: set[str]) -> Points:
-    """An arrow (k, 4, 2) in metres ahead of and to the left of its foot."""
+    """Return an arrow (k, 4, 2) in metres ahead and left of its foot."""
     parts = [_stroke((0.0, 0.0), FORK)]
     for branch in sorted(branches):
         parts += [_stroke(FORK, TIPS[branch]), _head(FORK, TIPS[branch])]
@@ -87,21 +87,21 @@ Points = NDArray[np.float64]
 
 DASH_M = 3.0
 DASH_PERIOD_M = 9.0
-# Roads this much higher than others are drawn over them.
+# A road that is higher than another one by this much is drawn over it.
 LEVEL_M = 4.0
 STOP_LINE_M = 0.7
-# A hull that covers more than so many times the area of its paths is land with roads around it.
+# A hull with more than this multiple of the area of its paths is land enclosed by roads.
 MAX_HULL_SHARE = 1.2
-MIN_HULL_M2 = 150.0  # smaller ones are filled in any case
-# SUMO's link directions from left to right: left, half left, straight, half right, right. A turn
-# comes before them, or after them where one drives on the left.
+MIN_HULL_M2 = 150.0  # smaller hulls are always filled
+# SUMO's link directions from left to right: left, half left, straight, half right, right. A U-turn
+# comes before them, or after them in left-hand traffic.
 DIRECTIONS_FROM_LEFT = "lLsRr"
 CAR_BIT = 1  # VEHICLE_CLASSES[0], passenger
 
 
 @dataclass(frozen=True)
 class Patch:
-    """The inside of a junction: a convex polygon (n, 2)."""
+    """The interior of a junction: a convex polygon (n, 2)."""
 
     outline: Points
     level: int
@@ -112,19 +112,19 @@ class Patch:
 class RoadShapes:
     """All shapes of a network, in metres."""
 
-    starts: Points  # (n, 2), each straight piece of a lane begins here and
-    ends: Points  # (n, 2) ends here
-    half_widths: Points  # (n,) of the pieces
-    # (n,) a round joint at the piece's end belongs to the road and covers no other level
+    starts: Points  # (n, 2) start of each straight piece of a lane
+    ends: Points  # (n, 2) end of each piece
+    half_widths: Points  # (n,) half width of each piece
+    # (n,) whether a round joint is drawn at the piece's end: the road continues on the same level
     joined: NDArray[np.bool_]
-    levels: NDArray[np.int64]  # (n,) as from `level_of`
-    for_cars: NDArray[np.bool_]  # (n,) the lane is open to cars
-    junctions: tuple[Patch, ...]  # the insides of junctions
-    junction_boxes: Points  # (num junctions, 2, 2) their lower left and upper right corners
-    dashes: Points  # (k, 2, 3) from and to, x y z, between lanes of one direction
-    centre_lines: Points  # (k, 2, 3) between opposite directions
-    arrows: Points  # (k, 4, 3) on lanes before junctions
-    stop_lines: Points  # (num_links, 4, 2) the link's part of the bar at the end of its lane
+    levels: NDArray[np.int64]  # (n,) level of each piece, from `level_of`
+    for_cars: NDArray[np.bool_]  # (n,) whether the lane is open to cars
+    junctions: tuple[Patch, ...]  # interiors of junctions
+    junction_boxes: Points  # (num junctions, 2, 2) lower left and upper right corners
+    dashes: Points  # (k, 2, 3) ends of lines between lanes of one direction
+    centre_lines: Points  # (k, 2, 3) lines between opposite directions
+    arrows: Points  # (k, 4, 3) arrows on lanes before junctions
+    stop_lines: Points  # (num_links, 4, 2) the link's part of its lane's stop line
     roofs: Points  # (k, 4, 2) parts of buildings
 
 
@@ -164,12 +164,12 @@ def road_shapes(network: RoadNetwork) -> RoadShapes:
 
 
 def level_of(z: Points) -> NDArray[np.int64]:
-    """Heights in m as levels: where two roads cross, the higher level is the bridge."""
+    """Return the levels of heights in m; where two roads cross, the higher level is the bridge."""
     return np.asarray(np.round(z / LEVEL_M).astype(np.int64))
 
 
 def offset_polyline(polyline: Points, offset_m: float) -> Points:
-    """A polyline (n, 2) moved to its left by `offset_m`, corners mitred up to twice of it."""
+    """Shift a polyline (n, 2) left by `offset_m`; corners are mitred up to twice that distance."""
     steps = np.diff(polyline, axis=0)
     normals = np.stack([-steps[:, 1], steps[:, 0]], axis=1)
     normals /= np.hypot(normals[:, 0], normals[:, 1])[:, None]
@@ -182,7 +182,7 @@ def offset_polyline(polyline: Points, offset_m: float) -> Points:
 
 
 def convex_hull(points: Points) -> Points:
-    """The corners (k, 2) of the convex hull of (n, 2) points (Andrew's monotone chain, 1979)."""
+    """Return the convex hull (k, 2) of points (n, 2), by Andrew's monotone chain (1979)."""
     unique = sorted(set(map(tuple, points.tolist())))
     if len(unique) < 3:
         return np.array(unique)
@@ -202,13 +202,13 @@ def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> f
 
 
 def _side(network: RoadNetwork, lane: int | np.integer[Any], offset_m: float) -> Points:
-    """The line `offset_m` to the left of a lane's centre, (n, 3)."""
+    """Return the line `offset_m` to the left of a lane's centre, (n, 3)."""
     centre = network.lane_polyline(int(lane))
     return np.column_stack([offset_polyline(centre[:, :2], offset_m), centre[:, 2]])
 
 
 def _goes_on_level(network: RoadNetwork) -> NDArray[np.bool_]:
-    """Whether a road follows the end of each lane, on the level of its last piece."""
+    """Return whether a road continues from the end of each lane on the same level."""
     lanes, z = network.lanes, network.points["z"]
     link = np.where(lanes["num_links"] > 0, lanes["first_link"], -1)
     after = np.where(link >= 0, network.links["next_lane"][link], lanes["successor"])
@@ -218,7 +218,7 @@ def _goes_on_level(network: RoadNetwork) -> NDArray[np.bool_]:
 
 
 def _junction_patches(network: RoadNetwork, for_cars: NDArray[np.bool_]) -> tuple[Patch, ...]:
-    """The hull of the lane mouths at each junction and of the paths between them."""
+    """Return the hull of the lane ends at each junction and of the paths between them."""
     corners: dict[tuple[int, bool], list[Points]] = {}
     areas: dict[tuple[int, bool], float] = {}
     lanes, links = network.lanes, network.links
@@ -242,7 +242,7 @@ def _junction_patches(network: RoadNetwork, for_cars: NDArray[np.bool_]) -> tupl
 
 
 def _mouths(network: RoadNetwork) -> Points:
-    """Both sides of where each link leaves its lane and reaches the next, (num_links, 4, 2)."""
+    """Return both sides of the ends of each link, (num_links, 4, 2)."""
     lanes, links = network.lanes, network.links
     start, reached = lanes[links["from_lane"]], lanes[links["to_lane"]]
     last = network.points[start["first_point"] + start["num_points"] - 1]
@@ -256,7 +256,7 @@ def _mouths(network: RoadNetwork) -> Points:
 
 
 def _area(polygon: Points) -> float:
-    """Of a polygon (n, 2), by the shoelace formula."""
+    """Return the area of a polygon (n, 2), by the shoelace formula."""
     x, y = polygon[:, 0], polygon[:, 1]
     return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2.0
 
@@ -274,7 +274,7 @@ def _dashes(network: RoadNetwork) -> Points:
 
 
 def _centre_lines(network: RoadNetwork) -> Points:
-    """Along the inner side of each road that has an opposite direction, once for both."""
+    """Return one line per pair of opposite roads, along the inner side."""
     edges, lanes = network.edges, network.lanes
     roads = edges[~edges["internal"]]
     ways = set(zip(roads["from_junction"].tolist(), roads["to_junction"].tolist(), strict=True))
@@ -290,7 +290,7 @@ def _centre_lines(network: RoadNetwork) -> Points:
 
 
 def _stop_lines(network: RoadNetwork) -> Points:
-    """Each link's share of its lane's stop line: the left turn's at the left."""
+    """Return each link's part of its lane's stop line; the part of the left turn is at the left."""
     links, lanes = network.links, network.lanes
     order = DIRECTIONS_FROM_LEFT + "t" if network.left_hand else "t" + DIRECTIONS_FROM_LEFT
     quads = np.zeros((len(links), 4, 2))

@@ -1,6 +1,6 @@
-"""`TopDownRenderer`: a world from above, as a picture.
+"""`TopDownRenderer`: pictures of a world from above.
 
-`WorldView` is what `CavEnv.render()` shows.
+`WorldView` implements `CavEnv.render()`.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 
 class Window:
-    """Shows pictures at a steady pace; opens at the first one.
+    """A window that shows pictures at a steady rate and opens at the first picture.
 
-    When the person at the screen closes it, the run goes on unseen.
+    When the user closes the window, the run continues without it.
 
-    `fps`: pictures a second; `show` waits for its turn.
+    `fps`: pictures per second; `show` waits accordingly.
     """
 
     def __init__(self, title: str, fps: float) -> None:
@@ -44,7 +44,7 @@ class Window:
         self._clock: Any = None
 
     def show(self, surface: Surface) -> None:
-        """Put a picture on the screen and handle what the person did since the last one."""
+        """Show a picture and handle the user's input since the last one."""
         if self.closed_by_person:
             return
         pygame = load_pygame()
@@ -67,10 +67,10 @@ class Window:
             self._window = None
 
 
-# Smallest part of the world that a following camera shows, and how fast it turns to a new aim.
+# Smallest extent that a following camera shows, and its share of movement per picture.
 FOLLOW_M = 150.0
 FOLLOW_SHARE = 0.12
-MARGIN_PX = 50.0  # for what stands in the corners
+MARGIN_PX = 50.0  # margin for the overlays in the corners
 STILL_DETAIL = 4
 MOVING_DETAIL = 2
 
@@ -78,10 +78,10 @@ MOVING_DETAIL = 2
 class TopDownRenderer:
     """Draws the vehicles and signals of one map, off screen.
 
-    `size`: width and height of the picture in pixels; by default what suits the map's shape.
-    `focus`: (min_x, min_y, max_x, max_y) in metres to show; all roads by default, of
-    several maps those of the vehicles' map. `goal_edges`: EDGE rows (M, G) by MAP row and
-    `VEHICLE["goal"]`; given, each agent's destination is marked.
+    `size`: width and height of the picture in pixels; by default derived from the map's shape.
+    `focus`: (min_x, min_y, max_x, max_y) in metres to show; by default all roads or, if there are
+    several maps, those of the vehicles' map. `goal_edges`: EDGE rows (M, G) by MAP row and
+    `VEHICLE["goal"]`; if given, each agent's destination is marked.
 
     Raises MissingExtraError: pygame-ce is not installed.
     """
@@ -128,18 +128,18 @@ class TopDownRenderer:
 
         Args:
             vehicles: VEHICLE rows, in any order.
-            signal_phases: (num_signals,) PHASE rows that are on; by default none is shown.
-            title: for the upper left corner.
+            signal_phases: (num_signals,) present PHASE rows; by default no signal is shown.
+            title: text for the upper left corner.
             clock_s: time for the upper left corner.
-            follow: agents, by index, that the camera stays close to; it waits while none of them
-                is in the world. By default it shows `focus`.
-            center: (x, y) in metres that the camera stays close to, instead of agents.
-            zones: of a divided world: vehicles get the colours of their owners. `vehicles` are all
-                of the world then, as `Simulation.vehicles` gives them.
-            ghosts_of: the zone whose sight and ghosts are outlined.
+            follow: agents, by index, that the camera follows; it stays still while none of them is
+                in the world. By default it shows `focus`.
+            center: (x, y) in metres that the camera follows, instead of agents.
+            zones: zones of a divided world; vehicles get the colours of their owners. `vehicles`
+                must then be all vehicles of the world, as from `Simulation.vehicles`.
+            ghosts_of: zone whose sensing range and ghosts are outlined.
 
         Returns:
-            A new surface; see `frame` for an array.
+            a new surface; see `frame` for an array.
         """
         self._aim(vehicles, follow, center)
         camera = self._camera
@@ -157,7 +157,7 @@ class TopDownRenderer:
         return surface
 
     def _draw_drivers(self, surface: Surface, vehicles: NDArray[np.void]) -> list[Sample]:
-        """Vehicles by driver; agents with their numbers and destinations."""
+        """Draw vehicles by driver, and agents with their numbers and destinations."""
         camera = self._camera
         seen = in_view(vehicles, camera)
         if self._goals is not None:
@@ -174,7 +174,7 @@ class TopDownRenderer:
     def _draw_owners(
         self, surface: Surface, vehicles: NDArray[np.void], zones: ZoneView, ghosts_of: int | None
     ) -> list[Sample]:
-        """Zones, and vehicles by present and next owner, and zones that see them."""
+        """Draw zones, and vehicles by present and next owner and by the zones that see them."""
         camera = self._camera
         draw_zones(surface, zones.partition, zones.halo_m, camera)
         if ghosts_of is not None:
@@ -185,22 +185,22 @@ class TopDownRenderer:
         return samples_of_zones(zones.partition.count, ghosts_of)
 
     def frame(self, *args: Any, **named: Any) -> NDArray[np.uint8]:
-        """The picture of `draw` as uint8 (height, width, 3), red green blue."""
+        """Return the picture of `draw` as uint8 (height, width, 3) in red, green, blue."""
         return pixels(self.draw(*args, **named))
 
     def show(self, surface: Surface, title: str, fps: float) -> None:
-        """Put a picture of `draw` in a window, no sooner than 1/`fps` s after the last one."""
+        """Show a picture of `draw` in a window, at least 1/`fps` s after the last one."""
         if self._window is None:
             self._window = Window(title, fps)
         self._window.show(surface)
 
     @property
     def closed_by_person(self) -> bool:
-        """Whether there was a window and a person has closed it."""
+        """Return whether the user has closed the window."""
         return self._window is not None and self._window.closed_by_person
 
     def close(self) -> None:
-        """Close the window and let go of all pictures; drawing again makes them anew."""
+        """Close the window and free all pictures; drawing again recreates them."""
         if self._window is not None:
             self._window.close()
             self._window = None
@@ -237,7 +237,7 @@ class TopDownRenderer:
         return Viewport.fit((min_x, min_y, max_x, max_y), self.size)
 
     def _background(self, signal_phases: NDArray[np.int32] | None) -> Surface:
-        """Roads and stop lines, made anew when the camera moves or a signal switches."""
+        """Return roads and stop lines, redrawn if the camera has moved or a signal has changed."""
         camera = self._camera
         if self._ground is None or self._ground[0] != camera:
             detail = MOVING_DETAIL if self._following else STILL_DETAIL
@@ -254,7 +254,7 @@ class TopDownRenderer:
 
 
 def _edge_ends(network: RoadNetwork, edges: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Where edges (…) end, (…, 2) m: the middle of their last points."""
+    """Return the ends of edges (…), (…, 2) m: the mean of their lanes' last points."""
     ends = np.zeros((*edges.shape, 2))
     for row, edge in np.ndenumerate(network.edges[edges]):
         first = edge["first_lane"]
@@ -264,13 +264,13 @@ def _edge_ends(network: RoadNetwork, edges: NDArray[np.int32]) -> NDArray[np.flo
 
 
 class WorldView:
-    """Draws one world of a simulation from above, into arrays or into a window.
+    """Renders one world of a simulation from above, into arrays or into a window.
 
     Args:
         simulation: the worlds.
         mode: `rgb_array` or `human`.
-        title: for the picture's corner and the window.
-        fps: pictures a second of the window.
+        title: title of the picture and of the window.
+        fps: pictures per second of the window.
 
     Raises:
         MissingExtraError: pygame-ce is not installed.
@@ -284,13 +284,13 @@ class WorldView:
         self._renderer = TopDownRenderer(simulation.network, goal_edges=simulation.goal_edges)
 
     def show(self, ghosts_of: int | None = None, world: int = 0) -> NDArray[np.uint8] | None:
-        """Draw the present moment of a world: (height, width, 3) for `rgb_array`, None for `human`.
+        """Render the present state: (height, width, 3) in mode `rgb_array`, None in mode `human`.
 
-        A divided world is drawn with its zones, and vehicles in the colours of their owners.
+        A divided world is drawn with its zones, and with vehicles in the colours of their owners.
 
         Args:
-            ghosts_of: the zone whose sight and ghosts are outlined.
-            world: which of the simulation's.
+            ghosts_of: zone whose sensing range and ghosts are outlined.
+            world: index of the simulation's world.
 
         Raises:
             ConfigError: the world has no such zone.

@@ -1,4 +1,4 @@
-"""`VideoWriter`: pictures into an MP4 file that any browser plays."""
+"""`VideoWriter`: writes pictures to an MP4 file that all browsers can play."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, require
 
-# Constant rate factor of x264: lower is better and larger; 18 is visually lossless, 23 its default.
+# Constant rate factor of x264: lower is better and larger; 18 is visually lossless, 23 the default.
 QUALITY = 20
 
 
 class VideoWriter:
     """Writes uint8 frames to an H.264 file (yuv420p); use it in a `with` block.
 
-    Missing folders are made. The first frame sets the size; without frames there is no file.
+    Missing folders are created. The first frame sets the size; without frames, no file is written.
 
     `path`: ends in `.mp4`.
 
-    Raises ConfigError: the path cannot be written, or is no `.mp4`; MissingExtraError:
+    Raises ConfigError: the path is not writable or does not end in `.mp4`; MissingExtraError:
     imageio-ffmpeg is not installed.
     """
 
@@ -33,7 +33,7 @@ class VideoWriter:
         self._sink: Generator[None, bytes, None] | None = None
         self._ffmpeg = require("imageio_ffmpeg", "render")
         if self.path.suffix != ".mp4":
-            raise ConfigError(f"{path}: a video's name ends in .mp4")
+            raise ConfigError(f"{path}: the name of a video must end in .mp4")
         if not 0.0 < fps <= 240.0:
             raise ConfigError(f"fps = {fps!r}: must be above 0 and at most 240")
         try:
@@ -54,8 +54,8 @@ class VideoWriter:
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Append a frame, (height, width, 3).
 
-        Raises ConfigError: not uint8 (height, width, 3), another size than the first frame's, or
-        the file cannot be written.
+        Raises ConfigError: the frame is not uint8 (height, width, 3) or has another size than the
+        first frame, or the file cannot be written.
         """
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise ConfigError(
@@ -65,8 +65,9 @@ class VideoWriter:
             self._shape = frame.shape
             self._sink = self._open(frame.shape)
         if frame.shape != self._shape:
-            raise ConfigError(f"frame of {frame.shape}: the video began with {self._shape}")
-        # yuv420p holds one colour for four pixels: odd sides repeat their last row or column.
+            raise ConfigError(f"frame of {frame.shape}: the first frame has {self._shape}")
+        # yuv420p has one colour per four pixels, so odd sides are padded by repeating the last
+        # line.
         height, width = frame.shape[:2]
         even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         try:

@@ -1,4 +1,4 @@
-"""`Viewport`: which part of the plane a picture shows."""
+"""`Viewport`: the part of the plane that a picture shows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Bounds = tuple[float, float, float, float]  # min_x, min_y, max_x, max_y in metres
 
-# Pixels of a picture whose size is not given, and how much wider than high it may be.
+# Default size of a picture in pixels, and limits of its aspect ratio.
 PICTURE_PX = 960 * 720
 MIN_ASPECT = 1.25
 MAX_ASPECT = 3.0
@@ -17,16 +17,16 @@ MAX_ASPECT = 3.0
 
 @dataclass(frozen=True)
 class Viewport:
-    """A view from straight above, north up, the same scale both ways."""
+    """A view from straight above, north up, with equal scales of both axes."""
 
-    x: float  # of the picture's centre, m
-    y: float  # of the picture's centre, m
-    scale: float  # pixels a metre
+    x: float  # centre of the picture, m
+    y: float  # centre of the picture, m
+    scale: float  # pixels per metre
     size: tuple[int, int]  # width and height in pixels
 
     @classmethod
     def fit(cls, bounds: Bounds, size: tuple[int, int], margin_px: float = 0.0) -> Viewport:
-        """The closest view of all of `bounds` with a margin (up to a quarter) at each side."""
+        """Return the closest view of `bounds`, with a margin of at most a quarter at each side."""
         min_x, min_y, max_x, max_y = bounds
         width, height = (max(side - 2.0 * margin_px, side / 2.0) for side in size)
         scale = min(width / max(max_x - min_x, 1.0), height / max(max_y - min_y, 1.0))
@@ -34,7 +34,7 @@ class Viewport:
 
     @property
     def bounds(self) -> Bounds:
-        """What the picture shows, m."""
+        """The visible area, m."""
         half_width = self.size[0] / 2.0 / self.scale
         half_height = self.size[1] / 2.0 / self.scale
         return (
@@ -45,20 +45,20 @@ class Viewport:
         )
 
     def to_pixels(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Metres (…, 2 or 3) as pixels (…, 2) from the picture's upper left corner."""
+        """Convert metres (…, 2 or 3) to pixels (…, 2) from the upper left corner."""
         pixels = np.empty((*xy.shape[:-1], 2))
         pixels[..., 0] = (xy[..., 0] - self.x) * self.scale + self.size[0] / 2.0
         pixels[..., 1] = (self.y - xy[..., 1]) * self.scale + self.size[1] / 2.0
         return pixels
 
     def enlarged(self, factor: int) -> Viewport:
-        """The same view on `factor` times as many pixels each way."""
+        """Return the same view with `factor` times as many pixels in each direction."""
         return Viewport(
             self.x, self.y, self.scale * factor, (self.size[0] * factor, self.size[1] * factor)
         )
 
     def towards(self, target: Viewport, share: float) -> Viewport:
-        """A view that has come `share` of the way to `target`; the scale moves by ratios."""
+        """Return a view moved by `share` towards `target`; the scale changes geometrically."""
         return Viewport(
             self.x + share * (target.x - self.x),
             self.y + share * (target.y - self.y),
@@ -68,7 +68,7 @@ class Viewport:
 
 
 def suitable_size(bounds: Bounds) -> tuple[int, int]:
-    """A size in the proportions of `bounds`, in steps of 16 pixels, which all video coders take."""
+    """Return a size with the proportions of `bounds`, in steps of 16 pixels for video encoders."""
     min_x, min_y, max_x, max_y = bounds
     aspect = max(max_x - min_x, 1.0) / max(max_y - min_y, 1.0)
     aspect = min(max(aspect, MIN_ASPECT), MAX_ASPECT)

@@ -1,6 +1,6 @@
-"""Zones over a map: a wash of colour, the halo that others see of them, borders, numbers.
+"""Zones drawn over a map: tinted areas, halos, borders and numbers.
 
-Vehicles show which zone owns them, which see them as ghosts, and where they are handed over.
+Vehicles show their owner, the zones that have them as ghosts, and transfers.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ DETAIL = 4
 def zone_picture(
     network: RoadNetwork, partition: ZonePartition, halo_m: float, title: str
 ) -> Surface:
-    """A map with its zones.
+    """Draw a map with its zones.
 
-    `halo_m`: how far zones see over their borders; each is darker where another sees it. `title`:
-    for the upper left corner.
+    `halo_m`: how far zones see over their borders; areas seen by another zone are darker. `title`:
+    text for the upper left corner.
 
     Raises MissingExtraError: pygame-ce is not installed.
     """
@@ -82,10 +82,10 @@ def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera
 def draw_sight(
     surface: Surface, partition: ZonePartition, halo_m: float, zone: int, camera: Viewport
 ) -> None:
-    """Draw how far a zone sees: the line at the end of its halo, in its colour."""
+    """Draw the sensing range of a zone: the outer edge of its halo, in its colour."""
     pygame = load_pygame()
     seen = partition.reaching[[zone]] + np.array([-halo_m, -halo_m, halo_m, halo_m])
-    # Far enough out of view for the round corners of what is clipped to stay there.
+    # Far enough outside the view that round corners of clipped shapes stay invisible.
     beyond = halo_m + 2.0 * SIGHT_PX / camera.scale
     box = _pixels(_clipped(seen, camera, beyond)[0], camera)
     radius = round(halo_m * camera.scale)
@@ -96,19 +96,19 @@ def draw_sight(
 def _clipped(
     rects: NDArray[np.float64], camera: Viewport, beyond_m: float = 0.0
 ) -> NDArray[np.float64]:
-    """Rectangles (k, 4) without what is further than `beyond_m` out of view."""
+    """Clip rectangles (k, 4) to `beyond_m` around the view."""
     low, high = np.array(camera.bounds).reshape(2, 2) + np.array([[-beyond_m], [beyond_m]])
     return np.clip(rects, np.tile(low, 2), np.tile(high, 2))
 
 
 def _pixels(rect: NDArray[np.float64], camera: Viewport) -> tuple[int, int, int, int]:
-    """A rectangle in metres as left, top, width and height in pixels."""
+    """Convert a rectangle in metres to left, top, width and height in pixels."""
     (left, bottom), (right, top) = np.rint(camera.to_pixels(rect.reshape(2, 2))).astype(int)
     return int(left), int(top), int(right - left), int(bottom - top)
 
 
 def _number(surface: Surface, zone: int, room: Rect) -> None:
-    """The zone's number in the middle of what is seen of it, if there is room."""
+    """Draw the zone's number in the middle of its visible part, if it fits."""
     pygame = load_pygame()
     color = zone_color(zone)
     text = lettering(str(zone), NUMBER_PX, ink_on(color))
@@ -118,7 +118,7 @@ def _number(surface: Surface, zone: int, room: Rect) -> None:
         surface.blit(text, text.get_rect(center=room.center))
 
 
-# Between a vehicle and the ring around it, and the smallest ring.
+# Distance between a vehicle and the ring around it, and smallest radius of a ring.
 GAP_PX = 4.0
 MIN_RADIUS_PX = 10.0
 
@@ -126,11 +126,10 @@ MIN_RADIUS_PX = 10.0
 def owner_paints(
     view: ZoneView, vehicles: NDArray[np.void], seen: NDArray[np.void], ghosts_of: int | None
 ) -> list[Paint]:
-    """How vehicles are painted by their zones.
+    """Return the paint of vehicles by their zones.
 
-    `vehicles`: all of it, as `Simulation.vehicles` gives them. `seen`: those of them that are
-    drawn, in any order. `ghosts_of`: the zone whose ghosts get a rim in its colour; None: no
-    zone's.
+    `vehicles`: all vehicles, as from `Simulation.vehicles`. `seen`: the vehicles to draw, in any
+    order. `ghosts_of`: zone whose ghosts get a rim in its colour, or None.
     """
     owners = dict(zip(vehicles["id"].tolist(), view.owners.tolist(), strict=True))
     ghosts = set() if ghosts_of is None else set(view.ghosts[ghosts_of].tolist())
@@ -144,9 +143,9 @@ def owner_paints(
 def draw_transfers(
     surface: Surface, view: ZoneView, vehicles: NDArray[np.void], camera: Viewport
 ) -> None:
-    """A ring in the target's colour around each vehicle in transfer, and a head towards it.
+    """Draw a ring in the target's colour around each vehicle in transfer, with a head towards it.
 
-    `vehicles`: all of it; a transfer of a vehicle that has left is not drawn.
+    `vehicles`: all vehicles; a transfer of a vehicle that has left is not drawn.
     """
     rows = {int(row["id"]): row for row in vehicles}
     for transfer in view.transfers:
@@ -164,9 +163,9 @@ def draw_transfers(
 def _towards(
     partition: ZonePartition, transfer: TransferInFlight, place: NDArray[np.float64], heading: float
 ) -> tuple[float, float]:
-    """From the source to the target, seen from a place at their border: a direction in the plane.
+    """Return the direction in the plane from the source zone to the target, seen at their border.
 
-    A vehicle on the border itself is on its way: its own direction.
+    If the vehicle is on the border itself, the result is its own direction.
     """
     source, target = partition.reaching[[transfer.source, transfer.target]]
     way = np.clip(place, target[:2], target[2:]) - np.clip(place, source[:2], source[2:])

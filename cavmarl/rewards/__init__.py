@@ -7,7 +7,7 @@
 | weighted sum, team share | `rewards/kernels/reward.py` | `engine/kernels/outputs.py`, a world |
 | credit to the return | `rewards/kernels/reward.py` | `shards/kernels/group_phases.py` |
 
-The terms are computed inside of `sense` because that kernel has filled the grid of the vehicles
-around the agent, which the time to collision needs. `engine/tick.py` has the order of these calls.
-Evaluation reads the same terms.
+The terms are computed inside `sense` because that kernel has filled the grid of vehicles around the
+agent, which the time to collision needs. `engine/tick.py` has the order of these calls. Evaluation
+reads the same terms.
 """

@@ -1,4 +1,4 @@
-"""Terms from outside of the package: functions of what is around agents."""
+"""Terms registered by users: functions of an agent's surroundings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.driving.agent_view import AgentView, BatchView
 
 
 class RegisteredTerm(NamedTuple):
-    """A term from outside."""
+    """A term registered by a user."""
 
     function: Callable[[Any], Any]  # of an `AgentView`, or of a `BatchView`
     reach_m: float
@@ -29,24 +29,24 @@ def register_term(
     reach_m: float = 0.0,
     batched: bool = False,
 ) -> None:
-    """Add a term, which `terms.weights` can name like those of the package.
+    """Add a term, which `terms.weights` can name like the package's terms.
 
     Args:
-        name: of the term.
-        function: its number, of an `AgentView` at the end of the step; if `batched`, its numbers
-            (n,), of a `BatchView`. It must not depend on the order of `AgentView.others`; that is
-            checked when it is first used.
-        reach_m: how far away the centres of `AgentView.others` can be; 0: it looks at none.
-        batched: whether it answers for all agents of a world at once, and not once an agent.
+        name: name of the term.
+        function: returns the value for an `AgentView` at the end of the step; if `batched`, the
+            values (n,) for a `BatchView`. It must not depend on the order of `AgentView.others`;
+            this is checked at its first use.
+        reach_m: maximum distance of the centres in `AgentView.others`; 0: no others.
+        batched: whether the function is called once for all agents of a world.
 
     Raises:
-        ConfigError: the name is taken, or the reach is no distance.
+        ConfigError: the name is taken, or the reach is invalid.
     """
     if not 0.0 <= reach_m < math.inf:
-        raise ConfigError(f"term '{name}': reach_m = {reach_m}: must be a distance from 0")
+        raise ConfigError(f"term '{name}': reach_m = {reach_m}: must be at least 0 and finite")
     REGISTERED_TERMS.add(name, RegisteredTerm(function, float(reach_m), batched), function, TERMS)
 
 
 def terms_reach_m(config: TermsConfig) -> float:
-    """How far away the centre of a vehicle can be that changes a registered term, in m."""
+    """Return the largest distance in m at which a vehicle can affect a registered term."""
     return max((REGISTERED_TERMS[name].reach_m for name in config.registered), default=0.0)

@@ -1,4 +1,4 @@
-"""What agents observe, and what their vehicles carry.
+"""Sensors: the observations of agents, and sensors mounted on their vehicles.
 
-Kernels beside them; `shards` senses in each step.
+The kernels are in `kernels/`; `shards` runs them at the end of each step.
 """

@@ -1,7 +1,7 @@
-"""All sensors by name: those that agents observe, those that vehicles carry, those from outside.
+"""The registry of sensors: observed by agents, mounted on vehicles, or added by other packages.
 
-A new one that vehicles carry is a class in `config/rig.py`, one in `sensors/mounted/`, a kernel,
-and a place in `TYPES`.
+A new mounted sensor needs a class in `config/rig.py`, a class in `sensors/mounted/`, a kernel, and
+an entry in `_CARRIED`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _CARRIED: tuple[MountedType, ...] = (
     own_motion.LaneBoundary,
     own_motion.Collision,
 )
-# By the class of settings that each one is generic in.
+# Key: the class of settings, which is the type argument of the sensor's base class.
 TYPES: dict[type[MountedConfig], MountedType] = {
     get_args(kind.__orig_bases__[0])[0]: kind  # type: ignore[attr-defined]
     for kind in _CARRIED
@@ -50,7 +50,7 @@ _OBSERVED = {sensor.name: sensor for sensor in SENSORS}
 
 
 def sensor_names() -> tuple[str, ...]:
-    """All of them; those that vehicles carry as `rig.TYPE`."""
+    """Return the names of all sensors; mounted ones are named `rig.TYPE`."""
     return (*_OBSERVED, *REGISTERED_SENSORS.names, *_MOUNTED)
 
 
@@ -62,26 +62,27 @@ def register_sensor(
     reach_m: float = 0.0,
     batched: bool = False,
 ) -> None:
-    """Add a sensor that agents observe, which `sensors.registered` can name.
+    """Register a sensor that agents observe; `sensors.registered` can then name it.
 
     Args:
-        name: of the sensor.
-        sense: its numbers, of an `AgentView` at the end of the step, one a feature; if `batched`,
-            those of all agents (n, number of features), of a `BatchView`. They must not depend on
-            the order of `AgentView.others`; that is checked when it is first used.
-        features: what each number is; names are unique.
-        reach_m: how far away the centres of `AgentView.others` can be; 0: it looks at none.
-        batched: whether it answers for all agents of a world at once, and not once an agent.
+        name: name of the sensor.
+        sense: returns one number per feature for an `AgentView` at the end of the step; if
+            `batched`, an array (n, number of features) for a `BatchView` of n agents. The numbers
+            must not depend on the order of `AgentView.others`; this is checked at the first use.
+        features: meaning of each number; names are unique.
+        reach_m: largest distance of the centres of `AgentView.others`; 0: there are no others.
+        batched: whether `sense` is called once per world, with all its agents, instead of once per
+            agent.
 
     Raises:
-        ConfigError: the name is taken, the reach is no distance, or features are missing or of one
-            name.
+        ConfigError: the name is taken, `reach_m` is negative or infinite, `features` is empty, or
+            two features have the same name.
     """
     if not 0.0 <= reach_m < math.inf:
-        raise ConfigError(f"sensor '{name}': reach_m = {reach_m}: must be a distance from 0")
+        raise ConfigError(f"sensor '{name}': reach_m = {reach_m} must be finite and at least 0")
     listed = list(features)
     if not listed or len({feature.name for feature in listed}) < len(listed):
-        raise ConfigError(f"sensor '{name}': features must be at least one, each of its own name")
+        raise ConfigError(f"sensor '{name}': give at least one feature, each with a unique name")
 
     def features_of(config: SensorsConfig) -> list[Feature]:
         return listed if name in config.registered else []
@@ -94,25 +95,25 @@ def register_sensor(
 
 
 def type_of(name: str, config: MountedConfig) -> MountedType:
-    """The class of a sensor.
+    """Return the class of a mounted sensor.
 
-    Raises ConfigError: there is none of that type.
+    Raises ConfigError: there is no sensor for this class of settings.
     """
     try:
         return TYPES[type(config)]
     except KeyError:
-        raise ConfigError(f"rig.{name}: no sensor of type {type(config).__name__}") from None
+        raise ConfigError(f"rig.{name}: no sensor takes {type(config).__name__}") from None
 
 
 def mount(rig: Mapping[str, MountedConfig], platform: Platform) -> list[MountedSensor[Any]]:
-    """The sensors of a rig, in its order."""
+    """Create the sensors of a rig, in the rig's order."""
     return [type_of(name, config)(name, config, platform) for name, config in rig.items()]
 
 
 def rig_reach_m(rig: Mapping[str, MountedConfig], largest_radius_m: float) -> float:
-    """How far from an agent's centre the centre of a vehicle can be that its rig can tell, in m.
+    """Return the largest distance at which a rig can sense a vehicle, centre to centre, in m.
 
-    `rig`: the sensors by name.
+    `rig`: settings of the sensors, by name.
     """
     reaches = (
         type_of(name, config).reach_m(config, largest_radius_m) for name, config in rig.items()
@@ -123,9 +124,9 @@ def rig_reach_m(rig: Mapping[str, MountedConfig], largest_radius_m: float) -> fl
 def frame_layout(
     config: EnvConfig, num_worlds: int, prefix: str = "rig."
 ) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Dtype as text, and shape, of all arrays of the frames of W worlds; see `frames_in`.
+    """Return the dtype (as text) and shape of all frame arrays of W worlds; see `frames_in`.
 
-    `prefix`: begins their names.
+    `prefix`: start of each array's name.
     """
     clock, layout = config.clock, {}
     agents = (num_worlds, config.population.num_ids)
@@ -140,7 +141,7 @@ def frame_layout(
 
 
 def frames_in(arrays: Mapping[str, NDArray[Any]], prefix: str = "rig.") -> dict[str, SensorFrames]:
-    """The frames among arrays that are named as by `frame_layout`, by sensor."""
+    """Collect arrays named as in `frame_layout` into frames, by sensor."""
     found: dict[str, dict[str, NDArray[Any]]] = {}
     for key, array in arrays.items():
         if key.startswith(prefix):

@@ -1,15 +1,16 @@
-"""What the sensors of an agent see, as shapes that a page draws.
+"""Sensor data of an agent as shapes that the viewer page draws.
 
-A shape is a JSON object with `name` (of the sensor), `kind` and `axes`: `vehicle` (x ahead, y to
-the left, from its centre) or `map` (the same place, x east and y north). Places are in metres.
+A shape is a JSON object with `name` (of the sensor), `kind` and `axes`: `vehicle` (origin at the
+vehicle's centre, x forward, y left) or `map` (same origin, x east, y north). Positions are in
+metres.
 
-| kind | what there is |
+| kind | fields |
 |---|---|
-| `rays` | `from` [x, y], `ends` [x, y, x, y, …], `hits` 1 where a ray ends at something |
+| `rays` | `from` [x, y], `ends` [x, y, x, y, …], `hits`: 1 where a ray ends at an object |
 | `points` | `points` [x, y, …] |
-| `links` | the same, drawn from the vehicle |
+| `links` | as `points`, with a line from the vehicle to each point |
 | `picture` | `width`, `height`, `rgba` (base64); `cone` [x, y, yaw_rad, opening_rad, range_m] |
-| `grid` | a picture that lies on the ground: `corners` of its first row's ends and of its last's |
+| `grid` | a picture on the ground; `corners`: both ends of the first row, start of the last row |
 | `numbers` | `rows` of a unit and a number |
 """
 
@@ -34,15 +35,15 @@ from cavmarl.sensors.observed import layout
 MOST_RAYS = 360
 MOST_POINTS = 2000
 MOST_PIXELS = 64_000
-GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # its `units` are the noise's
-FARTHEST = 1.0 - 1e-6  # a ray of this share of the range has met nothing
+GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # `units` is for the noise
+FARTHEST = 1.0 - 1e-6  # a ray with at least this share of the range has hit nothing
 
 Shape = dict[str, Any]
 Floats = NDArray[np.float64]
 
 
 def observed_shapes(config: EnvConfig, observation: NDArray[np.float32]) -> list[Shape]:
-    """Those of an agent's observation (D,); of a stack those of the newest frame."""
+    """Return the shapes of an agent's observation (D,), from the newest frame of a stack."""
     shapes: list[Shape] = []
     if config.observation.mode == "sensors":
         return shapes
@@ -75,7 +76,7 @@ def observed_shapes(config: EnvConfig, observation: NDArray[np.float32]) -> list
 def _rays(
     name: str, shares: Floats, angles: Floats, range_m: float, axes: str = "vehicle"
 ) -> Shape:
-    """Rays from the vehicle's centre, of shares of the range."""
+    """Make rays from the vehicle's centre; `shares` are their lengths as shares of the range."""
     reach = np.clip(shares, 0.0, 1.0) * range_m
     ends = np.stack([np.cos(angles) * reach, np.sin(angles) * reach], axis=1)
     return _ray_shape(name, np.zeros(2), ends, shares < FARTHEST, axes)
@@ -101,13 +102,13 @@ def _places(name: str, kind: str, places: Floats) -> Shape:
 
 
 def _flat(places: Floats) -> list[float]:
-    """Finite numbers only: JSON has no others."""
+    """Return a flat list of finite numbers, as JSON cannot hold nan or infinity."""
     numbers: list[float] = np.nan_to_num(np.round(places, 2)).ravel().tolist()
     return numbers
 
 
 def _occupancy(settings: OccupancyGridConfig, numbers: Floats) -> Shape:
-    """The layers together: vehicles orange, roads grey, else the largest number as a shade."""
+    """Colour vehicles orange and roads grey; the other layers are not shown."""
     columns, rows = settings.shape
     layers = numbers.reshape(len(settings.features), columns, rows)
     shades = np.abs(layers / 255.0 - 0.5 if settings.as_image else layers)
@@ -121,7 +122,7 @@ def _occupancy(settings: OccupancyGridConfig, numbers: Floats) -> Shape:
             rgba[fresh] = (*color, 150)
     (low_x, _), (low_y, _) = settings.grid_size_m
     step_x, step_y = settings.grid_step_m
-    # highway-env's y points to the right of its x.
+    # highway-env's y axis points right of its x axis.
     left, right, top, bottom = low_x, low_x + columns * step_x, -low_y, -(low_y + rows * step_y)
     corners = np.array([[left, top], [right, top], [left, bottom]])
     axes = "vehicle" if settings.align_to_vehicle_axes else "map"
@@ -139,7 +140,7 @@ def _grid(name: str, rgba: NDArray[np.uint8], corners: Floats, axes: str = "vehi
 
 
 def sampled_shapes(name: str, settings: MountedConfig, data: NDArray[Any]) -> list[Shape]:
-    """What a sensor of the rig has got in one sample."""
+    """Return the shapes of one sample of a mounted sensor."""
     if isinstance(settings, LidarRigConfig):
         return [_lidar(name, settings, data.astype(np.float64))]
     if settings.type == "radar":  # type: ignore[attr-defined]
@@ -161,12 +162,12 @@ def sampled_shapes(name: str, settings: MountedConfig, data: NDArray[Any]) -> li
         return [_grid(name, rgba, _in_vehicle(settings, corners))]
     numbers = np.nan_to_num(data.astype(np.float64)).ravel()
     units = GNSS_UNITS if settings.type == "gnss" else getattr(settings, "units", ())  # type: ignore[attr-defined]
-    told = [[unit, round(float(value), 4)] for unit, value in zip(units, numbers, strict=False)]
-    return [{"name": name, "kind": "numbers", "rows": told}]
+    lines = [[unit, round(float(value), 4)] for unit, value in zip(units, numbers, strict=False)]
+    return [{"name": name, "kind": "numbers", "rows": lines}]
 
 
 def _lidar(name: str, settings: LidarRigConfig, distances: Floats) -> Shape:
-    """Of one layer rays, of several the points that they meet."""
+    """Draw a lidar of one layer as rays, and one of several layers as the points that they hit."""
     first, step, count = azimuths(settings.fov_deg, settings.rays)
     turns = first + step * np.arange(count)
     rises = np.radians(np.linspace(settings.lower_deg, settings.upper_deg, settings.layers))
@@ -188,13 +189,13 @@ def _lidar(name: str, settings: LidarRigConfig, distances: Floats) -> Shape:
 
 
 def _in_vehicle(settings: MountedConfig, places: Floats) -> Floats:
-    """Points (n, 2) of the sensor's plane in the vehicle's."""
+    """Transform points (n, 2) in the sensor's plane to the vehicle's frame."""
     flat = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
     return sensor_to_vehicle(mount_of(settings), flat)[:, :2]
 
 
 def _colored(settings: MountedConfig, data: NDArray[Any]) -> NDArray[np.uint8]:
-    """(height, width, 4): colours as they are, classes in their colours, depth as a shade."""
+    """Return a (height, width, 4) picture: colours as given, classes by palette, depths as grey."""
     every = max(1, math.ceil(math.sqrt(data.shape[0] * data.shape[1] / MOST_PIXELS)))
     data = data[::every, ::every]
     rgba = np.full((*data.shape[:2], 4), 255, np.uint8)

@@ -12,9 +12,9 @@ import numpy as np
 from cavmarl.client.world_protocol import flatten, pack
 from cavmarl.core.errors import CapacityError, ConfigError, MissingExtraError
 from cavmarl.env.vector import make_vec
-from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.error_names import problem
 from cavmarl.viewer.live_env import ShownEnv

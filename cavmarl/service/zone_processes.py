@@ -10,7 +10,7 @@ from typing import Any
 
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
-from cavmarl.parallel.nodes.newcomers import ANYONE
+from cavmarl.parallel.nodes.joining_nodes import ANYONE
 from cavmarl.parallel.nodes.node_starters import NODE
 
 Door = tuple[str, int, str]  # host, port, key

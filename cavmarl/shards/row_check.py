@@ -28,7 +28,8 @@ _LONGEST_WAY = 200_000  # lanes
 _ENDLESS = ("to_go", "step_to_go")  # fields that are infinite without a route
 _FLOATS = tuple(name for name in VEHICLE.names or () if VEHICLE[name].kind == "f")
 _INT32 = tuple(name for name in VEHICLE.names or () if VEHICLE[name] == np.int32)
-MOST = np.iinfo(np.int32).max
+MOST = int(np.iinfo(np.int32).max)
+MOST_IDS = 1 << 62  # of vehicles in a run
 
 
 class RowCheck:
@@ -38,6 +39,10 @@ class RowCheck:
         roads: the network.
         traffic: the types and routes of vehicles.
         num_agents: the largest number of agents in an episode of a world.
+
+    Attributes:
+        indices: ranges of the fields by which kernels index tables, except `way`.
+        steps: number of rows that `way` can point at after the lane is added to it.
     """
 
     def __init__(self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int) -> None:
@@ -49,27 +54,34 @@ class RowCheck:
         num_lanes, num_links = len(roads.lanes), len(roads.links)
         self._num_lanes = num_lanes
         self._num_goals, self._plan_steps = len(traffic.plans), traffic.plans.size
-        bounds = {
-            "lane": (0, num_lanes - 1),
-            "side_lane": (-1, num_lanes - 1),
-            "target_lane": (-1, num_lanes - 1),
-            "vtype": (0, len(travel.types) - 1),
-            "driver": (DRIVER_BACKGROUND, DRIVER_SUMO),
-            "link": (-1, num_links - 1),
-            "stopped_at": (-1, num_links - 1),
-            "hold": (0, HOLD_EXIT_BLOCKED),
-            "blinker": (-1, 1),
-            "stop": (-1, len(travel.stops)),
-            "stops_end": (-1, len(travel.stops)),
-            "agent": (-1, num_agents - 1),
-            "leg": (0, MOST),
-            "order": (-1, MOST),
-            "owner": (0, MOST),  # may be of different zones; a load overwrites it
-            "epoch": (0, MOST),
-            "transfer": (AUTHORITATIVE, AUTHORITATIVE),
+        self.steps = len(travel.steps)
+        goals = max(self._num_goals, len(travel.scripts.frames), self.steps // max(num_lanes, 1))
+        self.indices = {
+            "id": range(MOST_IDS),
+            "lane": range(num_lanes),
+            "side_lane": range(-1, num_lanes),
+            "target_lane": range(-1, num_lanes),
+            "link": range(-1, num_links),
+            "stopped_at": range(-1, num_links),
+            "vtype": range(len(travel.types)),
+            "driver": range(DRIVER_BACKGROUND, DRIVER_SUMO + 1),
+            "agent": range(-1, num_agents),
+            "goal": range(-1, goals),
+            "stop": range(-1, 1 + len(travel.stops)),
+            "stops_end": range(-1, 1 + len(travel.stops)),
         }
-        self._low = np.array([bounds.get(name, (-MOST - 1, 0))[0] for name in _INT32])
-        self._high = np.array([bounds.get(name, (0, MOST))[1] for name in _INT32])
+        values = self.indices | {
+            "hold": range(HOLD_EXIT_BLOCKED + 1),
+            "blinker": range(-1, 2),
+            "leg": range(MOST + 1),
+            "order": range(-1, MOST + 1),
+            "owner": range(MOST + 1),  # of other zones, perhaps: a load writes it anew
+            "epoch": range(MOST + 1),
+            "transfer": range(AUTHORITATIVE, AUTHORITATIVE + 1),
+        }
+        every = range(-MOST - 1, MOST + 1)
+        self._low = np.array([values.get(name, every).start for name in _INT32])
+        self._high = np.array([values.get(name, every).stop - 1 for name in _INT32])
         types = travel.types
         self._radius_m = 0.5 * float(_diagonals_m(types).max()) + 1e-6
         self._height_m = float(types["height"].max()) + 1e-6

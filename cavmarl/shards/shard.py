@@ -113,7 +113,7 @@ class Shard:
         self.cut(zones, halo)
         # Shards run one after the other and share this memory, so that it stays in the cache.
         self.scratch: Scratch = (
-            _make_scratch(network, capacity, travel.scripts.room)
+            make_shard_scratch(network, capacity, travel.scripts.room)
             if first is None
             else first.scratch
         )
@@ -268,7 +268,7 @@ def _seen(
     )
 
 
-def _make_scratch(network: RoadNetwork, capacity: int, covers: int = 0) -> Scratch:
+def make_shard_scratch(network: RoadNetwork, capacity: int, covers: int = 0) -> Scratch:
     def integers(size: int) -> NDArray[np.int32]:
         return huge_zeros(size, dtype=np.int32)
 

@@ -1,4 +1,4 @@
-"""`DEPARTURE`, an ordered vehicle that waits to enter, and the departure queue it waits in."""
+"""`DEPARTURE`, the record of a vehicle that waits to enter, and the queue of such records."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from cavmarl.core.records.arrays import DepartureQueue, RoadArrays
 from cavmarl.core.records.codes import NUM_COUNTS, NUM_SUMS
 
 DEPARTURE = record(
-    ("id", np.int64),  # of the vehicle; the queue is in this order
+    ("id", np.int64),  # vehicle id; the queue is sorted by it
     ("due", np.int64),  # tick
-    ("way", np.int64),  # as VEHICLE["way"], on its first edge
-    ("agent", np.int32),  # index of the agent that will drive it, or -1
-    ("order", np.int32),  # its own row in `DepartureQueue.orders`; -1: of the generator
+    ("way", np.int64),  # as VEHICLE["way"]; the vehicle starts on the first edge
+    ("agent", np.int32),  # index of the agent that will drive the vehicle, or -1
+    ("order", np.int32),  # row in `DepartureQueue.orders`; -1: ordered by the generator
     ("vtype", np.int32),  # VTYPE row
-    ("goal", np.int32),  # row of the plans' table, or -1: the end of its route
-    ("lane", np.int32),  # LANE where it enters, or any lane of that edge
+    ("goal", np.int32),  # row of the table of plans, or -1: the end of the vehicle's route
+    ("lane", np.int32),  # LANE row where the vehicle enters, or any lane of that edge
     ("stop", np.int32),  # STOP rows [stop, stops_end)
     ("stops_end", np.int32),
     ("lane_code", np.int8),  # LANE_*
     ("pos_code", np.int8),  # POS_*
     ("speed_code", np.int8),  # SPEED_*
-    ("pos", np.float64),  # of the front bumper, m; negative: from the end of the lane
+    ("pos", np.float64),  # position of the front bumper in m; negative: from the end of the lane
     ("speed", np.float64),  # m/s
-    ("speed_factor", np.float64),  # desired speed over the limit
+    ("speed_factor", np.float64),  # desired speed divided by the speed limit
 )
 
 
 def make_departure_queue(
     num_worlds: int, capacity: int, roads: RoadArrays, vehicle: np.dtype[np.void]
 ) -> DepartureQueue:
-    """The empty gates of `num_worlds` worlds that hold `capacity` records of vehicles each."""
+    """Return empty queues for `num_worlds` worlds, each with room for `capacity` vehicles."""
     return DepartureQueue(
         orders=np.zeros((num_worlds, 0), dtype=DEPARTURE),
         num_orders=np.zeros(num_worlds, dtype=np.int64),
@@ -64,7 +64,7 @@ def _room(
 
 
 def with_room(departures: DepartureQueue, num_orders: int) -> DepartureQueue:
-    """The departure queue with room for at least so many orders, all of which may wait at once."""
+    """Return the queue with room for at least `num_orders` orders, all of which may wait."""
     num_worlds, present = departures.orders.shape
     more = num_orders - present
     if more <= 0:

@@ -1,4 +1,4 @@
-"""`MapTrips`: which trips the generator has on a map, one of those of a network."""
+"""`MapTrips`: the trips that the generator may draw on one map of a network."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from cavmarl.core.records.arrays import TripTable
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
-MIN_ORIGIN_M = 15.0  # lanes shorter than this are no place to start
-MIN_GOAL_M = 10.0  # nor to arrive
-DENSITY_M = 25.0  # a lane is drawn at reset once for each such length
-MAX_TRIPS = 200_000  # of a table; longer ones are thinned evenly
+MIN_ORIGIN_M = 15.0  # m; trips do not start on shorter lanes
+MIN_GOAL_M = 10.0  # m; trips do not end on edges whose lanes are all shorter
+DENSITY_M = 25.0  # m; at reset, a lane counts once per such length in the draw
+MAX_TRIPS = 200_000  # per table; longer tables are thinned evenly
 
 ANY_LENGTH_M = (0.0, math.inf)
 
@@ -28,10 +28,10 @@ T = TypeVar("T")
 
 
 def for_each_map(network: RoadNetwork, make: Callable[[int], T]) -> list[T]:
-    """What `make` makes of each MAP row.
+    """Return `make(row)` for each MAP row.
 
     Raises:
-        CavmarlError: as `make`, of the kind of the first one, with all messages.
+        CavmarlError: `make` failed; of the class of the first error, with all messages.
     """
     found: list[T] = []
     refused: list[CavmarlError] = []
@@ -46,18 +46,18 @@ def for_each_map(network: RoadNetwork, make: Callable[[int], T]) -> list[T]:
 
 
 def together(parts: Sequence[NDArray[np.int32]]) -> TripTable:
-    """The trips of all maps, (P, 2) each."""
+    """Join the trips of all maps, (P, 2) each, into one table."""
     first = np.cumsum([0, *map(len, parts)], dtype=np.int64)
     return TripTable(np.ascontiguousarray(np.concatenate(parts)), first)
 
 
 class DrawnTrips(NamedTuple):
-    """Trips of one map, (P, 2) LANE and goal."""
+    """Trips of one map, (P, 2): LANE row of the origin, and goal."""
 
     agent_arrays: NDArray[np.int32]
     at_start: NDArray[np.int32]  # of background vehicles at reset
-    entering: NDArray[np.int32]  # of those that enter later
-    has_ways_in: bool  # whether those come on roads that lead into the map
+    entering: NDArray[np.int32]  # of vehicles that enter later
+    has_ways_in: bool  # whether `entering` starts on roads that lead into the map
 
 
 @dataclass(frozen=True)
@@ -70,19 +70,19 @@ class MapTrips:
 
     @cached_property
     def metres(self) -> float:
-        """Of lanes for cars outside junctions."""
+        """Total length in m of the lanes for cars outside junctions."""
         return float(self.network.lanes["length_m"][self._usable].sum())
 
     def goals(self, acted: Sequence[int]) -> list[int]:
-        """EDGE rows that trips lead to: named destinations first, then a spread over the map.
+        """Return the EDGE rows that trips lead to: named destinations, then a spread over the map.
 
-        `acted`: more of them, those of a scenario.
+        `acted`: further goals, used by a scenario.
         """
         named = [self._edge(name, "destinations") for name in self.traffic.destinations]
         edges = self._drivable_edges(MIN_GOAL_M)
         leaves = [e for e in edges if self._is_way_out(e)]
         rest = [e for e in edges if e not in set(leaves)]
-        # Ways out of the map first; the others evenly over the rows, whatever the seed.
+        # Ways out of the map come first. The other edges are picked evenly by row, for any seed.
         candidates = leaves + rest
         named += acted
         wanted = max(self.traffic.goals, len(named))
@@ -92,7 +92,7 @@ class MapTrips:
         return list(dict.fromkeys(named + candidates))[:wanted]
 
     def drawn(self, plans: NDArray[np.void], num_goals: int) -> DrawnTrips:
-        """What departures are drawn from.
+        """Return the trips that departures are drawn from.
 
         `plans`: PLAN (G, L). `num_goals`: G.
 
@@ -119,7 +119,7 @@ class MapTrips:
 
     @cached_property
     def _usable(self) -> NDArray[np.bool_]:
-        """(L,) whether a lane of this map is for cars, and outside junctions."""
+        """(L,) whether a lane belongs to this map, admits cars, and is outside junctions."""
         lanes = self.network.lanes
         usable: NDArray[np.bool_] = (
             (lanes["map"] == self.number)
@@ -139,7 +139,7 @@ class MapTrips:
             ) from None
 
     def _drivable_edges(self, least_m: float) -> list[int]:
-        """EDGE rows outside junctions with a lane for cars that is at least `least_m` long."""
+        """Return EDGE rows outside junctions that have a car lane at least `least_m` long."""
         lanes = self.network.lanes
         good = self._usable & (lanes["length_m"] >= least_m)
         found = [int(edge) for edge in np.unique(lanes["edge"][good])]
@@ -170,7 +170,7 @@ class MapTrips:
         goals: NDArray[np.int64],
         limits_m: tuple[float, float],
     ) -> NDArray[np.int32]:
-        """`_fitting`, `MAX_TRIPS` of them at most.
+        """Return `_fitting`, thinned to at most `MAX_TRIPS` trips.
 
         Raises ConfigError: there are none.
         """
@@ -182,7 +182,7 @@ class MapTrips:
         return np.ascontiguousarray(trips)
 
     def _no_trip(self, to_go: NDArray[np.float64], limits_m: tuple[float, float]) -> ConfigError:
-        """Why none of some ways, of so many m or inf, is a trip."""
+        """Return the error that says why ways of the lengths `to_go` (m, or inf) allow no trip."""
         name = self.network.name_of(self.number)
         if _is_within(to_go, limits_m).any():
             return ConfigError(
@@ -207,10 +207,10 @@ class MapTrips:
         goals: NDArray[np.int64],
         limits_m: tuple[float, float],
     ) -> NDArray[np.int32]:
-        """(P, 2) pairs of origin lane and goal whose way is as long as `limits_m` say.
+        """Return (P, 2) pairs of origin lane and goal whose way has a length within `limits_m`.
 
-        Vehicles start on a lane that their way can follow: no trip begins with a lane change. And
-        no trip has a turn for which a car's turning circle is too wide.
+        No trip begins with a lane change, and no trip has a turn that is too tight for the turning
+        circle of a car.
         """
         pairs = np.ix_(goals, origins)
         fits = _is_within(plans["to_go"][pairs], limits_m)

@@ -1,4 +1,4 @@
-"""The seeded traffic generator: which trips there are, and what departures are drawn from."""
+"""The seeded traffic generator: the possible trips, and the tables for drawing departures."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.turning_circle import TurningBody, with_tight_turns
 from cavmarl.traffic.way_search import WaySlots, seekers, way_slots
 
-FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
-JAM_GAP_M = 2.5  # between the bumpers of vehicles that stand in a queue
+FAST_FACTOR = 1.5  # speed divided by the limit; hardly any driver of a demand file wants more
+JAM_GAP_M = 2.5  # m between the bumpers of queued vehicles
 
 
 class TrafficCalls:
-    """The kernel calls of the departures of some worlds.
+    """Bound kernel calls for the departures of some worlds.
 
     Attributes:
-        running: (W,) vehicles of each world, in all zones, that `accept` reads.
-        inserted: (W, I, 3) that `insert` reads; see `Commands`.
+        running: (W,) vehicles of each world in all zones; read by `accept`.
+        inserted: (W, I, 3) vehicles to insert; read by `insert`, see `Commands`.
     """
 
     def __init__(
         self,
         traffic: NativeTraffic,
         departures: DepartureQueue,
-        ticks: NDArray[np.int64],  # (W,) of the worlds
-        keys: NDArray[np.uint64],  # (W,) of their random numbers
+        ticks: NDArray[np.int64],  # (W,) tick of each world
+        keys: NDArray[np.uint64],  # (W,) random key of each world
     ) -> None:
         self._traffic = traffic
         self._departures = departures
@@ -121,48 +121,48 @@ class NativeTraffic:
 
     network: RoadNetwork
     traffic: TrafficConfig  # settings of the generator
-    population: PopulationConfig  # which vehicles are in the world
-    blank: NDArray[np.void]  # VEHICLE (1,), the record that every vehicle starts from
+    population: PopulationConfig  # the kinds of vehicles in the world
+    blank: NDArray[np.void]  # VEHICLE (1,), template of every vehicle's record
     dt: float
-    horizon_s: float  # seconds an episode
-    file: DemandFile | None = None  # the demand whose vehicles drive beside the generator's
+    horizon_s: float  # length of an episode in s
+    file: DemandFile | None = None  # demand whose vehicles drive beside the generated ones
     num_worlds: int = 1
-    # makes the table of ways, where vehicles find some while the world runs
+    # allocates the table of ways if vehicles find ways while the world runs
     zeros: Zeros = np.zeros
-    scene: Scene | None = None  # what is played to the agents of each world
-    sumo: SumoDemand | None = None  # in the place of a file: what SUMO runs beside these worlds
+    scene: Scene | None = None  # the scenario that is played in each world
+    sumo: SumoDemand | None = None  # vehicles that SUMO runs beside these worlds; excludes `file`
 
     def __post_init__(self) -> None:
-        # Trips that do not exist are refused when the world is made, not at its first reset.
+        # Refuse impossible trips when the world is made, not at its first reset.
         _ = self.demand
         self._check_room()
 
     def for_worlds(self, num_worlds: int) -> NativeTraffic:
-        """The same for another number of worlds, with the tables that all worlds share."""
+        """Return a copy for another number of worlds; tables that all worlds share are kept."""
         other = copy(self)
         object.__setattr__(other, "num_worlds", num_worlds)
         for name in (
             "travel",
             "_travel_of_others",
-            "_slots",
+            "slots",
             "rerouting",
             "calls",
-        ):  # of each world
+        ):  # kept per world
             vars(other).pop(name, None)
         other._check_room()
         return other
 
     @cached_property
     def goal_edges(self) -> NDArray[np.int32]:
-        """EDGE rows (M, G) that trips of each map lead to; maps with fewer have some twice."""
+        """EDGE rows (M, G) of each map's goals; a map with fewer goals repeats some."""
         acted = [] if self.scene is None else self.scene.goal_edges
-        found = for_each_map(self.network, lambda number: self._trips_of(number).goals(acted))
+        found = for_each_map(self.network, lambda number: self.trips_of(number).goals(acted))
         most = max(map(len, found))
         return np.array([np.resize(goals, most) for goals in found], dtype=np.int32)
 
     @cached_property
     def plans(self) -> NDArray[np.void]:
-        """PLAN (G, L) of the goal edges: on each map's lanes, the ways to its goals."""
+        """PLAN (G, L): for each goal, the way from each lane of the same map."""
         names = dict.fromkeys(self.population.types)
         bodies = tuple(
             TurningBody(*(float(kind[name]) for name in TurningBody._fields))
@@ -179,7 +179,8 @@ class NativeTraffic:
         plans.setflags(write=False)
         return plans
 
-    def _trips_of(self, number: int) -> MapTrips:
+    def trips_of(self, number: int) -> MapTrips:
+        """Return the trips of one map."""
         return MapTrips(self.network, number, self.traffic)
 
     @cached_property
@@ -200,9 +201,9 @@ class NativeTraffic:
 
     @cached_property
     def travel(self) -> TripTables:
-        """Types and ways of all vehicles: the generator's, the demand file's, the actors', agents'.
+        """Types and ways of all vehicles: generated, from the demand file, actors and agents.
 
-        The car, which most agents have, is the generator's.
+        Most agents drive a car, which is a generated type.
         """
         more = agent_types(self._other_types, model_code(self.traffic.model))
         found = self._travel_of_others
@@ -211,12 +212,12 @@ class NativeTraffic:
 
     @property
     def _other_types(self) -> list[str]:
-        """Names of the types of agents' vehicles but the car."""
+        """Names of the types of agents' vehicles, without the car."""
         return [name for name in dict.fromkeys(self.population.types) if name != "car"]
 
     @cached_property
     def _agent_type_rows(self) -> NDArray[np.int32]:
-        """VTYPE rows of the agents' types, in turn."""
+        """VTYPE row of each agent's type, repeated in order."""
         first = len(self.travel.types) - len(self._other_types)
         names = {"car": 0} | {name: first + k for k, name in enumerate(self._other_types)}
         return np.array([names[name] for name in self.population.types], dtype=np.int32)
@@ -253,16 +254,16 @@ class NativeTraffic:
         )
 
     def _with_slots(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
-        """The table of ways, with room behind it where vehicles find some."""
-        if self._slots is None:
+        """Return the table of ways, with room for ways found at run time if vehicles reroute."""
+        if self.slots is None:
             return fixed
-        steps = self.zeros(len(fixed) + self._slots.room, dtype=fixed.dtype)
+        steps = self.zeros(len(fixed) + self.slots.room, dtype=fixed.dtype)
         steps[: len(fixed)] = fixed
         return steps
 
     @property
     def _barrier_stops(self) -> NDArray[np.void]:
-        """STOP (L,), where a barrier stands on each lane; none where nothing may be put."""
+        """STOP (L,): where a barrier stands on each lane; empty if insertions are off."""
         lanes = self.network.lanes
         stops = np.zeros(len(lanes) if self.population.insertions else 0, dtype=STOP)
         stops["lane"], stops["at_edge"] = np.arange(len(stops)), -1
@@ -275,7 +276,7 @@ class NativeTraffic:
     def _travel_of_sumo(
         self, sumo: SumoDemand, types: NDArray[np.void], fixed: NDArray[np.void]
     ) -> TripTables:
-        """The same with SUMO's types, room for its routes behind the fixed ways, and for stops."""
+        """Return the tables with SUMO's types, and room for its routes and stops."""
         steps = self.zeros(
             len(fixed) + RouteBook.room(self.network, self.num_worlds), dtype=fixed.dtype
         )
@@ -294,9 +295,10 @@ class NativeTraffic:
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
-        """How far any driver looks: as fast drivers have to, where all brake as SUMO's.
+        """Return the largest distance that any driver looks ahead, in m.
 
-        IDM reacts to whatever is ahead, and agents may drive as fast as they like.
+        If all drivers brake as SUMO's do, it follows from the fastest of them. IDM reacts to any
+        leader, and agents may drive at any speed; then it is `VIEW_M`.
         """
         own = self.population
         if self.file is None or own.agents + own.background + own.insertions > 0:
@@ -310,8 +312,8 @@ class NativeTraffic:
         )
 
     @cached_property
-    def _slots(self) -> WaySlots | None:
-        """Room for the ways that vehicles find while the world runs, where some may."""
+    def slots(self) -> WaySlots | None:
+        """Room for ways found at run time; None if no vehicle reroutes."""
         schedule = self.schedule
         if schedule is None or not self._reroutes:
             return None
@@ -323,26 +325,26 @@ class NativeTraffic:
 
     @property
     def _reroutes(self) -> bool:
-        """Whether the demand has vehicles that look for ways, or rerouters."""
+        """Return whether the demand has vehicles that search for ways, or rerouters."""
         file = self.file
         return file is not None and (file.may_look or len(file.rerouters.rules) > 0)
 
     @property
     def ticks_per_s(self) -> int:
-        """How many ticks a second has; at least 1."""
+        """Number of ticks per second; at least 1."""
         return max(1, round(1.0 / self.dt))
 
     @cached_property
     def rerouting(self) -> Rerouting | None:
-        """What keeps ways that are found; None where vehicles do not reroute."""
-        if self.schedule is None or self._slots is None:
+        """The rerouting of vehicles; None if vehicles do not reroute."""
+        if self.schedule is None or self.slots is None:
             return None
         first_type = len(generated_types())
-        return Rerouting(self.schedule, self.travel, self._slots, first_type, self.dt)
+        return Rerouting(self.schedule, self.travel, self.slots, first_type, self.dt)
 
     @cached_property
     def capacity(self) -> int:
-        """Rows that one world needs."""
+        """Number of vehicle rows that one world needs."""
         if self.sumo is not None:
             return _capacity_of_sumo(self.population, self.sumo)
         actors = 0 if self.scene is None else len(self.scene.actors)
@@ -357,7 +359,7 @@ class NativeTraffic:
         """
         num_goals = self.goal_edges.shape[1]
         parts = for_each_map(
-            self.network, lambda number: self._trips_of(number).drawn(self.plans, num_goals)
+            self.network, lambda number: self.trips_of(number).drawn(self.plans, num_goals)
         )
         return Demand(
             agent_trips=together([part.agent_arrays for part in parts]),
@@ -378,9 +380,9 @@ class NativeTraffic:
     def draw_orders(
         self, departures: DepartureQueue, worlds: Worlds, chosen: NDArray[np.bool_]
     ) -> DepartureQueue:
-        """Draw what the demand file orders in the chosen worlds' (W,) new episodes.
+        """Draw the orders of the demand file for new episodes of the `chosen` worlds (W,).
 
-        Returns the departure queue, or a larger one if there are more orders than ever before.
+        Return the departure queue, or a larger one if it had too little room for the orders.
         """
         if self.schedule is None:
             return departures
@@ -394,7 +396,7 @@ class NativeTraffic:
         return departures
 
     def num_orders(self, key: int) -> int:
-        """How many departures the demand file orders in the episode of a key."""
+        """Return how many departures the demand file orders in the episode with this key."""
         if self.schedule is None:
             return 0
         return self.schedule.count(key, self.horizon_s)
@@ -402,7 +404,7 @@ class NativeTraffic:
     def populate(
         self, departures: DepartureQueue, worlds: Worlds, chosen: NDArray[np.bool_]
     ) -> None:
-        """Fill the chosen worlds (W,) for a new episode."""
+        """Fill the `chosen` worlds (W,) for a new episode."""
         populate(self.demand, self.network.arrays, self.travel, departures, worlds, chosen)
         worlds.cues[chosen] = -1
         if self.cast is not None:
@@ -410,22 +412,22 @@ class NativeTraffic:
                 self.cast.enter(self.network.arrays, self.travel, departures, worlds, w, self.blank)
 
     def settle(self, departures: DepartureQueue, worlds: Worlds) -> None:
-        """Count vehicles that have left, and order those that follow."""
+        """Count vehicles that have left, and order their successors."""
         self.calls(departures, worlds.ticks, worlds.keys).settle()
 
     def assign_lanes(self, departures: DepartureQueue, worlds: Worlds) -> None:
-        """Assign vehicles of the queue the lanes on which they try to enter."""
+        """Assign to each queued vehicle the lane on which it tries to enter."""
         self.calls(departures, worlds.ticks, worlds.keys).assign_lanes()
 
     def call_orders(self, departures: DepartureQueue, worlds: Worlds) -> None:
-        """Put the orders that are due by the coming tick into the queue."""
+        """Move orders that are due by the coming tick into the queue."""
         if departures.next_order.tolist() != departures.num_orders.tolist():
             self.calls(departures, worlds.ticks, worlds.keys).call_orders()
 
     def insert(
         self, departures: DepartureQueue, worlds: Worlds, inserted: NDArray[np.float64]
     ) -> None:
-        """Put what is to enter in this step into the queue; `inserted` as in `Commands`."""
+        """Queue the vehicles that are to be inserted in this step; `inserted` as in `Commands`."""
         calls = self.calls(departures, worlds.ticks, worlds.keys)
         np.copyto(calls.inserted, inserted)
         calls.insert()
@@ -433,7 +435,7 @@ class NativeTraffic:
     def accept(
         self, departures: DepartureQueue, worlds: Worlds, running: NDArray[np.int64]
     ) -> None:
-        """Choose among vehicles that could enter; `running` (W,) are in the worlds already."""
+        """Choose which vehicles enter; `running` (W,): vehicles already in each world."""
         calls = self.calls(departures, worlds.ticks, worlds.keys)
         np.copyto(calls.running, running)
         calls.accept()
@@ -442,18 +444,18 @@ class NativeTraffic:
     def calls(
         self,
     ) -> Callable[[DepartureQueue, NDArray[np.int64], NDArray[np.uint64]], TrafficCalls]:
-        """Return the kernel calls for a departure queue, and the ticks and keys of its worlds."""
+        """Return the kernel calls for a departure queue and its worlds' ticks and keys."""
         return keep_last(partial(TrafficCalls, self))
 
     def _check_room(self) -> None:
-        """Refuse a population that cannot stand on each map, bumper to bumper.
+        """Check that the population has room on each map, standing bumper to bumper.
 
-        Raises CapacityError: more vehicles than that.
+        Raises CapacityError: there are more vehicles than fit.
         """
         for_each_map(self.network, self._check_room_of)
 
     def _check_room_of(self, number: int) -> None:
-        metres = self._trips_of(number).metres
+        metres = self.trips_of(number).metres
         room = int(metres / (float(self.blank["length"][0]) + JAM_GAP_M))
         wanted = self.population.agents + self.population.background
         if wanted > room:
@@ -471,7 +473,7 @@ def capacity_of(
     dt: float,
     horizon_s: float,
 ) -> int:
-    """How many vehicles a world can hold, as `NativeTraffic` will say when it is made of these."""
+    """Return how many vehicles a world can hold; equals `NativeTraffic.capacity` of that world."""
     if isinstance(file, SumoDemand):
         return _capacity_of_sumo(population, file)
     schedule = None if file is None else Schedule(file, 0, 0)
@@ -489,7 +491,7 @@ def _capacity(
     dt: float,
     horizon_s: float,
 ) -> int:
-    """No more vehicles than are ordered, or fit on the map."""
+    """Return the smaller of the number of ordered vehicles and the number that fit on the map."""
     own = population.agents + population.background + population.insertions
     if schedule is None or not len(schedule.demand.types):
         return own
@@ -501,5 +503,5 @@ def _capacity(
 
 
 def _centre_sees_line_m(kind: np.void, speed: float) -> float:
-    """How far before its centre a driver asks whether it may pass a line, in m."""
+    """Return how far before its centre a driver checks whether it may pass a line, in m."""
     return float(see_line_m(kind, speed) + 0.5 * kind["length"])

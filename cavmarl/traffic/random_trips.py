@@ -20,14 +20,14 @@ _TURNAROUND = ord("t")
 
 
 class RandomTrips:
-    """Draws routes for cars from one place to the next, each the shortest way there.
+    """Draws routes for cars between random places, each by the shortest way.
 
-    Places are edges, drawn in proportion to the length of their lanes. Only the largest part of the
-    map is used in which every edge can be reached from every other without turning round.
+    Places are edges, drawn in proportion to the length of their lanes. All are in the largest part
+    of the map in which every edge can be reached from every other without a U-turn.
 
-    `seed`: of the draws; equal arguments give equal routes.
+    `seed`: seed of the draws; equal arguments give equal routes.
 
-    Raises RouteError: the map has no two such edges.
+    Raises RouteError: the map has no two edges that reach each other.
     """
 
     def __init__(self, network: RoadNetwork, seed: int) -> None:
@@ -42,7 +42,7 @@ class RandomTrips:
         self._next_edges: dict[int, dict[int, int]] = {}
 
     def route(self, least_m: float) -> list[int]:
-        """The EDGE rows of a route that is at least `least_m` long."""
+        """Return the EDGE rows of a route that is at least `least_m` long."""
         lengths = self._network.edges["length_m"]
         route = [self._draw()]
         driven = float(lengths[route[0]])
@@ -58,7 +58,7 @@ class RandomTrips:
         return int(self._random.choice(self._edges, p=self._weights))
 
     def _toward(self, goal: int) -> dict[int, int]:
-        """Edge → the next one on its shortest way to `goal` (Dijkstra, from the goal backwards)."""
+        """Map each edge to the next one on its shortest way to `goal` (Dijkstra from the goal)."""
         if goal not in self._next_edges:
             lengths = self._network.edges["length_m"]
             onward: dict[int, int] = {}
@@ -80,12 +80,12 @@ class RandomTrips:
 def write_random_demand(
     network: RoadNetwork, path: Path, *, vehicles: int, within_s: float, route_m: float, seed: int
 ) -> None:
-    """Write a `.rou.xml` of cars that depart evenly spread over a time.
+    """Write a `.rou.xml` of cars whose departures are evenly spaced in time.
 
-    `within_s`: the time from the first departure to just after the last. `route_m`: routes are at
-    least as long. `seed`: equal arguments give equal bytes.
+    `within_s`: the period that departures are spread over. `route_m`: minimum length of a route.
+    `seed`: equal arguments give equal bytes.
 
-    Raises ConfigError: a number out of range, or the file cannot be written; RouteError: the map
+    Raises ConfigError: a number is out of range, or the file cannot be written; RouteError: the map
     has no circuit.
     """
     if not 1 <= vehicles <= MAX_VEHICLES:
@@ -116,7 +116,7 @@ def _lines(
 
 
 def _largest_part(network: RoadNetwork) -> tuple[list[list[int]], NDArray[np.int64]]:
-    """For each edge those that lead into it, and the edges of the largest part, by lane length."""
+    """Return the predecessors of each edge, and the edges of the part with the longest lanes."""
     lanes, links = network.lanes, network.links
     usable = lanes["permissions"] & _PASSENGER != 0
     good = (
@@ -130,8 +130,8 @@ def _largest_part(network: RoadNetwork) -> tuple[list[list[int]], NDArray[np.int
     in_part[sizes < 2] = 0.0
     if not in_part.any():
         raise RouteError(
-            f"map '{network.name}': no edge can be reached again without turning round, so routes "
-            "of any length do not exist; write demand with origins and destinations by hand"
+            f"map '{network.name}': no edge can be reached again without a U-turn, so routes "
+            "cannot be of any length; write demand with origins and destinations by hand"
         )
     chosen = part == np.argmax(in_part)
     into: list[list[int]] = [[] for _ in range(len(network.edges))]

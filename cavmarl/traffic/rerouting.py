@@ -1,8 +1,8 @@
-"""`Rerouting`: vehicles of the demand that look for another way while the world runs.
+"""`Rerouting`: vehicles of the demand that search for another way while the world runs.
 
-Two things make them: SUMO's rerouting device, which looks for the fastest way by the speeds of the
-last minutes, and <rerouter>s, which stand on edges. Both act once a second at the departure queue,
-in one place however the world is divided. Decision 011 says why it is done like this.
+Two mechanisms reroute vehicles. SUMO's rerouting device searches for the fastest way by the speeds
+of the last minutes; <rerouter>s act on vehicles that drive on their edges. Both run once a second
+on the departure queue, in one place for any division. Decision 011 gives the reasons.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult, WayS
 
 NEVER = np.iinfo(np.int64).max
 
-# What an ordered vehicle knows of its looking for ways, by VEHICLE["order"].
+# Rerouting state of an ordered vehicle; its row is VEHICLE["order"].
 LOOK = record(
-    ("next", np.int64),  # tick from which on it looks again
-    ("period", np.int64),  # ticks until it does so once more; 0: it does not
-    ("goal", np.int32),  # EDGE row that it drives to
-    ("seen", np.int32),  # EDGE row on which it has asked the rerouters last
-    ("may_leave", np.bool_),  # no edge between first and last is one that it has to pass
-    ("equipped", np.bool_),  # it has a rerouting device: knows the speeds
+    ("next", np.int64),  # tick of the next search
+    ("period", np.int64),  # ticks between searches; 0: no repetition
+    ("goal", np.int32),  # EDGE row of the destination
+    ("seen", np.int32),  # EDGE row on which the vehicle last asked the rerouters
+    ("may_leave", np.bool_),  # whether the route prescribes no edge between its first and last
+    ("equipped", np.bool_),  # whether it has a rerouting device, and so knows the speeds
 )
 
 
 class Rerouting:
-    """Vehicles that reroute, what is known of the traffic, and the ways that were found; W worlds.
+    """Rerouting of the vehicles of W worlds: measured speeds, searches and the ways found.
 
-    `travel`: types and ways, with room behind them. `slots`: that room. `first_type`: VTYPE row of
-    the file's first type.
+    `travel`: types and ways, with room for more ways at the end. `slots`: that room. `first_type`:
+    VTYPE row of the file's first type.
     """
 
     def __init__(
@@ -73,9 +73,9 @@ class Rerouting:
         self._lane_sums = np.zeros(lanes, dtype=np.int64)
 
     def begin(self, world: int, key: int, horizon_s: float) -> None:
-        """Forget an episode of a world and take up the next.
+        """Reset a world's state for its next episode.
 
-        `key`: of the world and the new episode. `horizon_s`: seconds an episode.
+        `key`: random key of the world and episode. `horizon_s`: length of an episode in s.
         """
         orders = self._schedule.orders(key, horizon_s)
         more = len(orders) - self._looks.shape[1]
@@ -98,24 +98,24 @@ class Rerouting:
             limit_speeds(self._roads, self._past[world], self._speed_sums[world])
 
     def act(self, departures: DepartureQueue, worlds: Worlds) -> None:
-        """Once a second, sample the speeds and let vehicles ask for ways; writes `next_rows`."""
+        """Once a second, sample the speeds and let vehicles search for ways; writes `next_rows`."""
         for w, tick in enumerate(worlds.ticks):
             if tick % self._ticks_per_s == 0:
                 self._sample(worlds, w, int(tick))
                 departures.counts[w, COUNT_REROUTED] += self._let_ask(worlds, w, int(tick))
 
     def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """VEHICLE["way"] (n,) of a world as it would be in the first one."""
+        """Convert VEHICLE["way"] (n,) of `world` to the values they would have in world 0."""
         return self._slots.ways_of_first_world(ways, world)
 
     def ways_of_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """VEHICLE["way"] (n,) in a world, of ways as they are in the first one."""
+        """Convert VEHICLE["way"] (n,) from the values of world 0 to those of `world`."""
         return self._slots.ways_of_first_world(ways, -world)
 
     def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
-        """What of a world's state is kept here, as arrays without padding.
+        """Yield the part of a world's state that is kept here, as arrays without padding.
 
-        `rows`: VEHICLE (n,), its vehicles: only the ways that they drive on count.
+        `rows`: VEHICLE (n,) of the world; only the ways that these vehicles drive on are included.
         """
         yield self._speed_sums[world]
         yield self._past[world]
@@ -128,12 +128,12 @@ class Rerouting:
         yield from _plain(steps.reshape(slots.number, slots.steps)[used])
 
     def arrays(self) -> Iterator[NDArray[np.generic]]:
-        """What a tick changes here, of all worlds; to be copied and put back."""
+        """Yield all arrays that a tick may change, of all worlds, for saving and restoring."""
         yield from (self._past, self._speed_sums, self._looks)
         yield self._travel.steps[self._slots.first :]
 
     def arrays_of(self, world: int) -> Iterator[NDArray[np.generic]]:
-        """`arrays` as they would be if there were no world but one."""
+        """Yield the part of `arrays` that belongs to one world."""
         for array in (self._past, self._speed_sums, self._looks):
             yield array[world : world + 1]
         first = self._slots.first_of(world)
@@ -177,7 +177,7 @@ class Rerouting:
         return int(rows["leg"][:num].sum() - legs)
 
     def _forget_seen(self, looks: NDArray[np.void], clock_s: float) -> None:
-        """Where a rule has begun within a second, vehicles on its edge ask once more."""
+        """Let vehicles ask again if a rule on their edge has begun within the last second."""
         rules = self._schedule.demand.rerouters.rules
         before_s = clock_s - self._ticks_per_s * self._dt
         begun = (rules["begin_s"] <= clock_s) & (before_s < rules["begin_s"])
@@ -185,7 +185,7 @@ class Rerouting:
             looks["seen"][np.isin(looks["seen"], rules["edge"][begun])] = -1
 
     def _closed(self, clock_s: float) -> NDArray[np.int64]:
-        """(num_edges,) bits of the classes that an edge is closed to now."""
+        """Return for each edge (num_edges,) the bits of the vehicle classes it is closed to."""
         closed = np.zeros(len(self._roads.edges), dtype=np.int64)
         closings = self._schedule.demand.rerouters.closings
         now = closings[(closings["begin_s"] <= clock_s) & (clock_s < closings["end_s"])]
@@ -195,7 +195,7 @@ class Rerouting:
     def _ask_rerouters(
         self, search: WaySearch, i: int, row: np.void, look: np.void, clock_s: float
     ) -> None:
-        """Follow the first rerouter on a vehicle's edge that has another way for it."""
+        """Follow the first rerouter on the vehicle's edge that has another way for it."""
         edge = self._roads.lanes[row["lane"]]["edge"]
         if look["seen"] == edge:
             return
@@ -210,14 +210,14 @@ class Rerouting:
         look["seen"] = edge
 
     def _is_meant(self, rule: np.void, row: np.void) -> bool:
-        """Whether a rule is about a vehicle's type, and the vehicle follows it."""
+        """Return whether a rule applies to the vehicle's type and the vehicle follows it."""
         types = self._schedule.demand.rerouters.types[rule["interval"]]
         if not types[row["vtype"] - self._first_type]:
             return False
         return self._drawn(rule, row, 0) < float(rule["chance"])
 
     def _drawn(self, rule: np.void, row: np.void, number: int) -> float:
-        """A number in [0, 1): the same however often a vehicle asks until it takes a way."""
+        """Return a number in [0, 1) that stays the same until the vehicle takes another way."""
         stream = STREAM_REROUTER + 2 * int(rule["interval"]) + number
         return uniform(row["rng_key"], row["id"], row["leg"], stream)
 
@@ -239,7 +239,7 @@ class Rerouting:
         answer = search.send(i, goal, knows, True)
         if answer is WaySearchResult.TAKEN:
             look["goal"] = goal
-            # No plan of detours leads there.
+            # The detour plans do not lead to the new goal.
             row["goal"] = -1
         return answer
 
@@ -262,6 +262,6 @@ class Rerouting:
 
 
 def _plain(records: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
-    """The fields of records, one after the other, without padding."""
+    """Yield the fields of records one by one, without padding."""
     for name in records.dtype.names or ():
         yield np.ascontiguousarray(records[name])

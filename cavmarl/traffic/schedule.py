@@ -1,4 +1,4 @@
-"""`Schedule`: a demand file made ready for the kernels: types, steps of all routes, departures."""
+"""`Schedule`: a demand file prepared for the kernels: types, steps of all routes, departures."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ MAX_STEPS = 50_000_000
 MAX_DETOUR_STEPS = 8_000_000
 DETOUR_CHANGE_WEIGHT = 100.0
 
-MAX_COUNTS = 4096  # episodes whose number of departures is known
+MAX_COUNTS = 4096  # episodes whose number of departures is cached
 
 
 class Schedule:
     """The departures of a demand file as records, and the steps of their routes.
 
-    Ways of trips are found once, when the world is made: the fastest ones at the speed limits, over
+    The ways of trips are found once, when the world is made: the fastest at the speed limits, over
     the edges that the trip names.
 
-    `demand`: of the files. `first_type`: VTYPE row of the file's first type in the world's table.
-    `first_step`: PLAN row of the first route's first step in the world's table.
+    `demand`: the demand of the files. `first_type`: VTYPE row of the file's first type in the
+    world's table. `first_step`: PLAN row of the first route's first step in the world's table.
 
-    Raises RouteError: a trip without a way; CapacityError: the routes have too many steps.
+    Raises RouteError: no way exists for a trip; CapacityError: the routes have too many steps.
     """
 
     def __init__(self, demand: DemandFile, first_type: int, first_step: int) -> None:
         self.demand = demand
-        # what has been drawn last, by (key, seconds): a state that is loaded is checked before
+        # departures per (key, horizon); checking and then loading a state asks for it twice
         self._counts: dict[tuple[int, float], int] = {}
         self._network: RoadNetwork = demand.network
         self._first_type = first_type
@@ -63,7 +63,8 @@ class Schedule:
             begin += len(steps)
             if begin > MAX_STEPS:
                 raise CapacityError(
-                    f"the routes of the demand have over {MAX_STEPS} steps: fewer or shorter ones"
+                    f"the routes of the demand have over {MAX_STEPS} steps; "
+                    "use fewer or shorter routes"
                 )
         self.first_detour = begin - first_step
         self.step_lanes = np.concatenate(lanes)  # LANE row of each step before the first detour
@@ -71,10 +72,10 @@ class Schedule:
         self.steps = np.concatenate(parts)
 
     def _detours(self, masks: NDArray[np.int64], ways: TripWays) -> NDArray[np.void]:
-        """Steps from everywhere to the last edges of the routes, with as few changes as can be.
+        """Return steps from every lane to the last edges of the routes, with few lane changes.
 
-        A vehicle that cannot make a lane change of its route goes on by them. Where they would take
-        more than `MAX_DETOUR_STEPS` there are none: such vehicles wait.
+        A vehicle that misses a lane change of its route continues on these steps. If they would
+        need more than `MAX_DETOUR_STEPS`, there are none, and such vehicles wait.
         """
         routes = self.demand.routes
         last = self.demand.route_edges[routes["first_edge"] + routes["num_edges"] - 1]
@@ -95,7 +96,7 @@ class Schedule:
         return plans.reshape(-1)
 
     def _driven(self) -> Iterable[tuple[int, int]]:
-        """Pairs of ROUTE row and class that some vehicle of the files may have."""
+        """Return pairs of ROUTE row and vehicle class that a vehicle of the files may have."""
         demand = self.demand
         choices = np.unique(demand.elements[["types", "routes"]])
         pairs = {
@@ -113,11 +114,11 @@ class Schedule:
         return self._longest
 
     def orders(self, key: int, horizon_s: float) -> NDArray[np.void]:
-        """ORDER (n,) of one episode, see `draw`."""
+        """Return ORDER (n,) of one episode, see `draw`."""
         return self.demand.draw(key, self.demand.begin_ms / 1000.0 + horizon_s)
 
     def last_edges(self, routes: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The EDGE rows (n,) that ROUTE rows (n,) end on."""
+        """Return the last EDGE row (n,) of each ROUTE row (n,)."""
         rows = self.demand.routes[routes]
         last: NDArray[np.int32] = self.demand.route_edges[
             rows["first_edge"] + rows["num_edges"] - 1
@@ -125,9 +126,9 @@ class Schedule:
         return last
 
     def way_on(self, route: int, vtype: int, edge: int) -> int:
-        """The way of a <route>'s vehicle on one of its edges, or -1.
+        """Return the way of a vehicle with this <route> from one of the route's edges, or -1.
 
-        `route`: ROUTE row, with all edges. `vtype`: VTYPE row of the file.
+        `route`: ROUTE row with all edges. `vtype`: VTYPE row of the file.
         """
         row = self.demand.routes[route]
         begin = self._way[route, self._class_of_type[vtype]]
@@ -145,7 +146,7 @@ class Schedule:
         return int(self._goal[route, self._class_of_type[vtype]])
 
     def _edges(self, route: int, mask: int, ways: TripWays) -> NDArray[np.int32]:
-        """The EDGE rows of a route, found where the file leaves them open."""
+        """Return the EDGE rows of a route; gaps between named edges are filled with a way."""
         row = self.demand.routes[route]
         named = self.demand.route_edges[row["first_edge"] : row["first_edge"] + row["num_edges"]]
         if row["exact"]:
@@ -155,18 +156,18 @@ class Schedule:
         except RouteError as error:
             raise RouteError(
                 f"{self._place(route)}: {error} of the map '{self._network.name}' for the class of "
-                "a trip between them: change the trip, or skip such (traffic.on_bad_route = skip)"
+                "a trip between them: change the trip, or set traffic.on_bad_route = skip"
             ) from None
 
     def _place(self, route: int) -> str:
-        """File and line of the first element that may have a route."""
+        """Return the file and line of the first element that may use a route."""
         demand = self.demand
         choices = range(len(demand.route_choices))
         having = [c for c in choices if route in demand.route_choices.options(c)]
         return demand.place(int(np.isin(demand.elements["routes"], having).argmax()))
 
     def _lanes(self, edges: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The LANE rows of the steps of a route."""
+        """Return the LANE rows of the steps of a route."""
         rows = self._network.edges[edges]
         ends = np.cumsum(rows["num_lanes"])
         firsts = np.repeat(rows["first_lane"] - (ends - rows["num_lanes"]), rows["num_lanes"])
@@ -179,14 +180,14 @@ class Schedule:
         return steps
 
     def count(self, key: int, horizon_s: float) -> int:
-        """How many departures `draw` has of an episode."""
+        """Return how many departures `draw` returns for an episode."""
         known = self._counts.get((key, horizon_s))
         return len(self.orders(key, horizon_s)) if known is None else known
 
     def draw(self, key: int, horizon_s: float, dt: float) -> NDArray[np.void]:
-        """The departures of one episode, DEPARTURE (n,) in order of `due`.
+        """Draw the departures of one episode: DEPARTURE (n,), sorted by `due`.
 
-        `horizon_s`: seconds an episode; later departures are not drawn.
+        `horizon_s`: length of an episode in s; later departures are left out.
         """
         demand = self.demand
         orders = self.orders(key, horizon_s)

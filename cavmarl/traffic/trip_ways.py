@@ -1,4 +1,4 @@
-"""`TripWays`: the ways of trips, which name only some of their edges."""
+"""`TripWays`: finds complete ways for trips, which name only some of their edges."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from cavmarl.roads.kernels.route_steps import trace_edges
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 
-MAX_EDGES = 100_000  # of one way
+MAX_EDGES = 100_000  # per way
 
 
 class TripWays:
-    """The fastest ways at the speed limits; each goal and class is planned for once.
+    """The fastest ways at the speed limits; each pair of goal and class is planned once.
 
-    Vehicles turn round where a road ends. Where nothing else leads to an edge, they do wherever the
-    map lets them, as SUMO's do.
+    Vehicles make U-turns at dead ends. If an edge cannot be reached otherwise, they make U-turns
+    wherever the map permits, as SUMO's vehicles do.
 
-    `turned`: (EDGE row of a goal, class) of which that is so.
+    `turned`: pairs (EDGE row of a goal, class) that need such U-turns.
     """
 
     def __init__(self, network: RoadNetwork) -> None:
@@ -34,10 +34,10 @@ class TripWays:
         self._plans: dict[tuple[int, int, bool], NDArray[np.void]] = {}
 
     def edges(self, named: NDArray[np.int32], mask: int) -> NDArray[np.int32]:
-        """The EDGE rows of a way over those that are named, for bits of a class.
+        """Return the EDGE rows of a way over the `named` edges for the classes in `mask`.
 
         Raises:
-            RouteError: two of them that no way joins: a clause that says which.
+            RouteError: no way joins two consecutive edges; the message names them.
         """
         found = [np.array([named[0]], dtype=np.int32)]
         for start, goal in pairwise(named.tolist()):
@@ -54,12 +54,12 @@ class TripWays:
     def plan(
         self, goal: int, mask: int, change_weight: float, turning: bool, out: NDArray[np.void]
     ) -> None:
-        """Fill PLAN (L,) of a goal; `turning`: whether vehicles turn round where they may."""
+        """Fill `out`, PLAN (L,), for a goal; `turning`: whether all permitted U-turns are used."""
         roads = self._turning if turning else self._network.arrays
         plan_goal(roads, goal, mask, change_weight, out)
 
     def _way(self, start: int, goal: int, mask: int, turning: bool) -> NDArray[np.int32] | None:
-        """The EDGE rows behind the first one; None: there is no way."""
+        """Return the EDGE rows after the first one; None: there is no way."""
         key = (goal, mask, turning)
         if key not in self._plans:
             self._plans[key] = np.zeros(len(self._network.lanes), dtype=PLAN)

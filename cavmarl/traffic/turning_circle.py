@@ -1,7 +1,7 @@
-"""Which turns of a map are too tight for a car's turning circle: trips keep away from these.
+"""Finds turns of a map that are too tight for a car's turning circle; trips avoid these turns.
 
-A car has no reverse gear here. Where a path turns back on itself within a few metres, as at dead
-ends and hairpins, it can only leave its road.
+Cars have no reverse gear here. Where a path turns back on itself within a few metres, as at dead
+ends and hairpins, a car would have to leave the road.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 
 CAR = 1 << VEHICLE_CLASSES.index("passenger")
-TURN_RAD = 0.9  # ways that turn less within `NEAR_M` are tight for no car
+TURN_RAD = 0.9  # rad; paths that turn less within `NEAR_M` suit every car
 NEAR_M = 12.0
 
 
 class TurningBody(NamedTuple):
-    """What a turn asks of a vehicle, named and measured as in `VTYPE`."""
+    """The dimensions of a vehicle that limit its turns, named and measured as in `VTYPE`."""
 
     length: float
     width: float
@@ -46,10 +46,10 @@ CAR_BODY = TurningBody(5.0, 2.0, 5.0, np.inf)
 def with_tight_turns(
     network: RoadNetwork, steering_rad: float, bodies: tuple[TurningBody, ...] = (CAR_BODY,)
 ) -> RoadArrays:
-    """The map with turns that one of some vehicles cannot take marked as U-turns; plans avoid them.
+    """Mark turns that one of the `bodies` cannot take as U-turns, which plans avoid.
 
-    `steering_rad`: the most that front wheels turn. A lane that turns too tightly itself makes all
-    links that lead there, and from there, such turns.
+    `steering_rad`: maximum angle of the front wheels. If a lane itself turns too tightly, all links
+    to and from it are marked.
     """
     trials = [_Trial(network, steering_rad, body) for body in bodies]
     for_cars = network.lanes["permissions"] & CAR != 0
@@ -65,7 +65,7 @@ def with_tight_turns(
 
 
 class _Trial:
-    """A vehicle that is driven over single turns."""
+    """A test drive of one kind of vehicle over single turns."""
 
     def __init__(self, network: RoadNetwork, steering_rad: float, body: TurningBody) -> None:
         self._body = body
@@ -104,8 +104,8 @@ class _Trial:
         ends = lanes[0], begin_m, lanes[-1], end_m
         stays = self._drives(*ends)
         if stays:
-            # So far it aimed as before the first link of the map. As it aims at this turn it may
-            # cut the corner, at whichever speed, until its centre is off the road.
+            # The drive so far aims as before the first link of the map. Aiming at this turn, the
+            # car may cut the corner at any speed until its centre is off the road.
             self._plan["link"][0, lanes[0]] = link
             stays = any(self._drives(*ends, speed, False) for speed in (TRIAL_MPS, FASTER_MPS))
             self._plan["link"][0, lanes[0]] = 0
@@ -143,7 +143,7 @@ class _Trial:
 
 
 def _most_turn(s: NDArray[np.float64], heading: NDArray[np.float64]) -> float:
-    """The most that a polyline turns within `NEAR_M`, in rad, to one side or to and fro."""
+    """Return the largest sum of absolute turns of a polyline within `NEAR_M`, in rad."""
     turned = np.concatenate(
         [[0.0], np.cumsum(np.abs(np.remainder(np.diff(heading) + np.pi, 2.0 * np.pi) - np.pi))]
     )

@@ -1,6 +1,6 @@
-"""`WaySearch`: ways through one world in one second, by what is known of its traffic then.
+"""`WaySearch`: searches for ways in one world at one second, using the traffic known then.
 
-Ways that are found lie in slots behind the table of all ways.
+Found ways are stored in slots behind the table of all ways.
 """
 
 from __future__ import annotations
@@ -29,53 +29,53 @@ from cavmarl.traffic.kernels.way_requests import (
 )
 from cavmarl.traffic.schedule import MAX_STEPS, Schedule
 
-LEAST_STEPS = 128  # of a slot, if the map has so many lanes
-DETOUR_RATIO = 3  # a way may take this many times the steps of the longest known one
+LEAST_STEPS = 128  # minimum size of a slot, if the map has as many lanes
+DETOUR_RATIO = 3  # a found way may have this many times the steps of the longest known way
 
 
 @dataclass(frozen=True)
 class WaySlots:
-    """Where the slots lie; they are never more, whatever an episode brings."""
+    """Layout of the slots; their number is fixed for all episodes."""
 
     first: int  # PLAN row of the first world's first slot
-    number: int  # slots of one world
-    steps: int  # of one slot
-    num_worlds: int  # how many worlds have slots
-    # of the map. So many unused steps before the first slot keep the ways in slots above all
-    # others: a way is a step's row minus that of a lane.
+    number: int  # slots per world
+    steps: int  # per slot
+    num_worlds: int  # worlds that have slots
+    # lanes of the map. As many unused steps precede the first slot, so that the ways in slots
+    # are greater than all others: a way is the row of a step minus the row of a lane.
     num_lanes: int
 
     @property
     def room(self) -> int:
-        """PLAN rows that have to be put behind the others."""
+        """PLAN rows to append to the table."""
         return self.num_lanes + self.num_worlds * self.of_world
 
     @property
     def of_world(self) -> int:
-        """Steps of one world's slots."""
+        """Steps in all slots of one world."""
         return self.number * self.steps
 
     def first_of(self, world: int) -> int:
-        """PLAN row of a world's first slot."""
+        """Return the PLAN row of a world's first slot."""
         return self.first + world * self.of_world
 
     def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """VEHICLE["way"] (n,) of a world as it would be in the first one: where slots play no part.
+        """Convert VEHICLE["way"] (n,) of a world to the values they would have in world 0.
 
-        `world`: in which they are.
+        `world`: the world of `ways`. Ways outside the slots stay as they are.
         """
         own = ways >= self.first - self.num_lanes
         return ways - own * (world * self.of_world)
 
 
 def seekers(schedule: Schedule, capacity: int, horizon_s: float) -> int:
-    """How many of the `capacity` vehicles of one world may look for a way at a time.
+    """Return the maximum number of vehicles of one world that search for ways at the same time.
 
-    `horizon_s`: seconds an episode.
+    `capacity`: vehicles of one world. `horizon_s`: length of an episode in s.
     """
     if len(schedule.demand.rerouters.rules):
         return capacity
-    # With a device only: how many have it is drawn.
+    # Without rerouters, only equipped vehicles search; their number is random.
     equipped = int(schedule.orders(0, horizon_s)["reroute"].sum())
     return min(capacity, equipped + 6 * math.isqrt(equipped) + 16)
 
@@ -83,48 +83,48 @@ def seekers(schedule: Schedule, capacity: int, horizon_s: float) -> int:
 def way_slots(
     lanes: NDArray[np.void],  # LANE, of the map
     longest: int,  # steps of the longest known way
-    first_step: int,  # how many PLAN rows come before
+    first_step: int,  # number of PLAN rows before the slots
     num_worlds: int,
-    number: int,  # slots of one world
+    number: int,  # slots per world
 ) -> WaySlots:
-    """Room for the ways of so many vehicles at a time.
+    """Return slots for the ways of `number` vehicles per world.
 
-    Raises CapacityError: they would take more than `MAX_STEPS`.
+    Raises CapacityError: the slots would take more than `MAX_STEPS`.
     """
     num_lanes = len(lanes)
     outside = int((~lanes["internal"]).sum())
     steps = min(outside, max(LEAST_STEPS, DETOUR_RATIO * longest))
     if num_worlds * number * steps > MAX_STEPS:
         raise CapacityError(
-            f"ways of {number} vehicles that look for their own, {steps} steps each, in "
-            f"{num_worlds} worlds are over {MAX_STEPS} steps: fewer worlds, or fewer vehicles "
-            "with a rerouting device"
+            f"{num_worlds} worlds, {number} vehicles each that may search for a way, {steps} steps "
+            f"per way: more than {MAX_STEPS} steps; use fewer worlds, or fewer vehicles with a "
+            "rerouting device"
         )
     return WaySlots(first_step + num_lanes, number, steps, num_worlds, num_lanes)
 
 
 class WaySearchResult(Enum):
-    """What came of looking for a way."""
+    """The result of a search for a way."""
 
     KEPT = 0  # the present way is as fast
     TAKEN = 1
-    LATER = 2  # the vehicle cannot turn off any more here: it asks again in a second
+    LATER = 2  # the vehicle can no longer turn off here; it asks again in a second
     NO_WAY = 3
 
 
 class Traffic(NamedTuple):
-    """What is known of one world's traffic."""
+    """The known traffic of one world."""
 
     speed_sums: NDArray[np.int64]  # (num_edges,) mm/s, see `sample_speeds`
-    samples: int  # how many a sum has
-    closed: NDArray[np.int64]  # (num_edges,) bits of the classes that an edge is closed to
+    samples: int  # number of samples in each sum
+    closed: NDArray[np.int64]  # (num_edges,) bits of the classes that may not use an edge
 
 
 class WaySearch:
-    """Ways of one world's vehicles. Plans are made where they are asked for, each once.
+    """Searches for ways of one world's vehicles. Each plan is made at its first use.
 
-    `travel`: types and ways; new ones are written into the slots. `slots`: where those are. `rows`:
-    VEHICLE, the world's.
+    `travel`: types and ways; found ways are written into the slots. `slots`: their layout. `rows`:
+    VEHICLE of the world.
     """
 
     def __init__(
@@ -152,18 +152,18 @@ class WaySearch:
         self._cost = np.zeros(slots.steps)
 
     def meets_closing(self, i: int) -> bool:
-        """Whether the way of row i leads over an edge that is closed to it."""
+        """Return whether the way of row i leads over an edge that is closed to the vehicle."""
         row = self._rows[i]
         roads = self._roads_now(self._permission(i), False)
         time: float = time_left(roads, self._travel.steps, row["way"], row["lane"])
         return CLOSED_S <= time < np.inf
 
     def send(self, i: int, goal: int, knows: bool, anyhow: bool) -> WaySearchResult:
-        """Put row i on the fastest way to a goal, if that is faster than its present way.
+        """Put row i on the fastest way to a goal if it is faster than the present way.
 
-        `i`: row of a vehicle outside junctions. `knows`: whether it knows the speeds; otherwise the
-        limits count. Closings all know. `anyhow`: whether it leaves its present way even for a
-        slower one.
+        `i`: row of a vehicle outside junctions. `knows`: whether it knows the measured speeds;
+        otherwise the limits are used. Closings are known to all. `anyhow`: whether to leave the
+        present way even for a slower one.
         """
         row = self._rows[i]
         permission = self._permission(i)
@@ -202,7 +202,7 @@ class WaySearch:
         return int(self._travel.types[self._rows[i]["vtype"]]["permissions"])
 
     def _roads_now(self, permission: int, knows: bool) -> RoadArrays:
-        """The roads with the speeds that count for a class as speed limits."""
+        """Return the roads with the speeds that a class can expect as their speed limits."""
         key = permission, knows
         if key not in self._speeds:
             lanes = self._roads.lanes.copy()
@@ -211,7 +211,7 @@ class WaySearch:
                 self._roads, self._traffic.speed_sums, samples, self._traffic.closed, permission,
                 lanes,
             )  # fmt: skip
-            # As immutable as the roads themselves: kernels are compiled for such.
+            # Immutable like the roads themselves, because kernels are compiled for immutable lanes.
             lanes.setflags(write=False)
             self._speeds[key] = self._roads._replace(lanes=lanes)
         return self._speeds[key]

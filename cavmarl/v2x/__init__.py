@@ -1,1 +1,1 @@
-"""Messages between vehicles and roadside units: what they say, how they travel, what is kept."""
+"""Messages between vehicles and roadside units: their schema, the channel, and inboxes."""

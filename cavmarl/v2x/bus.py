@@ -1,8 +1,8 @@
-"""`Bus`: the messages of W worlds, one bus for all zones of each.
+"""`Bus`: the messages of W worlds, one bus for all zones of each world.
 
-It reads the rows of all shards in the order of ids, and all that it keeps is by world: how far
-messages reach has nothing to do with how far a zone sees, so results do not depend on how a world
-is divided.
+The bus reads the rows of all shards in order of ids, and its state is per world. The range of
+messages is independent of a zone's sensing range, so results do not depend on the division of a
+world.
 """
 
 from __future__ import annotations
@@ -60,17 +60,17 @@ from cavmarl.v2x.v2x_messages import (
 
 Zeros = Callable[..., NDArray[Any]]
 Watch = Callable[[int, int, NDArray[np.void], NDArray[np.void]], None]
-"""Told a world, a tick, and what is sent in it: PACKET (n,) and REPORT (m,), views."""
+"""Called with a world, a tick, and views of what is sent in it: PACKET (n,) and REPORT (m,)."""
 
-CELL_M = 100.0  # of the packets of a tick
-BODY_CELL_M = 25.0  # of the vehicles that others see
+CELL_M = 100.0  # cell size of the grid of packets of a tick
+BODY_CELL_M = 25.0  # cell size of the grid of perceived vehicles
 
 
 class Bus:
-    """Sends, carries and keeps the messages of W worlds.
+    """Sends, transmits and stores the messages of W worlds.
 
-    `config`: the environment; `v2x.enabled`. `zoned`: the vehicles of all zones. `common`: clocks,
-    keys and signals. `zeros`: makes the arrays that outlive a tick.
+    `config`: the environment; `v2x.enabled` is set. `zoned`: vehicles of all zones. `common`:
+    clocks, keys and signals. `zeros`: allocates the arrays that outlive a tick.
 
     Attributes:
         units: UNIT (num_units,), the roadside units.
@@ -110,16 +110,16 @@ class Bus:
         self._empty(np.ones(num_worlds, dtype=np.bool_))
 
     def connect(self, network: NetworkSimulator) -> None:
-        """From now on let a network simulator decide receptions.
+        """Let a network simulator decide receptions from now on.
 
-        Raises ConfigError: the channel is one of our own.
+        Raises ConfigError: `v2x.channel.external` is not set.
         """
         check_external(self._config)
         self._network = network
 
     @contextmanager
     def muted(self) -> Iterator[None]:
-        """The time in which no network simulator is asked, and no station receives anything."""
+        """Suspend the network simulator; in this context, no station receives anything."""
         before, self._network = self._network, _Silence()
         try:
             yield
@@ -127,11 +127,11 @@ class Bus:
             self._network = before
 
     def watch(self, watch: Watch) -> None:
-        """Tell one more, from now on, what is sent in each tick; again in a tick begun again."""
+        """Call `watch` with the messages of each tick from now on; repeated ticks call it again."""
         self._watchers = (*self._watchers, watch)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Forget all that was said in the chosen worlds (W,)."""
+        """Discard all messages of the chosen worlds (W,)."""
         for array in self.mail:
             array[chosen] = np.zeros((), array.dtype)
         self.mail.owner[chosen] = -1
@@ -146,10 +146,11 @@ class Bus:
         """Send what is due in the present tick, and receive what arrives in it.
 
         Args:
-            side: on which side of the zones' rows the committed ones are.
+            side: side of the zones' rows that holds the committed ones.
 
         Raises:
-            ConfigError: no network simulator is connected where one is due, or it answers nonsense.
+            ConfigError: the channel is external, and no network simulator is connected or its
+                answer is invalid.
         """
         num_worlds = len(self._common.ticks)
         if not self._config.channel.external:
@@ -192,7 +193,7 @@ class Bus:
         self._hand_out(receptions, tick, latency, mail, world, self._scratch)
 
     def arrays(self) -> Iterator[NDArray[Any]]:
-        """All that outlives a tick, (W, …)."""
+        """Yield all arrays that outlive a tick, (W, …)."""
         mail = self.mail
         yield from (mail.objects, mail.events, mail.signals, mail.owner, mail.declared)
         yield from (mail.counts, mail.delays, mail.bands, mail.busy)
@@ -202,7 +203,7 @@ class Bus:
             yield from (mail.last_cams, mail.num_last)
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """What is wrong with saved arrays of the shapes of `arrays`; empty: nothing."""
+        """Return the error in saved arrays of the shapes of `arrays`, or an empty string."""
         found = {id(own): array for own, array in zip(self.arrays(), saved, strict=True)}
         mail, packets = self.mail, found.get(id(self.mail.packets))
         for numbers, most in (
@@ -212,47 +213,47 @@ class Bus:
         ):
             counts = found.get(id(numbers))
             if counts is not None and ((counts < 0) | (counts > most)).any():
-                return "there are more messages than there is room for"
+                return "there are more messages than v2x.capacity allows"
         if packets is None:
             return ""
         sent = np.arange(packets.shape[2]) < found[id(mail.num_packets)][:, :, np.newaxis]
         first, count = packets["first"][sent], packets["count"][sent]
         outside = (first < 0) | (count < 0) | (first + count > mail.reports.shape[2])
         outside |= (packets["kind"][sent] < 0) | (packets["kind"][sent] >= NUM_KINDS)
-        return "a message has reports that are not there" if outside.any() else ""
+        return "a message refers to missing reports" if outside.any() else ""
 
     def declare(self, causes: NDArray[np.int32]) -> None:
-        """Let agents tell of events in the next tick.
+        """Let agents report events in the next tick.
 
         Args:
-            causes: (W, A) ETSI's cause codes; 0: nothing to tell.
+            causes: (W, A) ETSI cause codes; 0: no event.
         """
         declared = self.mail.declared[:, : self._num_agents]
         np.copyto(declared, causes, where=causes != 0)
 
     def receiver_of_unit(self, unit: int) -> int:
-        """The row of `mail.objects[world]` and the like that are a roadside unit's.
+        """Return a roadside unit's row in `mail.objects[world]` and in the other inboxes.
 
         Raises ConfigError: there is no such unit.
         """
         if not 0 <= unit < len(self.units):
-            raise ConfigError(f"roadside unit {unit}: there are {len(self.units)}")
+            raise ConfigError(f"roadside unit {unit}: there are only {len(self.units)}")
         return self._num_agents + unit
 
     def declare_of_unit(self, world: int, unit: int, cause: str) -> None:
-        """Let a roadside unit tell of an event in the next tick.
+        """Let a roadside unit report an event in the next tick.
 
         Raises ConfigError: there is no such unit, or no such cause.
         """
         self.mail.declared[world, self.receiver_of_unit(unit)] = cause_code(cause)
 
     def statistics(self, world: int = 0) -> V2xStatistics:
-        """What has become of the messages of a world since its reset."""
+        """Return the message statistics of a world since its reset."""
         return statistics_of(self.mail, world, self._dt_s)
 
 
 class _Silence:
-    """A network simulator by which nothing is received."""
+    """A network simulator that delivers nothing."""
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         return np.zeros(0, RECEPTION)
@@ -288,7 +289,7 @@ def _make_mail(
 ) -> Mail:
     stations = capacity + num_units
     most = v2x.capacity or 3 * stations
-    # A CAM, a DENM or SPAT is one report, a CPM as many as it tells of.
+    # A CAM, DENM or SPAT has one report; a CPM has one per perceived vehicle.
     sees = v2x.perception.rate_hz > 0.0 or v2x.roadside.perception_hz > 0.0
     most_reports = most + (min(most, stations) * (v2x.perception.objects - 1) if sees else 0)
     slots = v2x.channel.latency_ticks + 1
@@ -361,25 +362,25 @@ def _make_scratch(
 class V2xStatistics:
     """Counts and ratios of one world; receivers are the agents and the roadside units."""
 
-    sent: tuple[int, ...]  # packets of each kind: CAM, DENM, CPM, SPAT
-    overflow: int  # packets for which there was no room (`v2x.capacity`)
-    no_access: int  # packets that never found the air free
-    reachable: int  # pairs of a packet and a receiver within reach of it
-    received: int  # those of them that received it
-    delays: NDArray[np.int64]  # (65,) receptions by ticks of delay
-    mean_latency_s: float  # of the receptions
-    # (40, 2) reachable and received, in bands of `BAND_M`; of channels that lose packets
+    sent: tuple[int, ...]  # number of packets by kind: CAM, DENM, CPM, SPAT
+    overflow: int  # packets beyond `v2x.capacity`
+    no_access: int  # packets that never got access to the channel
+    reachable: int  # pairs of a packet and a receiver within its reach
+    received: int  # pairs in which the packet was received
+    delays: NDArray[np.int64]  # (65,) number of receptions by delay in ticks
+    mean_latency_s: float  # mean of the receptions
+    # (40, 2) reachable and received, in bands of `BAND_M`; of lossy channels only
     bands: NDArray[np.int64]
     busy_mean: float  # channel busy ratio, mean over receivers and ticks
-    busy_max: float  # the largest
+    busy_max: float  # largest channel busy ratio
 
     @property
     def reception_ratio(self) -> float:
-        """Packet reception ratio, 1 where nothing could be received."""
+        """Packet reception ratio; 1 if nothing could be received."""
         return self.received / self.reachable if self.reachable else 1.0
 
     def ratio_by_distance(self) -> dict[float, float]:
-        """Packet reception ratio by the middle of each band of distance, m."""
+        """Return the packet reception ratio by the centre of each distance band, m."""
         return {
             (band + 0.5) * BAND_M: received / reachable
             for band, (reachable, received) in enumerate(self.bands.tolist())
@@ -387,7 +388,7 @@ class V2xStatistics:
         }
 
     def to_dict(self) -> dict[str, float]:
-        """The numbers of a report, named as in `traffic_stats`."""
+        """Return the numbers for a report, named as in `traffic_stats`."""
         return {
             "v2x_sent": float(sum(self.sent)),
             "v2x_received": float(self.received),

@@ -1,4 +1,4 @@
-"""The air, made of the configuration: tables of the path-loss model and what packets take."""
+"""Channel tables computed from the configuration: path loss, and airtime of packets."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from cavmarl.v2x.kernels.v2x_channel import Channel
 
 CARRIER_HZ = 5.9e9
 LIGHT_MPS = 299_792_458.0
-PREAMBLE_S = 40e-6  # of IEEE 802.11p in a channel of 10 MHz
-# The distance where fewer packets than this are received is the reach.
+PREAMBLE_S = 40e-6  # IEEE 802.11p, 10 MHz channel
+# The reach is the distance at which the probability of reception falls below this.
 LEAST_CHANCE = 1e-3
 MAX_REACH_M = 20_000
 _ROOT_2 = 1.4142135623730951
 _LN_10 = 2.302585092994046
-BUSY_LEVELS = 65  # steps in which chances of reception depend on how busy the air is
+BUSY_LEVELS = 65  # number of levels of channel load in the tables of reception probabilities
 
 
 def reference_loss_db() -> float:
-    """Free-space loss at 1 m (Friis), 47.9 dB at 5.9 GHz."""
+    """Return the free-space loss at 1 m (Friis), 47.9 dB at 5.9 GHz."""
     return 20.0 * log10(4.0 * math.pi * CARRIER_HZ / LIGHT_MPS)
 
 
 def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: float = 0.0) -> float:
-    """Chance that the received power is high enough.
+    """Return the probability that the received power is high enough.
 
-    The log-distance model with log-normal shadowing (Rappaport: "Wireless communications", 4.9;
-    fitted to 5.9 GHz between cars by Cheng et al., IEEE JSAC 25 (8), 2007): the power is normally
-    distributed, in dB, around P = tx - loss(1 m) - 10 n log10(d), so that the chance is
-    Φ((P - sensitivity) / σ).
+    The model is log-distance path loss with log-normal shadowing (Rappaport: "Wireless
+    communications", 4.9; fitted to 5.9 GHz between cars by Cheng et al., IEEE JSAC 25 (8), 2007).
+    The power in dB is normally distributed around P = tx - loss(1 m) - 10 n log10(d), so the
+    probability is Φ((P - sensitivity) / σ).
 
-    `config`: of which `path_loss_exponent` is not 0. `distance_m`: between the antennas; below 1 m
-    it counts as 1 m. `extra_db`: lost besides, in a building.
+    `config`: its `path_loss_exponent` is not 0. `distance_m`: between the antennas, at least 1 m is
+    used. `extra_db`: additional loss, as by a building.
     """
     lost_db = 10.0 * config.path_loss_exponent * log10(max(distance_m, 1.0))
     power_dbm = config.tx_power_dbm - reference_loss_db() - lost_db - extra_db
@@ -47,7 +47,7 @@ def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: floa
 
 
 def median_range_m(config: ChannelConfig) -> float:
-    """Distance at which half of the packets are received; inf without path loss."""
+    """Return the distance at which half of the packets are received; inf without path loss."""
     if config.path_loss_exponent == 0.0:
         return math.inf
     margin_db = config.tx_power_dbm - reference_loss_db() - config.sensitivity_dbm
@@ -55,16 +55,17 @@ def median_range_m(config: ChannelConfig) -> float:
 
 
 def airtime_s(config: ChannelConfig) -> float:
-    """For how long a packet takes the air; 0: it does not matter."""
+    """Return the airtime of a packet; 0 if airtime is not modelled."""
     if config.data_rate_mbps == 0.0:
         return 0.0
     return PREAMBLE_S + 8.0 * config.packet_bytes / (1e6 * config.data_rate_mbps)
 
 
 def hidden_share(distance_m: float, sensing_m: float) -> float:
-    """Share of the stations a receiver hears that the sender does not: part of a circle.
+    """Return the share of the stations heard by a receiver that the sender does not hear.
 
-    Both hear what is within `sensing_m` of themselves; traffic is taken to be as dense everywhere.
+    Both hear stations within `sensing_m`; the density of stations is assumed to be uniform, so the
+    share is that of a part of a circle.
     """
     half = 0.5 * distance_m / sensing_m
     if half >= 1.0:
@@ -73,22 +74,22 @@ def hidden_share(distance_m: float, sensing_m: float) -> float:
 
 
 def chances_among_others(busy: float, hidden: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the chances (n,) that no hidden station disturbs a packet.
+    """Return the probabilities (n,) that no hidden station disturbs a packet.
 
-    The sender does not wait for hidden stations. They send at random, and a packet is lost if one
-    of them begins within two packet times: exp(-2 G), where G is their share of the air (Abramson:
-    "The ALOHA system", 1970; Tobagi, Kleinrock: "Packet switching in radio channels: part II, the
-    hidden terminal problem", 1975).
+    The sender does not wait for hidden stations. These send at random, and a packet is lost if one
+    of them begins within two packet times: exp(-2 G), where G is their channel load (Abramson: "The
+    ALOHA system", 1970; Tobagi, Kleinrock: "Packet switching in radio channels: part II, the hidden
+    terminal problem", 1975).
 
     Args:
-        busy: share of the time in which the receiver hears a station.
-        hidden: (n,) shares of the stations that the sender does not hear.
+        busy: share of time in which the receiver hears a station.
+        hidden: (n,) shares of stations that the sender does not hear.
     """
     return exp_all(-2.0 * busy * hidden)
 
 
 def _distances_m(config: ChannelConfig, sensing_m: float) -> int:
-    """How many whole metres a table has."""
+    """Return the length of a table, in whole metres."""
     end_m = config.range_m or math.inf
     if config.path_loss_exponent > 0.0:
         metre, last = 1, min(end_m, MAX_REACH_M)
@@ -101,7 +102,7 @@ def _distances_m(config: ChannelConfig, sensing_m: float) -> int:
 
 
 def _table(config: ChannelConfig, sensing_m: float, extra_db: float) -> NDArray[np.float64]:
-    """Chances of reception (B, K), see `Channel`."""
+    """Return probabilities of reception (B, K), see `Channel`."""
     metres = range(_distances_m(config, sensing_m))
     levels = BUSY_LEVELS if config.data_rate_mbps > 0.0 else 1
     chances = np.full((levels, len(metres)), 1.0 - config.loss)
@@ -116,9 +117,9 @@ def _table(config: ChannelConfig, sensing_m: float, extra_db: float) -> NDArray[
 
 
 def make_channel(config: ChannelConfig, tick_s: float, walls: Walls) -> Channel:
-    """What kernels take of a channel.
+    """Build the channel that kernels use.
 
-    The chance of reception is (1 - loss) · `chance_of_reception` · `chances_among_others`.
+    The probability of reception is (1 - loss) · `chance_of_reception` · `chances_among_others`.
     """
     reach_m = config.range_m or math.inf
     sensing_m = min(median_range_m(config), reach_m)

@@ -1,26 +1,25 @@
-"""The schema of messages: fixed records, little-endian, with a version.
+"""The message schema: fixed little-endian records with a version.
 
-They are like those of the standards, and simpler: metres and radians in the world's frame instead
-of degrees and tenths, ticks instead of milliseconds, no encoding rules, no certificates.
+The records resemble those of the standards but are simpler: metres and radians in the world's frame
+instead of degrees, ticks instead of milliseconds, no encoding rules, no certificates.
 
-| message | after | one of them is |
+| message | modelled after | contents |
 |---|---|---|
-| `CAM` | ETSI EN 302 637-2, cooperative awareness | a vehicle about itself |
+| `CAM` | ETSI EN 302 637-2, cooperative awareness | state of the sending vehicle |
 | `DENM` | ETSI EN 302 637-3, decentralized notification | an event |
 | `CPM_OBJECT` | ETSI TS 103 324, collective perception | a vehicle that the sender sees |
-| `SPAT` | SAE J2735, signal phase and timing | what a signal shows |
+| `SPAT` | SAE J2735, signal phase and timing | the present phase of a signal |
 | `MAP` | SAE J2735, map data | one approach to a signal |
 
-All positions are those of a body's centre, x east, y north, z up; headings are counter-clockwise
-from east. Ticks are those of the world; a station is a vehicle by its id, or roadside unit k by
-`FIRST_ROADSIDE_ID` + k.
+All positions are centres of bodies, x east, y north, z up; headings are counter-clockwise from
+east. Ticks are those of the world. A station is a vehicle, given by its id, or roadside unit k,
+given by `FIRST_ROADSIDE_ID` + k.
 
 Roadside units stand at signals, and send maps of them.
 
-A simulator of the network (ns-3, OMNeT++ or any other) that runs beside the world implements
-`NetworkSimulator.exchange`. It is called once a tick and world, with what is sent in that tick, and
-returns when it has simulated up to that tick: the call is the barrier of a step. Neither side runs
-ahead.
+An external network simulator (ns-3, OMNeT++ or any other) implements `NetworkSimulator.exchange`.
+This method is called once per tick and world with the packets sent in that tick, and returns when
+it has simulated up to that tick. The call is a barrier: neither side runs ahead.
 """
 
 from __future__ import annotations
@@ -54,10 +53,10 @@ HEADER = np.dtype(
     [
         ("version", "<u2"),  # SCHEMA_VERSION
         ("kind", "<u2"),  # 0 CAM, 1 DENM, 2 CPM, 3 SPAT
-        ("count", "<u4"),  # records that follow: 1, of a CPM as many as it tells of
+        ("count", "<u4"),  # number of records that follow: 1, or the objects of a CPM
         ("sender", "<i8"),  # station
-        ("tick", "<i8"),  # when it was sent
-        ("x", "<f8"),  # m, where the sender was
+        ("tick", "<i8"),  # tick of sending
+        ("x", "<f8"),  # m, position of the sender
         ("y", "<f8"),  # m
     ]
 )
@@ -67,7 +66,7 @@ _KINEMATICS = [
     ("y", "<f8"),  # m
     ("z", "<f8"),  # m
     ("heading", "<f8"),  # rad
-    ("speed", "<f8"),  # m/s, negative backwards
+    ("speed", "<f8"),  # m/s, negative if reversing
     ("accel", "<f8"),  # m/s²
     ("yaw_rate", "<f8"),  # rad/s
     ("length", "<f8"),  # m
@@ -78,7 +77,7 @@ CAM = np.dtype(
     [
         ("sender", "<i8"),
         ("tick", "<i8"),
-        ("vclass", "<i4"),  # position in roads.network.VEHICLE_CLASSES
+        ("vclass", "<i4"),  # index in roads.network.VEHICLE_CLASSES
         *_KINEMATICS,
     ]
 )
@@ -87,7 +86,7 @@ CPM_OBJECT = np.dtype(
     [
         ("sender", "<i8"),
         ("tick", "<i8"),
-        ("object", "<i8"),  # the vehicle that is seen
+        ("object", "<i8"),  # the perceived vehicle
         ("vclass", "<i4"),
         *_KINEMATICS,
     ]
@@ -96,13 +95,13 @@ CPM_OBJECT = np.dtype(
 DENM = np.dtype(
     [
         ("sender", "<i8"),
-        ("tick", "<i8"),  # when it was so
-        ("expires", "<i8"),  # the last tick in which it is to be believed
-        ("cause", "<i4"),  # ETSI's cause code: 2, 10, 94, 99
-        ("x", "<f8"),  # m, of the event
+        ("tick", "<i8"),  # tick of the event
+        ("expires", "<i8"),  # last tick in which the event is valid
+        ("cause", "<i4"),  # ETSI cause code: 2, 10, 94, 99
+        ("x", "<f8"),  # m, position of the event
         ("y", "<f8"),
         ("z", "<f8"),
-        ("heading", "<f8"),  # rad, of the traffic that it concerns
+        ("heading", "<f8"),  # rad, of the affected traffic
         ("speed", "<f8"),  # m/s, of the vehicle
     ]
 )
@@ -112,8 +111,8 @@ SPAT = np.dtype(
         ("sender", "<i8"),
         ("tick", "<i8"),
         ("signal", "<i4"),  # SIGNAL row
-        ("phase", "<i4"),  # PHASE row that is on: the letters of all of its links
-        ("left_s", "<f8"),  # s until it ends, at the soonest
+        ("phase", "<i4"),  # present PHASE row, which has the letters of all links
+        ("left_s", "<f8"),  # earliest remaining time of the phase, s
     ]
 )
 
@@ -122,10 +121,10 @@ MAP = np.dtype(
         ("sender", "<i8"),
         ("signal", "<i4"),  # SIGNAL row
         ("link", "<i4"),  # LINK row: one movement
-        ("letter", "<i4"),  # which letter of the signal's phases is its
-        ("x", "<f8"),  # m, of its stop line
+        ("letter", "<i4"),  # index of the link's letter in the signal's phases
+        ("x", "<f8"),  # m, position of its stop line
         ("y", "<f8"),
-        ("heading", "<f8"),  # rad, in which one drives there
+        ("heading", "<f8"),  # rad, direction of travel
         ("speed_limit", "<f8"),  # m/s
     ]
 )
@@ -137,7 +136,7 @@ KINDS: dict[int, np.dtype[Any]] = {
     KIND_SPAT: SPAT,
 }
 
-# What an event can be, with ETSI's cause codes.
+# Causes of events, with ETSI's cause codes.
 CAUSES = {
     "collision": CAUSE_COLLISION,
     "obstacle": CAUSE_OBSTACLE,
@@ -145,7 +144,7 @@ CAUSES = {
     "hard_braking": CAUSE_HARD_BRAKING,
 }
 
-# Where a record's field stands in the bus's own REPORT, if it has another name there.
+# Fields with another name in the bus's own REPORT.
 _OWN_NAMES = {
     "vclass": "code",
     "cause": "code",
@@ -156,19 +155,19 @@ _OWN_NAMES = {
 
 
 def cause_code(cause: str) -> int:
-    """ETSI's code of a cause.
+    """Return ETSI's code of a cause.
 
-    Raises ConfigError: no cause of that name.
+    Raises ConfigError: no cause has that name.
     """
     if cause not in CAUSES:
-        raise ConfigError(f"cause = {cause!r}: there are {', '.join(CAUSES)}")
+        raise ConfigError(f"cause = {cause!r}: must be one of {', '.join(CAUSES)}")
     return CAUSES[cause]
 
 
 def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:
-    """Reports of the bus as records of the schema.
+    """Convert reports of the bus to records of the schema.
 
-    `reports`: REPORT (n,) of that kind; places where none is (sender -1) are left out.
+    `reports`: REPORT (n,) of that kind; empty places (sender -1) are left out.
 
     Returns CAM, DENM, CPM_OBJECT or SPAT (n,).
     """
@@ -180,7 +179,7 @@ def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def encode(packet: np.void, reports: NDArray[np.void]) -> bytes:
-    """A packet as it goes over a wire: the header, then its records.
+    """Serialize a packet: the header, then its records.
 
     `reports`: REPORT (Q,) of its tick.
     """
@@ -193,41 +192,41 @@ def encode(packet: np.void, reports: NDArray[np.void]) -> bytes:
 
 
 def decode(data: bytes) -> tuple[np.void, NDArray[np.void]]:
-    """Header and records of a packet.
+    """Parse the header and the records of a packet.
 
-    Raises MessageError: of another version, of an unknown kind, or of the wrong length.
+    Raises MessageError: another version, an unknown kind, or a wrong length.
     """
     if len(data) < HEADER.itemsize:
-        raise MessageError(f"{len(data)} bytes are no message: a header has {HEADER.itemsize}")
+        raise MessageError(f"{len(data)} bytes are no message: a header needs {HEADER.itemsize}")
     header = np.frombuffer(data, HEADER, 1)[0]
     if header["version"] != SCHEMA_VERSION:
         raise MessageError(
-            f"message of version {header['version']}: version {SCHEMA_VERSION} is read here"
+            f"message of version {header['version']}: only version {SCHEMA_VERSION} can be read"
         )
     kind, count = int(header["kind"]), int(header["count"])
     if kind not in KINDS:
-        raise MessageError(f"message of kind {kind}: there are {', '.join(map(str, KINDS))}")
+        raise MessageError(f"message of kind {kind}: must be one of {', '.join(map(str, KINDS))}")
     size = HEADER.itemsize + count * KINDS[kind].itemsize
     if len(data) != size:
-        raise MessageError(f"message of {len(data)} bytes: with {count} records it has {size}")
+        raise MessageError(f"message of {len(data)} bytes: {count} records need {size}")
     return header, np.frombuffer(data, KINDS[kind], count, HEADER.itemsize)
 
 
-# One receiver receives one packet in the tick of the call.
+# The reception of one packet by one receiver, in the tick of the call.
 RECEPTION = record(
-    ("tick", np.int64),  # in which the packet was sent
-    ("packet", np.int64),  # its number among the packets of that tick
+    ("tick", np.int64),  # tick of sending
+    ("packet", np.int64),  # index among the packets of that tick
     ("receiver", np.int64),  # row of `Exchange.receivers`
 )
 
 
 class Exchange(NamedTuple):
-    """What a network simulator is told of one tick of one world; views, not to be kept."""
+    """One tick of one world for a network simulator; the arrays are views, not to be kept."""
 
     world: int
-    tick: int  # of that world; it begins at 1 after a reset
-    packets: NDArray[np.void]  # PACKET (n,) that are sent now, by sender, then kind
-    # RECEIVER (R,), where the agents and the roadside units are; id -1: none
+    tick: int  # tick of the world, from 1 after a reset
+    packets: NDArray[np.void]  # PACKET (n,) sent in this tick, by sender, then kind
+    # RECEIVER (R,), positions of agents and roadside units; id -1: none
     receivers: NDArray[np.void]
 
 
@@ -237,41 +236,42 @@ class NetworkSimulator(Protocol):
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         """Simulate up to this tick.
 
-        A tick that is begun again, because a host has died, is asked for again with the same
-        packets, and must be answered alike.
+        If a host dies, a tick is repeated: the same packets are passed again and must get the same
+        answer.
 
-        Returns RECEPTION (n,): what is received now, of this tick's packets or of earlier ones.
+        Returns RECEPTION (n,): packets of this or earlier ticks that are received in this tick.
         """
         ...
 
 
 def check_external(v2x: V2xConfig) -> None:
-    """Refuse to connect a network simulator where none is asked."""
+    """Refuse to connect a network simulator if the channel is not external."""
     if not (v2x.enabled and v2x.channel.external):
-        raise ConfigError("the channel is our own: set v2x.channel.external to connect another")
+        raise ConfigError("v2x.channel.external is off: set it to connect a network simulator")
 
 
 def check_receptions(
     receptions: NDArray[np.void], sent: Exchange, latency_ticks: int, num_packets: NDArray[np.int64]
 ) -> NDArray[np.void]:
-    """Refuse receptions that cannot be.
+    """Refuse impossible receptions.
 
     `receptions`: the answer to `sent`. `latency_ticks`: the longest delay. `num_packets`:
     (latency_ticks + 1,) packets in flight, by tick modulo that.
 
     Returns:
-        them by receiver, tick and packet, so that the order of the answer does not matter.
+        the receptions sorted by receiver, tick and packet, so that the order of the answer is
+        irrelevant.
 
     Raises:
-        MessageError: another dtype, packets or receivers that are not there, or a delay that is too
-            long or negative.
+        MessageError: a wrong dtype, an unknown packet or receiver, or a delay that is too long or
+            negative.
     """
     if not isinstance(receptions, np.ndarray) or receptions.dtype != RECEPTION:
-        raise MessageError("a network simulator answers with an array of dtype RECEPTION")
+        raise MessageError("a network simulator must return an array of dtype RECEPTION")
     delay = sent.tick - receptions["tick"]
     if ((delay < 0) | (delay > latency_ticks) | (receptions["tick"] < 1)).any():
         raise MessageError(
-            f"tick {sent.tick}: a reception of another tick than those from "
+            f"tick {sent.tick}: a reception has a tick outside "
             f"{max(1, sent.tick - latency_ticks)} to {sent.tick}; v2x.channel.latency_ticks is the "
             "longest delay"
         )
@@ -280,17 +280,17 @@ def check_receptions(
         raise MessageError(f"tick {sent.tick}: a reception of a packet that was not sent")
     receiver = receptions["receiver"]
     if ((receiver < 0) | (receiver >= len(sent.receivers))).any():
-        raise MessageError(f"tick {sent.tick}: a reception by no station")
+        raise MessageError(f"tick {sent.tick}: a reception by an unknown receiver")
     there = sent.receivers["id"][receiver] >= 0
     return np.sort(receptions[there], order=("receiver", "tick", "packet"))
 
 
 def make_units(config: RoadsideConfig, network: RoadNetwork) -> NDArray[np.void]:
-    """UNIT (n,): one at each signal that has one, in the middle of its stop lines.
+    """Return UNIT (n,): a unit at each equipped signal, at the centre of its stop lines.
 
-    `config`: which signals.
+    `config`: the equipped signals.
 
-    Raises ConfigError: no signal of that name.
+    Raises ConfigError: no signal has that name.
     """
     known = network.signal_ids
     names = known if config.signals == (EVERY_SIGNAL,) else config.signals
@@ -301,7 +301,7 @@ def make_units(config: RoadsideConfig, network: RoadNetwork) -> NDArray[np.void]
             listed = ", ".join(known[:8]) + (", …" if len(known) > 8 else "")
             raise ConfigError(
                 f"v2x.roadside.signals: no signal '{name}' on the map '{network.name}'; {meant}"
-                f"There are: {listed or 'none'}"
+                f"The map has: {listed or 'none'}"
             )
     units = np.zeros(len(names), UNIT)
     for unit, name in zip(units, names, strict=True):
@@ -318,14 +318,14 @@ def _links(network: RoadNetwork, signal: int) -> NDArray[np.intp]:
 
 
 def _stop_lines(network: RoadNetwork, signal: int) -> NDArray[np.void]:
-    """POINT of the end of the lane before each link of a signal."""
+    """Return the last POINT of the lane before each link of a signal."""
     lanes = network.lanes[network.links["from_lane"][_links(network, signal)]]
     ends: NDArray[np.void] = network.points[lanes["first_point"] + lanes["num_points"] - 1]
     return ends
 
 
 def map_of(network: RoadNetwork, units: NDArray[np.void], unit: int) -> NDArray[np.void]:
-    """MAP (n,): the approaches that a roadside unit's phases are about; they never change."""
+    """Return MAP (n,): the approaches to a roadside unit's signal, which never change."""
     signal = int(units[unit]["signal"])
     rows = _links(network, signal)
     ends = _stop_lines(network, signal)

@@ -20,11 +20,12 @@ from cavmarl.core import errors
 from cavmarl.core.tracebacks import print_traceback
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.verify.differences import Arrays, DrivenRun, single_arrays, snapshot
 
 
-def _main() -> None:
+def main() -> None:
+    """Run the job that standard input describes."""
     job = json.loads(sys.stdin.readline())
     try:
         for line in _steps(job):
@@ -65,4 +66,4 @@ def _digest(arrays: Arrays) -> str:
 
 
 if __name__ == "__main__":
-    _main()
+    main()

@@ -21,9 +21,9 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.backend_name import NODES, BackendName
 from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.placement.backend_name import NODES, BackendName
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import DrivenRun, same_bytes
 

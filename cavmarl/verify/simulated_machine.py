@@ -18,8 +18,6 @@ from typing import Any
 
 from cavmarl.core.errors import MessageError
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.transport import (
     Bytes,
     Connection,
@@ -29,6 +27,8 @@ from cavmarl.parallel.network.transport import (
 )
 from cavmarl.parallel.nodes.leases import late_ticks
 from cavmarl.parallel.nodes.node_system import NodeSystem
+from cavmarl.parallel.worlds.journaled_worlds import without_journals
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 ADDRESS = "node"
 ALIVE_S = 25.0  # time without an answer, after which the system ends a connection
@@ -421,9 +421,9 @@ class _System:
         return here
 
     def worlds_of(
-        self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
+        self, message: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
     ) -> LocalWorlds:
         world = self._machine.world
         late = late_ticks(world.config)
-        world = unwatched(world)
+        world = without_journals(world)
         return LocalWorlds(world, num_worlds, in_next_step=in_next_step, late_ticks=late)

@@ -24,11 +24,11 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, NodeRefusedError, WorkerDeathError
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.backend_name import NODES, BackendName
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import NodeStarter, Route
 from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.placement.backend_name import NODES, BackendName
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import Arrays, DrivenRun, first_results, same_bytes, step_results
 from cavmarl.verify.simulated_faults import (

@@ -17,10 +17,10 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.core.machine import describe_hardware
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.backend_name import PROCESSES, BackendName
 from cavmarl.parallel.backends import find_backend
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.placement.backend_name import PROCESSES, BackendName
 from cavmarl.parallel.processes.worker_pool import Death, Pool
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.verify.differences import Arrays, DrivenRun, same_bytes
 
 FIRST_STEPS = 10  # steps without kills, to measure the duration of a step

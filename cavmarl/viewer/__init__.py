@@ -1,4 +1,4 @@
-"""The web viewer: a page that shows a running world, and the server that feeds it.
+"""The web viewer: a page that shows a running world, and its server.
 
 See docs/guides/viewer.md.
 """

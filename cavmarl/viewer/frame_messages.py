@@ -1,12 +1,12 @@
-"""Frames as binary messages: nine bytes a vehicle, and a roster of what seldom changes.
+"""Binary frame messages: nine bytes per vehicle, plus a roster of fields that rarely change.
 
-A vehicle's id, size and kind, its zone and where it is handed over are a row of the *roster*. A
-change of the roster is a message of its own with a version; messages of one version after another
-make the whole. A *frame* names the version that it belongs to, and has the vehicles in the order of
-their ids in that roster. So a watcher may miss frames, but no change of the roster.
+A vehicle's id, size, kind, zone and transfer are a row of the *roster*. A change of the roster is a
+separate message with a version; the messages of consecutive versions add up to the whole roster. A
+*frame* names its roster version and has the vehicles in the order of their ids in that roster. A
+watcher may therefore miss frames, but no change of the roster.
 
-All is little endian. Places are centimetres from a corner `MARGIN_M` below and left of the map's
-origin; headings have 2048 parts of a turn, speeds are quarters of m/s.
+All data is little-endian. Positions are in centimetres from a corner `MARGIN_M` below and left of
+the map's origin; headings are in 1/2048 turns, speeds in quarters of m/s.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from cavmarl.render.shapes import level_of
 ROSTER_MESSAGE = 2
 FRAME_MESSAGE = 3
 
-ROSTER_HEAD = struct.Struct("<BBxxIII")  # message, whole, version, rows, ids that have left
-# message, flags, world, version, time, tick, pace, vehicles, signals, zones whose ghosts follow
+ROSTER_HEAD = struct.Struct("<BBxxIII")  # message, whole, version, rows, number of removed ids
+# message, flags, world, version, time, tick, pace, vehicles, signals, ghost zones
 FRAME_HEAD = struct.Struct("<BBHIdIfIII")
 PAUSED = 1  # flag of a frame
 
@@ -38,7 +38,7 @@ ROSTER_ROW = np.dtype(
         ("width_cm", "<u2"),
         ("height_cm", "<u2"),
         ("zone", "<i2"),
-        ("target", "<i2"),  # the zone that it is handed over to; -1: to none
+        ("target", "<i2"),  # target zone of a transfer; -1: none
         ("vclass", "u1"),
         ("driver", "u1"),
         ("level", "i1"),
@@ -50,13 +50,13 @@ MARGIN_M = 1000.0
 MOST = 2**24 - 1
 HEADINGS = 2048
 SPEEDS_PER_MPS = 4.0
-BRAKING_MPS2 = -0.8  # from here brake lights are on
-REBASE_ROWS = 1000  # changes beyond twice the vehicles, after which the roster is sent whole
+BRAKING_MPS2 = -0.8  # brake lights are on at or below this
+REBASE_ROWS = 1000  # changes beyond twice the vehicles after which the whole roster is sent
 REBASE_CHANGES = 256
 
 
 class Change(NamedTuple):
-    """One message of the roster."""
+    """One roster message."""
 
     version: int
     message: bytes
@@ -64,13 +64,13 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class Publication:
-    """What watchers get of one moment: a frame, and the changes that its roster is made of."""
+    """The messages for one frame: the frame itself, and the roster changes that lead to it."""
 
     frame: bytes
-    roster: tuple[Change, ...]  # by version; the first one is whole
+    roster: tuple[Change, ...]  # by version; the first one has all rows
 
     def since(self, version: int) -> list[bytes]:
-        """What a watcher lacks that has the roster of a version; 0: it has none."""
+        """Return the roster messages after a version; 0: the watcher has none yet."""
         return [change.message for change in self.roster if change.version > version]
 
     @property
@@ -79,7 +79,7 @@ class Publication:
 
 
 class FrameEncoder:
-    """Makes publications of the frames of one world, one after the other.
+    """Encodes successive frames of one world as publications.
 
     `origin`: (2,) m, of the map's message.
     """
@@ -100,12 +100,13 @@ class FrameEncoder:
         pace: float = 1.0,
         ghosts_of: tuple[int, ...] = (),
     ) -> Publication:
-        """A frame for watchers.
+        """Encode a frame for watchers.
 
         Args:
-            frame: of the world, not older than the last one unless the world has begun anew.
-            paused: whether the world waits.
-            pace: seconds of the world in one of ours; 0: as fast as it can.
+            frame: a frame of the world, not older than the previous one unless the world has
+                restarted.
+            paused: whether the world is paused.
+            pace: simulated seconds per second; 0: as fast as possible.
             ghosts_of: zones whose ghosts are marked.
         """
         vehicles = frame.vehicles
@@ -132,7 +133,7 @@ class FrameEncoder:
         return Publication(b"".join(parts), self._changes)
 
     def _rows(self, vehicles: NDArray[np.void]) -> bytes:
-        """ROW_BYTES of each vehicle: x and y with three bytes each, and three with the rest."""
+        """Return ROW_BYTES per vehicle: three each for x and y, and three for the rest."""
         words = np.zeros((len(vehicles), 3), dtype="<u4")
         for k, name in enumerate(("x", "y")):
             place = (vehicles[name] - (self._origin[k] - MARGIN_M)) * 100.0
@@ -149,7 +150,7 @@ class FrameEncoder:
         return np.ascontiguousarray(words.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]).tobytes()
 
     def _keep_roster(self, roster: NDArray[np.void], begun_anew: bool) -> None:
-        """Add what has changed since the last frame to the messages that watchers need."""
+        """Add the changes since the last frame to the roster messages."""
         before = self._roster
         if self._changes and not begun_anew and np.array_equal(before, roster):
             return
@@ -177,7 +178,7 @@ class FrameEncoder:
 
 
 def _roster_of(vehicles: NDArray[np.void]) -> NDArray[np.void]:
-    """SEEN (n,) as ROSTER_ROW."""
+    """Convert SEEN (n,) to ROSTER_ROW."""
     rows = np.zeros(len(vehicles), ROSTER_ROW)
     for name in ("id", "agent", "zone", "vclass", "driver"):
         rows[name] = vehicles[name]

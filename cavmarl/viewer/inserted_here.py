@@ -1,4 +1,4 @@
-"""What pages put into a world: a vehicle, or a barrier, which they also take away again."""
+"""Insertions by pages: a vehicle, or a barrier, which pages can also remove."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from cavmarl.viewer.page_requests import PageRequest
 from cavmarl.viewer.subscribers import Audience
 from cavmarl.viewer.vehicle_details import Shown
 
-FARTHEST_M = 30.0  # from the middle of a lane
+FARTHEST_M = 30.0  # largest distance from a lane's centre
 _CARS = 1 << VEHICLE_CLASSES.index("passenger")
 
 
-def put_in(
+def handle_insertion(
     env: Shown, world: int, audience: Audience, watcher: int, request: PageRequest, tick: int
 ) -> bool:
-    """Heed a page that wants to insert a vehicle, to close or to open a road; whether it was one.
+    """Insert a vehicle, or close or open a road; return whether the request asked for that.
 
     Args:
-        env: whose world it is.
-        world: its number.
-        audience: is told of it, on the time line.
-        watcher: the page, which is told why it cannot be.
-        request: of the page.
-        tick: of the world now.
+        env: environment of the world.
+        world: index of the world.
+        audience: receives the result as an event on the time line.
+        watcher: the page, which receives an error's reason.
+        request: request of the page.
+        tick: present tick of the world.
     """
     if request.kind not in ("insert", "close", "open"):
         return False
     try:
-        kind, detail = _put_in(env, world, request)
+        kind, detail = _apply(env, world, request)
     except (ActionError, CapacityError, ConfigError) as error:
-        audience.tell(watcher, {"kind": "notice", "text": str(error)})
+        audience.send(watcher, {"kind": "notice", "text": str(error)})
     else:
-        audience.tell_events([[tick, kind, -1, -1, detail]])
+        audience.send_events([[tick, kind, -1, -1, detail]])
     return True
 
 
-def _put_in(env: Shown, world: int, request: PageRequest) -> tuple[str, str]:
-    """Do it; kind and detail of the event that tells of it."""
+def _apply(env: Shown, world: int, request: PageRequest) -> tuple[str, str]:
+    """Carry out the request; return kind and detail of the resulting event."""
     network = env.network
     among = env.closed_roads(world) if request.kind == "open" else None
     lane, place_m = lane_at(network, request.x, request.y, among)
@@ -61,19 +61,19 @@ def _put_in(env: Shown, world: int, request: PageRequest) -> tuple[str, str]:
 def lane_at(
     network: RoadNetwork, x: float, y: float, among: Collection[str] | None = None
 ) -> tuple[int, float]:
-    """The lane of a road that is nearest to a place, and where on it that is.
+    """Return the lane nearest to a position, and the position along it.
 
     Args:
         network: the map.
         x: m from `map_origin`.
-        y: likewise.
-        among: ids of edges, of which it is one; None: any.
+        y: m from `map_origin`.
+        among: ids of allowed edges; None: all.
 
     Returns:
         LANE row, and m along it.
 
     Raises:
-        ActionError: none that cars drive on is within `FARTHEST_M`.
+        ActionError: no lane for cars is within `FARTHEST_M`.
     """
     lanes = network.lanes
     usable = ~lanes["internal"] & ((lanes["permissions"] & _CARS) != 0)
@@ -92,8 +92,8 @@ def lane_at(
     away = np.hypot(*(points[start] + along * shares[:, None] - here).T)
     nearest = int(away.argmin()) if len(away) else -1
     if nearest < 0 or away[nearest] > FARTHEST_M:
-        what = "road for cars" if among is None else "closed road"
-        raise ActionError(f"there is no {what}: choose a place nearer to one")
+        kind = "road for cars" if among is None else "closed road"
+        raise ActionError(f"there is no {kind} within {FARTHEST_M:g} m: choose a nearer place")
     lane = int(of_piece[nearest])
     before = (of_piece == lane) & (within < within[nearest])
     place_m = float(lengths[before].sum() + shares[nearest] * lengths[nearest])

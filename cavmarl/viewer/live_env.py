@@ -11,7 +11,7 @@ from typing import Any
 
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.viewer.frame_publisher import FramePublisher
-from cavmarl.viewer.inserted_here import put_in
+from cavmarl.viewer.inserted_here import handle_insertion
 from cavmarl.viewer.page_requests import PageRequest
 from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.run_loads import RunLoads
@@ -27,20 +27,23 @@ FRAME_HEIGHT_PX = 560  # in a notebook
 class ShownEnv:
     """Serves pages that watch the worlds of an environment; a context manager.
 
-    In a notebook it is shown as the page itself.
+    A notebook displays it as the embedded page.
 
     Args:
-        env: which a program steps.
-        options: of the server. Where pages may control it, a step waits while they have paused.
-        title: what drives the worlds, in words.
-        looks_itself: whether it is called after each reset and step of `env`; else by `look`, or
-            by `turn` and `moved`, where nothing may wait.
-        tell: told the address, and a token that was made.
-        reset: begins the episode of a world anew, by its number; None: pages may not.
+        env: environment that the program steps.
+        options: options of the server. With control, a step waits while a page has paused the
+            worlds.
+        title: description of what drives the worlds.
+        looks_itself: whether to call `look` after each reset and step of `env`; otherwise call
+            `look`, or `turn` and `moved` where nothing may wait.
+        tell: called with lines of text: the address, and a generated token.
+        reset: restarts the episode of a world by index; None: pages may not.
 
     Attributes:
-        address: of the page.
-        changes: how often pages have asked for something that changes a world.
+        address: address of the page.
+        audiences: the pages that watch each world.
+        publishers: publish the frames of each world.
+        changes: number of requests that have changed a world.
     """
 
     def __init__(
@@ -64,8 +67,8 @@ class ShownEnv:
         hello["may"] += ["reset"] if reset is not None else []
         first = first_stage("world 0", env.network, hello)
         stages = [first, *(first.named(f"world {k}") for k in range(1, count))]
-        self._audiences = [stage.audience for stage in stages]
-        self._publishers = [FramePublisher(stage.audience, stage.encoder) for stage in stages]
+        self.audiences = [stage.audience for stage in stages]
+        self.publishers = [FramePublisher(stage.audience, stage.encoder) for stage in stages]
         with ExitStack() as stack:
             self.address = serve_stages(stack, stages, options, tell)
             self._loads = stack.enter_context(RunLoads(env.worlds, first.audience))
@@ -74,15 +77,15 @@ class ShownEnv:
             self._stack = stack.pop_all()
 
     def look(self) -> None:
-        """Show the present moment to pages; while they have paused it, wait."""
+        """Update the pages; while a page has paused the worlds, wait."""
         self._renew()
         while wait_s := self.turn():
-            self._audiences[0].wait(wait_s)
+            self.audiences[0].wait(wait_s)
         self._clock.tick(time.monotonic(), self._env.step_s)
 
     def turn(self) -> float:
-        """Heed the pages and show them what is due; how long the next step has to wait, in s."""
-        self._heed()
+        """Handle requests and update the pages; return how long the next step must wait, in s."""
+        self._handle()
         wait_s = self._clock.wait_s(time.monotonic()) if self._controlled else 0.0
         if self._env.is_ready:
             self._publish()
@@ -90,27 +93,27 @@ class ShownEnv:
         return wait_s
 
     def tell_others(self, rows: list[dict[str, Any]]) -> None:
-        """Say what else has a LoadScore, in rows as of `run_loads.load_rows`."""
+        """Set the load rows of other processes, as from `run_loads.load_rows`."""
         self._loads.others = rows
 
     def moved(self) -> None:
-        """The worlds have taken a step: the clock goes on, and there is something new to show."""
+        """Advance the clock after a step of the worlds, and mark the frames as new."""
         self._clock.tick(time.monotonic(), self._env.step_s)
         self._renew()
 
     @property
     def is_watched(self) -> bool:
-        """Whether a page is open."""
-        return any(audience.wishes.watchers for audience in self._audiences)
+        """Return whether a page is open."""
+        return any(audience.wishes.watchers for audience in self.audiences)
 
     def _renew(self) -> None:
-        for publisher in self._publishers:
+        for publisher in self.publishers:
             publisher.is_new = True
 
-    def _heed(self) -> None:
-        for world, audience in enumerate(self._audiences):
+    def _handle(self) -> None:
+        for world, audience in enumerate(self.audiences):
             for number, request in audience.requests():
-                if not self._clock.heed(request) and self._controlled and self._env.is_ready:
+                if not self._clock.handle(request) and self._controlled and self._env.is_ready:
                     self._change(world, audience, number, request)
 
     def _change(self, world: int, audience: Audience, number: int, request: PageRequest) -> None:
@@ -118,25 +121,27 @@ class ShownEnv:
         if request.kind == "reset" and self._reset is not None:
             self._reset(world)
             self._renew()
-        elif not put_in(self._env, world, audience, number, request, tick):
+        elif not handle_insertion(self._env, world, audience, number, request, tick):
             return
         self.changes += 1
 
     def _publish(self) -> None:
-        for world, publisher in enumerate(self._publishers):
-            see, tell = partial(self._see, world), partial(self._tell, world)
-            publisher.publish(time.monotonic(), self._clock, see, tell)
+        for world, publisher in enumerate(self.publishers):
+            frame_of, details_of = partial(self._frame, world), partial(self._details, world)
+            publisher.publish(time.monotonic(), self._clock, frame_of, details_of)
 
-    def _see(self, world: int, ghosts: bool) -> WorldFrame:
+    def _frame(self, world: int, ghosts: bool) -> WorldFrame:
         return self._env.world_frames([world], ghosts)[0]
 
-    def _tell(self, world: int, frame: WorldFrame, vehicle: int, sensors: bool) -> dict[str, Any]:
+    def _details(
+        self, world: int, frame: WorldFrame, vehicle: int, sensors: bool
+    ) -> dict[str, Any]:
         return vehicle_details(self._env, world, frame, vehicle, sensors)
 
     def refresh(self) -> None:
-        """Show the present moment to pages that are open or will be, however lately one was."""
-        for world, publisher in enumerate(self._publishers):
-            publisher.keep(self._see(world, ghosts=False), self._clock)
+        """Publish the present frame, even without watchers or right after another frame."""
+        for world, publisher in enumerate(self.publishers):
+            publisher.keep(self._frame(world, ghosts=False), self._clock)
 
     def _repr_html_(self) -> str:
         if self._env.is_ready:
@@ -145,7 +150,7 @@ class ShownEnv:
         return f'<iframe src="{source}" width="100%" height="{FRAME_HEIGHT_PX}"></iframe>'
 
     def close(self) -> None:
-        """End the server; the environment goes on."""
+        """Stop the server; the environment stays open."""
         self._stack.close()
 
     def __enter__(self) -> ShownEnv:
@@ -167,12 +172,12 @@ def show(
     """Serve a page that shows an environment while a program steps it (docs/guides/viewer.md).
 
     Args:
-        env: of `parallel_env` or `make_vec`.
-        port: of the page; 0: any that is free.
-        host: address; one that is not this machine's own needs a token.
-        token: that a page has to give; off this machine one is made and printed without it.
-        control: pages may pause, step and slow the program: its `step` waits for them.
-        title: what drives the worlds, in words.
+        env: from `parallel_env` or `make_vec`.
+        port: port of the page; 0 picks a free port.
+        host: address; any other than the loopback address needs a token.
+        token: token that a page must give; if missing and needed, one is generated and printed.
+        control: whether pages may pause, step and slow the program; `step` then waits for them.
+        title: description of what drives the worlds.
 
     Raises:
         ServiceError: the port is taken.

@@ -1,4 +1,4 @@
-"""A recorded episode that pages watch: played, searched along its time line, paused."""
+"""A recorded episode for pages: playback, seeking along the time line, pause."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.vehicle_details import hello_of_map, vehicle_state
 from cavmarl.viewer.viewed_world import Stage, first_stage
 
-MOST_TOLD = 500  # events of an episode
-QUIET = frozenset({"arrived", "transferred"})  # left out first where there are more
-MOST_STEPS_AHEAD = 20  # that one turn goes on
+MOST_SHOWN = 500  # largest number of events shown of an episode
+QUIET = frozenset({"arrived", "transferred"})  # dropped first if there are more events
+MOST_STEPS_AHEAD = 20  # largest number of frames per turn
 
 
 class ShownRecording:
-    """Shows an episode of a recording; at its end it pauses.
+    """Shows an episode of a recording; playback pauses at its end.
 
     Args:
-        recording: of which it is.
-        world: its number.
-        episode: of that world.
-        stage: on which it is shown; of `recording_stages`.
+        recording: the recording.
+        world: index of the world.
+        episode: index of the episode.
+        stage: stage from `recording_stages`.
 
     Raises:
-        RecordingError: it has no frames, or a part is missing or damaged.
+        RecordingError: the episode has no frames, or a part is missing or damaged.
     """
 
     def __init__(self, recording: Recording, world: int, episode: int, stage: Stage) -> None:
@@ -44,28 +44,28 @@ class ShownRecording:
         self._place = 0
         self._has_told = False
         self.clock = RunClock()
-        self.publisher = FramePublisher(stage.audience, stage.encoder, tells_events=False)
+        self.publisher = FramePublisher(stage.audience, stage.encoder, has_events=False)
         self.step_s = recording.head.step_s
 
     def turn(self) -> float:
-        """Heed the pages, go on if it is time, publish what is due; how long to wait then."""
+        """Handle requests, advance and publish as due; return how long to wait then, in s."""
         for _, request in self._audience.requests():
             if request.kind == "play" and self._place == len(self._ticks) - 1:
                 self._go_to(0)
             if request.kind == "seek" and request.number is not None:
                 found = int(np.searchsorted(self._ticks, request.number, side="right")) - 1
                 self._go_to(max(0, found))
-            self.clock.heed(request)
+            self.clock.handle(request)
         if not self._audience.wishes.watchers:
             self.clock.wait_s(time.monotonic())
             return 1.0
-        self._tell_all_events()
+        self._send_all_events()
         wait_s = self._go_on()
-        self.publisher.publish(time.monotonic(), self.clock, self._see, self._tell)
+        self.publisher.publish(time.monotonic(), self.clock, self._frame, self._details)
         return wait_s
 
     def _go_on(self) -> float:
-        """Take the steps that are due; how long there is none."""
+        """Take the steps that are due; return the time until the next one."""
         now = time.monotonic()
         for _ in range(MOST_STEPS_AHEAD):
             wait_s = self.clock.wait_s(now)
@@ -82,17 +82,17 @@ class ShownRecording:
         self._place = place
         self.publisher.is_new = True
 
-    def _see(self, ghosts: bool) -> WorldFrame:
+    def _frame(self, ghosts: bool) -> WorldFrame:
         return self._recording.at(self._ticks[self._place], self._world, self._episode)
 
-    def _tell(self, frame: WorldFrame, vehicle: int, sensors: bool) -> dict[str, Any]:
+    def _details(self, frame: WorldFrame, vehicle: int, sensors: bool) -> dict[str, Any]:
         found = vehicle_state(self._recording.network, self._agents, frame, vehicle)
         if found["here"] and found["agent"] >= 0:
             found |= self._sensors.of(frame.tick, vehicle, sensors)
         return found
 
-    def _tell_all_events(self) -> None:
-        """The whole time line, at once; pages that come later get it from the audience."""
+    def _send_all_events(self) -> None:
+        """Send the whole time line at once; pages that join later get it from the audience."""
         if self._has_told:
             return
         self._has_told = True
@@ -101,17 +101,17 @@ class ShownRecording:
             for found in self._recording.events(self._world)
             if found.episode == self._episode and found.event.kind in TIME_LINE | ASKED
         ]
-        if len(events) > MOST_TOLD:
+        if len(events) > MOST_SHOWN:
             events = [event for event in events if event[1] not in QUIET]
         if events:
-            self._audience.tell_events(events[:MOST_TOLD])
+            self._audience.send_events(events[:MOST_SHOWN])
 
 
 def recording_stages(recording: Recording) -> list[tuple[int, int, Stage]]:
-    """A stage of each episode of each world, with their numbers.
+    """Return world, episode and stage of each episode.
 
     Raises:
-        RecordingError: there is none, or the recording is without its map.
+        RecordingError: there is no episode, or the map is missing.
     """
     head = recording.head
     network, partition = recording.network, recording.partition
@@ -124,10 +124,10 @@ def recording_stages(recording: Recording) -> list[tuple[int, int, Stage]]:
             ticks = recording.ticks(world, episode)
             stage = first.named(f"world {world}, episode {episode}")
             agents = _agents_of(recording.at(ticks[0], world, episode))
-            told = {"span": [ticks[0], ticks[-1]], "tick_s": head.sim_dt_s, "agents": agents}
-            stages.append((world, episode, stage.telling(told)))
+            more = {"span": [ticks[0], ticks[-1]], "tick_s": head.sim_dt_s, "agents": agents}
+            stages.append((world, episode, stage.telling(more)))
     if not stages:
-        raise RecordingError(f"{recording.path}: no frame was committed; record the run again")
+        raise RecordingError(f"{recording.path}: the recording has no frames; record the run again")
     return stages
 
 

@@ -1,8 +1,9 @@
-"""A map as one compact binary message: what the page draws below the vehicles.
+"""A map as one compact binary message, which the page draws below the vehicles.
 
-The message is a byte `MAP_MESSAGE`, three bytes of padding, the length of a JSON head as uint32,
-the head padded with spaces to a multiple of four, and the sections that it lists: little endian,
-metres from the origin that it names. Names are data of the head; the page shows them as text.
+The message consists of a byte `MAP_MESSAGE`, three bytes of padding, the length of a JSON head as
+uint32, the head padded with spaces to a multiple of four, and the sections that the head lists.
+Sections are little-endian, in metres from the origin in the head. Names in the head are data; the
+page shows them as text only.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from cavmarl.roads.network import RoadNetwork
 
 MAP_MESSAGE = 1
 
-# What a surface is made of; the page has a colour of each.
+# Kinds of surface; the page has a colour for each.
 ROAD, PATH_SURFACE, KERB_SURFACE, MARK, MIDDLE_LINE, BUILDING = range(6)
 
-LINE_M = 0.2  # how wide lines on the road are
+LINE_M = 0.2  # width of lines on the road
 WAITING_LINE_M = 0.35
-LEVELS = 30  # from lowest to highest; more are drawn as one
-RULED_STATES = b"sw"  # links at which one has to stop
+LEVELS = 30  # levels are clipped to [-30, 30]
+RULED_STATES = b"sw"  # states of links with a mandatory stop
 
-# A straight piece with a flat start, and a round end where it is joined to what follows.
+# A straight piece with a flat start; its end is round if it is joined to the next piece.
 PIECE = np.dtype(
     [
         ("start", "<f4", 2),
@@ -41,7 +42,7 @@ PIECE = np.dtype(
     ]
 )
 CORNER = np.dtype([("place", "<f4", 2), ("style", "u1"), ("level", "i1"), ("unused", "<u2")])
-# The part of a stop line that one signalled link has: two corners, and where it goes back to.
+# One link's part of a stop line: two corners, and the direction back along the lane.
 STOP_LINE = np.dtype(
     [
         ("near", "<f4", 2),
@@ -55,17 +56,17 @@ STOP_LINE = np.dtype(
 
 
 def map_origin(network: RoadNetwork) -> NDArray[np.float64]:
-    """(2,) m: where the places of all messages about a map start from."""
+    """Return the origin (2,) of positions in all messages about a map, in m."""
     origin: NDArray[np.float64] = np.floor(np.array(network.extent_m[:2]))
     return origin
 
 
 def map_message(network: RoadNetwork) -> bytes:
-    """The map as the page takes it.
+    """Encode a map for the page.
 
-    Sections: `roads` and `lines` (PIECE), `surfaces` (CORNER, three a triangle), `buildings`
-    likewise, `stop_lines` (STOP_LINE), `phase_states` (uint8 positions in `SIGNAL_STATES`) and
-    `phase_first` (uint32): what a signal shows is `phase_states[phase_first[phase] + letter]`.
+    Sections: `roads` and `lines` (PIECE), `surfaces` and `buildings` (CORNER, three per triangle),
+    `stop_lines` (STOP_LINE), `phase_states` (uint8 positions in `SIGNAL_STATES`) and `phase_first`
+    (uint32). A signal shows `phase_states[phase_first[phase] + letter]`.
     """
     shapes = road_shapes(network)
     origin = map_origin(network)
@@ -99,7 +100,7 @@ def map_message(network: RoadNetwork) -> bytes:
 
 
 def pack(head: dict[str, Any], sections: dict[str, NDArray[Any]]) -> bytes:
-    """A message of a head and arrays; each begins at a multiple of four bytes after the head."""
+    """Encode a message from a head and arrays; each array begins at a multiple of four bytes."""
     places, blocks, at = {}, [], 0
     for name, rows in sections.items():
         block = rows.tobytes()
@@ -112,10 +113,10 @@ def pack(head: dict[str, Any], sections: dict[str, NDArray[Any]]) -> bytes:
 
 
 def unpack(message: bytes) -> tuple[dict[str, Any], memoryview]:
-    """The head of a message of `pack`, and the bytes that its sections lie in."""
+    """Return the head of a message of `pack`, and the bytes of its sections."""
     kind, length = struct.unpack_from("<BxxxI", message)
     if kind != MAP_MESSAGE:
-        raise ValueError(f"message {kind}: is no map")
+        raise ValueError(f"message {kind}: not a map (expected {MAP_MESSAGE})")
     return json.loads(message[8 : 8 + length]), memoryview(message)[8 + length :]
 
 
@@ -141,7 +142,7 @@ def _roads(shapes: RoadShapes, origin: Points) -> NDArray[np.void]:
 
 
 def _outlines(shapes: RoadShapes, origin: Points) -> NDArray[np.void]:
-    """The kerbs around the insides of junctions."""
+    """Return the kerbs around the insides of junctions."""
     parts = [np.zeros(0, PIECE)]
     for patch in shapes.junctions:
         corners = patch.outline - origin
@@ -166,7 +167,7 @@ def _corners(places: Points, style: int, level: Any) -> NDArray[np.void]:
 
 
 def _quads(quads: Points, style: int, levels: NDArray[Any], origin: Points) -> NDArray[np.void]:
-    """Two triangles of each of the quadrilaterals (n, 4, 2)."""
+    """Return two triangles for each quadrilateral (n, 4, 2)."""
     places = (quads[:, [0, 1, 2, 0, 2, 3]] - origin).reshape(-1, 2)
     return _corners(places, style, np.repeat(levels, 6))
 
@@ -174,7 +175,7 @@ def _quads(quads: Points, style: int, levels: NDArray[Any], origin: Points) -> N
 def _surfaces(
     network: RoadNetwork, shapes: RoadShapes, origin: Points
 ) -> tuple[NDArray[np.void], NDArray[np.void]]:
-    """Arrows and waiting lines; the insides of junctions."""
+    """Return arrows and waiting lines, and the insides of junctions."""
     insides = [np.zeros(0, CORNER)]
     for patch in shapes.junctions:
         hull = patch.outline - origin
@@ -197,7 +198,7 @@ def _surfaces(
 
 
 def _levels_of_ends(network: RoadNetwork) -> NDArray[np.int64]:
-    """The level of each lane's end."""
+    """Return the level of each lane's end."""
     last = network.lanes["first_point"] + network.lanes["num_points"] - 1
     return level_of(network.points["z"][last])
 

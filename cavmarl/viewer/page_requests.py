@@ -1,4 +1,4 @@
-"""What a page may ask of a running world: JSON objects with a `kind`, checked before they count."""
+"""Requests of a page to a running world: JSON objects with a `kind`, validated before use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cavmarl.core.errors import MessageError
 
 MAX_TEXT = 4096
 MAX_PACE = 1000.0
-# Kinds that change the world or its clock; the others only change what the page itself is told.
+# Kinds that change the world or its clock; the others affect only the page itself.
 CONTROLS = frozenset(
     {"pause", "play", "step", "pace", "reset", "seat", "drive", "seek", "insert", "close", "open"}
 )
@@ -20,17 +20,17 @@ MAX_PLACE_M = 1e7
 
 @dataclass(frozen=True)
 class PageRequest:
-    """One wish of a page.
+    """One request of a page.
 
     Attributes:
         kind: `watch` a vehicle, mark the `ghosts` of a zone; of `CONTROLS`: `pause`, `play`,
             `step`, `pace`, `reset`, take a `seat` and `drive` in it, `seek` a tick of a recording,
-            `insert` a vehicle at a place, `close` the road there, or `open` it again.
-        number: the vehicle, zone, agent or tick, None for none; seconds of the world in one of ours
-            as `pace`, 0 for as fast as it can.
-        x: of the place, m from the map's origin.
-        y: likewise.
-        sensors: whether to tell what the sensors of a vehicle see that is watched.
+            `insert` a vehicle at a position, `close` the road there, or `open` it again.
+        number: the vehicle, zone, agent or tick, None for none; for `pace`, simulated seconds per
+            second, 0 for as fast as possible.
+        x: position, m from the map's origin.
+        y: position, m from the map's origin.
+        sensors: whether to send the sensor data of a watched vehicle.
         throttle: within [-1, 1].
         steering: within [-1, 1], positive to the left.
     """
@@ -45,25 +45,25 @@ class PageRequest:
 
 
 def read_object(text: str) -> dict[str, Any]:
-    """A JSON object of a page.
+    """Parse a JSON object sent by a page.
 
-    Raises MessageError: it is none, or too long.
+    Raises MessageError: the text is no JSON object, or too long.
     """
     if len(text) > MAX_TEXT:
-        raise MessageError(f"a request of {len(text)} characters: at most {MAX_TEXT} are taken")
+        raise MessageError(f"request of {len(text)} characters: at most {MAX_TEXT} are allowed")
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise MessageError("a request that is no JSON") from error
+        raise MessageError("the request is not valid JSON") from error
     if not isinstance(found, dict):
-        raise MessageError(f"a request that is a {type(found).__name__}, no object")
+        raise MessageError(f"the request is a {type(found).__name__}: it must be an object")
     return found
 
 
 def read_request(text: str) -> PageRequest:
-    """What a page asks for.
+    """Parse a request of a page.
 
-    Raises MessageError: it is not understood.
+    Raises MessageError: the request is invalid.
     """
     found = read_object(text)
     kind = found.get("kind")
@@ -84,12 +84,12 @@ def read_request(text: str) -> PageRequest:
     if kind in ("insert", "close", "open"):
         x, y = (_within(name, found.get(name), -MAX_PLACE_M, MAX_PLACE_M) for name in ("x", "y"))
         return PageRequest(kind, x=x, y=y)
-    raise MessageError(f"a request of the kind {str(kind)[:40]!r}: there is none of that kind")
+    raise MessageError(f"request of kind {str(kind)[:40]!r}: unknown kind")
 
 
 def _whole(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**53:
-        raise MessageError(f"{name}: must be a whole number from 0, or null")
+        raise MessageError(f"{name}: must be a whole number of at least 0, or null")
     return value
 
 

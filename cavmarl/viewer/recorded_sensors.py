@@ -1,4 +1,4 @@
-"""What a recording has of the sensors of an agent's vehicle, for pages."""
+"""Recorded sensor data of an agent's vehicle, for pages."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.sensors.sensed_shapes import Shape, observed_shapes, sampled_shapes
 from cavmarl.viewer.vehicle_details import named_numbers, named_terms
 
-OLDEST_S = 2.0  # of a sample that is still shown
+OLDEST_S = 2.0  # largest age of a sample to show
 
 
 class RecordedSensors:
-    """Observations, terms and shapes of sensors of one episode, as far as they were recorded.
+    """Observations, terms and sensor shapes of one episode, as far as they were recorded.
 
     Args:
-        recording: of which it is.
-        world: its number.
-        episode: of that world.
+        recording: the recording.
+        world: index of the world.
+        episode: index of the episode.
     """
 
     def __init__(self, recording: Recording, world: int, episode: int) -> None:
@@ -36,12 +36,12 @@ class RecordedSensors:
         self._config, self._note = _settings_of(recording)
 
     def of(self, tick: int, vehicle: int, sensors: bool) -> dict[str, Any]:
-        """What a page is told of an agent's vehicle: `terms`, `observation`, `shapes`, `note`.
+        """Return the data of an agent's vehicle: `terms`, `observation`, `shapes`, `note`.
 
         Args:
-            tick: of which there is a frame.
-            vehicle: its id.
-            sensors: whether its sensors' shapes are wanted; `note` says why there are none.
+            tick: tick of a recorded frame.
+            vehicle: id of the vehicle.
+            sensors: whether to include the sensors' shapes; if there are none, `note` says why.
         """
         head, found = self._recording.head, {}
         rows = self._rows("observations", tick, vehicle) if self._observes else ()
@@ -66,7 +66,7 @@ class RecordedSensors:
         return mine
 
     def _newest(self, table: str, tick: int, vehicle: int) -> NDArray[Any] | None:
-        """The data of the last sample up to a tick; None: it is too old, lost, or not recorded."""
+        """Return the last sample up to a tick; None if it is too old, lost, or not recorded."""
         if table not in self._recording.extras:
             return None
         oldest = tick - OLDEST_S / self._recording.head.sim_dt_s
@@ -81,12 +81,12 @@ class RecordedSensors:
 
 
 def _settings_of(recording: Recording) -> tuple[EnvConfig | None, str]:
-    """The environment that was recorded, if it can be read, and what a page says of sensors."""
+    """Return the recorded environment's settings if readable, and a note for the page."""
     try:
         settings = recording.manifest["world"]["config"]
         config = validate(EnvConfig, settings, f"{recording.path}")
     except (ConfigError, KeyError, TypeError):
-        return None, "The settings of the sensors are not in the recording, or another version's."
+        return None, "The recording has no sensor settings that this version can read."
     missing: Sequence[str] = [
         name
         for name, is_missing in (
@@ -101,6 +101,6 @@ def _settings_of(recording: Recording) -> tuple[EnvConfig | None, str]:
     if not missing:
         return config, ""
     return config, (
-        f"Not in this recording: {' and '.join(missing)} of sensors; "
+        f"This recording has no {' and no '.join(missing)} of sensors; "
         f"--record-also {','.join(missing)} records them."
     )

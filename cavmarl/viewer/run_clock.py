@@ -1,4 +1,4 @@
-"""`RunClock`: when a world that pages watch takes its next step."""
+"""`RunClock`: schedules the steps of a world that pages watch."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import time
 
 from cavmarl.viewer.page_requests import PageRequest
 
-IDLE_S = 0.25  # the longest wait before requests are looked at again
-LATE_S = 0.5  # a clock that is later does not catch up
-MOST_STEPS = 10  # that wait while the world is paused
+IDLE_S = 0.25  # longest wait before requests are checked again
+LATE_S = 0.5  # a clock that is later than this does not catch up
+MOST_STEPS = 10  # largest number of requested steps that wait while paused
 
 
 class RunClock:
-    """Paused or not, and how fast.
+    """The pace and the pause of a world.
 
     Attributes:
-        pace: seconds of the world in one of ours; 0: as fast as it can.
-        is_paused: steps are only taken one by one, when a page asks for one.
+        pace: simulated seconds per second; 0: as fast as possible.
+        is_paused: whether steps are only taken one by one, on request.
     """
 
     def __init__(self, pace: float = 1.0) -> None:
@@ -25,8 +25,8 @@ class RunClock:
         self._steps_wanted = 0
         self._due_s = time.monotonic()
 
-    def heed(self, request: PageRequest) -> bool:
-        """Take a request; whether it was one for the clock."""
+    def handle(self, request: PageRequest) -> bool:
+        """Apply a request; return whether it was one for the clock."""
         match request.kind:
             case "pause":
                 self.is_paused = True
@@ -43,7 +43,7 @@ class RunClock:
         return True
 
     def wait_s(self, now_s: float) -> float:
-        """For how long no step is due, at most `IDLE_S`; 0: one is."""
+        """Return the time until the next step is due, at most `IDLE_S`; 0: it is due now."""
         if self._steps_wanted:
             return 0.0
         if self.is_paused:
@@ -52,7 +52,7 @@ class RunClock:
         return min(max(0.0, self._due_s - now_s), IDLE_S) if self.pace else 0.0
 
     def tick(self, now_s: float, step_s: float) -> None:
-        """A step of so many seconds is taken now."""
+        """Record a step of `step_s` simulated seconds."""
         self._steps_wanted = max(0, self._steps_wanted - 1)
         if self.pace:
             self._due_s = max(self._due_s, now_s - LATE_S) + step_s / self.pace

@@ -1,4 +1,4 @@
-"""`RunLoads`: tells pages how busy the nodes are that run a world, and which zones each has."""
+"""`RunLoads`: sends pages the load and the zones of the nodes that run a world."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from cavmarl.balance.load_score import load_score
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.probe import Watch
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.viewer.subscribers import Audience
 
 EVERY_S = 2.0
 
 
 class RunLoads:
-    """Measures in a thread of its own, while there are watchers; a context manager.
+    """Measures loads in a separate thread while there are watchers; a context manager.
 
-    Nodes of other machines measure theirs, and are asked by `look`.
+    Nodes on other machines measure themselves and are queried by `look`.
 
     Args:
-        worlds: whose workers or nodes are watched; without any, this process.
-        audience: is told.
+        worlds: worlds whose workers or nodes are measured; without workers, this process.
+        audience: receives the loads.
 
     Attributes:
-        others: rows of what runs no zones of these worlds, which pages are told, too.
+        others: further rows to send, of processes that run no zones of these worlds.
     """
 
     def __init__(self, worlds: SteppedWorlds, audience: Audience) -> None:
@@ -37,7 +37,7 @@ class RunLoads:
         self._audience = audience
         self.others: list[dict[str, Any]] = []
         self._apart = worlds if isinstance(worlds, NodeWorlds) and not worlds.worker_pids else None
-        self._looked_s = 0.0  # when nodes apart were asked last; 0: never
+        self._looked_s = 0.0  # time of the last query of remote nodes; 0: never
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="viewer loads", daemon=True)
 
@@ -58,34 +58,34 @@ class RunLoads:
             self._over.wait(EVERY_S)
             if watch is not None:
                 zones = self._worlds.world.partition.count
-                self._tell(load_rows(pids, watch.snapshot(), self._worlds.plans, zones))
+                self._send(load_rows(pids, watch.snapshot(), self._worlds.plans, zones))
 
     def look(self) -> None:
-        """Ask nodes of other machines, if it is time; the thread of the worlds calls it."""
+        """Query nodes of other machines if due; called by the thread of the worlds."""
         nodes, now_s = self._apart, time.monotonic()
         if nodes is None or not self._audience.wishes.watchers or now_s - self._looked_s < EVERY_S:
             return
         is_first, self._looked_s = not self._looked_s, now_s
         snapshot = nodes.node_snapshot()
-        if is_first:  # their watches have only begun
+        if is_first:  # the nodes have only begun to measure
             return
         pids = dict(enumerate(nodes.pool.pids))
-        self._tell(load_rows(pids, snapshot, nodes.plans, nodes.world.partition.count))
+        self._send(load_rows(pids, snapshot, nodes.plans, nodes.world.partition.count))
 
-    def _tell(self, rows: list[dict[str, Any]]) -> None:
-        self._audience.tell_all({"kind": "loads", "rows": rows + self.others})
+    def _send(self, rows: list[dict[str, Any]]) -> None:
+        self._audience.send_all({"kind": "loads", "rows": rows + self.others})
 
 
 def load_rows(
     pids: Mapping[int, int], snapshot: LoadSnapshot, plans: tuple[Plan, ...], zones: int = 1
 ) -> list[dict[str, Any]]:
-    """What a page shows of each worker: its zones in the first world, and its LoadScore.
+    """Return the page's row of each worker: its zones in the first world, and its LoadScore.
 
     Args:
-        pids: of the workers' processes.
-        snapshot: of the same workers.
-        plans: which worker hosts what; none where the first one hosts all.
-        zones: of a world.
+        pids: process ids of the workers.
+        snapshot: loads of the same workers.
+        plans: zones by worker; if empty, the first worker hosts all zones.
+        zones: number of zones of a world.
     """
     homes: dict[int, list[int]] = {} if plans else {min(pids): list(range(zones))}
     for plan in plans[:1]:

@@ -1,4 +1,4 @@
-"""Shows worlds and recordings to pages until it is interrupted: server and runs together."""
+"""Shows worlds and recordings to pages until interrupted: runs both the server and the worlds."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ Tell = Callable[[str], None]
 
 
 class Shown(Protocol):
-    """What is shown on one stage."""
+    """A run or a recording on a stage."""
 
     def turn(self) -> float:
-        """Do what is due; how long to wait then, in s."""
+        """Do what is due; return how long to wait then, in s."""
         ...
 
 
@@ -40,18 +40,18 @@ def show_worlds(
     tell: Tell,
     seconds: float | None = None,
 ) -> dict[str, float]:
-    """Drive worlds, which are closed at the end, and serve pages that watch them.
+    """Drive worlds and serve pages that watch them; the worlds are closed at the end.
 
     Args:
-        envs: one world each, of the same environment.
-        policy: name or path of what drives their agents.
-        seed: of the first episode of the first; those after it have the next numbers.
-        options: where pages are served; off the loopback address a token is made if it has none.
-        tell: told the address, and a token that was made.
-        seconds: of the first world; None: until it is interrupted.
+        envs: environments of one world each, with equal settings.
+        policy: name or path of the agents' policy.
+        seed: seed of the first episode of the first world; the other worlds have the next numbers.
+        options: options of the server; outside the loopback address, a missing token is generated.
+        tell: called with lines of text: the address, and a generated token.
+        seconds: simulated duration of the first world; None: until interrupted.
 
     Returns:
-        the traffic of the first world's last episode.
+        traffic statistics of the first world's last episode.
 
     Raises:
         ServiceError: the port is taken.
@@ -80,13 +80,13 @@ def show_recording(
     """Serve pages that watch a recording.
 
     Args:
-        recording: that is shown.
-        options: as of `show_worlds`, like `tell`.
-        tell: is told the address.
-        seconds: of ours; None: until it is interrupted.
+        recording: the recording to show.
+        options: options of the server, see `show_worlds`.
+        tell: called with lines of text, see `show_worlds`.
+        seconds: duration in wall time; None: until interrupted.
 
     Raises:
-        RecordingError: it cannot be read, or is without its map.
+        RecordingError: the recording cannot be read, or its map is missing.
         ServiceError: the port is taken.
         MissingExtraError: starlette, uvicorn or websockets are not installed.
     """
@@ -95,20 +95,20 @@ def show_recording(
     with ExitStack() as stack:
         stages = [stage for _, _, stage in found]
         serve_stages(stack, stages, options, tell)
-        # Each reads for itself: a reader keeps the part of the recording that it is in.
+        # Each episode has its own reader, since a reader caches one part of the recording.
         shown = [ShownRecording(Recording(recording.path), *one) for one in found]
         end = None if seconds is None else time.monotonic() + seconds
         _go_on(shown, stages[0], tell, lambda: end is None or time.monotonic() < end)
 
 
 def check_extra() -> None:
-    """Raises MissingExtraError: what serves pages is not installed."""
+    """Raise MissingExtraError if the server's packages are not installed."""
     for module in ("starlette", "uvicorn", "httptools", "websockets"):
         require(module, "viewer")
 
 
 def serve_stages(stack: ExitStack, stages: Sequence[Stage], options: WebOptions, tell: Tell) -> str:
-    """Serve pages of some stages until `stack` ends; their address.
+    """Serve the pages of some stages until `stack` closes; return the address.
 
     Raises ServiceError: the port is taken.
     """

@@ -1,8 +1,8 @@
-"""Between a world and its watchers: the world's thread publishes, the server's thread sends.
+"""Connects a world with its watchers: the world's thread publishes, the server's thread sends.
 
-The world never waits. Each watcher has room for one frame: a newer one takes its place, so that one
-that reads slowly gets fewer. What it must not miss, changes of the roster and texts, waits for it
-within bounds; a watcher beyond them is dropped.
+The world never waits. Each watcher has a buffer of one frame, which a newer frame replaces, so a
+slow watcher gets fewer frames. Roster changes and texts must not be missed; they are queued up to a
+limit, beyond which the watcher is dropped.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from cavmarl.viewer.page_requests import PageRequest
 
 P = ParamSpec("P")
 
-MAX_TEXTS = 256  # that wait for one watcher
-MAX_REQUESTS = 1000  # that wait for the world
+MAX_TEXTS = 256  # queued for one watcher
+MAX_REQUESTS = 1000  # queued for the world
 
 
 @dataclass(eq=False)
 class PageWatcher:
-    """One page that is open; of the server's thread."""
+    """One open page; used by the server's thread only."""
 
     number: int
-    has_version: int = 0  # of the roster
-    newest: Publication | None = None  # that it has not been sent
+    has_version: int = 0  # version of the roster
+    newest: Publication | None = None  # not sent yet
     texts: deque[str] = field(default_factory=deque)
     news: asyncio.Event = field(default_factory=asyncio.Event)
-    vehicle: int | None = None  # whose state it is told
-    sensors: bool = False  # and what its sensors see
+    vehicle: int | None = None  # id of the watched vehicle
+    sensors: bool = False  # whether to include its sensors
     ghosts_of: int | None = None
-    skipped: int = 0  # frames that it did not get
-    is_lost: bool = False  # it reads too slowly
+    skipped: int = 0  # number of frames that it missed
+    is_lost: bool = False  # whether it reads too slowly
 
     def offer(self, publication: Publication) -> None:
         self.skipped += self.newest is not None
         self.newest = publication
         self.news.set()
 
-    def tell(self, text: str) -> None:
+    def queue(self, text: str) -> None:
         if len(self.texts) >= MAX_TEXTS:
             self.is_lost = True
         else:
@@ -54,7 +54,7 @@ class PageWatcher:
         self.news.set()
 
     def take(self) -> list[str | bytes]:
-        """All that is to be sent to it now, in its order."""
+        """Return all messages to send now, in order."""
         messages: list[str | bytes] = list(self.texts)
         self.texts.clear()
         publication, self.newest = self.newest, None
@@ -68,11 +68,11 @@ class PageWatcher:
 
 @dataclass(frozen=True)
 class Wishes:
-    """What all watchers together want to be told."""
+    """The combined requests of all watchers."""
 
     watchers: int = 0
     vehicles: frozenset[int] = frozenset()
-    sensed: frozenset[int] = frozenset()  # those of which also sensors are told
+    sensed: frozenset[int] = frozenset()  # vehicles of which sensors are included
     ghosts_of: tuple[int, ...] = ()
 
 
@@ -80,12 +80,12 @@ class Audience:
     """The watchers of one world.
 
     Args:
-        beside: of another world that the same thread runs: `wait` of either ends with a request to
-            any of them.
+        beside: audience of another world that the same thread runs; `wait` of either returns on a
+            request to any of them.
 
     Attributes:
         wishes: replaced as a whole, so that the world's thread may read it at any time.
-        dropped: watchers that read too slowly.
+        dropped: number of watchers that read too slowly.
     """
 
     def __init__(self, beside: Audience | None = None) -> None:
@@ -99,28 +99,28 @@ class Audience:
         self._last: Publication | None = None
         self._events: deque[list[Any]] = deque(maxlen=500)
 
-    # The world's thread.
+    # Called by the world's thread.
 
     def publish(self, publication: Publication) -> None:
-        """Give all watchers a frame."""
+        """Offer a frame to all watchers."""
         self._call(self._spread, publication)
 
-    def tell_events(self, events: list[list[Any]]) -> None:
-        """Add to the time line: tick, kind, vehicle and what more there is to say of each."""
+    def send_events(self, events: list[list[Any]]) -> None:
+        """Add events to the time line: tick, kind, vehicle and details of each."""
         self._call(self._add_events, events)
 
-    def tell_all(self, content: dict[str, Any]) -> None:
-        self._call(self._tell_all, json.dumps(content, allow_nan=False))
+    def send_all(self, content: dict[str, Any]) -> None:
+        self._call(self._put_all, json.dumps(content, allow_nan=False))
 
-    def tell_of_vehicle(self, vehicle: int, content: dict[str, Any]) -> None:
-        """Tell those that watch a vehicle of it."""
-        self._call(self._tell_of, vehicle, json.dumps(content, allow_nan=False))
+    def send_vehicle(self, vehicle: int, content: dict[str, Any]) -> None:
+        """Send the details of a vehicle to the pages that watch it."""
+        self._call(self._put_vehicle, vehicle, json.dumps(content, allow_nan=False))
 
-    def tell(self, number: int, content: dict[str, Any]) -> None:
-        self._call(self._tell_one, number, json.dumps(content, allow_nan=False))
+    def send(self, number: int, content: dict[str, Any]) -> None:
+        self._call(self._put_one, number, json.dumps(content, allow_nan=False))
 
     def requests(self) -> Iterable[tuple[int, PageRequest]]:
-        """What pages have asked for since the last call: the watcher's number and its request."""
+        """Yield the requests since the last call: the watcher's number and its request."""
         while True:
             try:
                 yield self._requests.get_nowait()
@@ -128,14 +128,14 @@ class Audience:
                 return
 
     def wait(self, seconds: float) -> None:
-        """Wait so long, or until a page asks for something."""
+        """Wait for a time, or until a page sends a request."""
         self._asked.wait(seconds)
         self._asked.clear()
 
-    # The server's thread.
+    # Called by the server's thread.
 
     def begin(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Say on which loop the watchers are served."""
+        """Set the event loop that serves the watchers."""
         self._loop = loop
 
     def join(self) -> PageWatcher:
@@ -145,7 +145,7 @@ class Audience:
         if self._last is not None:
             watcher.offer(self._last)
         if self._events:
-            watcher.tell(_events_text(list(self._events)))
+            watcher.queue(_events_text(list(self._events)))
         self._update()
         self._asked.set()
         return watcher
@@ -153,10 +153,10 @@ class Audience:
     def leave(self, watcher: PageWatcher) -> None:
         self._watchers.pop(watcher.number, None)
         self._update()
-        self.ask(watcher, PageRequest("seat"))  # its seat is free again
+        self.ask(watcher, PageRequest("seat"))  # free its seat
 
     def ask(self, watcher: PageWatcher, request: PageRequest) -> None:
-        """Take a request of a page; beyond MAX_REQUESTS they are not kept."""
+        """Queue a request of a page; requests beyond MAX_REQUESTS are dropped."""
         if request.kind in ("watch", "ghosts"):
             number = None if request.number is None else int(request.number)
             if request.kind == "watch":
@@ -172,9 +172,9 @@ class Audience:
 
     def _update(self) -> None:
         watchers = self._watchers.values()
-        told = [(one.vehicle, one.sensors) for one in watchers if one.vehicle is not None]
-        vehicles = frozenset(vehicle for vehicle, _ in told)
-        sensed = frozenset(vehicle for vehicle, sensors in told if sensors)
+        watched = [(one.vehicle, one.sensors) for one in watchers if one.vehicle is not None]
+        vehicles = frozenset(vehicle for vehicle, _ in watched)
+        sensed = frozenset(vehicle for vehicle, sensors in watched if sensors)
         zones = {one.ghosts_of for one in watchers if one.ghosts_of is not None}
         self.wishes = Wishes(len(self._watchers), vehicles, sensed, tuple(sorted(zones)))
 
@@ -184,7 +184,7 @@ class Audience:
             return
         try:
             loop.call_soon_threadsafe(partial(function, *given, **named))
-        except RuntimeError:  # closed since
+        except RuntimeError:  # the loop has been closed meanwhile
             return
 
     def _spread(self, publication: Publication) -> None:
@@ -194,20 +194,20 @@ class Audience:
 
     def _add_events(self, events: list[list[Any]]) -> None:
         self._events.extend(events)
-        self._tell_all(_events_text(events))
+        self._put_all(_events_text(events))
 
-    def _tell_all(self, text: str) -> None:
+    def _put_all(self, text: str) -> None:
         for watcher in self._watchers.values():
-            watcher.tell(text)
+            watcher.queue(text)
 
-    def _tell_of(self, vehicle: int, text: str) -> None:
+    def _put_vehicle(self, vehicle: int, text: str) -> None:
         for watcher in self._watchers.values():
             if watcher.vehicle == vehicle:
-                watcher.tell(text)
+                watcher.queue(text)
 
-    def _tell_one(self, number: int, text: str) -> None:
+    def _put_one(self, number: int, text: str) -> None:
         if number in self._watchers:
-            self._watchers[number].tell(text)
+            self._watchers[number].queue(text)
 
 
 def _events_text(events: list[list[Any]]) -> str:

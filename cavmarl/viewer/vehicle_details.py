@@ -1,4 +1,4 @@
-"""What a page is told of a world, and of the vehicle that it watches."""
+"""The data that a page gets about a world, and about the vehicle that it watches."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cavmarl.engine.spaces import sensed_observation
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.observed import feature_names
 from cavmarl.sensors.sensed_shapes import Shape, observed_shapes, sampled_shapes
@@ -32,8 +32,8 @@ DRIVERS = {
     DRIVER_SCRIPTED: "script",
     DRIVER_SUMO: "SUMO",
 }
-MOST_NUMBERS = 400  # of an observation that are shown
-ZONE_MARGIN_M = 50.0  # of the map, to which zones are drawn
+MOST_NUMBERS = 400  # largest number of observed values to show
+ZONE_MARGIN_M = 50.0  # margin around the map up to which zones are drawn
 
 Shown = CavEnv | CavVectorEnv
 
@@ -41,7 +41,7 @@ Shown = CavEnv | CavVectorEnv
 def hello_of_map(
     title: str, network: RoadNetwork, partition: ZonePartition, step_s: float
 ) -> dict[str, Any]:
-    """What a page is told first of any world: JSON, places in metres from the map's origin."""
+    """Return the first message to a page about any world: JSON, metres from the map's origin."""
     origin = map_origin(network)
     min_x, min_y, max_x, max_y = network.extent_m
     zones: list[list[float]] = []
@@ -64,12 +64,12 @@ def hello_of_map(
 
 
 def hello_of(env: Shown, policy: str, *, is_driven_here: bool = True) -> dict[str, Any]:
-    """The same of an environment's world.
+    """Return the first message to a page about an environment's world.
 
     Args:
-        env: whose worlds are shown.
-        policy: what drives it, in words.
-        is_driven_here: whether pages may begin episodes and take seats.
+        env: environment of the world.
+        policy: description of what drives it.
+        is_driven_here: whether pages may restart episodes and take seats.
     """
     config = env.config
     partition = env.worlds.world.partition
@@ -85,7 +85,7 @@ def hello_of(env: Shown, policy: str, *, is_driven_here: bool = True) -> dict[st
 def vehicle_state(
     network: RoadNetwork, agents: list[str], frame: WorldFrame, vehicle: int
 ) -> dict[str, Any]:
-    """The state of a vehicle; its `rows` are pairs of a name and what the page shows beside it."""
+    """Return the state of a vehicle; its `rows` are pairs of a name and a value to show."""
     place = int(np.searchsorted(frame.vehicles["id"], vehicle))
     if place == len(frame.vehicles) or frame.vehicles["id"][place] != vehicle:
         return {"kind": "vehicle", "id": vehicle, "here": False, "rows": []}
@@ -102,21 +102,21 @@ def vehicle_state(
         ["zone", str(row["zone"])],
         ["driven", f"{row['distance_m']:.0f} m"],
         ["size", f"{row['length']:.1f} x {row['width']:.1f} m"],
-        ["place", f"{row['x']:.1f}, {row['y']:.1f}, {row['z']:.1f} m"],
+        ["position", f"{row['x']:.1f}, {row['y']:.1f}, {row['z']:.1f} m"],
     ]
     if math.isfinite(row["to_go"]) and agent is not None:
-        rows.insert(8, ["to go", f"{row['to_go']:.0f} m"])
+        rows.insert(8, ["distance to goal", f"{row['to_go']:.0f} m"])
     if row["transfer"]:
-        rows.insert(7, ["handed over to zone", str(row["target_zone"])])
+        rows.insert(7, ["in transfer to zone", str(row["target_zone"])])
     return {"kind": "vehicle", "id": vehicle, "here": True, "agent": number, "rows": rows}
 
 
 def vehicle_details(
     env: Shown, world: int, frame: WorldFrame, vehicle: int, sensors: bool = False
 ) -> dict[str, Any]:
-    """The state and the way of a vehicle; of an agent's also what it observes and is paid.
+    """Return the state and the path of a vehicle, and an agent's observation and reward.
 
-    With `sensors` also what its sensors see; see `sensed_shapes`.
+    With `sensors`, add its sensor data; see `sensed_shapes`.
     """
     found = vehicle_state(env.network, env.possible_agents, frame, vehicle)
     if not found["here"]:
@@ -135,7 +135,7 @@ def vehicle_details(
 
 
 def sensed_shapes(config: EnvConfig, arrays: StepArrays, world: int, agent: int) -> list[Shape]:
-    """Those of an agent's observation, then those of its rig: of the last sample, if it has one."""
+    """Return the shapes of an agent's observation, then of the last samples of its rig."""
     shapes = observed_shapes(config, arrays.observations[world, agent])
     for name, settings in config.rig.items():
         frames = arrays.frames[name]
@@ -145,7 +145,7 @@ def sensed_shapes(config: EnvConfig, arrays: StepArrays, world: int, agent: int)
 
 
 def _observed(env: Shown, world: int, agent: int) -> list[list[Any]]:
-    """Sensor, feature and number of each of the features; of a stack the newest frame."""
+    """Return sensor, feature and value of each feature in the newest frame."""
     config, arrays = env.config, env.worlds.arrays
     if config.observation.mode == "sensors":
         sensed = sensed_observation(arrays.frames)
@@ -158,14 +158,14 @@ def _observed(env: Shown, world: int, agent: int) -> list[list[Any]]:
 
 
 def named_numbers(names: Sequence[Sequence[str]], numbers: Any) -> list[list[Any]]:
-    """Sensor, feature and number of each of the newest numbers, whose names are given."""
+    """Return sensor, feature and value of each of the newest numbers, given their names."""
     newest = numbers[-len(names) :] if len(names) else []
     rows = [[*name, _number(value)] for name, value in zip(names, newest, strict=True)]
     return rows[:MOST_NUMBERS]
 
 
 def named_terms(names: Sequence[str], terms: Any) -> list[list[Any]]:
-    """Name and number of each reward term."""
+    """Return name and value of each reward term."""
     return [[name, round(float(value), 4)] for name, value in zip(names, terms, strict=True)]
 
 

@@ -1,4 +1,4 @@
-"""`Stage`: one world as pages can choose it."""
+"""`Stage`: one of the worlds that pages can choose."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from cavmarl.viewer.subscribers import Audience
 
 @dataclass(frozen=True)
 class Stage:
-    """A world, its watchers, and what they are told first.
+    """A world, its watchers, and the first messages to them.
 
     Attributes:
-        name: among those of one server.
-        audience: its watchers.
-        hello: what a page is told first, JSON; see `vehicle_details.hello_of`.
-        map_bytes: the map's message.
+        name: name, unique on a server.
+        audience: watchers of the world.
+        hello: first message to a page, JSON; see `vehicle_details.hello_of`.
+        map_bytes: message of the map.
     """
 
     name: str
@@ -32,24 +32,24 @@ class Stage:
 
     @property
     def encoder(self) -> FrameEncoder:
-        """A new one, of frames on its map."""
+        """Return a new encoder for frames on the stage's map."""
         return FrameEncoder(np.array(unpack(self.map_bytes)[0]["origin"]))
 
     def named(self, name: str) -> Stage:
-        """Another world on the same map, with watchers of its own."""
+        """Return a stage for another world on the same map, with its own watchers."""
         return replace(self, name=name, audience=Audience(self.audience))
 
     def telling(self, more: dict[str, Any]) -> Stage:
-        """The same, of which pages are told more."""
+        """Return the same stage with additional data in its first message."""
         return replace(self, hello={**self.hello, **more})
 
 
 def first_stage(name: str, network: RoadNetwork, hello: dict[str, Any]) -> Stage:
-    """The stage of a world on a map."""
+    """Create the stage of a world on a map."""
     return Stage(name, Audience(), hello, map_message(network))
 
 
 def welcome_of(stages: Sequence[Stage], number: int, control: bool) -> dict[str, Any]:
-    """The first message to a page that has chosen a stage."""
+    """Return the first message to a page that has chosen a stage."""
     names = [stage.name for stage in stages]
     return {**stages[number].hello, "control": control, "worlds": names, "world": number}

@@ -1,4 +1,4 @@
-"""Where the viewer listens and what its pages may do."""
+"""The viewer's address, and the permissions of its pages."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ DEFAULT_PORT = 8710
 
 @dataclass(frozen=True)
 class WebOptions:
-    """Of one server."""
+    """Options of one server."""
 
     host: str = "127.0.0.1"
-    port: int = DEFAULT_PORT  # 0: any that is free
-    token: str = ""  # that a page has to give; the loopback address needs none
-    watch_token: str = ""  # with which a page only watches, in the place of the token
-    control: bool = True  # pages may pause, step and drive
-    framed: bool = False  # notebooks of this machine may show the page within theirs
-    send_s: float = 5.0  # in which a page has to take a message
+    port: int = DEFAULT_PORT  # 0 picks a free port
+    token: str = ""  # token of pages; not needed on the loopback address
+    watch_token: str = ""  # alternative token of pages that may only watch
+    control: bool = True  # whether pages may pause, step and drive
+    framed: bool = False  # whether notebooks on this machine may embed the page
+    send_s: float = 5.0  # time limit of a page to receive a message

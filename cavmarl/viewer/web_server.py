@@ -1,4 +1,4 @@
-"""The viewer's server: the page's files, and a WebSocket that a running world is shown through."""
+"""The viewer's server: the files of the page, and a WebSocket for a running world."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
 )
-# Of Jupyter on this machine, and of the notebooks of VS Code.
+# Origins of Jupyter on this machine, and of notebooks in VS Code.
 NOTEBOOKS = "http://127.0.0.1:* http://localhost:* vscode-webview:"
 FRAMED_POLICY = POLICY.replace("frame-ancestors 'self'", f"frame-ancestors 'self' {NOTEBOOKS}")
 HEADERS = {
@@ -55,19 +55,19 @@ TRY_LATER, REFUSED, NOT_UNDERSTOOD = 1013, 4401, 1003
 
 
 class WebServer:
-    """Serves pages from a thread of its own.
+    """Serves pages from a separate thread.
 
     Args:
-        options: where and how.
-        stages: the worlds that a page can choose among; one at least.
+        options: address and permissions.
+        stages: worlds that a page can choose, at least one.
 
     Raises:
-        ServiceError: the port is taken, or others could watch without a token.
+        ServiceError: the port is taken, or the address is reachable from outside without a token.
     """
 
     def __init__(self, options: WebOptions, stages: Sequence[Stage]) -> None:
         if not is_loopback(options.host) and not options.token:
-            raise ServiceError(f"--host {options.host}: others can reach it; give a --token")
+            raise ServiceError(f"--host {options.host}: reachable from outside; give a --token")
         self._listener = listen(options.host, options.port)
         self.port: int = self._listener.getsockname()[1]
         self.address = f"http://{shown_host(options.host)}:{self.port}/"
@@ -110,14 +110,14 @@ class WebServer:
         for stage in self._stages:
             stage.audience.begin(asyncio.get_running_loop())
         self._begun()
-        # Not `serve`: signals are the main thread's.
+        # `serve` would install signal handlers, which belong to the main thread.
         await self._server._serve(sockets=[self._listener])
 
 
 class DroppedWhenDone(WebSocketsSansIOProtocol):
-    """Cuts the connection when the application has ended without a close of its own.
+    """Cuts the connection if the application ends without closing it.
 
-    A peer that reads nothing would never take in the close.
+    A peer that does not read would never process a close message.
     """
 
     async def run_asgi(self) -> None:
@@ -127,14 +127,14 @@ class DroppedWhenDone(WebSocketsSansIOProtocol):
 
 
 def viewer_app(options: WebOptions, port: int, stages: Sequence[Stage]) -> ASGIApp:
-    """The application of a server; see `WebServer`."""
+    """Create the application of a server; see `WebServer`."""
     pages = {file.name: file.read_bytes() for file in PAGE.iterdir() if file.is_file()}
 
     async def page(request: Request) -> Response:
         name = request.path_params.get("name") or "index.html"
         content = pages.get(name)
         if content is None:
-            return PlainTextResponse("there is no such file", 404)
+            return PlainTextResponse("file not found", 404)
         return Response(content, media_type=TYPES[name.rpartition(".")[2]])
 
     async def live(socket: WebSocket) -> None:
@@ -146,10 +146,10 @@ def viewer_app(options: WebOptions, port: int, stages: Sequence[Stage]) -> ASGIA
 
 
 class OwnPagesOnly:
-    """Refuses what comes through another name or from a page of another origin; adds headers.
+    """Refuses requests for another host name or from a page of another origin; adds headers.
 
-    On the loopback address the name is checked, too: a foreign name that is made to point here
-    would make a foreign page's origin look like ours.
+    On the loopback address, the host name is checked as well: otherwise a foreign name that
+    resolves to this machine would make a foreign page look like one of the same origin.
     """
 
     def __init__(self, app: ASGIApp, host: str, port: int, policy: str = POLICY) -> None:
@@ -176,14 +176,14 @@ class OwnPagesOnly:
             await send(message)
 
         if foreign:
-            refusal = PlainTextResponse("this address is not the viewer's", 403)
+            refusal = PlainTextResponse("the request has a foreign host name or origin", 403)
             await refusal(scope, receive, with_headers)
         else:
             await self._app(scope, receive, with_headers)
 
 
 class _LiveSocket:
-    """One page's WebSocket: it says hello with token and world, then asks and is told."""
+    """One page's WebSocket: a hello with token and world, then requests and updates."""
 
     def __init__(self, socket: WebSocket, options: WebOptions, stages: Sequence[Stage]) -> None:
         self._socket = socket
@@ -212,9 +212,9 @@ class _LiveSocket:
             return
 
     async def _chosen(self) -> int | None:
-        """The number of the world that the page asks for; None: it is turned away."""
+        """Return the index of the world that the page asks for; None if the page is refused."""
         if sum(stage.audience.wishes.watchers for stage in self._stages) >= MOST_WATCHERS:
-            await self._socket.close(TRY_LATER, f"{MOST_WATCHERS} pages watch already")
+            await self._socket.close(TRY_LATER, f"{MOST_WATCHERS} pages watch already; try later")
             return None
         try:
             async with asyncio.timeout(FIRST_MESSAGE_S):
@@ -236,12 +236,12 @@ class _LiveSocket:
                 return None
         number, last = first.get("world", 0), len(self._stages) - 1
         if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= last:
-            await self._socket.close(NOT_UNDERSTOOD, f"no such world: there are 0 to {last}")
+            await self._socket.close(NOT_UNDERSTOOD, f"no such world: must be from 0 to {last}")
             return None
         return number
 
     async def _watch(self, watcher: PageWatcher) -> None:
-        """Send and listen until either ends."""
+        """Send and receive until either ends."""
         tasks = {
             asyncio.create_task(self._send_news(watcher)),
             asyncio.create_task(self._listen(watcher)),

@@ -58,7 +58,7 @@ def step_tensors(env: Any) -> list[bytes]:
     """The same of TorchRL, whose worlds begin anew by themselves."""
     tensors = env.full_action_spec.zero()
     tensors["car", "action"][:] = 0.3
-    told = env._step(tensors)
+    told = env.step(tensors)["next"]
     return [told["car", name].numpy().tobytes() for name in ("observation", "reward", "done")]
 
 
@@ -102,10 +102,7 @@ def test_supersuits_copies_are_worlds_of_their_own() -> None:
     stable_baselines3 = pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     world = cavmarl.parallel_env("merge", agents=2, **SMALL)
     joined = supersuit.concat_vec_envs_v1(
-        supersuit.pettingzoo_env_to_vec_env_v1(world),
-        2,
-        num_cpus=0,
-        base_class="stable_baselines3",
+        supersuit.pettingzoo_env_to_vec_env_v1(world), 2, num_cpus=0, base_class="stable_baselines3"
     )
     seen = joined.reset()
     assert seen.shape[0] == 4

@@ -30,12 +30,12 @@ def test_one_vehicle_of_a_world_passes_gymnasiums_checker(mode: str, kind: str) 
 
 
 def test_the_other_agents_become_background() -> None:
-    population = make().unwrapped._env.config.population
+    population = make().unwrapped.parallel_env.config.population
     entry, _ = load_config("merge")
     everybody = entry.population.agents + entry.population.background
     assert (population.agents, population.background) == (1, everybody - 1)
     overridden = gymnasium.make("cavmarl/ring-v5", overrides={"population.background": 3})
-    assert overridden.unwrapped._env.config.population.background == 3
+    assert overridden.unwrapped.parallel_env.config.population.background == 3
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -69,7 +69,7 @@ def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
     ],
 )
 def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
+    with pytest.raises(ConfigError, match=f"^{key}: this view sets it"):
         gymnasium.make("cavmarl/ring-v5", **arguments)
 
 
@@ -77,7 +77,7 @@ def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
     world = make()
     assert world.spec is not None
     assert world.spec.max_episode_steps == 40
-    assert gymnasium.make(world.spec).unwrapped._env.max_cycles == 40
+    assert gymnasium.make(world.spec).unwrapped.parallel_env.max_cycles == 40
     cut = gymnasium.make("cavmarl/ring-v5", max_episode_steps=2)
     cut.reset(seed=0)
     cut.step(cut.action_space.sample())
@@ -93,7 +93,7 @@ def test_the_infos_say_what_highway_envs_say() -> None:
         driven = seed % 2 == 0
         world = gymnasium.make("cavmarl/merge-v6", background=0 if driven else 24)
         _, info = world.reset(seed=seed)
-        env, done = world.unwrapped._env, False
+        env, done = world.unwrapped.parallel_env, False
         while not done:
             assert not info["crashed"]
             assert not info["is_success"]
@@ -113,12 +113,12 @@ def test_the_infos_say_what_highway_envs_say() -> None:
 
 def test_config_holds_nested_keys_of_the_entry() -> None:
     config = {"sensors": {"lidar": {"rays": 8}}, "terms": {"weights": {"collision": -9.0}}}
-    made = make(config=config).unwrapped._env.config
+    made = make(config=config).unwrapped.parallel_env.config
     entry, _ = load_config("merge")
     assert made.sensors.lidar.rays == 8
     assert made.sensors.lanes == entry.sensors.lanes, "what it does not name stays"
     assert made.terms.weights == {**entry.terms.weights, "collision": -9.0}
     with pytest.raises(ConfigError, match="lanes_count"):
         gymnasium.make("cavmarl/merge-v6", config={"lanes_count": 4})
-    with pytest.raises(ConfigError, match="must be a mapping of keys"):
+    with pytest.raises(ConfigError, match="must be a mapping from keys"):
         gymnasium.make("cavmarl/merge-v6", config=[1])

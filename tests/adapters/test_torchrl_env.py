@@ -29,12 +29,9 @@ CAR = "car"
 def settings(mode: str = "respawn", **overrides: Any) -> dict[str, Any]:
     keys = {"population.mode": mode, "population.budget": BUDGET, **overrides}
     return {
-        "num_envs": WORLDS,
-        "agents": AGENTS,
-        "background": 3,
-        "max_cycles": HORIZON,
+        "num_envs": WORLDS, "agents": AGENTS, "background": 3, "max_cycles": HORIZON,
         "overrides": keys,
-    }
+    }  # fmt: skip
 
 
 def make(mode: str = "respawn", **overrides: Any) -> Any:
@@ -168,7 +165,7 @@ def test_wrong_use_is_refused() -> None:
     from cavmarl.adapters.torchrl_env import CavTorchRLEnv
 
     for key, value in {"autoreset_mode": "SameStep", "copy": False}.items():
-        with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
+        with pytest.raises(ConfigError, match=f"^{key}: this view sets it"):
             CavTorchRLEnv("merge", **{key: value})
     with pytest.raises(ConfigError, match="seed"):
         make().set_seed(-1)

@@ -113,7 +113,7 @@ def test_a_share_that_is_none_is_refused_in_a_stored_plan(plan: Plan) -> None:
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        (("shards", 0, "worker"), 9, r"homes .*: must be one a shard of 8, among .* \[0, 1, 2\]"),
+        (("shards", 0, "worker"), 9, r"homes .*: there must be one for each of 8 .* \[0, 1, 2\]"),
         (("shards", 0, "worker"), 3, "among the workers that answer"),
         (("shards", 0, "cost_s"), 1e300, "cost_s = 1e"),
         (("shards", 0, "cost_s"), 10**400, "cost_s is 1000"),

@@ -62,7 +62,7 @@ def test_other_shards_than_those_of_the_plan_are_refused(
     balancer: Balancer, costs: list[float]
 ) -> None:
     shards = tuple(ShardCost(n // 4, n % 4, cost) for n, cost in enumerate(costs))
-    with pytest.raises(ConfigError, match="must be those of the plan"):
+    with pytest.raises(ConfigError, match="must be the shards of the plan"):
         balancer.measure(shards)
 
 

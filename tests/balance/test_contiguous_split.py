@@ -110,7 +110,7 @@ def test_a_worker_that_is_lost_begins_a_new_row() -> None:
 
 
 def test_workers_that_are_in_no_row_are_refused() -> None:
-    with pytest.raises(ConfigError, match="in a row"):
+    with pytest.raises(ConfigError, match="must be ascending"):
         replace(worlds([1.0] * 3, idle_snapshot(2)), present=(0, 1, 0))
 
 

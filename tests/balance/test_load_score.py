@@ -172,12 +172,12 @@ def test_nobody_at_all_is_nobody_admissible() -> None:
 
 
 def test_an_unknown_preferred_worker_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"preferred worker 7: there are \[0\]"):
+    with pytest.raises(ConfigError, match=r"preferred worker 7: must be one of \[0\]"):
         select(fleet((0.0, 0.0, 0.0)), preferred=7)
 
 
 def test_a_worker_twice_is_refused() -> None:
-    with pytest.raises(ConfigError, match="named twice"):
+    with pytest.raises(ConfigError, match="must be named once"):
         select([Candidate(0, Utilisation(0.0, 0.0))] * 2)
 
 
@@ -190,7 +190,7 @@ def test_only_shares_are_utilisations(resource: str, value: float) -> None:
 
 
 def test_percent_is_refused_with_the_share_that_it_would_be() -> None:
-    with pytest.raises(ConfigError, match=r"percent\? use 0\.55"):
+    with pytest.raises(ConfigError, match=r"percentage, use 0\.55"):
         Utilisation(55.0, 0.0)
 
 
@@ -218,7 +218,7 @@ def test_weights_that_sum_to_one_are_taken(weights: tuple[float, float, float]) 
     ("rule", "said"),
     [
         ({"thresholds": (85.0, 0.9, 0.95)}, "threshold cpu = 85.0"),
-        ({"thresholds": (1.0, 1.0, 1.0)}, "may be used up"),
+        ({"thresholds": (1.0, 1.0, 1.0)}, "without free resources"),
         ({"margin": -0.1}, "margin = -0.1"),
         ({"margin": math.nan}, "margin = nan"),
     ],

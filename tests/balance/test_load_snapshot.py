@@ -86,7 +86,7 @@ def test_a_snapshot_goes_to_json_and_back() -> None:
 def test_no_worker_or_one_twice_is_no_snapshot() -> None:
     with pytest.raises(ConfigError, match="no workers"):
         idle_snapshot(0)
-    with pytest.raises(ConfigError, match="named twice"):
+    with pytest.raises(ConfigError, match="must be named once"):
         LoadSnapshot(idle_snapshot(1).workers * 2, "none", "")
 
 

@@ -20,7 +20,7 @@ from cavmarl.bench.highway_worlds import (
     length_m,
     straight_road,
 )
-from cavmarl.bench.step_speed import MORE, Row, _our_sides, measure_step_speed
+from cavmarl.bench.step_speed import MORE, Row, measure_step_speed, our_sides
 from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.maps.check import check_map
 
@@ -45,7 +45,7 @@ def test_both_sides_drive_as_many_vehicles_by_the_same_clock_and_look_alike(tmp_
     pytest.importorskip("highway_env")
     theirs = {seen["type"]: highway_env(5, seen) for seen in (THEIR_LIDAR, THEIR_KINEMATICS)}
     road_m = max(map(length_m, theirs.values()))
-    ours = _our_sides(tmp_path, road_m, agents=5, worlds=2)
+    ours = our_sides(tmp_path, road_m, agents=5, worlds=2)
     for sensors, their in (("lidar", "LidarObservation"), ("kinematics", "Kinematics")):
         vec, env = ours[sensors, "batched"][2].args[0], theirs[their]  # type: ignore[attr-defined]
         seconds: list[float] = []
@@ -94,25 +94,21 @@ class Clocked:
 
 def test_rates_are_agent_steps_a_second_of_steps_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     world: Any = Clocked(monkeypatch)
-    assert step_speed._their_rate(world, agents=3) == 3 / 0.5
-    assert step_speed._dicts_rate(world) == 3 / 0.5
-    assert step_speed._batched_rate(world) == 2 * 3 / 0.5
+    assert step_speed.their_rate(world, agents=3) == 3 / 0.5
+    assert step_speed.dicts_rate(world) == 3 / 0.5
+    assert step_speed.batched_rate(world) == 2 * 3 / 0.5
     assert world.steps == step_speed.THEIR_STEPS + 2 * step_speed.OUR_STEPS
 
 
 def test_ratios_are_ours_over_theirs() -> None:
     medians = {
-        ("lidar", "batched"): 600.0,
-        ("lidar", "highway_env"): 20.0,
-        ("kinematics", "batched"): 1000.0,
-        ("kinematics", "single"): 500.0,
-        ("kinematics", "dicts"): 250.0,
-        ("kinematics", "more"): 800.0,
-        ("kinematics", "highway_env"): 10.0,
-        ("kinematics", "highway_env_raw"): 40.0,
-    }
+        ("lidar", "batched"): 600.0, ("lidar", "highway_env"): 20.0,
+        ("kinematics", "batched"): 1000.0, ("kinematics", "single"): 500.0,
+        ("kinematics", "dicts"): 250.0, ("kinematics", "more"): 800.0,
+        ("kinematics", "highway_env"): 10.0, ("kinematics", "highway_env_raw"): 40.0,
+    }  # fmt: skip
     rows = [Row(*key, 1, 1, 0.5 * rate, rate, 2.0 * rate) for key, rate in medians.items()]
-    found = step_speed._compare(500.0, 2, rows)
+    found = step_speed.compare(500.0, 2, rows)
     assert (found.ratio, found.ratio_kinematics, found.ratio_kinematics_raw) == (30.0, 100.0, 25.0)
     assert found.cost_of_more == 1.25
     assert found.dict_us == pytest.approx(2000.0)

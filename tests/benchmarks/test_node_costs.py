@@ -113,7 +113,7 @@ def test_borders_of_a_square_of_zones(side: int) -> None:
 
 
 def test_too_few_runs_are_refused() -> None:
-    with pytest.raises(ValueError, match="two sizes undivided"):
+    with pytest.raises(ValueError, match="undivided runs of two sizes"):
         fitted([sample(1_000, nodes) for nodes in (0, 1, 2)], KNOWN.caches)
 
 

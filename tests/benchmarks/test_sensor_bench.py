@@ -168,5 +168,5 @@ def test_a_rig_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no rig or file 'nothing'"):
         find_settings("rig", "nothing")
     (tmp_path / "list.yaml").write_text("wheels: 20\n")
-    with pytest.raises(ConfigError, match="must be sensors by name"):
+    with pytest.raises(ConfigError, match="must contain sensors by name"):
         load_rig(tmp_path / "list.yaml")

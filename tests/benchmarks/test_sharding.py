@@ -90,7 +90,7 @@ def test_different_worlds_are_not_compared(make: Callable[[int], Simulation], de
         ([4], 0, 1, "after = 0: must be from 1 to 3600"),
         ([4], 1, 0, "repeats = 0: must be from 1 to 100"),
         ([0], 1, 1, "zones = 0: must be from 1 to 256"),
-        ([], 1, 1, "name at least one"),
+        ([], 1, 1, "give at least one"),
     ],
 )
 def test_numbers_out_of_range_are_refused(
@@ -141,7 +141,7 @@ def test_the_command_says_that_worlds_differ(
         (("--layout", "rings"), "is none of grid, strips, bisection"),
         (("--layout", "none.json"), "none.json"),
         (("-d", "none.rou.xml"), "none.rou.xml"),
-        (("-d", "none.rou.xml", "--agents", "2"), "leave --agents and --background out"),
+        (("-d", "none.rou.xml", "--agents", "2"), "omit --agents and --background"),
     ],
 )
 def test_the_command_refuses(

@@ -7,7 +7,6 @@ import sys
 import pytest
 
 from benchmarks.vectorization import LIBRARIES, measure
-from cavmarl.core.errors import ConfigError
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
 
@@ -28,8 +27,3 @@ def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> 
     found = measure(agents=2, workers=2, repeats=1)
     assert "'.[bench]'" in found.facts["missing"]["supersuit"]
     assert "ratio" not in found.rows[-1]
-
-
-def test_agents_are_shared_out_evenly() -> None:
-    with pytest.raises(ConfigError, match="5 agents over 2 workers"):
-        measure(agents=5, workers=2)

@@ -23,31 +23,16 @@ from benchmarks.world_rows import (
     sumo_beside_itself,
     worst,
 )
-from benchmarks.world_runs import (
-    KEPT,
-    ROWS_FILE,
-    WorldSeries,
-    read_rows,
-    run_worlds,
-    world_folder,
-)
+from benchmarks.world_runs import KEPT, ROWS_FILE, WorldSeries, read_rows, run_worlds, world_folder
 from cavmarl.core.errors import ConfigError, MissingExtraError
 
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 pytest.importorskip("matplotlib", reason="needs the extra 'report'")
 
 FIGURES = {
-    "departed": 100,
-    "waiting": 0,
-    "arrived": 80,
-    "mean_speed_mps": 10.0,
-    "mean_delay_s": 20.0,
-    "queue": 3.0,
-    "contacts": 0,
-    "longest_lock_s": 5.0,
-    "locked_junction": "a",
-    "teleports": 0,
-}
+    "departed": 100, "waiting": 0, "arrived": 80, "mean_speed_mps": 10.0, "mean_delay_s": 20.0,
+    "queue": 3.0, "contacts": 0, "longest_lock_s": 5.0, "locked_junction": "a", "teleports": 0,
+}  # fmt: skip
 SPREAD = {
     "departed": [100, 100, 100],
     "arrived": [78, 80, 82],
@@ -131,9 +116,7 @@ def test_the_worst_are_failed_ones_then_contacts_then_speeds() -> None:
     assert [row["seed"] for row in worst(rows, 3)] == [3, 2, 1]
 
 
-def test_the_table_of_the_worst_keeps_its_words_whole_on_a_narrow_terminal(
-    tmp_path: Path,
-) -> None:
+def test_the_table_of_the_worst_keeps_its_words_whole_on_a_narrow_terminal(tmp_path: Path) -> None:
     features = ["grid", "right_before_left", "turn_lanes", "random_priority", "near_capacity"]
     row = a_row(7, mean_speed_mps=9.0, contacts=3) | {"features": features}
     console = Console(width=80, record=True)
@@ -160,7 +143,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         world_folder(job.out, seed).mkdir()
         return a_row(seed, mean_speed_mps=10.0 + 0.1 * seed)
 
-    monkeypatch.setattr(world_runs, "_run_world", run_world)
+    monkeypatch.setattr(world_runs, "run_world", run_world)
     return ran
 
 
@@ -180,7 +163,7 @@ def test_a_run_goes_on_where_it_ended_and_keeps_the_files_of_the_worst(
 
 def test_rows_of_other_settings_are_not_mixed(tmp_path: Path, stubbed: list[int]) -> None:
     run_worlds(WorldSeries(tmp_path, 1, 0))
-    with pytest.raises(ConfigError, match="rows of other settings"):
+    with pytest.raises(ConfigError, match="rows with other settings"):
         run_worlds(WorldSeries(tmp_path, 1, 0, seconds=200))
     assert stubbed == [0]
 

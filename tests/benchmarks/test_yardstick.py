@@ -14,7 +14,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netgenerate
 
@@ -31,8 +31,8 @@ def test_trips_on_a_good_map_hold() -> None:
 
 def test_maps_have_their_names_without_folders_unless_two_are_alike() -> None:
     here, there = "/some/long/folder/Town01.xodr", "/another/Town01.net.xml"
-    assert yardstick._labels(["town", here]) == {"town": "town", here: "Town01"}
-    assert yardstick._labels([here, there]) == {here: here, there: there}
+    assert yardstick.labels(["town", here]) == {"town": "town", here: "Town01"}
+    assert yardstick.labels([here, there]) == {here: here, there: there}
 
 
 def test_the_table_has_room_for_all_columns_on_a_narrow_terminal(
@@ -52,7 +52,7 @@ def test_the_table_has_room_for_all_columns_on_a_narrow_terminal(
 def test_what_touches_on_shared_ground_is_counted_apart(tmp_path: Path) -> None:
     options = ("--grid", "--grid.number=3", "--grid.length=80", "--default.spreadtype=center")
     network = read_network(netgenerate(tmp_path / "bidi.net.xml", *options))
-    ground = yardstick._SharedGround(network)
+    ground = yardstick.SharedGround(network)
     one, other = yardstick.shared_ground(network)[0]
     rows = np.zeros(3, dtype=VEHICLE)
     rows["id"], rows["lane"], rows["x"] = [0, 1, 2], [one, other, one], [0.0, 4.0, 50.0]
@@ -90,21 +90,21 @@ def test_a_vehicle_that_stands_has_a_cause_at_red_and_behind_another() -> None:
     rows["wait_s"] = [yardstick.STANDS_S, 0.0]
     rows["x"][1] = rows["x"][0] + 500.0 * np.cos(rows["heading"][0])
     rows["y"][1] = rows["y"][0] + 500.0 * np.sin(rows["heading"][0])
-    watch = yardstick._Standing(vec)
+    watch = yardstick.StandingVehicles(vec)
     red = np.zeros(len(vec.network.links), dtype=np.uint8)
     red[:] = yardstick.SIGNAL_STATES.index("r")
     green = np.full(len(vec.network.links), yardstick.SIGNAL_STATES.index("G"), dtype=np.uint8)
-    assert watch._has_cause(rows, 0, red)
-    assert not watch._has_cause(rows, 0, green)
+    assert watch.has_cause(rows, 0, red)
+    assert not watch.has_cause(rows, 0, green)
     rows["x"][1] = rows["x"][0] + 8.0 * np.cos(rows["heading"][0])
     rows["y"][1] = rows["y"][0] + 8.0 * np.sin(rows["heading"][0])
-    assert watch._has_cause(rows, 0, green)
+    assert watch.has_cause(rows, 0, green)
 
 
 def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
     vec = CavVectorEnv(LocalWorlds(load_world("town", agents=2, background=0), 1))
     vec.reset(seed=1)
-    network, watch = vec.network, yardstick._Standing(vec)
+    network, watch = vec.network, yardstick.StandingVehicles(vec)
     others = vec.simulation.vehicles(0)[1:]
     yields = np.flatnonzero(network.conflicts["must_yield"] & ~network.conflicts["merging"])
     link = int(np.searchsorted(network.links["first_conflict"], yields[0], side="right")) - 1
@@ -112,7 +112,7 @@ def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
 
     def waits(lane: int, s: float) -> bool:
         others["lane"], others["s"] = lane, s
-        return watch._gives_way(others, link)
+        return watch.gives_way(others, link)
 
     assert waits(foe["from_lane"], network.lanes["length_m"][foe["from_lane"]] - 5.0)
     assert waits(foe["next_lane"], 0.5)
@@ -131,14 +131,14 @@ def test_one_inside_a_junction_waits_for_room_behind_it_and_for_no_signal() -> N
     link = int(np.flatnonzero(network.links["first_internal"] >= 0)[0])
     rows["x"], rows["y"] = [0.0, 500.0], 0.0
     rows["lane"] = network.links[["first_internal", "to_lane"]][link].tolist()
-    watch = yardstick._Standing(vec)
+    watch = yardstick.StandingVehicles(vec)
     red = np.full(len(network.links), yardstick.SIGNAL_STATES.index("r"), dtype=np.uint8)
     rows["s"] = 5.0
-    assert watch._has_cause(rows, 0, red)
+    assert watch.has_cause(rows, 0, red)
     rows["s"][1] = yardstick.NEAR_AHEAD_M + 1.0
-    assert not watch._has_cause(rows, 0, red)
+    assert not watch.has_cause(rows, 0, red)
 
 
 def test_no_map_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no map: name some"):
+    with pytest.raises(ConfigError, match="no map: give maps"):
         yardstick.measure()

@@ -61,7 +61,7 @@ def test_a_fault_of_a_policy_in_a_process_of_verify_determinism_does_too(
     job = {"spec": asdict(spec), "policy": str(script), "steps": 1}
     monkeypatch.setattr("sys.stdin", StringIO(json.dumps(job) + "\n\n"))
     with pytest.raises(SystemExit) as ended:
-        lockstep._main()
+        lockstep.main()
     assert ended.value.code == 1
     _see_the_one_line(capsys.readouterr().err)
 

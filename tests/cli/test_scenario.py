@@ -79,11 +79,11 @@ def test_a_run_is_played_to_several_agents(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["nothing"], "There are: failed_u_turn"),
+        (["nothing"], "Choose one of: failed_u_turn"),
         (["pedestrian_crossing", "--param", "walk_mps"], "must be KEY=VALUE"),
         (["pedestrian_crossing", "--param", 'walk_mps="fast"'], "must be KEY=VALUE"),
         (["pedestrian_crossing", "--map", "ring"], "has no place for it"),
-        (["failed_u_turn", "--agents", "99"], "ask for at most"),
+        (["failed_u_turn", "--agents", "99"], "set at most"),
         (["signal_outage", "--map", "merge"], "it needs a signal"),
         (["pedestrian_crossing", "--density", "some"], "must be one of none, low, high"),
         (["pedestrian_crossing", "--picture", "crossing.jpg"], "ends in .png"),

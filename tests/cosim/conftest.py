@@ -21,12 +21,7 @@ SETTINGS = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05, "horizon_s": 
 
 def make_env(agents: int = 3, zones: int = 1, workers: int = 0, **more: Any) -> cavmarl.CavEnv:
     return cavmarl.parallel_env(
-        "ring",
-        agents=agents,
-        background=3,
-        zones=zones,
-        workers=workers,
-        overrides=SETTINGS | more,
+        "ring", agents=agents, background=3, zones=zones, workers=workers, overrides=SETTINGS | more
     )
 
 

@@ -21,6 +21,8 @@ from cavmarl.core.errors import (
 )
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.followers.follower_client import Follower, FollowerView
+from cavmarl.cosim.followers.follower_connection import call
+from cavmarl.cosim.followers.follower_messages import Control, Hello, Say
 from cavmarl.engine.step_trace import QUEUE, SENSORS, STACK, TICK, StepTrace
 from tests.cosim.conftest import drive, hashes, make_env, seated, steer
 
@@ -320,19 +322,18 @@ def test_a_vehicle_has_one_follower(address: Path) -> None:
 
 def test_answers_to_other_frames(address: Path) -> None:
     with FollowedWorld(make_env(), address, timeout_s=1.0) as world:
-        follower = seated(world, ["car_0"])
-        follower._frame = -1
-        follower.answer({"car_0": [0.0, 0.0]})  # late: thrown away and counted
-        follower._frame = 0
-        follower.answer({"car_0": [0.0, 0.0]})
+        line = call(address, 10.0)
+        line.say(Say.HELLO, Hello("x", ["car_0"]))
+        world.wait_for(1, 10.0)
+        for frame in (-1, 0):  # the first one is late: it is dropped and counted
+            line.say(Say.CONTROL, Control(frame, {"car_0": [0.0, 0.0]}))
         world.reset(seed=0)
         (seat,) = world.seats
         assert (seat.answers, seat.late) == (1, 1)
-        follower._frame = 7
-        follower.answer({"car_0": [0.0, 0.0]})
+        line.say(Say.CONTROL, Control(7, {"car_0": [0.0, 0.0]}))
         with pytest.raises(FollowerError, match="answers frame 7; the last is 1"):
             world.step()
-        follower.close()
+        line.close()
 
 
 def test_nobody_comes(address: Path) -> None:
@@ -344,7 +345,7 @@ def test_nobody_comes(address: Path) -> None:
 
 
 def test_nobody_is_there(address: Path) -> None:
-    with pytest.raises(FollowerLostError, match="is it running"):
+    with pytest.raises(FollowerLostError, match="start it first"):
         Follower(address)
     with pytest.raises(ConfigError, match="at most 100 bytes"):
         Follower("x" * 200)
@@ -354,7 +355,7 @@ def test_impossible_worlds(address: Path) -> None:
     with pytest.raises(ConfigError, match="timeout_s"):
         FollowedWorld(make_env(), address, timeout_s=0.0)
     address.write_text("somebody's file")
-    with pytest.raises(ConfigError, match="cannot listen"):
+    with pytest.raises(ConfigError, match="cannot be opened"):
         FollowedWorld(make_env(), address)
     assert address.read_text() == "somebody's file"
 

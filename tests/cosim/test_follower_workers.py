@@ -17,7 +17,7 @@ from cavmarl.core.errors import ConfigError, FollowerLostError
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.followers.follower_client import Follower, FollowerView
 from cavmarl.engine.step_trace import StepTrace
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from tests.cosim.conftest import drive, make_env, spawn
 from tests.cosim.test_followed_world import reference
 from tests.cosim.test_killed_followers import DRIVER

@@ -69,7 +69,7 @@ def test_what_is_missing_is_said(world: Any, cloud: Path, tmp_path: Path) -> Non
 
     with pytest.raises(ConfigError, match="needs a point-cloud map"):
         stack(sensors, None)
-    with pytest.raises(ConfigError, match="no lidar among the sensors"):
+    with pytest.raises(ConfigError, match="needs a lidar"):
         stack([one for one in sensors if one.type != "lidar"], cloud)
     flat = tmp_path / "flat.csv"
     x, y = np.meshgrid(np.arange(30.0), np.arange(30.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 from collections.abc import Callable
@@ -26,7 +27,7 @@ from cavmarl.cosim.followers.follower_messages import (
     payload_of,
     read_payload,
 )
-from cavmarl.parallel.network.framed_socket import FramedSocket
+from cavmarl.cosim.followers.framed_socket import FramedSocket
 from tests.cosim.conftest import hashes, make_env, seated
 from tests.cosim.test_followed_world import reference
 from tests.support.descriptors import without_descriptors
@@ -105,15 +106,15 @@ def test_one_that_speaks_byte_by_byte_is_not_waited_for(
         slow = call(address)
         for k in range(len(words) - 1):
             slow.sendall(words[k : k + 1])
-            world._admit(0.0)
+            world.admit(0.0)
         assert not world.master.followers
         slow.sendall(words[-1:])
-        world._admit(0.0)
+        world.admit(0.0)
         assert [follower.name for follower in world.master.followers] == ["x"]
         monkeypatch.setattr(reception, "GREETING_S", 0.0)
         half = call(address)
         half.sendall(words[:20])
-        world._admit(0.0)
+        world.admit(0.0)
         assert "not introduced itself" in refusal(half)
         slow.close()
 
@@ -122,11 +123,11 @@ def test_a_crowd_does_not_keep_a_follower_out(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
         crowd = [call(address) for _ in range(reception.MAX_CALLERS)]
-        world._admit(0.0)
+        world.admit(0.0)
         late = call(address)
         late.sendall(hello_in(1))
-        world._admit(0.0)  # takes the place of the first of the crowd
-        world._admit(0.0)
+        world.admit(0.0)  # takes the place of the first of the crowd
+        world.admit(0.0)
         assert [follower.name for follower in world.master.followers] == ["x"]
         assert "too many callers" in refusal(crowd[0])
         for connection in (*crowd, late):
@@ -137,14 +138,14 @@ def test_a_world_without_descriptors_lets_the_oldest_caller_go(address: Path) ->
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
         first = call(address)
-        world._admit(0.0)
+        world.admit(0.0)
         later, words = call(address), hello_in(1)
         with without_descriptors():
-            world._admit(0.0)
+            world.admit(0.0)
             assert "no descriptors" in refusal(first)
-            world._admit(0.0)
+            world.admit(0.0)
             later.sendall(words)
-            world._admit(0.0)
+            world.admit(0.0)
             assert [follower.name for follower in world.master.followers] == ["x"]
         later.close()
 
@@ -152,27 +153,26 @@ def test_a_world_without_descriptors_lets_the_oldest_caller_go(address: Path) ->
 @pytest.mark.parametrize(
     ("speak", "match"),
     [
-        (lambda line: line.say(Say.HELLO, Hello("again", [])), "says HELLO"),
-        (lambda line: line._socket.sendall(b"garbage " * 20), "begins no frame"),
-        (lambda line: line._wire.send(Say.CONTROL, 0, {"frame": "x"}), "no Control"),
-        (lambda line: line._wire.send(Say.CONTROL, 0, None), "no Control"),
-        (
-            lambda line: line._wire.send(Say.CONTROL, 0, {"frame": 0, "controls": {}, "more": 1}),
-            "more",
-        ),
+        (lambda wire: wire.send(Say.HELLO, 0, payload_of(Hello("again", []))), "sent HELLO"),
+        (lambda wire: os.write(wire.fileno(), b"garbage " * 20), "begins no frame"),
+        (lambda wire: wire.send(Say.CONTROL, 0, {"frame": "x"}), "not a Control"),
+        (lambda wire: wire.send(Say.CONTROL, 0, None), "not a Control"),
+        (lambda wire: wire.send(Say.CONTROL, 0, {"frame": 0, "controls": {}, "more": 1}), "more"),
     ],
     ids=["hello twice", "garbage", "no number", "nothing", "more than is known"],
 )
 def test_a_follower_that_says_nonsense_is_let_go(
-    address: Path, speak: Callable[[FollowerConnection], None], match: str
+    address: Path, speak: Callable[[FramedSocket], object], match: str
 ) -> None:
     with FollowedWorld(make_env(), address) as world:
-        follower = seated(world, ["car_0"])
-        speak(follower._line)
+        wire = FramedSocket(call(address), FOLLOWERS)
+        wire.send(Say.HELLO, 0, payload_of(Hello("x", ["car_0"])))
+        world.wait_for(1, 10.0)
+        speak(wire)
         with pytest.raises(FollowerError, match=match):
             world.reset(seed=1)
         assert hashes(world, 2) == reference(2, {})
-        follower.close()
+        wire.close()
 
 
 def test_a_hello_for_too_many_is_refused(address: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_hello_for_too_many_is_refused(address: Path) -> None:
         world.reset(seed=0)
         hashes(world, 2)
         heard = line.hear(10.0)
-        assert "wants 5000 vehicles" in heard.payload["reason"]
+        assert "requests 5000 vehicles" in heard.payload["reason"]
         line.close()
 
 
@@ -221,12 +221,12 @@ def test_any_payload_is_a_message_or_a_typed_error(payload: object) -> None:
 @pytest.mark.parametrize(
     ("dtype", "shape", "stamps", "words"),
     [
-        ("O", [1], 1, "dtype 'O' is none of"),
-        ("<f4,<f4", [1], 1, "dtype '<f4,<f4' is none of"),
-        ("<f4", [], 1, "no array has the shape"),
-        ("<f4", [-1], 1, "no array has the shape"),
-        ("<f4", [0] + [1 << 40] * 2, 0, "no array has the shape"),
-        ("<f4", [1] * 40, 1, "no array has the shape"),
+        ("O", [1], 1, "dtype 'O': must be one of"),
+        ("<f4,<f4", [1], 1, "dtype '<f4,<f4': must be one of"),
+        ("<f4", [], 1, "invalid shape"),
+        ("<f4", [-1], 1, "invalid shape"),
+        ("<f4", [0] + [1 << 40] * 2, 0, "invalid shape"),
+        ("<f4", [1] * 40, 1, "invalid shape"),
         ("<f4", [2, 3], 1, "2 samples with 1 stamps"),
     ],
 )

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 import cavmarl
-from cavmarl.core.errors import (
-    ClockError,
-    ConfigError,
-)
+from cavmarl.core.errors import ClockError, ConfigError
 from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Stepwise, TimeMaster
 from cavmarl.engine.step_trace import SENSORS, TICK, StepTrace
 from cavmarl.shards.shard import Commands

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.kernels.junctions.junctions import _exit_blocked
+from cavmarl.driving.kernels.junctions.junctions import exit_blocked
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.roads.network import RoadNetwork
@@ -428,7 +428,7 @@ def test_vehicles_that_stand_far_beyond_the_junction_do_not_count(
     room = scratch(roads, len(rows))
     index_lanes(roads.arrays, ways, rows, len(rows), room)
     way = int(before[0]["way"])
-    assert _exit_blocked(roads.arrays, ways, rows[-1], link, way, room) == blocked
+    assert exit_blocked(roads.arrays, ways, rows[-1], link, way, room) == blocked
 
 
 def _beyond(roads: RoadNetwork, lane: int) -> int:

@@ -10,9 +10,9 @@ from cavmarl.driving.kernels.lanes.lane_choice import (
     MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
     SWAP_ROOM_M,
-    _change_is_safe,
-    _imposed_on_followers,
-    _rear_is_inside,
+    change_is_safe,
+    imposed_on_followers,
+    rear_is_inside,
     room_for_further_changes,
     wish_on_lane,
 )
@@ -80,9 +80,9 @@ def test_a_vehicle_changes_lanes_when_its_rear_is_out_of_the_junction(
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"] = driver
     lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
-    assert _rear_is_inside(lane, row) == waits
+    assert rear_is_inside(lane, row) == waits
     row["s"] = 2.6
-    assert not _rear_is_inside(lane, row)
+    assert not rear_is_inside(lane, row)
 
 
 @pytest.mark.parametrize(("length_m", "near_m"), [(16.4, 0.0), (18.5, 2.0), (100.0, 5.0)])
@@ -93,7 +93,7 @@ def test_a_vehicle_keeps_its_lane_where_long_vehicles_turn_in(
     row["driver"], row["length"], lane["length_m"] = DRIVER_BACKGROUND, 5.0, length_m
     for rear_m, stays in ((near_m - 0.1, True), (near_m + 0.1, False)):
         row["s"] = 2.5 + rear_m
-        assert _rear_is_inside(lane, row) == stays
+        assert rear_is_inside(lane, row) == stays
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_a_slow_steered_vehicle_changes_lanes_there(driver: int, speed: float, s
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"], row["length"], lane["length_m"] = driver, 5.0, 20.0
     row["s"], row["speed"] = 2.5 + 3.0, speed
-    assert _rear_is_inside(lane, row) == stays
+    assert rear_is_inside(lane, row) == stays
 
 
 @pytest.mark.parametrize(("far_mps", "asks"), [(25.0, True), (0.0, False)])
@@ -124,7 +124,7 @@ def test_a_lane_change_considers_followers_on_every_incoming_lane(
     )
     room = scratch(roads, 3)
     index_lanes(roads.arrays, tables, rows, 3, room)
-    least = _imposed_on_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
+    least = imposed_on_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
     assert (least < -MAX_BRAKING_NEEDED) == asks
 
 
@@ -143,4 +143,4 @@ def test_no_lane_change_ends_too_close_to_a_leader_at_low_speed(gap_m: float, sa
     )
     room = scratch(roads, 2)
     index_lanes(roads.arrays, tables, rows, 2, room)
-    assert _change_is_safe(roads.arrays, tables, rows, 0, left, 0.0, True, room) == safe
+    assert change_is_safe(roads.arrays, tables, rows, 0, left, 0.0, True, room) == safe

@@ -18,8 +18,8 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.lanes.adjacent_leaders import behind_askew
 from cavmarl.driving.kernels.lanes.lane_ends import (
     LONGEST_HALF_M,
-    _behind_turning,
     behind_over_line,
+    behind_turning,
     misses_last_change,
 )
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
@@ -157,7 +157,7 @@ def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
     room.approach["half"][0] = 0.5 * length_m
     room.approach["dist"][0] = 0.5 * length_m - over_m
     kind = generated_types()[0]
-    found = _behind_turning(roads.arrays._replace(lanes=lanes), kind, row, lane, 20.0, room)
+    found = behind_turning(roads.arrays._replace(lanes=lanes), kind, row, lane, 20.0, room)
     assert (found > no_constraint(kind)) == minds
 
 

@@ -16,7 +16,7 @@ from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.motion.scripted_rows import follow_script, note_cues, stand_at
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.roads.routing import PLAN, make_plans
-from cavmarl.shards.shard import _make_scratch
+from cavmarl.shards.shard import make_shard_scratch
 from cavmarl.traffic.scenarios.motions import Await, Move, Pose, Ride, Wait, arc, path_of
 from cavmarl.traffic.scenarios.movement_scripts import (
     BODIES,
@@ -118,7 +118,7 @@ def entries(
     tables: TripTables, rows: NDArray[np.void]
 ) -> dict[int, list[tuple[int, float, float]]]:
     """Return (id, start, end) of the entries of each lane in the index."""
-    room = _make_scratch(ROADS, len(rows), tables.scripts.room)
+    room = make_shard_scratch(ROADS, len(rows), tables.scripts.room)
     index_lanes(ROADS.arrays, tables, rows, len(rows), room)
     return {
         lane: [
@@ -203,7 +203,7 @@ def test_a_scripted_vehicle_registers_at_junctions_like_a_driver() -> None:
 
 
 def announced(tables: TripTables, rows: NDArray[np.void]) -> list[tuple[int, float]]:
-    room = _make_scratch(ROADS, 1, tables.scripts.room)
+    room = make_shard_scratch(ROADS, 1, tables.scripts.room)
     step, step_at = np.zeros(1, PLAN), np.zeros(1, np.int64)
     register_links(ROADS.arrays, tables, rows, 1, step, step_at, room)
     return [

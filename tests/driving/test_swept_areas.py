@@ -16,7 +16,7 @@ from cavmarl.core.records.codes import (
     MODEL_KRAUSS,
 )
 from cavmarl.core.records.rows import STEERED
-from cavmarl.driving.kernels.drivers import _at_line, decide
+from cavmarl.driving.kernels.drivers import decide, decide_at_line
 from cavmarl.driving.kernels.junctions.approach import APPROACH
 from cavmarl.driving.kernels.junctions.swept_areas import (
     behind_fork,
@@ -220,7 +220,7 @@ def test_a_car_that_stops_for_a_bus_is_ready_to_stop_inside(
         entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, 1, 0.5 * BUS_M
         entry["dist"] = 0.5 * BUS_M - float(sweep["foe_enter_m"]) - 1.0
         entry["speed"] = 2.0
-        found, hold, _ = _at_line(
+        found, hold, _ = decide_at_line(
             roads, travel, rows, 0, types[0], link, front_m + 0.5 * CAR_M, 0, phase, 0.1, room,
         )  # fmt: skip
         assert hold == HOLD_NONE

@@ -11,7 +11,7 @@ from cavmarl.core.records.rows import SWEPT_BEYOND_M
 from cavmarl.driving.kernels.drivers import decide
 from cavmarl.driving.kernels.junctions.approach import register_links
 from cavmarl.driving.kernels.junctions.swept_areas import stop_before_foe_sweep
-from cavmarl.driving.kernels.lanes.lane_choice import _change_is_safe
+from cavmarl.driving.kernels.lanes.lane_choice import change_is_safe
 from cavmarl.driving.kernels.lanes.lane_ends import constraint_of_side_lane
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.models.following import no_constraint
@@ -19,7 +19,7 @@ from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.roads.sumo_net.reader import read_network
-from cavmarl.traffic.kernels.admission import _is_swept, _may_be_swept
+from cavmarl.traffic.kernels.admission import is_entry_swept, may_entry_be_swept
 from tests.support.netgenerate import netgenerate
 from tests.support.traffic import on_lane, scratch, travel_by
 
@@ -212,10 +212,10 @@ def test_no_vehicle_enters_beside_a_bus_in_a_u_turn(
     if bus_m is not None:
         room.link_end[turn] = 1
         room.approach["half"][0], room.approach["dist"][0] = 0.5 * BUS_M, 0.5 * BUS_M - bus_m
-    assert bus_m is None or _may_be_swept(network.arrays, travel, row, room)
-    assert _is_swept(network.arrays, travel, row, room) == swept
+    assert bus_m is None or may_entry_be_swept(network.arrays, travel, row, room)
+    assert is_entry_swept(network.arrays, travel, row, room) == swept
     row["s"] = 30.0
-    assert not _is_swept(network.arrays, travel, row, room), "the vehicle enters further on"
+    assert not is_entry_swept(network.arrays, travel, row, room), "the vehicle enters further on"
 
 
 def dead_end(network: RoadNetwork) -> tuple[int, int]:
@@ -372,4 +372,4 @@ def test_no_lane_change_ends_close_behind_a_vehicle_over_the_line(
     room = scratch(network, 2)
     index_lanes(network.arrays, travel, rows, 2, room)
     register_links(network.arrays, travel, rows, 2, np.zeros(2, PLAN), np.zeros(2, np.int64), room)
-    assert _change_is_safe(network.arrays, travel, rows, 1, left, 0.0, True, room) == safe
+    assert change_is_safe(network.arrays, travel, rows, 1, left, 0.0, True, room) == safe

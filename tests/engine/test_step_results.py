@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.arrays import DepartureQueue, Outputs
-from cavmarl.core.records.codes import (
-    EVENT_ARRIVED,
-    EVENT_COLLIDED,
-    EVENT_OUT_OF_TIME,
-    NUM_COUNTS,
-)
+from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED, EVENT_OUT_OF_TIME, NUM_COUNTS
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_continuation
 from cavmarl.engine.world_setup import load_world

@@ -26,6 +26,8 @@ def test_every_entry_has_its_ids(name: str) -> None:
     assert f"cavmarl/{name}Agents-v{version}" in gymnasium.registry
     assert f"cavmarl/{name}Discrete-v{version}" in gymnasium.registry
     assert f"cavmarl/{name}DiscreteAgents-v{version}" in gymnasium.registry
+    ours = [spec for spec in gymnasium.registry if spec.startswith("cavmarl/")]
+    assert len(ours) == 4 * len(ALL)
     if not hasattr(pettingzoo, "make"):
         pytest.skip("this PettingZoo has no registry")
     for kind in ("parallel", "aec"):

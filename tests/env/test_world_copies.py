@@ -20,7 +20,6 @@ COPIES: dict[str, Callable[[Any], Any]] = {
     "deepcopy": copy.deepcopy,
     "pickle": lambda env: pickle.loads(pickle.dumps(env)),
 }
-RIG = {"rig": "highway", "observation.mode": "sensors"}
 WORLDS: dict[str, dict[str, Any]] = {
     "ring": {"env": "ring"},
     "open": {"env": "merge", "overrides": {"population.mode": "open", "population.budget": 30}},

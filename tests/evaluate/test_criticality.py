@@ -9,12 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap
-from cavmarl.evaluate.scenarios.criticality import (
-    TRACE,
-    _box,
-    least_ttc_s,
-    post_encroachment_s,
-)
+from cavmarl.evaluate.scenarios.criticality import TRACE, box, least_ttc_s, post_encroachment_s
 
 
 def body(
@@ -58,7 +53,7 @@ def test_it_is_when_the_first_small_step_lets_them_overlap(
             row["x"] += row["speed"] * math.cos(row["heading"]) * time_s
             row["y"] += row["speed"] * math.sin(row["heading"]) * time_s
             moved.append(row)
-        return bool(boxes_overlap(*_box(moved[0]), *_box(moved[1])))
+        return bool(boxes_overlap(*box(moved[0]), *box(moved[1])))
 
     hits = [0.01 * k for k in range(600) if touch(0.01 * k)]
     if hits:

@@ -12,13 +12,7 @@ import pytest
 
 from cavmarl.core.errors import ConfigError, PolicyError, UnknownEnvironmentError
 from cavmarl.core.processes import start_python
-from cavmarl.evaluate import (
-    EvaluationReport,
-    episodes,
-    evaluate,
-    load_report,
-    subprocess_calls,
-)
+from cavmarl.evaluate import EvaluationReport, episodes, evaluate, load_report, subprocess_calls
 from cavmarl.evaluate.episodes import worlds_at_once
 from cavmarl.evaluate.evaluation import load_tables, run_seeds
 from cavmarl.evaluate.metrics import METRICS

@@ -224,6 +224,6 @@ def test_causes(marks: list[str], cause: str) -> None:
 def test_a_recording_that_is_there_is_refused_before_anything_runs(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "file").write_text("kept")
-    with pytest.raises(RecordingError, match="give a new folder"):
+    with pytest.raises(RecordingError, match="name a new folder"):
         evaluate("ring", "idm", episodes=1, out=tmp_path / "out", record=tmp_path / "there")
     assert not (tmp_path / "out").exists()

@@ -115,7 +115,7 @@ def test_results_that_were_changed_are_refused(folder: Path) -> None:
 
 def test_a_folder_is_used_once(folder: Path) -> None:
     before = {path.name: hash_of_file(path) for path in folder.iterdir()}
-    with pytest.raises(ManifestError, match="give a new folder"):
+    with pytest.raises(ManifestError, match="name a new folder"):
         evaluate("merge", "idm", out=folder, **SMALL)
     assert {path.name: hash_of_file(path) for path in folder.iterdir()} == before
 

@@ -22,16 +22,10 @@ from cavmarl.evaluate.page import write_page
 
 SMALL: dict[str, Any] = {"episodes": 2, "agents": 3, "background": 3, "max_cycles": 80}
 QUIET = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
     "--hide-scrollbars",
-)
+)  # fmt: skip
 # Runs after the page and writes what the browser made of it into the page.
 PROBE = """<script>
 window.addEventListener("load", () => {

@@ -54,7 +54,7 @@ def test_every_map_is_driven_with_every_number_of_agents(tmp_path: Path) -> None
 def test_two_maps_of_one_name_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("maps: [merge/map/map.net.xml, ring/map/map.net.xml]\nagents: [1]\n")
-    with pytest.raises(ConfigError, match="two have one name"):
+    with pytest.raises(ConfigError, match="two maps have the same name"):
         worlds_of(load_suite(file), ROOT / "envs")
 
 
@@ -62,7 +62,7 @@ def test_two_maps_of_one_name_are_refused(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("maps: []\nagents: [1]", "maps = "),
-        ("maps: [ring, ring]\nagents: [1]", "each once"),
+        ("maps: [ring, ring]\nagents: [1]", "contain a value twice"),
         ("maps: [ring]\nagents: []", "agents = "),
         ("maps: [ring]\nagents: [1]\nmap: x", "map: unknown key"),
         ("maps: ring", "maps"),

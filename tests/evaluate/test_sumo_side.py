@@ -11,7 +11,7 @@ import pytest
 from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.evaluate.traffic.sumo_side import (
     SumoJob,
-    _VehicleReader,
+    VehicleReader,
     run_seeds,
     start_sumo,
     sumo_process,
@@ -192,6 +192,6 @@ def _first_place(
 ) -> tuple[float, float, float, float, tuple[float, float]]:
     libsumo = start_sumo(given, folder)
     libsumo.simulationStep()
-    row = _VehicleReader(libsumo, read_network(given.map_file)).rows()[0]
+    row = VehicleReader(libsumo, read_network(given.map_file)).rows()[0]
     front = libsumo.vehicle.getPosition("a")
     return row["x"], row["y"], row["heading"], row["length"], front

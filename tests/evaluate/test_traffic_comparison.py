@@ -166,7 +166,7 @@ def test_a_turn_counts_each_vehicle_once_a_step_on_both_sides(still: StillSumo) 
         step=lambda _: moved.append(None),
         vehicles=lambda: [None] * 7,
     )
-    ours, theirs = traffic_speed._our_turn(world, 4), traffic_speed.turn_of_sumo(4)
+    ours, theirs = traffic_speed.our_turn(world, 4), traffic_speed.turn_of_sumo(4)
     assert ours.vehicle_steps == theirs.vehicle_steps == 28
     assert len(moved) == still.steps == 4
 
@@ -187,7 +187,7 @@ def test_numbers_out_of_range_are_refused(wrong: dict[str, float], says: str) ->
         (("bench", "traffic", str(MAP), "-d", "none.rou.xml"), "none.rou.xml: cannot be read"),
         (
             ("bench", "traffic", str(GAME / "cross" / "cross.net.xml"), "-d", str(ROUTES)),
-            "is the file of another map",
+            "use files that were made for this map",
         ),
         ((*WORDS, "--speed", "--plot", "x.png"), "--plot"),
         ((*WORDS, "--speed", "--after", "0"), "after = 0"),

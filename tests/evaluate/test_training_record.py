@@ -18,11 +18,7 @@ from tests.cli.test_main import refusal, run
     [(5, 1, ["measured"]), (2, 4, ["length of lanes", "measured"])],  # one world is on one worker
 )
 def test_plans_are_made_again_from_the_manifest(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    worlds: int,
-    zones: int,
-    sources: list[str],
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], worlds: int, zones: int, sources: list[str]
 ) -> None:
     overrides = {"workers.balance_steps": 3, "workers.imbalance_tolerance": 0.0}
     vec = make_vec("ring", num_envs=worlds, zones=zones, workers=3, overrides=overrides)

@@ -122,7 +122,7 @@ def test_drivers_among_each_other() -> None:
 def test_a_matrix_needs_several_agents_and_different_drivers() -> None:
     with pytest.raises(ConfigError, match="has one agent"):
         cross("merge", ["idm"], agents=1)
-    with pytest.raises(PolicyError, match="stands there twice"):
+    with pytest.raises(PolicyError, match="is listed twice"):
         cross("merge", ["idm", "idm"])
 
 

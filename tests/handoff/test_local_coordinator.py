@@ -126,16 +126,17 @@ def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late(
     monkeypatch.setattr(direct, "LATE", late)
     vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
     vec.reset(seed=1)
-    for _ in range(3 * STEPS):
-        vec.step(vec.suggest_actions())
     simulation = vec.simulation
     (coordinator,), (log,) = simulation.coordinators, simulation.transfers
     assert isinstance(coordinator, LocalCoordinator)
-    assert 0 < len(coordinator._book) < late
-    assert coordinator._directory.table.tick < coordinator.tick == 6 * STEPS
+    directory, book = coordinator.directory, simulation.division.book
+    for _ in range(3 * STEPS):
+        vec.step(vec.suggest_actions())
+    assert 0 < book.num_changes[0] < late
+    assert directory.table.tick < coordinator.tick == 6 * STEPS
     assert len(log.rows) == simulation.migrations > late
-    assert coordinator._directory.table.tick == coordinator.tick
-    assert len(coordinator._book) == 0
+    assert directory.table.tick == coordinator.tick
+    assert book.num_changes[0] == 0
     owners = {v: zone for v, (zone, _) in coordinator.directory.table.owners.items()}
     born = dict(entry[:2] for entry in coordinator.notes()[0])
     gone = {entry.vehicle for entry in coordinator.notes()[1]}
@@ -149,12 +150,13 @@ def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> N
     (coordinator,) = vec.simulation.coordinators
     assert isinstance(coordinator, LocalCoordinator)
     vec.step(vec.suggest_actions())
-    assert coordinator.directory.table.owners, "who is there at the start is on record"
-    while not len(coordinator._book):
+    directory, book = coordinator.directory, vec.simulation.division.book
+    assert directory.table.owners, "who is there at the start is on record"
+    while not book.num_changes[0]:
         vec.step(vec.suggest_actions())
-    (change, *_) = coordinator._book.newest(len(coordinator._book))
-    coordinator._directory.table.owners[change.vehicle] = (change.target, change.epoch - 1)
-    with pytest.raises(ProtocolError, match=f"vehicle {change.vehicle} changed .* owner on record"):
+    vehicle, target, epoch = book.changes[0, 0][["vehicle", "target", "epoch"]].tolist()
+    directory.table.owners[vehicle] = (target, epoch - 1)
+    with pytest.raises(ProtocolError, match=f"vehicle {vehicle} changed .* owner on record"):
         _ = coordinator.directory
 
 

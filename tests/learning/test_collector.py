@@ -91,7 +91,7 @@ def test_seats_of_opponents_teach_nothing_and_drive_as_they_do() -> None:
     args = PPO.Args(num_steps=STEPS, opponents="idm,random_actions", opponent_share=0.3)
     collector = PPO.Collector(vec, ActorCritic(config), args, seed=0)
     batch = collector.collect(with_suggested=False)
-    theirs = ~collector._opponents.absent
+    theirs = ~collector.opponents.absent
     assert 0 < int(theirs.sum()) < theirs.size
     assert not batch.acted[:, theirs].any()
     assert not batch.goes_on[:, theirs].any()

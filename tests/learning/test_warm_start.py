@@ -18,9 +18,7 @@ from cavmarl.sensors.observed import feature_names
 
 FEWER = SensorsConfig(stack=2, conflicts=ConflictsConfig(count=2), history=HistoryConfig(steps=1))
 MORE = SensorsConfig(
-    stack=3,
-    conflicts=ConflictsConfig(count=3, indicators=True),
-    history=HistoryConfig(steps=2),
+    stack=3, conflicts=ConflictsConfig(count=3, indicators=True), history=HistoryConfig(steps=2)
 )
 FORMS = ({"shared": True}, {"residual": True}, {"state_size": 4})
 

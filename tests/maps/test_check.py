@@ -75,7 +75,6 @@ def check(tmp_path: Path) -> Callable[..., MapReport]:
 def test_figures_of_real_maps(built_map: BuiltMap, name: str) -> None:
     report = check_map(network_of(built_map(name)))
     road_km, lane_km, junctions, signals, connected, edges = FIGURES[name]
-
     assert report.drivable
     assert round(report.road_km, 2) == road_km
     assert round(report.lane_km, 2) == lane_km
@@ -90,7 +89,6 @@ def test_figures_equal_sumolib(built_map: BuiltMap, name: str) -> None:
     net = sumolib.net.readNet(str(path), withPrograms=True, withInternal=True)
     edges = [edge for edge in net.getEdges(withInternal=False) if edge.allows("passenger")]
     lanes = [lane for edge in edges for lane in edge.getLanes() if lane.allows("passenger")]
-
     assert report.edges == len(edges)
     assert report.lanes == len(lanes)
     assert report.road_km == pytest.approx(sum(edge.getLength() for edge in edges) / 1e3)
@@ -104,14 +102,12 @@ def test_figures_equal_sumolib(built_map: BuiltMap, name: str) -> None:
 
 def test_a_poorly_connected_map_is_drivable_and_noted(built_map: BuiltMap) -> None:
     report = check_map(network_of(built_map("osm/berlin_siegessaeule.osm.gz")))
-
     assert report.drivable
     assert any("only 27% of the edges" in note for note in report.notes)
 
 
 def test_steep_lanes_are_noted(built_map: BuiltMap) -> None:
     report = check_map(network_of(built_map("net/mcity/mcity.net.xml")))
-
     assert report.elevation_m == pytest.approx((266.0, 279.4), abs=0.05)
     assert report.max_grade == pytest.approx(0.346, abs=0.001)
     assert any("climbs 35%" in note for note in report.notes)
@@ -119,7 +115,6 @@ def test_steep_lanes_are_noted(built_map: BuiltMap) -> None:
 
 def test_a_ring_with_a_spur(check: Callable[..., MapReport]) -> None:
     report = check()
-
     assert report.drivable
     assert (report.connected_edges, report.edges) == (2, 3)
     assert report.dead_ends == ("x",)
@@ -132,7 +127,6 @@ def test_a_ring_with_a_spur(check: Callable[..., MapReport]) -> None:
 
 def test_a_map_without_connections_cannot_be_driven(check: Callable[..., MapReport]) -> None:
     report = check(("<connection ", "<param key='' value='' "))
-
     assert not report.drivable
     assert report.problems == (
         "no edge leads to another: the map has no connections (build it again)",
@@ -141,7 +135,6 @@ def test_a_map_without_connections_cannot_be_driven(check: Callable[..., MapRepo
 
 def test_a_map_for_buses_cannot_be_driven(check: Callable[..., MapReport]) -> None:
     report = check(("<lane ", '<lane allow="bus" '))
-
     assert not report.drivable
     assert (report.edges, report.road_km, report.connected_share) == (0, 0.0, 0.0)
     assert "no edge is open to passenger cars" in report.problems[0]
@@ -155,7 +148,6 @@ def test_odd_things_are_named(check: Callable[..., MapReport]) -> None:
         ('incLanes="x_0"', 'incLanes=""'),
         ('id="x_0" index="0" speed="10"', 'id="x_0" index="0" speed="0.5"'),
     )
-
     assert report.lanes_without_successor == ("a_1",)
     assert report.self_loops == ("x",)
     assert report.speed_outliers == ("a_1", "x_0")
@@ -173,7 +165,6 @@ def test_merging_without_a_rule_is_named(check: Callable[..., MapReport]) -> Non
     )
     report = check(*unruled)
     assert report.junctions_without_right_of_way == ("B",)
-
     requests = (
         '<request index="0" response="00" foes="10"/><request index="1" response="01" foes="01"/>'
     )
@@ -194,7 +185,6 @@ def test_signals_that_never_open_or_control_nothing_are_named(
         ('  <junction id="A"', f'{programs}<junction id="A"'),
         ('dir="s" state="M"', 'dir="s" state="o" tl="shut" linkIndex="1"'),
     )
-
     assert report.signals == 2
     assert report.signals_without_lanes == ("idle",)
     assert report.lanes_never_green == ("a_0",)
@@ -210,7 +200,6 @@ def test_signals_that_never_open_or_control_nothing_are_named(
 def test_components_equal_mutual_reach(graph: tuple[int, list[tuple[int, int]]]) -> None:
     size, arcs = graph
     component = strong_components(size, np.array(arcs, np.int32).reshape(-1, 2))
-
     reach = np.eye(size, dtype=bool)
     for source, target in arcs:
         reach[source, target] = True
@@ -222,5 +211,4 @@ def test_components_equal_mutual_reach(graph: tuple[int, list[tuple[int, int]]])
 
 def test_components_of_a_long_road() -> None:
     road = np.stack([np.arange(99_999), np.arange(1, 100_000)], axis=1).astype(np.int32)
-
     assert len(np.unique(strong_components(100_000, road))) == 100_000

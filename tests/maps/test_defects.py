@@ -47,7 +47,6 @@ def test_a_sound_map_has_none(town: Path) -> None:
 
 def test_narrow_lanes(town: Path) -> None:
     changed(town, r'(<lane id="10#1_0"[^>]*?) shape', r'\1 width="1.5" shape')
-
     (defect,) = found(town)
     assert (defect.kind, defect.name) == ("lane narrower than a car", "10#1_0")
     assert "1.50 m" in defect.about
@@ -58,7 +57,6 @@ def test_steps_in_height(town: Path) -> None:
     assert lane
     raised = " ".join(f"{x},{y},2.0" for x, y, *_ in (one.split(",") for one in lane[1].split()))
     town.write_text(town.read_text().replace(lane[1], raised))
-
     steps = [defect for defect in found(town) if defect.kind == "step in height"]
     assert any(defect.name == "10#1_0" and "2.00 m" in defect.about for defect in steps)
 
@@ -70,7 +68,6 @@ def test_signals_without_lanes(town: Path) -> None:
     )
     changed(town, r"<junction ", program)
     network = read_network(town)
-
     (defect,) = found(town)
     row = network.junctions[network.junction_ids.index("2")]
     assert (defect.kind, defect.name, defect.x_m) == ("signal without lanes", "2", row["x"])
@@ -81,7 +78,6 @@ def test_crossings_without_right_of_way(town: Path) -> None:
     for key in ("response", "foes"):
         text = re.sub(rf'{key}="([01]+)"', lambda word: word[0].replace("1", "0"), text)
     town.write_text(text)
-
     kinds = {defect.kind for defect in found(town)}
     assert kinds == {"crossing without right of way"}
 
@@ -92,7 +88,6 @@ def test_stop_lines_inside_junctions(town: Path) -> None:
     x, y = float(junction[1]), float(junction[2])
     rim = f"{x - 30},{y - 30} {x + 30},{y - 30} {x + 30},{y + 30} {x - 30},{y + 30}"
     changed(town, r'(<junction id="2"[^>]*? shape=")[^"]*', rf"\g<1>{rim}")
-
     kinds = {defect.kind for defect in found(town)}
     assert kinds == {"stop line inside a junction"}
 
@@ -116,7 +111,6 @@ def test_buildings_on_roads(town: Path, tmp_path: Path) -> None:
 def test_paths_on_two_levels_do_not_cross() -> None:
     one = np.array([[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]])
     other = np.array([[0.0, 10.0, 0.0], [10.0, 0.0, 0.0]])
-
     assert crossing_of(one, other) == (5.0, 5.0)
     assert crossing_of(one, other + np.array([0.0, 0.0, 6.0])) is None
     assert crossing_of(one, other + np.array([50.0, 0.0, 0.0])) is None
@@ -140,7 +134,6 @@ def two_parts(folder: Path) -> Path:
 def test_what_is_cut_off_is_mended(tmp_path: Path) -> None:
     path = two_parts(tmp_path)
     fixed, page, report = (tmp_path / name for name in ("fixed.net.xml", "p.html", "r.json"))
-
     words = ["check", str(path), "--fix", str(fixed), "--page", str(page), "--json", str(report)]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output

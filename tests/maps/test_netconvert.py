@@ -40,7 +40,6 @@ def town(tmp_path: Path) -> Path:
 
 def test_an_osm_file_becomes_a_network(town: Path, tmp_path: Path) -> None:
     result = build_network(town, tmp_path / "out" / "town.net.xml")
-
     assert result.kind == "osm"
     assert result.options == OSM_OPTIONS
     assert result.dropped == ()
@@ -53,7 +52,6 @@ def test_builds_are_equal_byte_for_byte(town: Path, tmp_path: Path) -> None:
     one = build_network(town, tmp_path / "one.net.xml").path.read_bytes()
     other = build_network(town, tmp_path / "other" / "town.net.xml").path.read_bytes()
     packed = build_network(town, tmp_path / "packed.net.xml.gz").path.read_bytes()
-
     assert one == other == gzip.decompress(packed)
     assert b"generated on" not in one
     assert str(tmp_path).encode() not in one
@@ -61,7 +59,6 @@ def test_builds_are_equal_byte_for_byte(town: Path, tmp_path: Path) -> None:
 
 def test_an_extension_does_not_matter(town: Path, tmp_path: Path) -> None:
     odd = town.rename(tmp_path / "download.bin")
-
     assert build_network(odd, tmp_path / "town.net.xml").kind == "osm"
 
 
@@ -71,7 +68,6 @@ def test_what_netconvert_refuses_is_refused_in_its_words(
 ) -> None:
     with pytest.raises(MapError) as caught:
         build_network(shared_maps / name, tmp_path / "out.net.xml")
-
     message = str(caught.value)
     assert REFUSED[name] in message
     assert f"cavmarl map build {shared_maps / name} --tolerant" in message
@@ -84,7 +80,6 @@ def test_tolerant_builds_list_what_was_dropped(
     shared_maps: Path, tmp_path: Path, name: str
 ) -> None:
     result = build_network(shared_maps / name, tmp_path / "out.net.xml", tolerant=True)
-
     assert any(REFUSED[name] in line for line in result.dropped)
     assert result.options[-1] == "--ignore-errors"
 
@@ -110,14 +105,9 @@ def test_tolerant_builds_list_what_was_dropped(
     ],
 )
 def test_corrections_and_warnings_are_counted_by_kind(
-    shared_maps: Path,
-    tmp_path: Path,
-    name: str,
-    corrections: set[str],
-    warnings: dict[str, int],
+    shared_maps: Path, tmp_path: Path, name: str, corrections: set[str], warnings: dict[str, int]
 ) -> None:
     result = build_network(shared_maps / "osm" / name, tmp_path / "built.net.xml")
-
     assert corrections <= set(result.corrections)
     for begin, count in warnings.items():
         found = sum(n for text, n in result.warnings.items() if text.startswith(begin))
@@ -128,7 +118,6 @@ def test_a_box_crops_the_map(shared_maps: Path, tmp_path: Path) -> None:
     whole = shared_maps / "osm" / "laufamholz.osm.xml"  # 1,425 m by 692 m
     box = (11.153, 49.464, 11.159, 49.468)
     result = build_network(whole, tmp_path / "part.net.xml", bbox=box)
-
     min_x, min_y, max_x, max_y = read_network(result.path).extent_m
     assert 700.0 < max_x - min_x < 1200.0  # a road of which a part lies within stays whole
     assert 300.0 < max_y - min_y < 600.0
@@ -147,11 +136,11 @@ def test_a_box_elsewhere_is_refused(town: Path, tmp_path: Path) -> None:
         (TOWN.replace("KIND", "footway"), "No edges loaded"),
         ('<osm version="0.6"/>', "No nodes loaded"),
         (TOWN.replace("48.001", "nan").replace("KIND", "residential"), "town.osm: "),
-        ("<html/>", "root of no map"),
+        ("<html/>", "not the root of a map"),
         (TOWN[:200], "line 4: broken XML"),
         ("", "broken XML"),
-        ('<!DOCTYPE o [<!ENTITY a "aa">]><osm>&a;</osm>', "no entities"),
-        ('<!DOCTYPE o SYSTEM "http://example.org/x.dtd"><osm/>', "no document type"),
+        ('<!DOCTYPE o [<!ENTITY a "aa">]><osm>&a;</osm>', "document type or entities"),
+        ('<!DOCTYPE o SYSTEM "http://example.org/x.dtd"><osm/>', "document type or entities"),
     ],
 )
 def test_useless_and_hostile_sources_are_refused(
@@ -159,7 +148,6 @@ def test_useless_and_hostile_sources_are_refused(
 ) -> None:
     path = tmp_path / "town.osm"
     path.write_text(content)
-
     for tolerant in (False, True):
         with pytest.raises(MapError, match=message):
             build_network(path, tmp_path / "out.net.xml", tolerant=tolerant)
@@ -170,7 +158,6 @@ def test_broken_networks_do_not_pass_through(shared_maps: Path, tmp_path: Path) 
     text = (shared_maps / "net" / "Town10HD.net.xml").read_text()
     path = tmp_path / "town.net.xml"
     path.write_text(text.replace('speed="13.89" length', 'speed="nan" length', 1))
-
     with pytest.raises(MapError, match="speed='nan'"):
         build_network(path)
     with pytest.raises(MapError, match="speed='nan'"):
@@ -180,7 +167,6 @@ def test_broken_networks_do_not_pass_through(shared_maps: Path, tmp_path: Path) 
 
 def test_a_network_is_copied_unchanged(shared_maps: Path, tmp_path: Path) -> None:
     source = shared_maps / "net" / "Town10HD.net.xml"
-
     result = build_network(source, tmp_path / "copy.net.xml")
     assert result.path.read_bytes() == source.read_bytes()
     assert (result.kind, result.options) == ("sumo", ())
@@ -189,7 +175,6 @@ def test_a_network_is_copied_unchanged(shared_maps: Path, tmp_path: Path) -> Non
 
 def test_the_source_is_never_overwritten(town: Path) -> None:
     before = town.read_bytes()
-
     with pytest.raises(MapError, match="target is the source"):
         build_network(town, town)
     assert town.read_bytes() == before
@@ -221,7 +206,6 @@ def test_the_environment_limits_the_time_of_a_map_that_is_driven(
 
 def test_map_file_builds_once(town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
-
     first = map_file(town)
     assert first.name == "town.net.xml"
     assert first.is_relative_to(tmp_path / "cache")

@@ -7,7 +7,6 @@ import numpy as np
 from tests.naive import idm, krauss
 
 CAR_M = 5.0  # IDM measures between the centres of two such cars
-MARGIN_M = 1.0  # kept before lines
 
 
 def idm_response(

@@ -28,12 +28,7 @@ def bicycle_step(
 
 
 def clip_control(
-    speed: float,
-    accel: float,
-    steering: float,
-    crashed: bool,
-    min_speed: float,
-    max_speed: float,
+    speed: float, accel: float, steering: float, crashed: bool, min_speed: float, max_speed: float
 ) -> tuple[float, float]:
     """Accelerate at most towards the limit that was passed."""
     wanted = -speed if crashed else accel

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tests.naive.digests import mixed
+
 MASK_32 = (1 << 32) - 1
 
 
@@ -17,12 +19,7 @@ def philox4x32(counter: list[int], key: list[int]) -> list[int]:
 
 def random_bits(key: int, vehicle: int, tick: int, stream: int) -> int:
     """The first 64 bits at the counter layout of `kernels.rng`, first word on top."""
-    counter = [
-        vehicle & MASK_32,
-        tick & MASK_32,
-        (vehicle >> 32) | (tick >> 32) << 16,
-        stream,
-    ]
+    counter = [vehicle & MASK_32, tick & MASK_32, (vehicle >> 32) | (tick >> 32) << 16, stream]
     words = philox4x32(counter, [key & MASK_32, key >> 32])
     return words[0] << 32 | words[1]
 
@@ -48,16 +45,9 @@ MASK_64 = (1 << 64) - 1
 GOLDEN = 0x9E3779B97F4A7C15
 
 
-def _mix(word: int) -> int:
-    """The finaliser of SplitMix64."""
-    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & MASK_64
-    word = (word ^ word >> 27) * 0x94D049BB133111EB & MASK_64
-    return word ^ word >> 31
-
-
 def quick_uniform(key: int, vehicle: int, tick: int, stream: int) -> float:
     """Key, vehicle and (stream, tick) mixed in turn; the upper 53 bits."""
-    word = _mix((key + GOLDEN) & MASK_64)
-    word = _mix(word ^ vehicle * GOLDEN & MASK_64)
-    word = _mix(word ^ ((stream << 32) + tick) * GOLDEN & MASK_64)
+    word = mixed((key + GOLDEN) & MASK_64)
+    word = mixed(word ^ vehicle * GOLDEN & MASK_64)
+    word = mixed(word ^ ((stream << 32) + tick) * GOLDEN & MASK_64)
     return (word >> 11) / 2**53

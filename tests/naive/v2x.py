@@ -35,17 +35,6 @@ class Said:
         return (-self.tick, 0 if self.cam else 1, self.sender)
 
 
-@dataclass(frozen=True)
-class Sent:
-    """One packet."""
-
-    sender: int
-    tick: int
-    x: float
-    y: float
-    reports: tuple[Said, ...]
-
-
 def finalised(word: int) -> int:
     return int(mix(np.uint64(word & MASK)))
 

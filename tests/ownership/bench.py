@@ -11,15 +11,7 @@ from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import row_hash, state_digest, world_digest
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import (
-    COORDINATOR,
-    Birth,
-    Message,
-    Output,
-    Record,
-    Removed,
-    Step,
-)
+from cavmarl.ownership.messages import COORDINATOR, Birth, Message, Output, Record, Removed, Step
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.trace import Trace
 from cavmarl.ownership.trace_check import check_trace
@@ -64,9 +56,7 @@ class Bench:
         return self.host(zone)
 
     def begin(
-        self,
-        movers: Iterable[tuple[int, int]] = (),
-        births: Iterable[tuple[int, int]] = (),
+        self, movers: Iterable[tuple[int, int]] = (), births: Iterable[tuple[int, int]] = ()
     ) -> tuple[Step, ...]:
         """BEGIN with vehicles in zones, and new ones in zones; the STEPs."""
         new = [Birth(vehicle, zone, self.state(vehicle)) for vehicle, zone in births]

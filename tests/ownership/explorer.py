@@ -85,13 +85,16 @@ class Node(NamedTuple):
 
 
 class Versions:
-    """The committed store of a coordinator: at its tick everybody has the version of that tick."""
+    """The committed store of a coordinator: at its tick everybody has the version of that tick.
 
-    def __init__(self, directory: Directory) -> None:
-        self._directory = directory
+    Attributes:
+        tick: of the coordinator that reads the store next.
+    """
+
+    tick = 0
 
     def state(self, vehicle: int) -> bytes:
-        return version(vehicle, self._directory.table.tick)
+        return version(vehicle, self.tick)
 
     def digest_of(self, vehicle: int) -> bytes:
         return state_digest(self.state(vehicle))
@@ -102,6 +105,7 @@ class Explorer:
 
     def __init__(self, small: Small) -> None:
         self.small = small
+        self._store = Versions()
         self._parties: list[Any] = []
         self._logs: dict[int, tuple[Record, ...]] = {}
         self._numbers: dict[Any, int] = {}
@@ -146,13 +150,13 @@ class Explorer:
 
     def _first(self) -> Node:
         small = self.small
-        directory = Directory(RUN, range(small.zones), None, small.limits)  # type: ignore[arg-type]
+        directory = Directory(RUN, range(small.zones), self._store, small.limits)
         log = list(directory.reset().records)
         for zone in range(small.zones):
             log += directory.host(zone, zone).records
         endpoints = tuple(self._endpoint(directory, zone) for zone in range(small.zones))
         budget = (small.crashes, small.false_alarms, small.coordinator_crashes)
-        number = self._keep_directory(fork(directory), tuple(log))
+        number = self._keep_directory(directory, tuple(log))
         return Node(number, endpoints, frozenset(), (), (-1,) * small.vehicles, 1, budget)
 
     def _next(self, node: Node) -> Iterator[Node]:
@@ -286,10 +290,8 @@ class Explorer:
 
     def _restart(self, node: Node) -> Node:
         small, log = self.small, self._logs[node.directory]
-        directory = Directory.restore(
-            log, range(small.zones), None, small.limits  # type: ignore[arg-type]
-        )  # fmt: skip
-        directory = fork(directory)
+        directory = Directory.restore(log, range(small.zones), self._store, small.limits)
+        self._store.tick = directory.table.tick
         sent = self._stirred(directory.resend().messages)
         return node._replace(directory=self._keep_directory(directory, log), soup=node.soup | sent)
 
@@ -298,6 +300,7 @@ class Explorer:
         key = (number, what)
         if key not in self._known:
             directory = fork(self._parties[number])
+            self._store.tick = directory.table.tick
             output = change(directory)
             log = self._logs[number] + output.records
             sent = self._stirred(output.messages)
@@ -376,15 +379,12 @@ def version(vehicle: int, tick: int) -> bytes:
 
 
 def fork(party: Any) -> Any:
-    """A copy that shares nothing that changes."""
-    copied = _fork(party)
-    if isinstance(copied, Directory):
-        copied._store = copied._decisions._store = Versions(copied)
-        copied._decisions._readiness = copied.readiness
-    return copied
+    """Return a copy that shares nothing that changes."""
+    return _fork(party, {})
 
 
-def _fork(party: Any) -> Any:
+def _fork(party: Any, forked: dict[int, Any]) -> Any:
+    """`forked`: the copies up to now, by the `id` of what was copied."""
     if isinstance(party, dict):
         copied = party.copy()
         for key, inner in party.items():
@@ -396,10 +396,12 @@ def _fork(party: Any) -> Any:
     kind = type(party)
     if kind not in CHANGING:
         return party
-    copied = kind.__new__(kind)
+    if id(party) in forked:
+        return forked[id(party)]
+    copied = forked[id(party)] = kind.__new__(kind)
     for name in _names(party):
         value = getattr(party, name)
-        setattr(copied, name, value if name in APART else _fork(value))
+        setattr(copied, name, value if name in APART else _fork(value, forked))
     return copied
 
 

@@ -8,9 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavmarl.core.errors import (
-    MessageError,
-)
+from cavmarl.core.errors import MessageError
 from cavmarl.ownership.codec import KINDS, VERSION, decode, encode
 from cavmarl.ownership.ledger import OwnedTally
 from cavmarl.ownership.messages import (

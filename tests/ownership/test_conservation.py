@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from cavmarl.ownership.messages import COORDINATOR, Message
 from tests.ownership.bench import Bench
 from tests.ownership.toy import number
+from tests.support.held_entries import held_entries
 from tests.support.lossy_network import FaultPlan, Network, Rates
 
 ZONES = 4
@@ -90,9 +93,8 @@ def test_nothing_grows_with_the_ticks() -> None:
         traffic.tick()
         directory, endpoints = traffic.bench.directory, traffic.bench.endpoints.values()
         assert set(directory.readiness.held) <= {tick + 1}
-        kept = [directory.table.deferred, directory.table.seen.above, directory.dones]
+        kept: list[Any] = [directory.table.deferred, directory.table.seen.above, directory.dones]
         for end in endpoints:
-            kept += [end.replicas.held, end.replicas.fences, end.replicas._heard, end.retained]
-            kept += [end.offers.open, end.offers.owed, end.offers.barred]
-        sizes.append(sum(len(container) for container in kept))
+            kept += [end.replicas, end.retained, end.offers]
+        sizes.append(held_entries(kept))
     assert max(sizes[60:]) <= 1.1 * max(sizes[20:50])

@@ -16,11 +16,7 @@ RUN = bytes(range(16))
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"deferral": -1}, "deferral = -1"),
-        ({"attempts": 0}, "attempts = 0"),
-    ],
+    ("change", "why"), [({"deferral": -1}, "deferral = -1"), ({"attempts": 0}, "attempts = 0")]
 )
 def test_deadlines_that_cannot_work_are_refused(change: dict[str, Any], why: str) -> None:
     with pytest.raises(ConfigError, match=why):

@@ -13,21 +13,12 @@ from tests.ownership.scenarios import SCENARIOS
 
 MODEL = Path(__file__).resolve().parents[2] / "docs/model"
 REMEDY_OF = {
-    "M_NOWAL": "log_before_send",
-    "M_NOINC": "done_incarnation",
-    "M_NOACKINC": "ack_incarnation",
-    "M_NOFRESH": "ack_freshness",
-    "M_NOABTFENCE": "abort_fence",
-    "M_NOFLOOR": "fence_stays",
-    "M_OVERWRITE": "replica_slot",
-    "M_EARLYDROP": "copy_until_commit",
-    "M_NOATTACH": "reattach",
-    "M_NODEADLINE": "deadline",
-    "M_NOSTEPCHK": "step_tick",
-    "M_NODONESTEP": "done_tick",
-    "M_SINGLEBUF": "double_buffer",
-    "M_RESET": "tick_never_resets",
-}
+    "M_NOWAL": "log_before_send", "M_NOINC": "done_incarnation", "M_NOACKINC": "ack_incarnation",
+    "M_NOFRESH": "ack_freshness", "M_NOABTFENCE": "abort_fence", "M_NOFLOOR": "fence_stays",
+    "M_OVERWRITE": "replica_slot", "M_EARLYDROP": "copy_until_commit", "M_NOATTACH": "reattach",
+    "M_NODEADLINE": "deadline", "M_NOSTEPCHK": "step_tick", "M_NODONESTEP": "done_tick",
+    "M_SINGLEBUF": "double_buffer", "M_RESET": "tick_never_resets",
+}  # fmt: skip
 
 
 def test_each_mutation_of_the_model_takes_away_a_remedy_of_the_code() -> None:

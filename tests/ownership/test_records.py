@@ -7,10 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from cavmarl.core.errors import (
-    JournalError,
-    ProtocolError,
-)
+from cavmarl.core.errors import JournalError, ProtocolError
 from cavmarl.ownership.log_records import (
     SCHEMA,
     LogChain,

@@ -9,6 +9,7 @@ from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.ownership.transfers import KEPT_ROWS, Transfer, TransferLog
 from tests.ownership.bench import Bench
 from tests.ownership.test_simulator import campaign
+from tests.support.held_entries import held_entries
 
 
 def followed(trace: Trace) -> TransferLog:
@@ -53,7 +54,12 @@ def test_an_approach_that_ends_is_counted_and_one_that_is_forgotten_takes_no_roo
     log = followed(bench.trace)
     assert log.counts["aborted"] == 1
     assert not log.rows
-    assert not log._approaches
+    quiet = Bench(3)
+    quiet.tick(births=[(7, 0), (8, 0)])
+    for _ in range(bench.limits.lifetime + 4):
+        quiet.tick()
+    without = followed(quiet.trace)
+    assert held_entries(log) - len(log.counts) == held_entries(without) - len(without.counts)
 
 
 def test_the_rows_of_a_campaign_are_the_switches_of_its_log() -> None:

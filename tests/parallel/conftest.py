@@ -1,4 +1,4 @@
-"""Fixtures of tests on worlds that are stepped together."""
+"""Fixtures of tests of worlds that are stepped together."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.vec_runs import Make
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """`make_vec` whose environments are closed at the end."""
+    """Yield `make_vec`, and close its environments at the end."""
     made: list[CavVectorEnv] = []
 
     def call(env: str, **arguments: Any) -> CavVectorEnv:

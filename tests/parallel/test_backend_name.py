@@ -9,7 +9,7 @@ import pytest
 
 import cavmarl
 from cavmarl.core.errors import ConfigError
-from cavmarl.parallel.backend_name import BackendName, read_backend
+from cavmarl.parallel.placement.backend_name import BackendName, read_backend
 
 
 @pytest.mark.parametrize(
@@ -58,8 +58,8 @@ def test_short_forms_stand_for_backends(arguments: dict[str, Any], text: str) ->
         ({"backend": ""}, "there is no backend ''"),
         ({"backend": 3}, "backend = 3: must be a string"),
         ({"backend": "local:2"}, "'local' has no number"),
-        ({"backend": "processes"}, "does not say how many; use 'processes:2'"),
-        ({"backend": "nodes"}, "does not say how many; use 'nodes:2'"),
+        ({"backend": "processes"}, "the number is missing; use 'processes:2'"),
+        ({"backend": "nodes"}, "the number is missing; use 'nodes:2'"),
         ({"backend": "processes:0"}, "the number '0' must be 1 or more"),
         ({"backend": "processes:-1"}, "the number '-1' must be 1 or more"),
         ({"backend": "ray:"}, "the number '' must be 1 or more; use 'ray:2'"),
@@ -82,7 +82,7 @@ def test_short_forms_stand_for_backends(arguments: dict[str, Any], text: str) ->
         ({"hosts": "ray"}, "hosts was removed: use backend='ray:N'"),
     ],
 )
-def test_what_cannot_be_is_refused(arguments: dict[str, Any], words: str) -> None:
+def test_bad_backends_are_refused(arguments: dict[str, Any], words: str) -> None:
     for make in (cavmarl.make_vec, cavmarl.parallel_env):
         with pytest.raises(ConfigError, match=words):
             make("ring", **arguments)

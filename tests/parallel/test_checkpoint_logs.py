@@ -1,4 +1,4 @@
-"""Workers that die while their checkpoint log begins anew, and such logs alone."""
+"""Checkpoint logs: alone, and of workers that die while the log restarts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cavmarl.engine.world_setup import load_world
-from cavmarl.parallel.checkpoint.checkpoint_log import STEPS, CheckpointLog, make_segments
+from cavmarl.parallel.state.checkpoint_log import STEPS, CheckpointLog, make_segments
 from cavmarl.shards.shard import Commands
 from tests.support.vec_runs import Make, drive, pool_of, same
 
@@ -23,7 +23,7 @@ SPLIT = {"zones": 4}
 
 @pytest.mark.parametrize("kind", [WHOLE, SPLIT])
 @pytest.mark.parametrize("worker", [0, 1])
-def test_a_worker_that_dies_when_the_diary_is_full(
+def test_a_worker_that_dies_when_the_log_is_full(
     make: Make, kind: dict[str, Any], worker: int
 ) -> None:
     wanted = {**kind, "agents": 4, "background": 20, "max_cycles": 60}
@@ -41,7 +41,7 @@ def test_a_worker_that_dies_when_the_diary_is_full(
 
 
 @pytest.mark.parametrize("kind", [WHOLE, SPLIT])
-def test_worlds_that_are_reset_when_the_diary_is_full(make: Make, kind: dict[str, Any]) -> None:
+def test_worlds_that_are_reset_when_the_log_is_full(make: Make, kind: dict[str, Any]) -> None:
     wanted = {**kind, "agents": 4, "background": 20, "max_cycles": 60}
 
     def run(workers: int) -> list[Any]:
@@ -86,7 +86,7 @@ def state_of(checkpoint_log: CheckpointLog) -> list[float]:
     return [float(value) for value in found]
 
 
-def test_what_is_committed_stays_until_the_next_is(checkpoint_log: CheckpointLog) -> None:
+def test_a_committed_state_stays_until_the_next_commit(checkpoint_log: CheckpointLog) -> None:
     checkpoint_log.prepare([np.full(3, 1.0)])
     checkpoint_log.begin()
     for value in range(STEPS):
@@ -101,7 +101,7 @@ def test_what_is_committed_stays_until_the_next_is(checkpoint_log: CheckpointLog
     checkpoint_log.begin()
     checkpoint_log.note(commands_like(checkpoint_log.entries[0], 99))
     assert (state_of(checkpoint_log), noted(checkpoint_log)) == ([2.0] * 3, [99.0])
-    checkpoint_log.go_to(committed)  # the order in which it began anew was not committed
+    checkpoint_log.go_to(committed)  # the command with which it restarted was not committed
     assert (state_of(checkpoint_log), noted(checkpoint_log)) == (
         [1.0] * 3,
         [float(k) for k in range(STEPS)],

@@ -1,4 +1,4 @@
-"""Each feature of a world goes with each way to host it, bit for bit, or is refused by name."""
+"""Each feature of a world works with each way to host it, bit for bit, or is refused by name."""
 
 from __future__ import annotations
 
@@ -92,14 +92,14 @@ PLACES: dict[str, Keywords] = {
     "worlds on Ray": {"num_envs": 2, "backend": "ray:2"},
     "nodes on Ray": {"zones": 3, "backend": "ray:2"},
 }
-# What an undivided world, beside which others are run, does not know.
+# Settings that the undivided world of a comparison does not have.
 ONLY_DIVIDED = (
     "zones.journal", "zones.check_invariants", "zones.repartition_steps",
     "workers.balance_steps", "workers.monitor_cpu",
 )  # fmt: skip
-OF_THE_CALLER = "a network simulator is in the caller's process"
-BY_COSTS = "whole worlds on nodes are balanced by what they cost"
-NOT_OVER_NODES = "worlds over nodes do not have it"
+OF_THE_CALLER = "the network simulator is in the process of the caller"
+BY_COSTS = "whole worlds on nodes are balanced by their costs only"
+NOT_OVER_NODES = "not supported over nodes"
 REFUSED = {
     ("a network simulator", "workers"): OF_THE_CALLER,
     ("a network simulator", "zones over workers"): OF_THE_CALLER,
@@ -114,7 +114,7 @@ REFUSED = {
 
 
 class _Odd:
-    """A network simulator: receivers hear vehicles of odd ids."""
+    """A network simulator in which stations receive messages of vehicles with odd ids only."""
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         odd = np.flatnonzero(sent.packets["sender"] % 2).tolist()
@@ -130,12 +130,12 @@ def _run(vec: CavVectorEnv) -> Run:
 
 
 def _idle(workers: Mapping[int, Any]) -> LoadSnapshot:
-    """How busy this machine is if no other program uses it: workers of busy ones are refused."""
+    """Return an idle machine, since workers on busy machines are refused."""
     return idle_snapshot(len(workers))
 
 
 def check(make: Make, folder: Path, feature: str, place: str) -> None:
-    """They are the undivided world bit for bit, or refused as the table says."""
+    """Compare worlds with the undivided one bit for bit, or expect the refusal of the table."""
     keywords, where = FEATURES[feature](folder), PLACES[place]
     if words := REFUSED.get((feature, place)):
         with pytest.raises(ConfigError, match=words):
@@ -152,7 +152,7 @@ def check(make: Make, folder: Path, feature: str, place: str) -> None:
 
 
 @pytest.mark.parametrize("feature", FEATURES)
-def test_in_zones(make: Make, tmp_path: Path, feature: str) -> None:
+def test_features_in_zones(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "zones")
 
 
@@ -167,26 +167,26 @@ hosted = pytest.mark.parametrize(
 
 
 @hosted
-def test_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
+def test_features_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "workers")
 
 
 @hosted
-def test_zones_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
+def test_features_of_zones_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "zones over workers")
 
 
 @hosted
-def test_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
+def test_features_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "nodes")
 
 
 @hosted
-def test_worlds_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
+def test_features_of_whole_worlds_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "worlds over nodes")
 
 
-def test_the_table_of_the_page_is_this_one() -> None:
+def test_the_page_has_the_same_table() -> None:
     rows = [
         (feature, *("refused" if (feature, place) in REFUSED else "yes" for place in PLACES))
         for feature in FEATURES

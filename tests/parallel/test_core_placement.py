@@ -1,4 +1,4 @@
-"""Workers that have been found on one core are kept apart."""
+"""Workers that were seen on one core are separated."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from cavmarl.parallel.processes.process_barrier import usable_cores
         ([0, 1], {0, 1}, [0, 1]),
     ],
 )
-def test_each_has_a_core(cores: list[int], usable: set[int], expected: list[int]) -> None:
+def test_each_process_has_a_core(cores: list[int], usable: set[int], expected: list[int]) -> None:
     assert homes(cores, usable) == expected
 
 
 @pytest.fixture
 def sleepers() -> Iterator[list[int]]:
-    """Pids of two processes that sleep."""
+    """Yield the pids of two sleeping processes."""
     command = [sys.executable, "-c", "import time; time.sleep(60)"]
     processes = [subprocess.Popen(command) for _ in range(2)]
     yield [process.pid for process in processes]
@@ -39,7 +39,7 @@ def sleepers() -> Iterator[list[int]]:
 
 
 @pytest.mark.skipif(len(usable_cores()) < 2, reason="one core")
-def test_those_on_one_core_leave_it_to_each_other(sleepers: list[int]) -> None:
+def test_processes_on_one_core_are_separated(sleepers: list[int]) -> None:
     usable = usable_cores()
     first, second, *_ = sorted(usable)
     keep_apart(sleepers, [first, second])
@@ -49,7 +49,7 @@ def test_those_on_one_core_leave_it_to_each_other(sleepers: list[int]) -> None:
     assert [os.sched_getaffinity(pid) for pid in sleepers] == [usable - {first}, usable - {second}]
 
 
-def test_who_is_dead_has_no_core() -> None:
+def test_a_dead_process_is_ignored() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     keep_apart([process.pid, process.pid], [min(usable_cores())] * 2)

@@ -1,4 +1,4 @@
-"""Frames with right checksums that say what cannot be: the sender is lost, the run goes on."""
+"""Bad frames with correct checksums: the sender counts as lost, and the run goes on."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from cavmarl.core.errors import JournalError, MessageError, ProtocolError
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.index_check import IndexCheck
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, reading
-from cavmarl.parallel.nodes.row_checks import RowChecks
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 
 SMALL: dict[str, Any] = {"agents": 3, "background": 12, "zones": 3, "steps": 6}
 HUGE = np.full(400, 1 << 40, dtype=np.int64).tobytes()
 GARBAGE = (b"[[[1]]]", b"\xff" * 64, b"[" * 99_999, HUGE)
-# What is sent beside, or in the place of, a frame of a kind: a node's to the caller, the caller's
-# to a node, a node's to another one.
+# Frames that are sent beside, or in place of, a frame of a kind: from a node to the caller, from
+# the caller to a node, and from a node to another one.
 FORGED = {
     FrameKind.REPORT: (
         FrameKind.REPORT, FrameKind.SHARE, FrameKind.RESULT, FrameKind.PONG, FrameKind.NOT_MINE,
@@ -42,7 +42,7 @@ FORGED = {
 def forge(
     monkeypatch: pytest.MonkeyPatch, carrier: FrameKind, kind: FrameKind, data: bytes
 ) -> list[bool]:
-    """Let a frame be sent once before one of the kind `carrier`, or in its place."""
+    """Send a frame once before a frame of the kind `carrier`, or in its place."""
     send, forged = Links.send, [False]
     seen = 0
 
@@ -63,8 +63,10 @@ def forge(
 
 @pytest.mark.parametrize("carrier", FORGED)
 @pytest.mark.parametrize("data", GARBAGE, ids=lambda data: f"{data[:4]!r}x{len(data)}")
-def test_garbage(monkeypatch: pytest.MonkeyPatch, carrier: FrameKind, data: bytes) -> None:
-    """The run ends with the same results, and at most the sender is lost."""
+def test_a_run_survives_forged_frames(
+    monkeypatch: pytest.MonkeyPatch, carrier: FrameKind, data: bytes
+) -> None:
+    """The results stay the same, and at most the sender is lost."""
     wrong = []
     for kind in FORGED[carrier]:
         with monkeypatch.context() as patch:
@@ -72,7 +74,7 @@ def test_garbage(monkeypatch: pytest.MonkeyPatch, carrier: FrameKind, data: byte
             found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **SMALL)
         (line,) = found.lines
         assert forged[0]
-        # Without faults no node may be lost; but this one was.
+        # Elsewhere, no node may be lost without faults.
         others = [text for text in line.wrong if "must be tolerated" not in text]
         if others or line.lost > 1:
             wrong.append((kind, line))
@@ -95,15 +97,15 @@ def simulation() -> Simulation:
         {"goal": 10**6}, {"stop": 10**6}, {"way": -(1 << 40)}, {"way": 1 << 40}, {"id": -1},
     ],
 )  # fmt: skip
-def test_rows_that_point_at_nothing(simulation: Simulation, change: dict[str, int]) -> None:
-    checks, rows = RowChecks(simulation), simulation.division.vehicles(0).copy()
+def test_rows_with_an_index_out_of_range(simulation: Simulation, change: dict[str, int]) -> None:
+    checks, rows = IndexCheck(simulation), simulation.division.vehicles(0).copy()
     assert rows.dtype == VEHICLE
     assert len(rows) > 5
     checks.check(rows)
     checks.check(rows[:0])
     for name, value in change.items():
         rows[name][-1] = value
-    with pytest.raises(MessageError, match="where nothing is"):
+    with pytest.raises(MessageError, match="an index that no table has"):
         checks.check(rows)
 
 
@@ -111,7 +113,7 @@ def test_rows_that_point_at_nothing(simulation: Simulation, change: dict[str, in
     "error",
     [ValueError("x"), KeyError(1), IndexError(), TypeError(), ProtocolError("x"), OverflowError()],
 )
-def test_what_fails_while_a_frame_is_read_is_its_senders_fault(error: Exception) -> None:
+def test_an_error_while_a_frame_is_read_is_the_fault_of_its_sender(error: Exception) -> None:
     with pytest.raises(LinkLostError, match="node 7") as lost, reading(7):
         raise error
     assert lost.value.peer == 7
@@ -120,7 +122,7 @@ def test_what_fails_while_a_frame_is_read_is_its_senders_fault(error: Exception)
 
 
 @pytest.mark.parametrize("found", [[3], [-1], [True], [1.0], ["1"], np.array([0, 3])])
-def test_indices_of_what_there_is_not(found: Any) -> None:
+def test_indices_out_of_range(found: Any) -> None:
     check_indices("zone", [0, 2], 3)
     check_indices("zone", np.array([0, 2]), 3)
     with pytest.raises(MessageError, match="zone"):

@@ -15,21 +15,21 @@ from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError, JournalError
 from cavmarl.handoff.coordinator.journal import Journal, JournalReader
 from cavmarl.ownership.log_records import replay
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from tests.support.replayed import BUSY
 from tests.support.vec_runs import Make
 
-STEPS = 40  # two images of the checkpoint log, and more
+STEPS = 40  # more than two images of the checkpoint log
 
 
 @pytest.fixture(autouse=True)
 def _same_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs have names that can be foreseen, so that their journals can be compared."""
+    """Give runs predictable names, so that their journals can be compared."""
     monkeypatch.setattr("secrets.token_bytes", lambda size: bytes(range(size)))
 
 
 def _drive(vec: CavVectorEnv, kills: bool = False) -> list[Any]:
-    """What comes out; a reset without a seed and one of some worlds are among it."""
+    """Return the results of a run with a reset without a seed, and a reset of some worlds."""
     found: list[Any] = [vec.reset(seed=3)[0].tobytes()]
     struck = itertools.count(1)
     for step in range(STEPS):
@@ -71,7 +71,7 @@ def test_journals_are_those_of_an_undisturbed_run(
     assert run("killed", workers, kills=True) == (alone, journals)
 
 
-def test_a_journal_that_is_there_is_left_alone(make: Make, tmp_path: Path) -> None:
+def test_an_existing_journal_is_not_changed(make: Make, tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
     path.write_text("somebody's")
     with pytest.raises(JournalError, match="exists"):
@@ -92,7 +92,7 @@ def test_a_journal_is_locked_until_its_world_is_closed(
     Journal(path, resume=True).close()
 
 
-def test_zones_that_are_cut_anew_are_gone_on_with(make: Make, tmp_path: Path) -> None:
+def test_a_successor_resumes_with_repartitioned_zones(make: Make, tmp_path: Path) -> None:
     def run(name: str, workers: int, kills: bool = False) -> tuple[list[Any], dict[str, bytes]]:
         folder = tmp_path / name
         folder.mkdir()
@@ -107,7 +107,7 @@ def test_zones_that_are_cut_anew_are_gone_on_with(make: Make, tmp_path: Path) ->
     assert run("killed", 1, kills=True) == alone
 
 
-def test_worlds_that_move_and_are_cut_anew_are_refused(make: Make) -> None:
+def test_worlds_that_move_and_are_repartitioned_are_refused(make: Make) -> None:
     overrides = {
         "zones.journal": "x.jsonl",
         "workers.balance_steps": 5,
@@ -119,7 +119,7 @@ def test_worlds_that_move_and_are_cut_anew_are_refused(make: Make) -> None:
 
 
 @pytest.mark.parametrize("zones", [2, 3])
-def test_a_journal_says_that_a_loaded_state_begins_an_episode(
+def test_a_journal_records_that_a_loaded_state_starts_an_episode(
     make: Make, tmp_path: Path, zones: int
 ) -> None:
     first = make("grid4x4", zones=2, overrides=dict(BUSY))

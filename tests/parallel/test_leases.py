@@ -1,4 +1,4 @@
-"""Leases of several ticks, and vehicles that cross a border before they are on record."""
+"""Leases of several ticks, and vehicles that cross a border before they have a record."""
 
 from __future__ import annotations
 
@@ -15,19 +15,25 @@ from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Offer, Prepare
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.index_check import IndexCheck
 from cavmarl.parallel.nodes.leases import MOST, late_ticks, lease_ticks, leases_of
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
-from cavmarl.parallel.nodes.row_checks import RowChecks
-from cavmarl.parallel.nodes.zone_hosts import Report, ZoneHosts, packed, read_report, unpacked
+from cavmarl.parallel.nodes.zone_endpoints import (
+    Report,
+    ZoneEndpoints,
+    packed,
+    read_report,
+    unpacked,
+)
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 WAIT_S = 0.1
 
 
 @pytest.mark.parametrize("ticks", range(1, 2 * MOST + 2))
-def test_leases_are_for_all_ticks_of_a_step(ticks: int) -> None:
+def test_a_lease_covers_the_ticks_of_a_step(ticks: int) -> None:
     config = stepped(ticks)
     each = lease_ticks(config)
     assert each <= MOST
@@ -37,13 +43,13 @@ def test_leases_are_for_all_ticks_of_a_step(ticks: int) -> None:
 
 
 def stepped(ticks: int) -> EnvConfig:
-    """Settings with so many ticks a step."""
+    """Return settings with this number of ticks per step."""
     overrides = {"clock.ctrl_dt_s": 0.05 * ticks, "clock.sim_dt_s": 0.05}
     overrides["horizon_s"] = 5.0 * ticks
     return load_config("grid4x4", zones=2, overrides=overrides)[0]
 
 
-def test_zones_see_as_far_as_their_vehicles_get_in_a_lease() -> None:
+def test_zones_see_as_far_as_vehicles_drive_in_a_lease() -> None:
     config, base_dir = load_config("grid4x4", zones=2, agents=1)
     world = make_world(config, base_dir)
     halos = [
@@ -55,7 +61,7 @@ def test_zones_see_as_far_as_their_vehicles_get_in_a_lease() -> None:
 
 
 class Wires:
-    """Links that keep what is sent; those to oneself carry it at once."""
+    """Links that keep what is sent, and deliver it at once to the coordinator."""
 
     def __init__(self) -> None:
         self.reports: list[list[Report]] = []
@@ -72,14 +78,14 @@ class Wires:
             self.coordinator.commit({0: (messages, said)})
         else:
             self.answers += [message for _, message in unpacked(data)]
-            self.coordinator.hear(0, NodeFrame(kind, number, data))
+            self.coordinator.receive(0, NodeFrame(kind, number, data))
 
     def now_s(self) -> float:
         return 0.0
 
 
-def begun() -> tuple[ZoneHosts, NodeCoordinator, ZonedShards, Any]:
-    """Hosts of two zones at one node, that have begun an episode and not reported it."""
+def begun() -> tuple[ZoneEndpoints, NodeCoordinator, ZonedShards, Any]:
+    """Return endpoints of two zones at one node, before the report of a new episode."""
     config, base_dir = load_config("grid4x4", zones=2, agents=1, background=20)
     worlds = LocalWorlds(make_world(config, base_dir), 1)
     worlds.arrays.chosen[:] = True
@@ -90,17 +96,20 @@ def begun() -> tuple[ZoneHosts, NodeCoordinator, ZonedShards, Any]:
     coordinator = NodeCoordinator([bytes(16)], [0, 0], limits, wires, [None])
     wires.coordinator = coordinator
     hostings = coordinator.host(neighbours_of(division))
-    checks = RowChecks(worlds.simulation)
-    hosts = ZoneHosts(division, (0, 1), (0, 0), hostings, limits, wires, [], checks, ticks=2)
+    checks = IndexCheck(worlds.simulation)
+    hosts = ZoneEndpoints(division, (0, 1), (0, 0), hostings, limits, wires, [], checks, ticks=2)
     hosts.reset(np.ones(1, dtype=np.bool_))
     return hosts, coordinator, division, wires
 
 
-def test_a_vehicle_that_crosses_before_it_is_on_record_is_offered_without_a_tick() -> None:
+def test_a_vehicle_that_crosses_before_it_has_a_record_is_offered_in_a_lease_of_no_ticks() -> None:
     hosts, coordinator, division, wires = begun()
     row = division.owned(0, 0)[0]
     there = division.owned(0, 1)[0]
-    row["x"], row["y"] = there["x"], there["y"]  # of zone 0 on record, and far behind the border
+    row["x"], row["y"] = (
+        there["x"],
+        there["y"],
+    )  # zone 0 owns it on record, but it is far beyond the border
 
     hosts.report()
     ((report,),) = wires.reports
@@ -113,10 +122,10 @@ def test_a_vehicle_that_crosses_before_it_is_on_record_is_offered_without_a_tick
     assert coordinator.switched == 1
 
 
-def test_an_offer_that_comes_before_the_lease_of_its_episode_is_answered_after_it() -> None:
+def test_an_offer_before_the_lease_of_its_episode_is_answered_after_the_lease() -> None:
     hosts, coordinator, division, wires = begun()
     hosts.report()
-    table, row = coordinator._worlds[0].directory.table, division.owned(0, 0)[0]
+    table, row = coordinator.worlds[0].directory.table, division.owned(0, 0)[0]
     before, row["id"] = int(row["id"]), 10**6
     state = division.changes.state(0, 0, 0)
     row["id"] = before
@@ -124,7 +133,7 @@ def test_an_offer_that_comes_before_the_lease_of_its_episode_is_answered_after_i
     prepare = Prepare(
         bytes(16), table.episode, table.tick + 1, 0, 1, 1, division.codec.schema, (offer,)
     )
-    hosts.hear(1, NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
+    hosts.receive(NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
     assert wires.answers == []
     hosts.note(unpacked(memoryview(coordinator.begin(WAIT_S)[0])))
     (ack,) = wires.answers

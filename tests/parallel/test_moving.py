@@ -1,4 +1,4 @@
-"""Worlds and zones that change their worker while they are stepped: results stay the same."""
+"""Worlds and zones that move to other workers between steps: the results stay the same."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.plan_file import plan_from_dict
 from cavmarl.config.registry import entries
 from cavmarl.core.errors import NoAdmissibleWorkerError
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.parallel.processes.worker_pool import Pool
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
+from cavmarl.parallel.worlds.tasks import Task
 from tests.support.pools import strike_soon
 from tests.support.replayed import BUSY
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
@@ -31,14 +31,14 @@ from tests.support.vec_runs import Make, drive, pool_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 
-# The small ones are first, and so in every run.
+# Small environments come first, and so are part of each run.
 SMALL_FIRST = sorted(entries(), key=lambda env: (env not in ("grid4x4", "merge", "ring"), env))
 RESTLESS = {"workers.balance_steps": 2, "workers.imbalance_tolerance": 0.0, "workers.max_moves": 64}
 
 
 @pytest.fixture
 def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Costs that are another shard's in every round; how many shards each round has moved."""
+    """Exchange the costs of shards in each round; yield the number of moves of each round."""
     rng = np.random.default_rng(3)
     moved: list[int] = []
     round_ = StepPlacement.round
@@ -57,7 +57,7 @@ def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_worlds_that_move_are_the_same(
     make: Make, uneven: list[int], number: int, env: str
 ) -> None:
-    """Zones and workers take turns over the entries."""
+    """The numbers of zones and workers alternate over the entries."""
     wanted = {"num_envs": 6, "max_cycles": 8, "zones": (1, 4)[number % 2]}
     whole = drive(make(env, **wanted))
     vec = make(env, workers=(2, 2, 3, 3)[number % 4], overrides=RESTLESS, **wanted)
@@ -65,7 +65,7 @@ def test_worlds_that_move_are_the_same(
     assert sum(uneven) > 0
 
 
-def test_worlds_take_their_journals_along(
+def test_worlds_keep_their_journals(
     make: Make, uneven: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("secrets.token_bytes", lambda size: bytes(range(size)))
@@ -96,7 +96,9 @@ STACKED = {"sensors.stack": 3, "population.mode": "respawn", "action.kind": "dis
 
 
 @pytest.mark.parametrize("more", [{"autoreset_mode": "NextStep"}, {"overrides": STACKED}])
-def test_whatever_else_is_asked_for(make: Make, uneven: list[int], more: dict[str, Any]) -> None:
+def test_worlds_that_move_with_other_settings(
+    make: Make, uneven: list[int], more: dict[str, Any]
+) -> None:
     wanted = {"num_envs": 5, "agents": 3, "background": 10, "max_cycles": 5, **more}
     whole = drive(make("merge", **wanted), steps=20)
     wanted["overrides"] = {**wanted.get("overrides", {}), **RESTLESS}
@@ -104,9 +106,7 @@ def test_whatever_else_is_asked_for(make: Make, uneven: list[int], more: dict[st
     assert sum(uneven) > 0
 
 
-def test_vehicles_that_find_their_own_way_keep_it(
-    make: Make, uneven: list[int], tmp_path: Path
-) -> None:
+def test_rerouted_vehicles_keep_their_routes(make: Make, uneven: list[int], tmp_path: Path) -> None:
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
         "traffic.demand": [str(path) for path in files],
@@ -125,10 +125,10 @@ def test_vehicles_that_find_their_own_way_keep_it(
     assert sum(uneven) > 0
 
 
-def test_worlds_with_demand_of_sumos_take_their_ways_along(
+def test_worlds_with_sumo_demand_keep_their_routes(
     make: Make, uneven: list[int], tmp_path: Path
 ) -> None:
-    """Those who drive and those who wait; ways and stops stand elsewhere in each worker."""
+    """Driving and waiting vehicles; routes and stops have other places in each worker."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     overrides: dict[str, Any] = {
         "traffic.source": "sumo-demand",
@@ -144,7 +144,7 @@ def test_worlds_with_demand_of_sumos_take_their_ways_along(
     assert sum(uneven) > 0
 
 
-def test_chosen_worlds_begin_anew_wherever_they_are(make: Make, uneven: list[int]) -> None:
+def test_chosen_worlds_are_reset_in_any_worker(make: Make, uneven: list[int]) -> None:
     chosen = np.array([False, True, False, True, True])
     found = []
     for workers in (0, 2):
@@ -159,7 +159,7 @@ def test_chosen_worlds_begin_anew_wherever_they_are(make: Make, uneven: list[int
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("split", [False, True])
-def test_workers_that_die_while_something_moves(
+def test_workers_that_die_during_a_move(
     make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch, how: signal.Signals, split: bool
 ) -> None:
     wanted = {"num_envs": 1 if split else 5, "agents": 5, "background": 30, "max_cycles": 9}
@@ -181,7 +181,7 @@ def test_workers_that_die_while_something_moves(
 
 
 @pytest.mark.parametrize("split", [False, True])
-def test_who_dies_later_comes_back_with_what_it_had_last(
+def test_a_worker_that_dies_later_resumes_with_its_present_worlds(
     make: Make, uneven: list[int], split: bool
 ) -> None:
     wanted = {"num_envs": 1 if split else 5, "agents": 3, "background": 20, "max_cycles": 30}
@@ -198,7 +198,7 @@ def test_who_dies_later_comes_back_with_what_it_had_last(
     assert sum(uneven) > 0
 
 
-def test_a_move_that_fails_has_not_been(
+def test_a_failed_move_changes_nothing(
     make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = {"num_envs": 5, "agents": 3}
@@ -209,7 +209,7 @@ def test_a_move_that_fails_has_not_been(
     def interrupt(self: Pool, task: int, payload: Any = None, commits: bool = True) -> Any:
         if task == Task.UNPACK and not failed:
             failed.append(task)
-            self._open = self._all  # as if it came while the workers were at it
+            self._open = self._all  # as if it came while the workers moved
             raise KeyboardInterrupt
         return run(self, task, payload, commits)
 
@@ -230,8 +230,8 @@ def test_a_move_that_fails_has_not_been(
     assert sum(uneven) > 0
 
 
-def test_by_what_they_cost_worlds_move(make: Make) -> None:
-    """Half of the worlds are crowded: who hosts them gives some away."""
+def test_worlds_move_by_their_costs(make: Make) -> None:
+    """Half of the worlds are crowded, so their worker gives some away."""
     overrides = {"workers.balance_steps": 10, "workers.imbalance_tolerance": 0.05}
     vec = make("merge", num_envs=8, agents=1, background=60, workers=2, overrides=overrides)
     assert isinstance(vec.worlds, PooledWorlds)
@@ -244,7 +244,7 @@ def test_by_what_they_cost_worlds_move(make: Make) -> None:
     assert replan(plan, plan.problem.snapshot) == plan
 
 
-def test_the_plan_is_told_at_a_reset(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_plan_is_logged_at_a_reset(make: Make, caplog: pytest.LogCaptureFixture) -> None:
     vec = make("ring", num_envs=3, workers=2)
     with caplog.at_level(logging.INFO, logger="cavmarl.workers"):
         vec.reset(seed=0)
@@ -265,12 +265,12 @@ def test_the_plan_is_told_at_a_reset(make: Make, caplog: pytest.LogCaptureFixtur
         ("max_moves", 0, "from 1"),
     ],
 )
-def test_settings_that_cannot_be(key: str, value: float, words: str) -> None:
+def test_bad_settings_are_refused(key: str, value: float, words: str) -> None:
     with pytest.raises(ConfigError, match=rf"workers\.{key}.*{words}"):
         make_vec("ring", workers=1, overrides={f"workers.{key}": value})
 
 
-def test_workers_that_others_keep_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_that_other_programs_keep_busy(monkeypatch: pytest.MonkeyPatch) -> None:
     busy = LoadSnapshot(
         (Candidate(0, Utilisation(0.1, 0.1)), Candidate(1, Utilisation(0.9, 0.1))), "none", ""
     )

@@ -1,4 +1,4 @@
-"""Worlds over the ranks of an MPI run: the undivided ones, and the end when a rank is lost."""
+"""Worlds over the ranks of an MPI run: equal results, and the end when a rank is lost."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ print("equal:", same(found, drive(whole)), flush=True)
 
 
 def mpirun(*words: str) -> subprocess.CompletedProcess[str]:
-    """What an MPI run prints; it ends within a time, and leaves no shared memory behind."""
+    """Return the output of an MPI run, which ends in time and leaves no shared memory behind."""
     before = set(Path("/dev/shm").glob("mpich*"))
     done = subprocess.run(
         [str(MPIRUN), *words],
@@ -86,7 +86,7 @@ def test_rank_0_of_nodes_runs_a_program(program: str) -> None:
 
 @pytest.mark.parametrize("loss", ["lost", "killed"])
 def test_a_lost_rank_ends_the_run(program: str, loss: str) -> None:
-    """With a typed error, or by MPI itself; nothing waits for ever."""
+    """The run ends with a typed error, or by MPI itself; no process waits for ever."""
     done = mpirun("-n", "3", *NODE, program, loss)
     assert done.returncode != 0, done.stdout
     assert "equal" not in done.stdout
@@ -101,8 +101,8 @@ def test_a_run_without_a_caller_ends() -> None:
 
 
 def test_more_nodes_than_ranks(program: str) -> None:
-    """Rank 0 ends before it listens, and the others with it."""
+    """Rank 0 ends before it listens, and the other ranks end with it."""
     done = mpirun("-n", "2", *NODE, program)
     assert done.returncode != 0
-    assert "1 ranks are beside this one" in done.stdout
+    assert "there are 1 other ranks" in done.stdout
     assert "rank 0 of MPI has ended" in done.stdout

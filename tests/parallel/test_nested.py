@@ -1,4 +1,4 @@
-"""Worlds over workers live inside the daemonic workers of other libraries."""
+"""Worlds over workers run inside the daemonic workers of other libraries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worlds over nodes whose zones are cut anew are the undivided ones, whichever node is lost."""
+"""Repartitioned worlds over nodes equal undivided worlds, whichever node is lost."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.ownership.messages import Reset
 from cavmarl.parallel.nodes import node_process
-from cavmarl.parallel.nodes.node_cuts import read_neighbours, read_zones, told_zones
+from cavmarl.parallel.nodes.node_cuts import read_neighbours, read_zones, zones_as_json
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.render import topdown
 from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 from cavmarl.zones.partition.zone_layouts import cut_map
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
@@ -42,7 +43,7 @@ def over_nodes(vec: CavVectorEnv) -> NodeWorlds:
         ({"env": "town", "overrides": {"v2x.enabled": True, "sensors.stack": 3}}, 2),
     ],
 )
-def test_zones_that_are_cut_anew_change_nothing(
+def test_repartitioning_changes_no_result(
     make: Make, arguments: dict[str, Any], nodes: int
 ) -> None:
     wanted = WANTED | arguments
@@ -56,7 +57,7 @@ def test_zones_that_are_cut_anew_change_nothing(
     assert worlds.pool.recoveries == 0
 
 
-def test_vehicles_that_look_for_their_way_are_where_they_were(make: Make, tmp_path: Path) -> None:
+def test_rerouting_vehicles_keep_their_places(make: Make, tmp_path: Path) -> None:
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     named = {
         "traffic.demand": [str(path) for path in files],
@@ -70,11 +71,13 @@ def test_vehicles_that_look_for_their_way_are_where_they_were(make: Make, tmp_pa
     assert over_nodes(vec).repartitions
 
 
-def test_nodes_that_are_lost_before_and_after_a_cut(
+def test_nodes_that_are_lost_before_and_after_repartitioning(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All go back to the zones that there were when the state was kept, and cut them again."""
-    monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.KEEP_S", 1e6)  # only at the beginning
+    """All nodes go back to the zones of the kept state, and repartition again."""
+    monkeypatch.setattr(
+        "cavmarl.parallel.nodes.node_pool.KEEP_S", 1e6
+    )  # keep a state only at the start
     wanted = {**WANTED, "max_cycles": 40}
     whole = drive(make("grid4x4", **wanted), steps=24)
     vec = make("grid4x4", zones=4, nodes=4, overrides=OFTEN, **wanted)
@@ -91,7 +94,7 @@ def test_nodes_that_are_lost_before_and_after_a_cut(
     assert worlds.pool.zones != first or worlds.pool.replacements
 
 
-def test_a_cut_that_is_interrupted_is_as_if_it_had_not_been(
+def test_an_interrupted_repartitioning_changes_nothing(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vecs = [make("grid4x4", **WANTED), make("grid4x4", zones=4, nodes=2, overrides=OFTEN, **WANTED)]
@@ -102,7 +105,7 @@ def test_a_cut_that_is_interrupted_is_as_if_it_had_not_been(
 
     def interrupt(neighbours: Any) -> None:
         if not interrupted:
-            interrupted.append(worlds._steps_begun)
+            interrupted.append(step)
             raise KeyboardInterrupt
         know(neighbours)
 
@@ -115,11 +118,11 @@ def test_a_cut_that_is_interrupted_is_as_if_it_had_not_been(
         except KeyboardInterrupt:
             vecs[1].step(actions)
         assert vecs[0].state_hash() == vecs[1].state_hash(), step
-    assert interrupted == [4]
+    assert interrupted == [3]
     assert worlds.repartitions
 
 
-def test_the_journal_begins_anew_with_each_cut(make: Make, tmp_path: Path) -> None:
+def test_repartitioning_starts_an_episode_in_the_journal(make: Make, tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
     overrides = OFTEN | {"zones.journal": str(path)}
     vec = make("grid4x4", zones=4, nodes=2, overrides=overrides, **{**WANTED, "max_cycles": 40})
@@ -128,28 +131,36 @@ def test_the_journal_begins_anew_with_each_cut(make: Make, tmp_path: Path) -> No
     vec.close()
     episodes = [record.episode for record in JournalReader(path) if isinstance(record, Reset)]
     assert episodes == sorted(set(episodes))
-    assert len(episodes) == cuts + 2  # before the first reset, and with it
+    assert len(episodes) == cuts + 2  # before the first reset, and at the reset
     assert cuts > 1
 
 
-def test_pictures_have_the_zones_of_now(make: Make) -> None:
+def test_frames_show_the_present_zones(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     vec = make("grid4x4", zones=4, nodes=2, overrides=OFTEN, render_mode="rgb_array", **WANTED)
     drive(vec, steps=8)
     before, now = vec.worlds.world.partition, over_nodes(vec).partition
     assert over_nodes(vec).repartitions
+    drawn: list[str] = []
+    draw = topdown.draw_zones
+
+    def note(surface: Any, partition: Any, *more: Any) -> None:
+        drawn.append(partition.content_hash)
+        draw(surface, partition, *more)
+
+    monkeypatch.setattr(topdown, "draw_zones", note)
     vec.render()
-    assert vec._session.present().partition.content_hash == now.content_hash != before.content_hash
+    assert set(drawn) == {now.content_hash} != {before.content_hash}
 
 
-def test_zones_are_told_to_the_last_bit(make: Make) -> None:
+def test_zones_are_sent_exactly(make: Make) -> None:
     vec = make("grid4x4", agents=1, background=0)
     partition = cut_map(vec.simulation.network, "bisection", 7)
-    assert read_zones(told_zones(partition)).content_hash == partition.content_hash
+    assert read_zones(zones_as_json(partition)).content_hash == partition.content_hash
     assert read_neighbours([[[0, 1], [1]], True], 2).near == (frozenset({0, 1}), frozenset({1}))
 
 
 @pytest.mark.parametrize("mix", ["kill", "kill_in_recovery"])
-def test_simulated_nodes_fail_while_zones_are_cut_anew(
+def test_simulated_nodes_fail_during_repartitioning(
     monkeypatch: pytest.MonkeyPatch, mix: str
 ) -> None:
     cuts, ran = [0], node_process.cut_worlds

@@ -1,4 +1,4 @@
-"""Nodes that share out whole worlds give the results of one process, also when they are killed."""
+"""Whole worlds over nodes have the results of one process, also when nodes are killed."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from cavmarl.core.errors import WorkerDeathError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.worlds.tasks import Task
 from tests.support.vec_runs import Make, drive, same
 
 WANTED: dict[str, Any] = {"env": "grid4x4", "num_envs": 3, "agents": 6, "background": 20}
@@ -54,7 +54,9 @@ def kill(vec: CavVectorEnv, at: dict[int, list[int]]) -> Callable[[int], None]:
         ({"env": "town", "agents": 2, "overrides": {"rig": "ten_sensors"}}, 2),
     ],
 )
-def test_nobody_can_tell(make: Make, arguments: dict[str, Any], nodes: int) -> None:
+def test_whole_worlds_over_nodes_equal_those_of_one_process(
+    make: Make, arguments: dict[str, Any], nodes: int
+) -> None:
     wanted = WANTED | arguments
     whole = drive(
         make(
@@ -79,7 +81,7 @@ def test_nobody_can_tell(make: Make, arguments: dict[str, Any], nodes: int) -> N
 @pytest.mark.parametrize(
     "arguments", [{}, {"zones": 2}, {"env": "town", "overrides": {"rig": "ten_sensors"}}]
 )
-def test_nodes_that_are_killed_are_not_missed(make: Make, arguments: dict[str, Any]) -> None:
+def test_killed_nodes_change_no_result(make: Make, arguments: dict[str, Any]) -> None:
     wanted = WANTED | arguments
     whole = drive(make(**wanted | {"zones": 1}), steps=20)
     vec = make(backend="nodes:2", **wanted)
@@ -89,7 +91,7 @@ def test_nodes_that_are_killed_are_not_missed(make: Make, arguments: dict[str, A
     assert [group.pool.recoveries for group in groups_of(vec)] == [3, 2]
 
 
-def test_a_node_that_stops_is_taken_for_lost(make: Make) -> None:
+def test_a_stopped_node_counts_as_lost(make: Make) -> None:
     whole = drive(make(**WANTED))
     vec = make(backend="nodes:2", **WANTED)
 
@@ -101,23 +103,23 @@ def test_a_node_that_stops_is_taken_for_lost(make: Make) -> None:
     assert [group.pool.losses for group in groups_of(vec)] == [0, 1]
 
 
-def test_nodes_that_are_killed_again_and_again_end_the_run(make: Make) -> None:
+def test_repeatedly_killed_nodes_end_the_run(make: Make) -> None:
     vec = make(backend="nodes:2", overrides={"workers.max_retries": 1}, **WANTED)
     drive(vec, steps=2)
     pool = groups_of(vec)[0].pool
-    tell = pool._tell_zones
+    tell = pool.send_zones
 
     def strike_and_tell(*told: Any, **more: Any) -> None:
         tell(*told, **more)
         os.kill(pool.pids[0], signal.SIGKILL)
 
-    pool._tell_zones = strike_and_tell  # type: ignore[method-assign]
+    pool.send_zones = strike_and_tell  # type: ignore[method-assign]
     os.kill(pool.pids[0], signal.SIGKILL)
     with pytest.raises(WorkerDeathError, match=r"zones 0"):
         drive(vec, steps=2)
 
 
-def test_a_step_that_fails_for_one_node_is_done_by_none(
+def test_a_step_that_fails_for_one_node_is_undone_by_all(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vecs = [make(**WANTED), make(backend="nodes:3", **WANTED)]
@@ -146,7 +148,7 @@ def test_a_step_that_fails_for_one_node_is_done_by_none(
         ]
 
 
-def test_worlds_are_saved_and_go_on_elsewhere(make: Make) -> None:
+def test_saved_worlds_resume_with_another_backend(make: Make) -> None:
     vec, one = make(backend="nodes:2", **WANTED), make(**WANTED)
     for each in (vec, one):
         each.reset(seed=1)
@@ -186,7 +188,7 @@ def test_worlds_over_nodes_are_drawn(make: Make) -> None:
         ),
     ],
 )
-def test_what_cannot_be_is_refused(arguments: dict[str, Any], words: str) -> None:
+def test_bad_settings_are_refused(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec(backend="nodes:2", **WANTED | arguments)
 
@@ -196,7 +198,7 @@ RESTLESS = {"workers.balance_steps": 3, "workers.imbalance_tolerance": 0.0}
 
 @pytest.fixture
 def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Rounds of balance in which worlds seem to cost something else each time."""
+    """Let worlds have other costs in each round of balancing."""
     spent, rounds = StepPlacement.round, list[int]()
 
     def turn(self: StepPlacement, spent_s: Any, steps: int, seen: LoadSnapshot) -> bool:
@@ -232,7 +234,7 @@ def test_worlds_that_move_are_the_same(
     assert sum(group.pool.losses for group in groups_of(vec)) == sum(map(len, at.values()))
 
 
-def test_a_move_that_is_interrupted_leaves_worlds_where_they_were(
+def test_an_interrupted_move_is_undone(
     make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = WANTED | {"num_envs": 6}
@@ -241,15 +243,15 @@ def test_a_move_that_is_interrupted_leaves_worlds_where_they_were(
     for each in (whole, vec):
         each.reset(seed=3)
     group, calls = groups_of(vec)[1], [0]
-    become = group.become
+    set_worlds = group.set_worlds
 
     def interrupt(*worlds: Any) -> None:
         calls[0] += 1
         if calls[0] in (1, 4):
             raise KeyboardInterrupt
-        become(*worlds)
+        set_worlds(*worlds)
 
-    monkeypatch.setattr(group, "become", interrupt)
+    monkeypatch.setattr(group, "set_worlds", interrupt)
     for _ in range(20):
         actions = whole.suggest_actions()
         whole.step(actions)

@@ -1,4 +1,4 @@
-"""Nodes that join a world from anywhere: who is let in, and what goes over the wire."""
+"""Nodes that join a run from anywhere: which are accepted, and what they send."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from cavmarl.core.errors import (
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.network.listener import MAX_CALLERS, Listener
 from cavmarl.parallel.nodes import node_starters
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, JoiningNode, JoiningNodes
 from cavmarl.parallel.nodes.link import Link
-from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import read_key
@@ -38,9 +38,9 @@ from cavmarl.parallel.nodes.zone_moves import moves_of
 from tests.parallel.test_moving import RESTLESS, uneven
 from tests.parallel.test_nodes import over_nodes
 from tests.support.actuated import actuated_grid
+from tests.support.local_actors import FORKS, LocalActors
 from tests.support.vec_runs import Make, drive, same
 from tests.support.wires import Proxy, free_port, own_address
-from tests.support.world_hosts import FORKS, WorldHosts
 
 __all__ = ["uneven"]
 
@@ -50,7 +50,7 @@ WAIT_S = 60.0
 
 
 def join(place: tuple[str, int], key: bytes, keeps_files: bool = False) -> None:
-    """A node; it may see no file of the caller."""
+    """Run a node, which may have no access to the files of the caller."""
     if keeps_files:
         found = WorldFile.found
 
@@ -67,7 +67,7 @@ def join(place: tuple[str, int], key: bytes, keeps_files: bool = False) -> None:
 
 
 class Crowd:
-    """Nodes that somebody has started by hand."""
+    """Nodes that were started by hand."""
 
     def __init__(self) -> None:
         self.processes: list[Any] = []
@@ -118,10 +118,10 @@ def elsewhere() -> str:
 
 
 @pytest.mark.parametrize("is_elsewhere", [False, True])
-def test_what_goes_over_the_wire(
+def test_frames_between_machines_are_encrypted(
     make: Make, crowd: Crowd, key_file: Path, whole: Any, is_elsewhere: bool
 ) -> None:
-    """Beyond this machine nobody can read it, and what is spoiled is a node that is lost."""
+    """Frames to other machines are encrypted, and a damaged frame loses its node."""
     address = elsewhere() if is_elsewhere else "127.0.0.1"
     place = (address, free_port(address))
     wire = Proxy(place)
@@ -142,19 +142,19 @@ def test_what_goes_over_the_wire(
     said = bytes(wire.said) + b"".join(wire.heard)
     assert (b"cavN" in said) == (not is_elsewhere)
     assert KEY.encode() not in said
-    newcomers = over_nodes(vec).pool.newcomers
-    for heard in wire.heard:  # said again, it is nothing
+    joining_nodes = over_nodes(vec).pool.joining_nodes
+    for heard in wire.heard:  # a replay is refused
         with socket.create_connection(place) as stranger, suppress(OSError):
             stranger.sendall(heard)
             for _ in range(3):
-                newcomers.look(10.0)
-            assert newcomers.ready == []
+                joining_nodes.look(10.0)
+            assert joining_nodes.ready == []
             assert stranger.recv(1 << 16)[:4] != b"cavN"
     assert over_nodes(vec).pool.losses == 1
     wire.close()
 
 
-def test_a_node_that_joins_later_takes_the_place_of_a_lost_one(
+def test_a_node_that_joins_later_replaces_a_lost_one(
     make: Make, crowd: Crowd, key_file: Path
 ) -> None:
     place = ("127.0.0.1", free_port("127.0.0.1"))
@@ -171,14 +171,14 @@ def test_a_node_that_joins_later_takes_the_place_of_a_lost_one(
     lost = step_alike(one, vec, lambda: bool(worlds.pool.replacements))
     assert (worlds.pool.losses, worlds.pool.recoveries, worlds.pool.replacements) == (1, 1, 1)
     assert worlds.pool.zones == [[0, 1], [2, 3]]
-    os.kill(worlds.pool.pids[1], signal.SIGKILL)  # now the new one has all
+    os.kill(worlds.pool.pids[1], signal.SIGKILL)  # the new node takes over all zones
     step_alike(one, vec, lambda: worlds.pool.zones[1] == [])
     assert worlds.pool.zones == [[0, 1, 2, 3], []]
     assert lost > 1
 
 
 def step_alike(one: CavVectorEnv, vec: CavVectorEnv, is_done: Callable[[], bool]) -> int:
-    """Step both until something is so, and a little further."""
+    """Step both environments until a condition holds, and a little further."""
     until_s, steps, more = time.monotonic() + WAIT_S, 0, 5
     while more:
         assert time.monotonic() < until_s
@@ -192,7 +192,7 @@ def step_alike(one: CavVectorEnv, vec: CavVectorEnv, is_done: Callable[[], bool]
     return steps
 
 
-def test_a_node_of_this_machine_is_started_again(make: Make) -> None:
+def test_a_node_of_this_machine_is_restarted(make: Make) -> None:
     one, vec = (make("grid4x4", **WANTED, **more) for more in ({}, {"zones": 4, "nodes": 2}))
     worlds = over_nodes(vec)
     for each in (one, vec):
@@ -203,7 +203,7 @@ def test_a_node_of_this_machine_is_started_again(make: Make) -> None:
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
-def test_zones_that_change_their_node(make: Make, uneven: list[int], is_lost: bool) -> None:
+def test_zones_that_move_to_another_node(make: Make, uneven: list[int], is_lost: bool) -> None:
     wanted = {"agents": 8, "background": 30, "max_cycles": 8}
     whole = drive(make("town", **wanted), steps=20)
     vec = make("town", zones=4, nodes=3, overrides=RESTLESS, **wanted)
@@ -219,8 +219,8 @@ def test_zones_that_change_their_node(make: Make, uneven: list[int], is_lost: bo
     assert over_nodes(vec).pool.generation > 1 + is_lost
 
 
-def test_hosts_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(node_starters, "RayActors", WorldHosts)
+def test_actors_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_starters, "RayActors", LocalActors)
     one = make("grid4x4", **WANTED)
     vec = make("grid4x4", zones=4, backend="ray:2", **WANTED)
     worlds = over_nodes(vec)
@@ -234,18 +234,18 @@ def test_hosts_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_node_that_the_others_cannot_reach(
     make: Make, monkeypatch: pytest.MonkeyPatch, whole: Any
 ) -> None:
-    """The one that two others miss is lost, though it lives."""
+    """A node that two others cannot reach counts as lost, although it lives."""
     wires: list[Proxy] = []
-    take = Newcomers.take
+    take = JoiningNodes.take
 
-    def through_a_wire(newcomers: Newcomers, number: int) -> tuple[Newcomer, Link]:
-        newcomer, link = take(newcomers, number)
-        assert newcomer.place is not None
-        wires.append(Proxy(newcomer.place))
-        newcomer.place = wires[-1].place
-        return newcomer, link
+    def through_a_wire(joining_nodes: JoiningNodes, number: int) -> tuple[JoiningNode, Link]:
+        joining_node, link = take(joining_nodes, number)
+        assert joining_node.place is not None
+        wires.append(Proxy(joining_node.place))
+        joining_node.place = wires[-1].place
+        return joining_node, link
 
-    monkeypatch.setattr(Newcomers, "take", through_a_wire)
+    monkeypatch.setattr(JoiningNodes, "take", through_a_wire)
     vec = make("grid4x4", zones=4, nodes=3, **WANTED)
 
     def cut(step: int) -> None:
@@ -258,10 +258,10 @@ def test_a_node_that_the_others_cannot_reach(
         wire.close()
 
 
-def test_a_crowd_of_strangers_disturbs_nobody(make: Make, whole: Any) -> None:
+def test_many_strangers_do_not_disturb_a_run(make: Make, whole: Any) -> None:
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     worlds = over_nodes(vec)
-    address, port = worlds.pool.newcomers.place.split(":")
+    address, port = worlds.pool.joining_nodes.place.split(":")
     before = psutil.Process().num_fds()
     strangers: list[socket.socket] = []
 
@@ -282,7 +282,7 @@ def test_a_crowd_of_strangers_disturbs_nobody(make: Make, whole: Any) -> None:
     assert not any(map(psutil.pid_exists, pids))
 
 
-def test_a_caller_waits_for_so_long(key_file: Path) -> None:
+def test_a_caller_waits_up_to_a_limit(key_file: Path) -> None:
     port = free_port("127.0.0.1")
     limited = keyed(key_file, **{"workers.join_timeout_s": 1.0})
     with closing(Listener("127.0.0.1", b"", port)):
@@ -307,12 +307,12 @@ def test_a_key_is_a_secret(tmp_path: Path) -> None:
         read_key(path)
 
 
-def test_files_are_kept_by_what_is_in_them(tmp_path: Path) -> None:
+def test_files_are_stored_by_their_content(tmp_path: Path) -> None:
     content = secrets.token_bytes(100)
     digest = hashlib.sha256(content).hexdigest()
     file = WorldFile("map.source", -1, "/nowhere/map.net.xml", digest)
     assert file.found() is None
-    with pytest.raises(MessageError, match="something else"):
+    with pytest.raises(MessageError, match="another SHA-256 digest"):
         file.keep(content[:-1])
     file.keep(content)
     assert file.found() == cache_dir() / "files" / digest / "map.net.xml"
@@ -320,11 +320,11 @@ def test_files_are_kept_by_what_is_in_them(tmp_path: Path) -> None:
     assert file.found() is None
     file.kept.unlink()
     file.kept.parent.rmdir()
-    with pytest.raises(MessageError, match="no SHA-256"):
+    with pytest.raises(MessageError, match="not an SHA-256 digest"):
         _ = file._replace(digest="../../x").kept
 
 
-def test_a_node_by_its_command(make: Make, key_file: Path, tmp_path: Path) -> None:
+def test_a_node_started_from_the_command_line(make: Make, key_file: Path, tmp_path: Path) -> None:
     net = actuated_grid(tmp_path)
     port = free_port("127.0.0.1")
     words = ["node", "--join", f"127.0.0.1:{port}", "--key-file", str(key_file)]
@@ -339,7 +339,7 @@ def test_a_node_by_its_command(make: Make, key_file: Path, tmp_path: Path) -> No
     assert process.returncode == 0
 
 
-def test_who_hosts_what_after_losses_and_newcomers() -> None:
+def test_zones_after_losses_and_joins() -> None:
     first = [[0, 1], [2], [3, 4]]
     found = moves_of(first, first, lost=[1], living=[0, 2], state=1)
     assert found.zones == [[0, 1], [], [2, 3, 4]]
@@ -349,4 +349,4 @@ def test_who_hosts_what_after_losses_and_newcomers() -> None:
     assert again.donors == [(2, 1)]
     with pytest.raises(WorkerDeathError, match="zones 2; zones 3, 4"):
         moves_of(first, first, lost=[1, 2], living=[0], state=1)
-    assert json.dumps(again)  # it is told as JSON
+    assert json.dumps(again)  # it is sent as JSON

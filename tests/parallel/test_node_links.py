@@ -1,4 +1,4 @@
-"""Frames between nodes: their bytes, what is none, and who may say what."""
+"""Frames between nodes: their bytes, bad frames, and which node may send what."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from cavmarl.ownership.messages import Done
 from cavmarl.parallel.network.encryption import encrypted
 from cavmarl.parallel.network.tcp_transport import TcpConnection
 from cavmarl.parallel.network.transport import READS
-from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.node_handshake import accept_nodes, call_node
 from cavmarl.parallel.nodes.node_system import MACHINE
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
-from cavmarl.parallel.nodes.zone_hosts import packed
+from cavmarl.parallel.nodes.zone_endpoints import packed
 from tests.parallel.test_node_joining import WAIT_S
 
 
@@ -44,7 +44,7 @@ def frame(kind: FrameKind, data: bytes | memoryview) -> bytes:
 
 
 def head(kind: int, size: int) -> bytes:
-    """The head of a first frame."""
+    """Return the head of a first frame."""
     found = b"cavN\x07\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
     found += bytes(8)
     return found + xxh3_64_intdigest(found, 1).to_bytes(8, "little")
@@ -60,30 +60,30 @@ def test_the_bytes_of_a_frame() -> None:
 @pytest.mark.parametrize(
     ("said", "words"),
     [
-        (b"GET / HTTP/1.1\r\n" * 9, "begins no frame"),
-        (head(FrameKind.PING, MAX_FRAME + 1), "is none"),
+        (b"GET / HTTP/1.1\r\n" * 9, "does not start a frame"),
+        (head(FrameKind.PING, MAX_FRAME + 1), f"more than {MAX_FRAME}"),
         (b"cavN\x09\x00" + bytes(34), "version 9"),
         (head(255, 0), "kind 255"),
-        (frame(FrameKind.PING, b"abc")[:-1] + b"d", "not what was sent"),
+        (frame(FrameKind.PING, b"abc")[:-1] + b"d", "are damaged"),
         (2 * frame(FrameKind.SYNC, b"abc"), "not the next one"),
         (frame(FrameKind.SYNC, b"abc")[:-1], "has ended"),
     ],
 )
-def test_what_is_no_frame_ends_a_connection(said: bytes, words: str) -> None:
+def test_a_bad_frame_ends_the_connection(said: bytes, words: str) -> None:
     links, far = pair()
     far.sendall(said)
     far.close()
     with pytest.raises(LinkLostError, match=words):
-        _ = [links.take([0], WAIT_S) for _ in range(3)]
+        _ = [links.receive([0], WAIT_S) for _ in range(3)]
 
 
-def test_a_node_speaks_for_its_own_zones() -> None:
-    """One that says something of another's zone is cut off."""
+def test_a_node_sends_for_its_own_zones_only() -> None:
+    """A node that sends something about a zone of another node is disconnected."""
     links, far = pair()
     coordinator = NodeCoordinator([bytes(16)], [0, 0, 1], Limits(), links, [None])
     coordinator.host(Neighbours((frozenset((1,)), frozenset((0, 2)), frozenset((1,)))))
-    links.urgent = coordinator.hear
-    table = coordinator._worlds[0].directory.table
+    links.urgent = coordinator.receive
+    table = coordinator.worlds[0].directory.table
     done = {
         zone: Done(bytes(16), table.episode, table.tick, zone=zone, incarnation=1)
         for zone in (1, 2, 9)
@@ -91,20 +91,20 @@ def test_a_node_speaks_for_its_own_zones() -> None:
     coordinator.check(0, [(0, done[1])])
     coordinator.check(1, [(0, done[2])])
     for number, zone in ((0, 2), (1, 1), (0, 9)):
-        with pytest.raises(MessageError, match=f"node {number} speaks for zone {zone}"):
+        with pytest.raises(MessageError, match=f"node {number} sends for zone {zone}"):
             coordinator.check(number, [(0, done[zone])])
     others, theirs = pair()
     others.send(0, FrameKind.MESSAGES, 0, [packed([(0, done[2])])])
     with far, theirs:
         far.sendall(theirs.recv(1 << 16))
-        with pytest.raises(LinkLostError, match="speaks for zone 2"):
+        with pytest.raises(LinkLostError, match="sends for zone 2"):
             links.pump(1000.0)
     others.close()
 
 
 @pytest.mark.parametrize(("size", "bits"), [(3, None), (9999, 99)])
-def test_each_bit_of_a_frame_is_guarded(size: int, bits: int | None) -> None:
-    """None makes another frame of it, or lets the receiver wait for more."""
+def test_each_changed_bit_of_a_frame_is_noticed(size: int, bits: int | None) -> None:
+    """No changed bit makes another frame, or lets the receiver wait for more bytes."""
     drawn = np.random.default_rng(size)
     sent = frame(FrameKind.SYNC, drawn.bytes(size))
     every = 8 * len(sent)
@@ -114,7 +114,7 @@ def test_each_bit_of_a_frame_is_guarded(size: int, bits: int | None) -> None:
         links, far = pair()
         far.sendall(changed)
         with pytest.raises(LinkLostError, match="frame"):
-            links.take([0], WAIT_S)
+            links.receive([0], WAIT_S)
         far.close()
 
 
@@ -124,7 +124,7 @@ def test_words_are_sent_as_bytes() -> None:
 
 
 @pytest.mark.parametrize("is_encrypted", [False, True])
-def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool) -> None:
+def test_bytes_that_the_system_does_not_accept_are_sent_later(is_encrypted: bool) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         ends = socket.create_connection(server.getsockname()), server.accept()[0]
     if is_encrypted:
@@ -142,13 +142,13 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
         near.send(0, FrameKind.SYNC, 2, [b"small"])
     alone = parts[0, :-1].copy()
     near.send(0, FrameKind.SHARE, 3, [alone.data])
-    alone[:] = 0  # its owner writes the next one there
+    alone[:] = 0  # the sender reuses its memory
     with ThreadPoolExecutor() as pool:
         flushed = pool.submit(near.flush)
         for part in parts:
-            assert far.next(0).data == part.data
-            assert far.next(0).data == b"small"
-        assert far.next(0).data == parts[0, :-1].data
+            assert far.receive_next(0).data == part.data
+            assert far.receive_next(0).data == b"small"
+        assert far.receive_next(0).data == parts[0, :-1].data
         flushed.result()
     near.close()
     far.close()
@@ -157,10 +157,10 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
 @pytest.mark.parametrize("said", [b"no JSON", b"{}", b"\xff"])
 def test_a_list_is_a_list(said: bytes) -> None:
     with pytest.raises(MessageError, match="a frame of kind PONG: it"):
-        said_by(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
+        read_list(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
 
 
-def test_machines_that_vanish_are_missed() -> None:
+def test_connections_probe_silent_machines() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         connection = socket.create_connection(server.getsockname())
     links = Links(lambda number, frame: None)
@@ -174,11 +174,11 @@ def test_machines_that_vanish_are_missed() -> None:
     links.close()
 
 
-def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
+def test_a_call_of_an_earlier_generation_is_rejected() -> None:
     listener = MACHINE.listen("127.0.0.1", b"secret")
 
     def call(generation: int) -> int:
-        """How many bytes come until the connection ends, at most 1."""
+        """Return the number of bytes, at most 1, until the connection ends."""
         room = memoryview(bytearray(1))
         with closing(call_node(MACHINE, listener.place, b"secret", 2, generation, of=1)) as found:
             poll = MACHINE.poll()
@@ -189,8 +189,8 @@ def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
 
     with closing(listener), ThreadPoolExecutor() as callers:
         earlier = callers.submit(call, 6)
-        (found,) = calls_of(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
-        found.close()  # the attempt has come to nothing
+        (found,) = accept_nodes(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
+        found.close()  # the attempt has failed
         assert earlier.result() == 0
         earlier = callers.submit(call, 6)
         present: list[object] = []
@@ -199,9 +199,9 @@ def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
             if earlier.done() and not present:
                 present.append(callers.submit(call, 7))
 
-        found_now = calls_of(MACHINE, listener, [2], 7, WAIT_S, check)
+        found_now = accept_nodes(MACHINE, listener, [2], 7, WAIT_S, check)
         assert earlier.result() == 0
         assert list(found_now) == [2]
         found_now[2].close()
         with pytest.raises(LinkLostError, match="node 3"):
-            calls_of(MACHINE, listener, [3], 7, 0.0, lambda: None)
+            accept_nodes(MACHINE, listener, [3], 7, 0.0, lambda: None)

@@ -1,4 +1,4 @@
-"""What nodes tell of themselves and of their machines, and zones that move by it."""
+"""Loads that nodes report of themselves and of their machines, and zones that move by them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.balance.load_score import Utilisation
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.parallel.nodes.node_loads import TO_SHOW
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_placement import StepPlacement
+from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.subscribers import Audience, Wishes
 from tests.parallel.test_nodes import WANTED, over_nodes
@@ -23,7 +23,7 @@ from tests.support.vec_runs import Make, drive, same
 IDLE = Utilisation(0.0, 0.0)
 
 
-def test_nodes_tell_what_they_have_done(make: Make) -> None:
+def test_nodes_report_their_loads(make: Make) -> None:
     vec = make("grid4x4", zones=4, nodes=2, num_envs=1, **WANTED)
     drive(vec, steps=5)
     over_nodes(vec).node_loads()
@@ -44,22 +44,20 @@ def test_nodes_tell_what_they_have_done(make: Make) -> None:
     assert all(load.ticks == 0 for load in over_nodes(vec).node_loads())
 
 
-def test_loads_of_the_nodes_machines_are_told_to_pages(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pages_show_the_loads_of_machines(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     drive(vec, steps=2)
     nodes = over_nodes(vec)
     assert sorted(nodes.worker_pids) == [0, 1]
     assert os.getpid() not in nodes.worker_pids.values()
-    monkeypatch.setattr(NodeWorlds, "worker_pids", {})  # as of nodes of other machines
+    monkeypatch.setattr(NodeWorlds, "worker_pids", {})  # as for nodes on other machines
     monkeypatch.setattr("cavmarl.viewer.run_loads.EVERY_S", 0.05)
     audience = Audience()
     told: list[Any] = []
-    monkeypatch.setattr(audience, "tell_all", told.append)
+    monkeypatch.setattr(audience, "send_all", told.append)
     loads = RunLoads(nodes, audience)
     loads.look()
-    assert not told  # none watches
+    assert not told  # no page watches
     audience.wishes = Wishes(watchers=1)
     loads.look()
     time.sleep(0.3)
@@ -72,10 +70,8 @@ def test_loads_of_the_nodes_machines_are_told_to_pages(
     assert vec.state_hash(0) == before
 
 
-def test_zones_leave_nodes_whose_machine_others_keep_busy(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A node that is busy by what it says is given nothing more, and loses no last zone."""
+def test_zones_leave_nodes_on_busy_machines(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node on a busy machine gets no more zones, but keeps its last zone."""
     watched = {"workers.balance_steps": 2, "workers.monitor_cpu": True}
     whole = drive(make("grid4x4", **WANTED))
     said: list[LoadSnapshot] = []

@@ -1,4 +1,4 @@
-"""A network simulator of the caller beside worlds over nodes gives the bytes of one process."""
+"""A network simulator of the caller: worlds over nodes receive the bytes of one process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cavmarl import ConfigError, make_vec
 from cavmarl.core.errors import MessageError
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.nodes.node_network import asked_of, read_asked
+from cavmarl.parallel.nodes.node_network import read_request, request_of
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.v2x.kernels.v2x_records import PACKET, RECEIVER
 from cavmarl.v2x.v2x_messages import RECEPTION, Exchange
@@ -24,7 +24,7 @@ WANTED: dict[str, Any] = {"env": "grid4x4", "agents": 6, "background": 30, "max_
 
 
 class Delayed:
-    """Delivers packets after 0 to 2 ticks, by its own memory of what was sent; counts calls."""
+    """Delivers packets after 0 to 2 ticks, from its own memory, and counts calls."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -55,7 +55,7 @@ def over_nodes(vec: CavVectorEnv) -> NodeWorlds:
 
 
 @pytest.mark.parametrize("more", [{"num_envs": 2}, {"overrides": {"zones.repartition_steps": 3}}])
-def test_what_is_received_is_what_one_process_receives(make: Make, more: dict[str, Any]) -> None:
+def test_receptions_equal_those_of_one_process(make: Make, more: dict[str, Any]) -> None:
     here, there = Delayed(), Delayed()
     alone = {**more, "overrides": {}}
     whole = drive(with_network(make, here, **alone))
@@ -72,7 +72,7 @@ class Nothing:
         return np.zeros(0, RECEPTION)
 
 
-def test_a_step_that_is_done_again_is_not_asked_again(make: Make) -> None:
+def test_a_repeated_step_does_not_ask_the_simulator_again(make: Make) -> None:
     here, there = Delayed(), Delayed()
     whole = drive(with_network(make, here), steps=20)
     vec = with_network(make, there, zones=4, nodes=3)
@@ -88,7 +88,7 @@ def test_a_step_that_is_done_again_is_not_asked_again(make: Make) -> None:
 
 
 class Failing(Delayed):
-    """Fails at one call, and goes on as if it had not been called."""
+    """Fails at one call, and otherwise ignores that call."""
 
     def __init__(self, at: int, how: Exception | NDArray[Any]) -> None:
         super().__init__()
@@ -108,11 +108,11 @@ class Failing(Delayed):
     [
         (OSError("it is gone"), OSError, "it is gone"),
         (KeyError("a bug"), KeyError, "a bug"),
-        (np.array([(9, 0, 0)], RECEPTION), MessageError, "another tick than those"),
+        (np.array([(9, 0, 0)], RECEPTION), MessageError, "has a tick outside"),
         (np.zeros(3), MessageError, "dtype RECEPTION"),
     ],
 )
-def test_a_simulator_that_fails_is_no_loss_of_nodes(
+def test_a_failing_simulator_loses_no_node(
     make: Make, how: Any, error: type[Exception], words: str
 ) -> None:
     vec = with_network(make, Failing(0, how), zones=2, nodes=2)
@@ -130,7 +130,7 @@ def test_a_simulator_that_fails_is_no_loss_of_nodes(
     assert over_nodes(vec).pool.losses == 0
 
 
-def test_what_cannot_be_connected_is_refused(make: Make) -> None:
+def test_bad_connections_are_refused(make: Make) -> None:
     vec = make(**WANTED, zones=2, nodes=2, overrides=EXTERNAL)
     vec.reset(seed=1)
     with pytest.raises(ConfigError, match="connect a network simulator before the first step"):
@@ -138,21 +138,21 @@ def test_what_cannot_be_connected_is_refused(make: Make) -> None:
     vec.worlds.connect_network(Delayed())
     vec.step(vec.suggest_actions())
     own = make(**WANTED, zones=2, nodes=2, overrides={"v2x.enabled": True})
-    with pytest.raises(ConfigError, match="the channel is our own"):
+    with pytest.raises(ConfigError, match="external is off"):
         own.worlds.connect_network(Delayed())
     with pytest.raises(ConfigError, match="use backend='local', or nodes"):
         make_vec("grid4x4", workers=1, overrides=EXTERNAL)
 
 
-def test_what_is_asked_goes_over_whole() -> None:
+def test_requests_are_sent_exactly() -> None:
     packets, receivers = np.zeros(3, PACKET), np.zeros(2, RECEIVER)
     packets["sender"], receivers["id"] = [4, 5, 6], [7, -1]
-    pieces = asked_of(Exchange(1, 12, packets, receivers), np.array([3, 0, 2]))
+    pieces = request_of(Exchange(1, 12, packets, receivers), np.array([3, 0, 2]))
     data = memoryview(b"".join(map(bytes, pieces)))
-    sent, num_packets = read_asked(data, 2, 2)
+    sent, num_packets = read_request(data, 2, 2)
     assert (sent.world, sent.tick, num_packets.tolist()) == (1, 12, [3, 0, 2])
     assert sent.packets.tobytes() == packets.tobytes()
     assert sent.receivers.tobytes() == receivers.tobytes()
     for worlds, cut in ((1, len(data)), (2, len(data) - 1), (2, 20)):
         with pytest.raises(MessageError, match="an exchange"):
-            read_asked(data[:cut], worlds, 2)
+            read_request(data[:cut], worlds, 2)

@@ -1,4 +1,4 @@
-"""What acts in a tick beside the traffic does the same over nodes, also when nodes are killed."""
+"""Sensors, messages, scenes and SUMO have the same results over nodes, also over killed ones."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WANTED: dict[str, Any] = {"agents": 8, "background": 30, "max_cycles": 8}
 
 
 def lose_one(vec: CavVectorEnv, at: int) -> Callable[[int], None]:
-    """What kills a node in a step, a random time after it has begun."""
+    """Return a function that kills a node a random time after the start of a step."""
     worlds, drawn = over_nodes(vec), random.Random(at)
 
     def strike(step: int) -> None:
@@ -54,7 +54,7 @@ def test_rigs(make: Make, mode: str) -> None:
         assert frames.data.any(), name
 
 
-def test_samples_go_along_with_agents_that_change_their_node(make: Make) -> None:
+def test_samples_follow_agents_to_another_node(make: Make) -> None:
     overrides = {"rig": SMALL_RIG, "observation.mode": "sensors"}
     wanted = {"agents": 12, "background": 4, "max_cycles": 25, "overrides": overrides}
     whole = drive(make("grid4x4", **wanted), steps=25)
@@ -84,7 +84,7 @@ def test_scripted_scenes(make: Make) -> None:
     assert over_nodes(vec).pool.recoveries == 1
 
 
-def test_vehicles_that_look_for_another_way(make: Make, tmp_path: Path) -> None:
+def test_rerouting_vehicles(make: Make, tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {

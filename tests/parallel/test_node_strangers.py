@@ -1,4 +1,4 @@
-"""Callers that are no nodes of the run, or none that are wanted, at real sockets."""
+"""Callers that are no nodes of the run, or are not needed, at real sockets."""
 
 from __future__ import annotations
 
@@ -13,39 +13,38 @@ import pytest
 from cavmarl.core.errors import MessageError, MissingExtraError, NodeRefusedError
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.code_stamp import code_stamp
-from cavmarl.parallel.network.framed_socket import VERSION
-from cavmarl.parallel.network.listener import Listener, call
+from cavmarl.parallel.network.listener import VERSION, Listener, call
 from cavmarl.parallel.network.tcp_transport import TcpConnection, TcpListener
-from cavmarl.parallel.nodes import newcomers as newcomers_module
+from cavmarl.parallel.nodes import joining_nodes
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, JoiningNodes
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomers
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from tests.parallel.test_node_joining import WAIT_S, elsewhere
 
 
 class Door:
-    """A caller's end, in a thread."""
+    """The end that nodes call, in a thread."""
 
     def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
         self.listener = TcpListener(address, key)
-        self.newcomers = Newcomers(self.listener, {}, [], lambda: room, 1)
+        self.joining_nodes = JoiningNodes(self.listener, {}, [], lambda: room, 1)
         self._is_open = True
         self._thread = threading.Thread(target=self._look)
         self._thread.start()
 
     def _look(self) -> None:
         while self._is_open:
-            self.newcomers.look(5.0)
+            self.joining_nodes.look(5.0)
 
     def close(self) -> None:
         self._is_open = False
         self._thread.join()
-        self.newcomers.close()
+        self.joining_nodes.close()
 
 
-def test_who_has_another_key_stays_outside() -> None:
+def test_a_node_with_another_key_is_refused() -> None:
     for address in ("127.0.0.1", elsewhere()):
         with closing(Door(b"a" * 32, address)) as door:
             with pytest.raises(MessageError, match="give both the same key"):
@@ -53,7 +52,7 @@ def test_who_has_another_key_stays_outside() -> None:
 
 
 def answer(server: socket.socket, said: bytes) -> threading.Thread:
-    """Somebody who answers the first caller, and ends."""
+    """Start a process that answers the first caller, and ends."""
 
     def run() -> None:
         connection, _ = server.accept()
@@ -66,7 +65,7 @@ def answer(server: socket.socket, said: bytes) -> threading.Thread:
     return thread
 
 
-def test_who_does_not_encrypt_stays_outside() -> None:
+def test_a_peer_without_encryption_is_refused() -> None:
     with closing(Door(b"a" * 32, elsewhere())) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
@@ -75,19 +74,21 @@ def test_who_does_not_encrypt_stays_outside() -> None:
                 assert b"cav" not in stranger.recv(100)
     with socket.create_server((elsewhere(), 0)) as server:
         answering = answer(server, bytes(100))
-        with pytest.raises(MessageError, match="does not encrypt as cavmarl does"):
+        with pytest.raises(MessageError, match="does not use the encryption of cavmarl"):
             call(server.getsockname()[:2], b"a" * 32, ANYONE)
         answering.join()
 
 
-def test_encryption_needs_its_library_from_the_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_for_encryption_is_noticed_at_the_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "cryptography", None)
     with pytest.raises(MissingExtraError, match="nodes"):
         Listener(elsewhere(), secrets.token_bytes(32))
     Listener("127.0.0.1").close()
 
 
-def test_another_version_is_told_which_one_is_spoken() -> None:
+def test_another_version_of_the_handshake_is_refused() -> None:
     with closing(Door(b"a" * 32)) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
@@ -95,7 +96,7 @@ def test_another_version_is_told_which_one_is_spoken() -> None:
             assert stranger.recv(100) == b"cavW" + VERSION.to_bytes(2, "little")
     with socket.create_server(("127.0.0.1", 0)) as server:
         answering = answer(server, b"cavW\x63\x00")
-        with pytest.raises(MessageError, match=f"speaks version 99, this is {VERSION}"):
+        with pytest.raises(MessageError, match=f"version 99 of .*, this one has {VERSION}"):
             call(server.getsockname()[:2], b"a" * 32, ANYONE)
         answering.join()
 
@@ -104,26 +105,26 @@ def test_another_version_is_told_which_one_is_spoken() -> None:
     ("code", "room", "words"),
     [
         ("cavmarl of another day", 1, "runs cavmarl of another day.*install the same versions"),
-        ("", 0, "no more nodes are wanted"),
+        ("", 0, "no more nodes are needed"),
     ],
 )
-def test_nodes_that_are_not_wanted(
+def test_nodes_that_are_not_needed_are_refused(
     monkeypatch: pytest.MonkeyPatch, code: str, room: int, words: str
 ) -> None:
     if code:
-        monkeypatch.setattr(newcomers_module, "code_stamp", code_stamp)
+        monkeypatch.setattr(joining_nodes, "code_stamp", code_stamp)
         monkeypatch.setattr("cavmarl.parallel.nodes.node_process.code_stamp", lambda: code)
     with closing(Door(b"a" * 32, room=room)) as door:
         with pytest.raises(NodeRefusedError, match=words):
             run_node(door.listener.place, b"a" * 32, ANYONE)
 
 
-def test_who_has_come_in_and_talks_nonsense_is_sent_away() -> None:
+def test_an_admitted_caller_with_bad_frames_is_disconnected() -> None:
     with closing(Door(b"a" * 32)) as door:
         for said in (b"no JSON", b"[]", b"{}"):
             links = Links(lambda number, frame: None)
             links.add(COORDINATOR, TcpConnection(call(door.listener.place, b"a" * 32, ANYONE)))
             links.send(COORDINATOR, FrameKind.JOIN, 0, [said])
             with pytest.raises(LinkLostError):
-                links.take([COORDINATOR], WAIT_S)
+                links.receive([COORDINATOR], WAIT_S)
             links.close()

@@ -1,4 +1,4 @@
-"""Worlds over nodes that share nothing are the undivided ones, whichever node is lost."""
+"""Worlds over nodes equal undivided worlds, whichever node is lost."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from cavmarl import ConfigError, make_vec, parallel_env
 from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
-from cavmarl.parallel.nodes.node_actions import Actions, ActionsTaken, read_refusal
+from cavmarl.parallel.nodes.node_actions import Actions, ReceivedActions, read_refusal
 from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import LocalNodes
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from tests.support.actuated import actuated_grid
 from tests.support.forks import said_in_fork
 from tests.support.vec_runs import Make, drive, same
@@ -46,7 +46,9 @@ def over_nodes(vec: CavVectorEnv) -> NodeWorlds:
         ({"env": "town", "overrides": {"clock.control_latency_ticks": 2}}, 1),
     ],
 )
-def test_nobody_can_tell(make: Make, arguments: dict[str, Any], nodes: int) -> None:
+def test_worlds_over_nodes_equal_those_of_one_process(
+    make: Make, arguments: dict[str, Any], nodes: int
+) -> None:
     wanted = WANTED | arguments
     whole = drive(make(**wanted))
     vec = make(zones=4, nodes=nodes, **wanted)
@@ -56,7 +58,7 @@ def test_nobody_can_tell(make: Make, arguments: dict[str, Any], nodes: int) -> N
     assert over_nodes(vec).pool.recoveries == 0
 
 
-def test_an_action_that_comes_to_the_wrong_node_is_refused_and_sent_to_the_owner(
+def test_an_action_at_the_wrong_node_is_forwarded_to_the_owner(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
@@ -73,7 +75,7 @@ def test_an_action_that_comes_to_the_wrong_node_is_refused_and_sent_to_the_owner
     assert worlds.pool.redirected > 50
 
 
-def test_a_node_is_told_what_its_own_agents_do() -> None:
+def test_a_node_receives_the_actions_of_its_agents() -> None:
     arrays = StepArrays.of(
         {name: np.zeros((1, 4, 2)) for name in StepArrays._fields[:-2]} | {"mask": np.ones((1, 4))}
     )
@@ -84,41 +86,41 @@ def test_a_node_is_told_what_its_own_agents_do() -> None:
     there = StepArrays(*(array.copy() for array in arrays[:-2]), {}, {})
     there = there._replace(meta_actions=np.zeros((1, 4), np.int64))
     there.controls[...] = -1.0
-    taken = ActionsTaken(there, number=1)
+    taken = ReceivedActions(there, number=1)
     taken.begin(owner)
     data = memoryview(bytes(8) + bytes(actions.of_node(1, owner)))
-    wrong, end = taken.take(data, 8, owner)
+    wrong, end = taken.read(data, 8, owner)
     assert (wrong.tolist(), end, taken.are_due) == ([], len(data), False)
     assert there.controls[0, :, 0].tolist() == [0.0, -1.0, 2.0, 3.0]
     assert there.meta_actions.tolist() == [[0, 0, 2, 3]]
 
 
-def test_actions_of_others_and_what_are_none() -> None:
+def test_actions_of_other_nodes_and_bad_actions() -> None:
     arrays = StepArrays.of(
         {name: np.ones((1, 4, 2)) for name in StepArrays._fields[:-2]}
         | {"mask": np.ones((1, 4), bool), "meta_actions": np.ones((1, 4), np.int64)}
     )
     owner = np.array([1, 0, 1, -1], np.int32)
-    taken = ActionsTaken(arrays, number=1)
+    taken = ReceivedActions(arrays, number=1)
     taken.begin(owner)
     told = bytes(Actions.of(arrays).some(np.array([0, 1])))
-    wrong, _ = taken.take(memoryview(told), 0, owner)
+    wrong, _ = taken.read(memoryview(told), 0, owner)
     assert wrong.tolist() == [1]
     assert taken.are_due, "agent 2 is missing"
-    taken.take(memoryview(bytes(Actions.of(arrays).some(np.array([2])))), 0, owner)
+    taken.read(memoryview(bytes(Actions.of(arrays).some(np.array([2])))), 0, owner)
     assert not taken.are_due
     words = np.frombuffer(told, np.int64)
     for word, value in ((0, -1), (0, 5), (1, 4), (2, 4), (6, -1)):
         other = words.copy()
         other[word] = value
-        with pytest.raises(MessageError, match="do not tell what agents do"):
-            taken.take(memoryview(other.tobytes()), 0, owner)
+        with pytest.raises(MessageError, match="no actions of agents"):
+            taken.read(memoryview(other.tobytes()), 0, owner)
 
 
 @pytest.mark.parametrize(
     "found", [bytes(8), np.array([4, 1]).tobytes(), np.array([0, 7]).tobytes()]
 )
-def test_a_refusal_that_cannot_be_is_none(found: bytes) -> None:
+def test_a_bad_refusal_is_refused(found: bytes) -> None:
     assert read_refusal(memoryview(np.array([3, 1]).tobytes()), 4, {0, 1}).tolist() == [[3], [1]]
     with pytest.raises(MessageError, match="refusal"):
         read_refusal(memoryview(found), 4, {0, 1})
@@ -140,7 +142,7 @@ def test_actuated_signals_and_a_demand(make: Make, tmp_path: Path) -> None:
 
 
 def test_no_memory_is_shared(make: Make) -> None:
-    """No node has a mapping in common with another process that both can write."""
+    """No node shares writable memory with another process."""
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     drive(vec, steps=3)
     for pid in over_nodes(vec).pool.pids:
@@ -179,7 +181,7 @@ def test_nodes_that_are_lost_at_any_time(make: Make, env: str, seed: int) -> Non
     assert over_nodes(vec).pool.losses == 3
 
 
-def test_a_node_that_stops_is_taken_for_lost(make: Make) -> None:
+def test_a_stopped_node_counts_as_lost(make: Make) -> None:
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=3, **WANTED)  # long before workers.timeout_s
 
@@ -191,7 +193,7 @@ def test_a_node_that_stops_is_taken_for_lost(make: Make) -> None:
     assert over_nodes(vec).pool.losses == 1
 
 
-def test_two_nodes_apart_are_lost_at_once(make: Make) -> None:
+def test_two_nodes_that_are_not_neighbours_are_lost_at_once(make: Make) -> None:
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     worlds = over_nodes(vec)
@@ -205,24 +207,24 @@ def test_two_nodes_apart_are_lost_at_once(make: Make) -> None:
     assert worlds.pool.losses == 2
 
 
-def test_commands_that_are_alike_are_done_as_often_as_they_were_given(make: Make) -> None:
+def test_equal_commands_are_repeated_as_often_as_they_were_given(make: Make) -> None:
     wanted = {**WANTED, "max_cycles": 100}
     vecs = [make("grid4x4", **wanted), make("grid4x4", zones=4, nodes=3, **wanted)]
     for vec in vecs:
         vec.reset(seed=2)
     still = np.zeros_like(vecs[0].suggest_actions())
     for step in range(60):
-        if step == 50:  # by then states were kept several times
+        if step == 50:  # by then, states were kept several times
             os.kill(over_nodes(vecs[1]).pool.pids[0], signal.SIGKILL)
         for vec in vecs:
             vec.step(still)
         assert vecs[0].state_hash() == vecs[1].state_hash(), step
 
 
-def test_an_interrupted_step_can_be_taken_again(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.KEEP_S", 0.0)  # before every step
+def test_an_interrupted_step_can_be_repeated(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "cavmarl.parallel.nodes.node_pool.KEEP_S", 0.0
+    )  # keep a state before each step
     vecs = [make("grid4x4", **WANTED), make("grid4x4", zones=4, nodes=2, **WANTED)]
     for vec in vecs:
         vec.reset(seed=2)
@@ -250,28 +252,28 @@ def test_an_interrupted_step_can_be_taken_again(
 def test_nodes_that_are_lost_while_states_are_kept(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A state that nodes have gone back beyond displaces none that they may go back to."""
+    """After a return to an older state, newer ones do not displace it."""
     monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.KEEP_S", 0.0)
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     worlds = over_nodes(vec)
     doomed = {5: worlds.pool.pids[0], 6: worlds.pool.pids[2]}
-    commit, steps = worlds.pool._commit, [0]
+    commit, steps = worlds.pool.commit, [0]
 
     def strike_and_commit() -> list[memoryview]:
-        if steps[0] in doomed:  # all nodes have been told to keep a state, and are in the step
+        if steps[0] in doomed:  # all nodes have orders to keep a state, and are in the step
             os.kill(doomed.pop(steps[0]), signal.SIGKILL)
         return commit()
 
     def note(step: int) -> None:
         steps[0] = step
 
-    monkeypatch.setattr(worlds.pool, "_commit", strike_and_commit)
+    monkeypatch.setattr(worlds.pool, "commit", strike_and_commit)
     assert same(drive(vec, before=note), whole)
     assert (worlds.pool.losses, worlds.pool.recoveries) == (2, 2)
 
 
-def test_a_node_and_the_one_that_keeps_its_state_are_lost(make: Make) -> None:
+def test_a_node_and_the_node_with_its_replica_are_lost(make: Make) -> None:
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     vec.reset(seed=1)
     for number in (1, 2):
@@ -281,7 +283,7 @@ def test_a_node_and_the_one_that_keeps_its_state_are_lost(make: Make) -> None:
 
 
 def test_the_only_node_is_lost(make: Make) -> None:
-    """The caller keeps its states, and another node takes its place."""
+    """The caller keeps replicas of its states, and another node takes its place."""
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=2, nodes=1, **WANTED)
 
@@ -293,7 +295,7 @@ def test_the_only_node_is_lost(make: Make) -> None:
     assert (over_nodes(vec).pool.losses, over_nodes(vec).pool.recoveries) == (2, 2)
 
 
-def test_nothing_stays_behind(make: Make) -> None:
+def test_nothing_is_left_behind(make: Make) -> None:
     vec = make("grid4x4", zones=2, nodes=2, **WANTED)
     vec.reset(seed=1)
     pids = over_nodes(vec).pool.pids
@@ -301,7 +303,7 @@ def test_nothing_stays_behind(make: Make) -> None:
     assert not any(map(psutil.pid_exists, pids))
 
 
-def test_a_journal_tells_of_changes_of_owner(make: Make, tmp_path: Path) -> None:
+def test_a_journal_records_changes_of_owner(make: Make, tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
     vec = make("grid4x4", zones=4, nodes=2, overrides={"zones.journal": str(path)}, **WANTED)
     drive(vec, steps=20)
@@ -328,7 +330,7 @@ def test_one_environment_of_pettingzoo() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"nodes": 5, "zones": 4}, "hosted by 1 to 4 nodes"),
+        ({"nodes": 5, "zones": 4}, "needs 1 to 4 nodes"),
         ({"nodes": 0}, "nodes = 0"),
         ({"nodes": 2, "workers": 2}, "leave out workers, or nodes"),
         ({"backend": "nodes:2@here"}, "must be HOST:PORT"),
@@ -345,19 +347,19 @@ def test_bad_input(arguments: dict[str, Any], words: str) -> None:
         make_vec("grid4x4", **arguments)
 
 
-def test_what_needs_the_worlds_here_is_refused(make: Make) -> None:
+def test_calls_that_need_the_worlds_in_this_process_are_refused(make: Make) -> None:
     vec = make("grid4x4", zones=2, nodes=2, **WANTED)
     with pytest.raises(ConfigError, match="use backend='local'"):
         _ = vec.simulation
     with pytest.raises(ConfigError, match="cannot be copied"):
         vec.worlds.__reduce__()
     vec.reset(seed=0)
-    with pytest.raises(ConfigError, match="the state is one of other worlds"):
+    with pytest.raises(ConfigError, match="the saved state belongs to other worlds"):
         vec.worlds.load_worlds([b"nothing"])
     vec.step(vec.suggest_actions())
 
 
-def test_a_node_that_cannot_begin_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_node_that_cannot_start_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cavmarl.parallel.nodes.node_starters.NODE", "cavmarl.nothing")
     with pytest.raises(WorkerError, match="before it had begun"):
         make_vec("grid4x4", zones=2, nodes=2)
@@ -368,7 +370,7 @@ def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
     make: Make, monkeypatch: pytest.MonkeyPatch, how: signal.Signals
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
-    start, started = LocalNodes._start, []
+    start, started = LocalNodes.start, []
 
     def start_and_strike(self: LocalNodes, number: int) -> Any:
         process = start(self, number)
@@ -377,12 +379,12 @@ def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
             os.kill(process.pid, how)
         return process
 
-    monkeypatch.setattr(LocalNodes, "_start", start_and_strike)
+    monkeypatch.setattr(LocalNodes, "start", start_and_strike)
     vec = make("grid4x4", zones=4, nodes=2, overrides={"workers.join_timeout_s": 60.0}, **WANTED)
     assert sorted(started) == [0, 0, 1, 1]
     assert same(drive(vec), whole)
     started.clear()
-    with pytest.raises(WorkerError, match="ended with -9 before it had begun"):
+    with pytest.raises(WorkerError, match="ended with exit status -9 before it had begun"):
         make("grid4x4", zones=4, nodes=2, overrides={"workers.max_retries": 1}, **WANTED)
 
 
@@ -395,18 +397,18 @@ def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
         (3, signal.SIGSTOP, True),
     ],
 )
-def test_a_node_that_is_lost_while_zones_are_given_out_is_replaced(
+def test_a_node_that_is_lost_while_zones_are_assigned_is_replaced(
     make: Make, monkeypatch: pytest.MonkeyPatch, nodes: int, how: signal.Signals, is_told: bool
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
-    tell, struck = NodePool._tell_zones, list[int]()  # processes
+    tell, struck = NodePool.send_zones, list[int]()  # processes
 
     def tell_and_strike(self: NodePool, *told: Any, **more: Any) -> None:
         process = psutil.Process(self.pids[-1 if struck else 0])
         strikes = len(struck) < 2
         if is_told:
             if strikes:
-                process.suspend()  # else it may have answered before it is struck
+                process.suspend()  # so that it cannot answer before it is killed
             tell(self, *told, **more)
         if strikes:
             struck.append(process.pid)
@@ -416,11 +418,13 @@ def test_a_node_that_is_lost_while_zones_are_given_out_is_replaced(
         if not is_told:
             tell(self, *told, **more)
 
-    monkeypatch.setattr(NodePool, "_tell_zones", tell_and_strike)
+    monkeypatch.setattr(NodePool, "send_zones", tell_and_strike)
     vec = make("grid4x4", zones=4, nodes=nodes, **WANTED)
     assert len(set(struck)) == 2
     assert same(drive(vec), whole)
     assert (over_nodes(vec).pool.losses, over_nodes(vec).pool.recoveries) == (2, 0)
     struck.clear()
-    with pytest.raises(WorkerError, match=f"node {nodes - 1} ended with -9 before it had begun"):
+    with pytest.raises(
+        WorkerError, match=f"node {nodes - 1} ended with exit status -9 before it had begun"
+    ):
         make("grid4x4", zones=4, nodes=nodes, overrides={"workers.max_retries": 1}, **WANTED)

@@ -12,7 +12,7 @@ import pytest
 
 from cavmarl import CavEnv, ConfigError, parallel_env
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from tests.support.pools import alive
 
 SMALL = {"zones": 4, "agents": 4, "background": 12, "max_cycles": 20}
@@ -24,7 +24,7 @@ def settings(mode: str, kind: str = "flat") -> dict[str, Any]:
 
 
 def drive(env: CavEnv, before: Callable[[int], None] = lambda step: None) -> list[str]:
-    """All that comes out of two episodes, in words that tell floats apart."""
+    """Return all results of two episodes, as exact text."""
     found: list[str] = []
     rng = np.random.default_rng(3)
     with np.printoptions(threshold=10**9, floatmode="unique"):
@@ -50,14 +50,14 @@ def drive(env: CavEnv, before: Callable[[int], None] = lambda step: None) -> lis
     ("mode", "kind", "workers"),
     [("closed", "flat", 1), ("closed", "dict", 2), ("open", "flat", 2), ("respawn", "flat", 2)],
 )
-def test_nobody_can_tell(mode: str, kind: str, workers: int) -> None:
+def test_worlds_over_workers_equal_those_of_one_process(mode: str, kind: str, workers: int) -> None:
     whole = drive(parallel_env("grid4x4", **settings(mode, kind) | {"zones": 1}))
     env = parallel_env("grid4x4", workers=workers, **settings(mode, kind))
     assert drive(env) == whole
     env.close()
 
 
-def test_workers_that_die_are_not_missed() -> None:
+def test_dead_workers_change_no_result() -> None:
     whole = drive(parallel_env("grid4x4", **settings("open")))
     env = parallel_env("grid4x4", workers=2, **settings("open"))
     assert isinstance(env.worlds, PooledWorlds)
@@ -94,6 +94,6 @@ def test_the_processes_end_with_the_environment() -> None:
         ),
     ],
 )
-def test_backends_that_cannot_be(arguments: dict[str, Any], words: str) -> None:
+def test_bad_backends_are_refused(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         parallel_env("ring", **arguments)

@@ -1,4 +1,4 @@
-"""What a pool takes from the system, processes, memory and descriptors, and what it leaves."""
+"""Resources of a pool: processes, memory and descriptors, and that nothing is left behind."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.core.errors import (
     WorkerError,
     WorkerFailureError,
 )
-from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.processes.worker_pool import Pool
 from tests.support.forks import said_in_fork
 from tests.support.pools import (
@@ -58,7 +58,7 @@ def test_a_pool_of_another_thread_ends_with_the_process_and_not_before() -> None
     pids = [int(word) for word in loner.stdout.split()]
     assert loner.returncode == -signal.SIGKILL, loner.stderr
     assert len(pids) == 3
-    assert gone_soon(pids)  # also the one that was stopped
+    assert gone_soon(pids)  # also the stopped one
 
 
 def maps(pid: int) -> list[str]:
@@ -67,8 +67,8 @@ def maps(pid: int) -> list[str]:
 
 @pytest.mark.parametrize("way", ["close", "forget"])
 def test_nothing_is_left_behind(way: str) -> None:
-    Pool(program(1), 60.0, 3).close()  # the process whose forks tests start stays
-    gc.collect()  # what other tests have left
+    Pool(program(1), 60.0, 3).close()  # the fork server of the tests stays
+    gc.collect()  # free what other tests have left
     files = len(os.listdir("/proc/self/fd"))
     pool = Pool(program(3), 60.0, 3)
     pool.run(ADD)
@@ -94,26 +94,26 @@ def test_a_stopped_pool_is_closed() -> None:
     assert gone(pids)
 
 
-def test_a_program_that_does_not_come_up() -> None:
-    Pool(program(1), 60.0, 3).close()  # the process whose forks tests start stays
+def test_a_program_that_does_not_start() -> None:
+    Pool(program(1), 60.0, 3).close()  # the fork server of the tests stays
     gc.collect()
     files = len(os.listdir("/proc/self/fd"))
     with pytest.raises(WorkerFailureError, match="no jobs today") as caught:
         Pool(program(2, fails="no jobs today"), 60.0, 3)
     assert "make_jobs" in caught.value.traceback
-    with pytest.raises(WorkerError, match="ended with 3"):
+    with pytest.raises(WorkerError, match="ended with exit status 3"):
         Pool(program(2, ends=3), 60.0, 3)
     del caught
     gc.collect()
     assert len(os.listdir("/proc/self/fd")) == files
 
 
-def test_memory_that_cannot_be_had() -> None:
+def test_too_little_memory_is_reported() -> None:
     with pytest.raises(WorkerError, match=r"GB of shared memory .* num_envs"):
         Segment.make(1 << 50)
 
 
-def test_memory_where_there_is_no_memfd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_memory_without_memfd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delattr(os, "memfd_create")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     segment = Segment.make(5000)
@@ -126,7 +126,7 @@ def test_memory_where_there_is_no_memfd(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 @pytest.mark.usefixtures("fresh_processes")
 @pytest.mark.parametrize("room", [0, 3, 12, 16, 19, 20])
-def test_descriptors_that_cannot_be_had(room: int) -> None:
+def test_too_few_descriptors_are_reported(room: int) -> None:
     gc.collect()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     used = {int(name) for name in os.listdir("/proc/self/fd")}
@@ -174,14 +174,12 @@ def test_a_pool_without_compiled_loops() -> None:
 
 def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> None:
     pool = make(workers=1)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(os, "getpid", lambda: 1)
-        pool._processes.release()
+    assert said_in_fork(pool.close) == ""
     pool.run(ADD)
     assert totals(pool) == [[3.0, MORE]]
 
 
-def test_a_fork_of_the_pools_process_cannot_order_its_workers(make: Make) -> None:
+def test_a_fork_of_the_pools_process_cannot_command_its_workers(make: Make) -> None:
     pool = make(workers=1)
     said = said_in_fork(lambda: pool.run(ADD))
     assert f"process {os.getpid()}" in said
@@ -190,7 +188,7 @@ def test_a_fork_of_the_pools_process_cannot_order_its_workers(make: Make) -> Non
     assert totals(pool) == [[3.0, MORE]]
 
 
-def test_more_descriptors_than_select_takes(make: Make) -> None:
+def test_more_descriptors_than_select_accepts(make: Make) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < 1300:
         pytest.skip(f"the system allows {hard} open files")
@@ -217,6 +215,6 @@ def test_a_thread_may_start_workers_and_end(make: Make) -> None:
     thread.start()
     thread.join()
     while Path(f"/proc/self/task/{thread.native_id}").exists():
-        time.sleep(0.001)  # the system ends it a little later
+        time.sleep(0.001)  # the system ends the thread a little later
     pools[0].run(ADD)
     assert pools[0].deaths == []

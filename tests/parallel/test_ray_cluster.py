@@ -1,4 +1,4 @@
-"""Which node is given which host, and clusters that are not there."""
+"""The choice of nodes for actors, and missing clusters."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from cavmarl.parallel.network.ray_cluster import Node, choose_nodes
 IDLE = Utilisation(0.0, 0.0)
 
 
-def test_hosts_go_to_the_nodes_in_turn() -> None:
+def test_actors_go_to_the_nodes_in_turn() -> None:
     known = [Node("a", 2, IDLE), Node("b", 4, IDLE)]
     assert choose_nodes(known, 5) == ["a", "b", "a", "b", "b"]
 
 
-def test_hosts_go_where_the_score_is_lowest() -> None:
+def test_actors_go_where_the_score_is_lowest() -> None:
     known = [Node("a", 2, Utilisation(0.5, 0.1)), Node("b", 2, Utilisation(0.2, 0.1))]
     assert choose_nodes(known, 3) == ["b", "b", "a"]
 
 
-def test_nodes_that_are_too_busy_are_given_none() -> None:
+def test_busy_nodes_get_no_actor() -> None:
     known = [Node("a", 2, Utilisation(0.9, 0.1)), Node("b", 1, IDLE)]
     assert choose_nodes(known, 1) == ["b"]
     with pytest.raises(NoAdmissibleWorkerError, match=r"worker 0: cpu 0\.9"):
@@ -41,17 +41,17 @@ def test_more_workers_than_cpus() -> None:
         ({"backend": "ray:5", "zones": 4}, "nodes = 5: a world of 4 zone"),
         (
             {"backend": "ray", "sensor_workers": 1, "overrides": {"rig": "ten_sensors"}},
-            "workers.sensors = 1: worlds over nodes",
+            "workers.sensors = 1: not supported over nodes",
         ),
         ({"backend": "ray", "overrides": {"workers.monitor_cpu": True}}, "workers.monitor_cpu"),
     ],
 )
-def test_settings_that_cannot_be(arguments: dict[str, object], words: str) -> None:
+def test_bad_settings_are_refused(arguments: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec("ring", **arguments)  # type: ignore[arg-type]
 
 
-def test_ray_is_asked_for_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_ray_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"'ray'.*pip install '\.\[ray\]'"):
         make_vec("ring", backend="ray")

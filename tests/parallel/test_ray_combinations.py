@@ -26,5 +26,5 @@ def cluster() -> Iterator[None]:
 @pytest.mark.parametrize(
     "place", [pytest.param("worlds on Ray", marks=pytest.mark.slow), "nodes on Ray"]
 )
-def test_on_ray(make: Make, tmp_path: Path, feature: str, place: str) -> None:
+def test_features_on_ray(make: Make, tmp_path: Path, feature: str, place: str) -> None:
     check(make, tmp_path, feature, place)

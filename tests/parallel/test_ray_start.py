@@ -1,4 +1,4 @@
-"""Clusters that are started for some worlds, and those that are not there."""
+"""Clusters that are started for some worlds, and missing clusters."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ if __name__ == "__main__":
 """
 
 
-def test_a_cluster_that_was_started_for_them_ends_with_the_last_of_them() -> None:
+def test_a_cluster_that_was_started_for_worlds_ends_with_the_last_of_them() -> None:
     done = subprocess.run(
         [sys.executable, "-c", ALONE], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "left: []"  # and no complaint of Ray's
+    assert done.stdout.strip() == "left: []"  # Ray has not complained
     assert not done.stderr.strip()
 
 
@@ -70,7 +70,7 @@ if __name__ == "__main__":
 """
 
 
-def test_nodes_are_actors_and_a_lost_one_comes_back() -> None:
+def test_a_lost_actor_is_restarted() -> None:
     done = subprocess.run(
         [sys.executable, "-c", NODES], cwd=ROOT, capture_output=True, text=True, timeout=180
     )
@@ -80,7 +80,7 @@ def test_nodes_are_actors_and_a_lost_one_comes_back() -> None:
     assert said[-1] == "left: []"
 
 
-def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_cluster_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(WorkerError, match=r"no Ray cluster at 127.0.0.1:1.*ray start --head"):
         make_vec("ring", backend="ray:1")
@@ -96,7 +96,7 @@ def test_ray_understands_the_file_of_machines() -> None:
     assert kind["max_workers"] == len(settings["provider"]["worker_ips"])
 
 
-def test_a_client_is_no_member(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ray_client_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "ray://127.0.0.1:10001")
-    with pytest.raises(ConfigError, match="on a node of the cluster"):
+    with pytest.raises(ConfigError, match="on a machine of the cluster"):
         make_vec("ring", backend="ray:1")

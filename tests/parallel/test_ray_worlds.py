@@ -1,4 +1,4 @@
-"""Worlds on a Ray cluster of two nodes are the worlds of one process, whichever node dies."""
+"""Worlds on a Ray cluster of two nodes equal those of one process, whichever node dies."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def two_nodes() -> Iterator[Any]:
 
 @pytest.fixture
 def cluster(two_nodes: Any) -> Any:
-    """The same, when all that was closed has given its CPUs back."""
+    """Yield the cluster, once closed worlds have released their CPUs."""
     await_true(lambda: ray.available_resources().get("CPU") == 3.0)
     return two_nodes
 
@@ -64,7 +64,7 @@ def losses_of(vec: CavVectorEnv) -> list[int]:
 
 
 def nodes_of(pids: list[int]) -> list[int]:
-    """The raylets that have started these processes."""
+    """Return the raylets that have started these processes."""
     return [psutil.Process(pid).ppid() for pid in pids]
 
 
@@ -76,7 +76,7 @@ def nodes_of(pids: list[int]) -> list[int]:
         {"env": "town", "overrides": {"population.mode": "respawn", "action.kind": "discrete"}},
     ],
 )
-def test_machines_change_nothing(make: Make, cluster: Any, arguments: dict[str, Any]) -> None:
+def test_machines_change_no_result(make: Make, cluster: Any, arguments: dict[str, Any]) -> None:
     wanted = WANTED | arguments
     here = drive(make(**wanted))
     vec = make(backend="ray:2", **wanted)
@@ -86,7 +86,7 @@ def test_machines_change_nothing(make: Make, cluster: Any, arguments: dict[str, 
     assert len(set(nodes_of(pids_of(vec)))) == 2
 
 
-def test_chosen_worlds_begin_anew_on_their_machines(make: Make, cluster: Any) -> None:
+def test_chosen_worlds_are_reset_on_their_machines(make: Make, cluster: Any) -> None:
     chosen = np.array([False, True, False, True, True])
     found = []
     for arguments in ({}, {"backend": "ray"}):
@@ -101,7 +101,7 @@ def test_chosen_worlds_begin_anew_on_their_machines(make: Make, cluster: Any) ->
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_an_actor_that_dies_is_not_missed(
+def test_a_dead_actor_changes_no_result(
     make: Make, cluster: Any, whole: Any, how: signal.Signals
 ) -> None:
     vec = make("grid4x4", backend="ray:2", overrides={"workers.timeout_s": 2.0}, **WANTED)
@@ -116,11 +116,11 @@ def test_an_actor_that_dies_is_not_missed(
 
     assert same(drive(vec, before=strike), whole)
     assert losses_of(vec) == [1, 1]
-    assert psutil.Process(pids_of(vec)[0]).create_time() < times[0]  # the spare one
+    assert psutil.Process(pids_of(vec)[0]).create_time() < times[0]  # the spare actor
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in struck), for_s=20.0)
 
 
-def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, whole: Any) -> None:
+def test_an_actor_that_dies_during_a_step(make: Make, cluster: Any, whole: Any) -> None:
     vec = make("grid4x4", backend="ray:2", **WANTED)
     timers: list[Timer] = []
 
@@ -138,9 +138,7 @@ def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, wh
 
 
 @pytest.mark.parametrize("more", [{"backend": "ray:1"}, {"backend": "ray"}])
-def test_the_view_of_pettingzoo_is_the_one_of_one_process(
-    cluster: Any, more: dict[str, Any]
-) -> None:
+def test_the_pettingzoo_view_equals_that_of_one_process(cluster: Any, more: dict[str, Any]) -> None:
     whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     env = parallel_env("grid4x4", **settings("open", "dict"), **more)
     pools = [group.pool for group in getattr(env.worlds, "groups", [env.worlds])]
@@ -161,7 +159,7 @@ def test_the_view_of_pettingzoo_is_the_one_of_one_process(
 def test_worlds_that_move_between_nodes_are_the_same(
     make: Make, cluster: Any, uneven: list[int]
 ) -> None:
-    """The host that dies has worlds by then that it had not been started with."""
+    """By its death, the actor has worlds with which it had not started."""
     whole = drive(make("grid4x4", **WANTED), steps=16)
     vec = make("grid4x4", backend="ray:3", overrides=RESTLESS, **WANTED)
     vec.reset(seed=0)
@@ -204,8 +202,8 @@ def test_nothing_is_left_behind_and_the_cluster_stays(make: Make, cluster: Any) 
     assert ray.is_initialized()
 
 
-def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) -> None:
-    """All its processes at once; what it hosted goes on at the other node."""
+def test_a_dead_node_changes_no_result(make: Make, cluster: Any, whole: Any) -> None:
+    """All its processes die at once; its worlds resume at the other node."""
     node = cluster.add_node(num_cpus=1)
     vec = make("grid4x4", backend="ray:4", **WANTED)
     raylet = node.all_processes["raylet"][0].process.pid
@@ -216,7 +214,9 @@ def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) ->
     def strike(step: int) -> None:
         if step == STEPS // 2:
             cluster.remove_node(node, allow_graceful=False)
-            await_true(lambda: not psutil.pid_exists(pids[victim]))  # it ends with its raylet
+            await_true(
+                lambda: not psutil.pid_exists(pids[victim])
+            )  # the actor ends with its raylet
 
     assert same(drive(vec, before=strike), whole)
     assert losses_of(vec)[victim] == 1
@@ -236,7 +236,7 @@ if __name__ == "__main__":
 """
 
 
-def test_nothing_is_left_behind_by_a_program_that_is_killed(cluster: Any) -> None:
+def test_a_killed_program_leaves_nothing_behind(cluster: Any) -> None:
     done = subprocess.run(
         [sys.executable, "-c", KILLED],
         cwd=ROOT,

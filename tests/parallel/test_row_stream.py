@@ -1,4 +1,4 @@
-"""Rows between two nodes: what is taken is what was sent, whatever changed since then."""
+"""Ghosts between two nodes: they arrive as they were sent, whatever has changed."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from tests.support.traffic import network
 
 CAPACITY = 40
 WORLDS = 2
-ROOM = 6  # vehicles that pass a departure queue
+ROOM = 6  # for vehicles that pass a departure queue
 ROADS = network("merge")
 MINE, THEIRS = np.array([0]), np.array([1, 2])
-GHOSTS = 1 + 3 * WORLDS  # the word of a frame from which on it says how many there are
-LIKE = GHOSTS + 2 * WORLDS * len(THEIRS)  # and what they are like
+GHOSTS = 1 + 3 * WORLDS  # word of a frame at which the numbers of ghosts start
+LIKE = GHOSTS + 2 * WORLDS * len(THEIRS)  # word at which their kinds start
 
 
 class Node:
-    """What one of two nodes has of the worlds."""
+    """The part of one of two nodes."""
 
     def __init__(self, zones: NDArray[np.int64], others: NDArray[np.int64]) -> None:
         self.zoned = make_zone_state(3, WORLDS, CAPACITY)
@@ -43,17 +43,17 @@ class Node:
     def packed(self) -> bytearray:
         return bytearray(self._frames.packed(1, passing_of(self.departures)))
 
-    def take(self, data: bytes | bytearray) -> None:
-        self._frames.take(memoryview(data), 1, passing_of(self.departures))
+    def read(self, data: bytes | bytearray) -> None:
+        self._frames.read(memoryview(data), 1, passing_of(self.departures))
 
 
 def nodes() -> tuple[Node, Node]:
-    """One of zone 0 and one of zones 1 and 2."""
+    """Return a node of zone 0, and a node of zones 1 and 2."""
     return Node(MINE, THEIRS), Node(THEIRS, MINE)
 
 
 def fill(zoned: ZoneState, drawn: np.random.Generator, ids: NDArray[np.int64]) -> None:
-    """Ghosts of these vehicles in some order, many words of them as they were."""
+    """Return ghosts of these vehicles in random order, with many unchanged words."""
     for zone in THEIRS.tolist():
         for w in range(WORLDS):
             chosen = drawn.permutation(ids)[: drawn.integers(len(ids) + 1)]
@@ -72,13 +72,13 @@ def fill(zoned: ZoneState, drawn: np.random.Generator, ids: NDArray[np.int64]) -
 
 
 def clear(zoned: ZoneState) -> None:
-    """What a tick does before ghosts are taken: owned rows stay."""
+    """Do the part of a tick before ghosts arrive: owned rows stay."""
     zoned.num_owned[THEIRS] = 2
     zoned.num_rows[THEIRS] = zoned.num_near[THEIRS] = 2
 
 
 def found(zoned: ZoneState, first: int) -> list[list[bytes]]:
-    """The ghosts of each zone and world behind its first rows, in no order; near ones apart."""
+    """Return the ghosts of each zone and world, in no order, near ones apart."""
     parts = []
     for zone in THEIRS.tolist():
         for w in range(WORLDS):
@@ -96,14 +96,14 @@ def found(zoned: ZoneState, first: int) -> list[list[bytes]]:
 
 
 def leave(node: Node, drawn: np.random.Generator) -> None:
-    """Some vehicles leave, and some take another way."""
+    """Let some vehicles leave, and some take another route."""
     departures = node.departures
     departures.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
     departures.passing["id"] = drawn.integers(1000, size=departures.passing.shape)
     departures.counts[:, COUNT_REROUTED] += drawn.integers(3, size=WORLDS)
 
 
-def test_what_is_taken_is_what_was_sent() -> None:
+def test_ghosts_arrive_as_they_were_sent() -> None:
     near, far = nodes()
     drawn = np.random.default_rng(1)
     for tick in range(30):
@@ -114,7 +114,7 @@ def test_what_is_taken_is_what_was_sent() -> None:
         far.running[:] = 100
         first = far.departures.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
         counted = far.departures.counts[:, COUNT_REROUTED].copy()
-        far.take(near.packed())
+        far.read(near.packed())
         assert found(far.zoned, 2) == found(near.zoned, 0)
         assert far.running.tolist() == [100 + tick, 107]
         more = near.departures.counts[:, COUNT_REROUTED] - near.rerouted
@@ -126,8 +126,8 @@ def test_what_is_taken_is_what_was_sent() -> None:
             assert sent.tobytes() == near.departures.passing[w, :num].tobytes()
 
 
-def test_what_is_foreseen_is_not_sent() -> None:
-    """Of a vehicle that drives, its acceleration and place, and seldom more."""
+def test_forecast_words_are_not_sent() -> None:
+    """For a moving vehicle, few words beside acceleration and position are sent."""
     near, far = nodes()
     vec = make_vec("merge", agents=1, background=20, overrides={"clock.ctrl_dt_s": 0.05}, seed=0)
     vec.reset()
@@ -142,7 +142,7 @@ def test_what_is_foreseen_is_not_sent() -> None:
         near.zoned.num_rows[zone, 0] = near.zoned.num_near[zone, 0] = ghosts
         clear(far.zoned)
         data = near.packed()
-        far.take(data)
+        far.read(data)
         assert found(far.zoned, 2) == found(near.zoned, 0)
         sizes.append((len(data) // 8 - LIKE) / ghosts - 2)
     vec.close()
@@ -151,7 +151,7 @@ def test_what_is_foreseen_is_not_sent() -> None:
 
 
 def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
-    """A frame without vehicles that leave, changed."""
+    """Return a changed frame without leaving vehicles."""
     ghosts = int(words[GHOSTS:LIKE:2].sum())
     if harm == "cut short":
         return words[:-1]
@@ -193,13 +193,13 @@ def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
         "less than none that leave",
     ],
 )
-def test_what_cannot_be_is_refused(harm: str) -> None:
+def test_bad_frames_are_refused(harm: str) -> None:
     near, far = nodes()
     fill(near.zoned, np.random.default_rng(3), np.arange(30))
     data = harmed(np.frombuffer(near.packed(), np.int64).copy(), harm).tobytes()
     clear(far.zoned)
-    with pytest.raises(MessageError, match=f"^{len(data)} bytes are not"):
-        far.take(data)
+    with pytest.raises(MessageError, match=f"^{len(data)} bytes are no"):
+        far.read(data)
     assert (far.zoned.num_rows[THEIRS] == 2).all(), "nothing of it was put anywhere"
     assert not far.departures.num_passing.any()
 
@@ -217,13 +217,13 @@ def packed(here: Sequence[NDArray[Any]], mine: NDArray[np.bool_]) -> memoryview:
     return memoryview(told)
 
 
-def test_agents_are_taken_as_they_were_sent() -> None:
+def test_agents_arrive_as_they_were_sent() -> None:
     here, there = tables(4), tables(4)
     drawn = np.random.default_rng(4)
     here[0][...], here[1][...] = drawn.random((WORLDS, 4, 3)), True
     mine = np.array([True, False, False, True, False, False, True, False])
     owner = np.full(8, -1, dtype=np.int32)
-    AgentStream(there).take(packed(here, mine), 5, owner)
+    AgentStream(there).read(packed(here, mine), 5, owner)
     assert owner.tolist() == [5, -1, -1, 5, -1, -1, 5, -1]
     for sent, taken in zip(here, there, strict=True):
         flat, other = (array.reshape(8, -1) for array in (sent, taken))
@@ -232,12 +232,12 @@ def test_agents_are_taken_as_they_were_sent() -> None:
 
 
 @pytest.mark.parametrize("change", [b"", bytes(4), (1).to_bytes(8, "little"), None])
-def test_agents_that_cannot_be_are_refused(change: bytes | None) -> None:
+def test_bad_frames_about_agents_are_refused(change: bytes | None) -> None:
     here, there = tables(4), tables(4)
     data = bytearray(packed(here, np.ones(8, dtype=np.bool_)))
     if change is None:
-        data[8:16] = (8).to_bytes(8, "little")  # there are agents 0 to 7
+        data[8:16] = (8).to_bytes(8, "little")  # valid agents are 0 to 7
     owner = np.full(8, -1, dtype=np.int32)
-    with pytest.raises(MessageError, match="not what a node tells of its agents"):
-        AgentStream(there).take(memoryview(data if change is None else change), 5, owner)
+    with pytest.raises(MessageError, match="no frame about agents"):
+        AgentStream(there).read(memoryview(data if change is None else change), 5, owner)
     assert (owner == -1).all()

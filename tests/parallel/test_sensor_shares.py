@@ -1,4 +1,4 @@
-"""Who senses what: nothing is left out, in turn is in turn, and by cost is not slower."""
+"""Shares of sensor workers: they are complete, and sharing by cost is not slower."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_shares import (
-    LEAST_S,
+    MIN_GAIN_S,
     Unit,
     cut,
     divide,
@@ -37,13 +37,13 @@ def test_units_cover_every_agent_of_every_sensor_once(
 
 
 @given(costs, workers)
-def test_by_cost_is_never_slower_than_in_turn(costs_s: list[float], count: int) -> None:
+def test_sharing_by_cost_is_never_slower_than_round_robin(costs_s: list[float], count: int) -> None:
     units = [Unit(sensor, 0, 1) for sensor in range(len(costs_s))]
     in_turn = share_in_turn(units, costs_s, count)
     by_cost = share_by_cost(units, costs_s, count)
     assert by_cost.units == in_turn.units
     assert all(0 <= home < count for home in by_cost.homes)
-    # Graham's bound for the costliest first, against the least that any way could take.
+    # Graham's bound for longest processing time first, against a lower bound of any schedule.
     least = max(max(costs_s), sum(costs_s) / count)
     assert max(by_cost.loads_s) <= (4.0 / 3.0) * least + 1e-12 or max(by_cost.loads_s) <= max(
         in_turn.loads_s
@@ -51,7 +51,7 @@ def test_by_cost_is_never_slower_than_in_turn(costs_s: list[float], count: int) 
     assert sum(by_cost.loads_s) == pytest.approx(sum(costs_s))
 
 
-def test_unequal_sensors_end_together() -> None:
+def test_unequal_sensors_finish_together() -> None:
     units = [Unit(sensor, 0, 1) for sensor in range(6)]
     costs_s = [6.0, 1.0, 5.0, 1.0, 4.0, 1.0]
     assert share_in_turn(units, costs_s, 2).loads_s == [15.0, 3.0]
@@ -89,7 +89,7 @@ def test_every_line_of_divided_frames_is_written_once(
         assert (written[sensor, :, most:] == 0).all()
 
 
-def test_one_large_frame_is_divided_and_all_end_together() -> None:
+def test_one_large_frame_is_divided_and_all_finish_together() -> None:
     units = [Unit(0, 0, 1, 0, 4096), Unit(1, 0, 1, 0, 1000), Unit(2, 0, 1)]
     costs_s = [16e-3, 4e-3, 1e-3]
     shares = divide(share_by_cost(units, costs_s, 3), LineCosts([4096, 1000, 1]))
@@ -97,15 +97,15 @@ def test_one_large_frame_is_divided_and_all_end_together() -> None:
     assert set(shares.divided) == {0}
 
 
-def test_what_would_save_next_to_nothing_is_not_divided() -> None:
+def test_frames_are_not_divided_without_a_gain() -> None:
     units = [Unit(0, 0, 1, 0, 100), Unit(1, 0, 1, 0, 100)]
-    costs_s = [1e-3 + 1.9 * LEAST_S, 1e-3]
+    costs_s = [1e-3 + 1.9 * MIN_GAIN_S, 1e-3]
     whole = share_by_cost(units, costs_s, 2)
     assert divide(whole, LineCosts([100, 100])) == whole
 
 
-def test_lines_that_cost_more_are_found_by_dividing_again() -> None:
-    """Of a picture whose lower half costs four times the upper one, half the time is 3/8 below."""
+def test_expensive_lines_are_found_by_repeated_division() -> None:
+    """The lower half costs four times the upper one: half the cost is 3/8 into the lower half."""
     true = np.repeat([1.0, 4.0], 500) / 2500.0
     found = LineCosts([1000])
     for _ in range(12):

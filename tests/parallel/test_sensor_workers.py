@@ -1,4 +1,4 @@
-"""Sensor workers: the same bytes for any number and any placement, and none is missed."""
+"""Sensor workers: the same bytes for any number and placement, also when workers die."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ import pytest
 import cavmarl
 from cavmarl import CavVectorEnv, make_vec
 from cavmarl.core.errors import ConfigError, WorkerError
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.sensor_workers import sensor_pool as sensor_farm
 from cavmarl.parallel.sensor_workers import sensor_shares
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
-from cavmarl.parallel.sensor_workers.sensor_shares import LineWorth, Shares
+from cavmarl.parallel.sensor_workers.sensor_shares import Shares
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.sensors.mounted.sensor_rig import Turn
 
 RIG: dict[str, dict[str, Any]] = {
@@ -69,7 +69,7 @@ def _results(vec: CavVectorEnv) -> list[bytes | str]:
 
 
 def _drive(steps: int = STEPS, **keywords: Any) -> list[list[bytes | str]]:
-    """All frames and hashes, the reset first."""
+    """Return all frames and hashes, starting with the reset."""
     vec = _make(**keywords)
     try:
         vec.reset(seed=7)
@@ -84,7 +84,7 @@ def _drive(steps: int = STEPS, **keywords: Any) -> list[list[bytes | str]]:
 
 @pytest.fixture(scope="module")
 def alone() -> list[list[bytes | str]]:
-    """What this process senses by itself."""
+    """Return what this process senses without sensor workers."""
     return _drive()
 
 
@@ -111,7 +111,7 @@ def _gone(pids: list[int], limit_s: float = 10.0) -> bool:
 
 @pytest.mark.parametrize("sensor_workers", [1, 2, 3])
 @pytest.mark.parametrize("placement", ["cost", "in_turn"])
-def test_nothing_depends_on_how_many_there_are_nor_who_senses_what(
+def test_results_do_not_depend_on_the_number_of_workers_or_their_shares(
     alone: list[list[bytes | str]], sensor_workers: int, placement: str
 ) -> None:
     settings = {"workers.sensor_placement": placement}
@@ -120,17 +120,17 @@ def test_nothing_depends_on_how_many_there_are_nor_who_senses_what(
 
 @pytest.mark.parametrize("sensor_workers", [2, 3])
 @pytest.mark.parametrize("agents", [1, 6])
-def test_nothing_depends_on_how_frames_are_divided(
+def test_results_do_not_depend_on_the_division_of_frames(
     monkeypatch: pytest.MonkeyPatch, agents: int, sensor_workers: int
 ) -> None:
-    """Frames as small as here are not worth it; divided they are all the same.
+    """Frames as small as these are not divided without force; the results are the same.
 
     What a frame costs is said to the sharing, as what is measured depends on the machine: each time
     another one is so dear that all workers have to write of it.
     """
     divided, turn = set[int](), count()
 
-    def divide(shares: Shares, _: LineWorth) -> Shares:
+    def divide(shares: Shares, _: LineCosts) -> Shares:
         lines = {unit.sensor: unit.end for unit in shares.units}
         fine = [number for number, unit in enumerate(shares.units) if unit.end >= 8]
         if not fine:
@@ -150,18 +150,18 @@ def test_nothing_depends_on_how_frames_are_divided(
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_rows_of_all_zones_are_as_good_as_own_rows_and_ghosts(
+def test_rows_of_all_zones_equal_own_rows_and_ghosts(
     alone: list[list[bytes | str]], zones: int
 ) -> None:
     assert _drive(zones=zones) == alone
     assert _drive(zones=zones, sensor_workers=2) == alone
 
 
-def test_with_workers_that_share_a_world(alone: list[list[bytes | str]]) -> None:
+def test_sensor_workers_of_a_divided_world(alone: list[list[bytes | str]]) -> None:
     assert _drive(zones=4, workers=2, sensor_workers=2) == alone
 
 
-def test_with_workers_that_have_whole_worlds() -> None:
+def test_sensor_workers_of_whole_worlds() -> None:
     both = _drive(num_envs=2)
     assert _drive(num_envs=2, workers=2, sensor_workers=1) == both
     assert _drive(num_envs=2, sensor_workers=2) == both
@@ -183,7 +183,7 @@ def test_ten_thousand_steps_without_a_frame_of_another_tick() -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_one_that_dies_is_replaced_and_senses_the_same(
+def test_a_dead_worker_is_replaced_and_senses_the_same(
     alone: list[list[bytes | str]], how: signal.Signals
 ) -> None:
     vec = _make(sensor_workers=2)
@@ -201,7 +201,7 @@ def test_one_that_dies_is_replaced_and_senses_the_same(
         vec.close()
 
 
-def test_one_that_dies_while_it_senses(alone: list[list[bytes | str]]) -> None:
+def test_a_worker_that_dies_while_it_senses(alone: list[list[bytes | str]]) -> None:
     vec = _make(sensor_workers=2)
     stop = threading.Event()
 
@@ -230,7 +230,7 @@ def test_one_that_dies_while_it_senses(alone: list[list[bytes | str]]) -> None:
         vec.close()
 
 
-def test_a_late_one_is_waited_for() -> None:
+def test_a_late_worker_is_awaited() -> None:
     vec = _make(SMALL, sensor_workers=2)
     try:
         vec.reset(seed=7)
@@ -265,7 +265,7 @@ def test_a_frame_of_another_tick_is_refused() -> None:
         vec.close()
 
 
-def test_closing_and_forgetting_leave_nobody_behind() -> None:
+def test_closing_and_forgetting_leave_no_process_behind() -> None:
     for forgets in (False, True):
         vec = _make(SMALL, sensor_workers=2)
         vec.reset(seed=0)
@@ -283,10 +283,10 @@ def test_closing_and_forgetting_leave_nobody_behind() -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_nobody_outlives_the_process_that_keeps_the_state(how: signal.Signals) -> None:
+def test_no_worker_outlives_the_process_of_the_worlds(how: signal.Signals) -> None:
     text = (
         "import signal, cavmarl\n"
-        # Started in the background, it would not hear of Ctrl-C.
+        # A program in the background ignores Ctrl-C.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"settings = {{'rig': {SMALL}}}\n"
         "vec = cavmarl.make_vec('grid4x4', agents=2, sensor_workers=2, overrides=settings)\n"
@@ -311,7 +311,7 @@ def test_nobody_outlives_the_process_that_keeps_the_state(how: signal.Signals) -
     assert _gone(pids)
 
 
-def test_an_interrupted_step_can_be_gone_on_from() -> None:
+def test_a_run_continues_after_an_interrupted_step() -> None:
     vec = _make(SMALL, sensor_workers=1)
     try:
         vec.reset(seed=0)
@@ -330,7 +330,7 @@ def test_an_interrupted_step_can_be_gone_on_from() -> None:
         vec.close()
 
 
-def test_parallel_env_has_them_too() -> None:
+def test_parallel_env_has_sensor_workers_too() -> None:
     def drive(count: int) -> list[str]:
         overrides = {"rig": SMALL}
         env = cavmarl.parallel_env("merge", agents=2, sensor_workers=count, overrides=overrides)
@@ -346,7 +346,7 @@ def test_parallel_env_has_them_too() -> None:
 @pytest.mark.parametrize(
     ("keywords", "said"),
     [
-        ({"overrides": {"rig": {}}, "sensor_workers": 1}, "there is no rig"),
+        ({"overrides": {"rig": {}}, "sensor_workers": 1}, "needs sensors under rig"),
         ({"sensor_workers": -1}, r"workers\.sensors"),
         ({"sensor_workers": 1000}, r"workers\.sensors"),
         ({"sensor_workers": 1, "overrides": {"workers.sensor_placement": "best"}}, "placement"),
@@ -359,12 +359,12 @@ def test_parallel_env_has_them_too() -> None:
         ),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(keywords: dict[str, Any], said: str) -> None:
+def test_bad_settings_are_refused(keywords: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         _make(SMALL, **keywords)
 
 
-def test_more_of_them_than_cores_are_warned_of() -> None:
+def test_more_workers_than_cores_cause_a_warning() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         _make(SMALL, sensor_workers=200).close()

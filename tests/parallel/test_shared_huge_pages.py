@@ -1,4 +1,4 @@
-"""Shared memory in huge pages: what is written there, who shares it, and where it lies."""
+"""Shared memory in huge pages: its content, its sharing and its placement."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.parallel.processes import shared_huge_pages
-from cavmarl.parallel.processes.shared_huge_pages import (
+from cavmarl.parallel.memory import shared_huge_pages
+from cavmarl.parallel.memory.shared_huge_pages import (
     HUGE_BYTES,
     MOST_BYTES,
     collapse_heap,
@@ -23,14 +23,14 @@ ROW = np.dtype([("id", np.int64), ("place", np.float32, (3,))], align=True)
 
 
 def mapped(address: int) -> dict[str, int]:
-    """What the system says of the memory that begins at an address, in bytes; empty: it is gone."""
+    """Return the figures of the system for the mapping at an address; empty: there is none."""
     text = Path("/proc/self/smaps").read_text(encoding="ascii")
     found = re.search(rf"^{address:x}-.*\n((?:\w+: .*\n)+)", text, re.MULTILINE)
     lines = re.findall(r"^(\w+): +(\d+) kB$", "" if found is None else found[1], re.MULTILINE)
     return {name: 1024 * int(number) for name, number in lines}
 
 
-def test_a_large_array_is_zeros_where_a_large_page_can_begin() -> None:
+def test_a_large_array_is_zeros_at_a_boundary_of_huge_pages() -> None:
     array = huge_shared_zeros((2, 3, HUGE_BYTES // 8), ROW)
     assert array.shape == (2, 3, HUGE_BYTES // 8)
     assert array.dtype == ROW
@@ -40,7 +40,7 @@ def test_a_large_array_is_zeros_where_a_large_page_can_begin() -> None:
 
 
 @pytest.mark.parametrize("size", [0, 5, HUGE_BYTES - 1, HUGE_BYTES, 3 * HUGE_BYTES + 7])
-def test_any_size_can_be_had(size: int) -> None:
+def test_arrays_of_any_size(size: int) -> None:
     array = huge_shared_zeros(size, np.uint8)
     expected = np.arange(size, dtype=np.uint8)
     array[:] = expected
@@ -49,8 +49,8 @@ def test_any_size_can_be_had(size: int) -> None:
 
 @pytest.mark.parametrize("can", [True, False])
 def test_a_fork_writes_the_same_array(can: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not can:  # as on a system that knows nothing of it
-        monkeypatch.setattr(shared_huge_pages, "_COLLAPSE", -1)
+    if not can:  # as on a system without MADV_COLLAPSE
+        monkeypatch.setattr(shared_huge_pages, "COLLAPSE", -1)
     array = huge_shared_zeros(HUGE_BYTES, np.int64)
     pid = os.fork()
     if pid == 0:
@@ -62,7 +62,7 @@ def test_a_fork_writes_the_same_array(can: bool, monkeypatch: pytest.MonkeyPatch
         assert mapped(array.ctypes.data)["ShmemPmdMapped"] == 0
 
 
-def test_all_of_its_pages_are_large_or_none() -> None:
+def test_all_pages_of_an_array_are_huge_or_none() -> None:
     array = huge_shared_zeros(3 * HUGE_BYTES + 9, np.uint8)
     array[:] = 1
     large = mapped(array.ctypes.data)["ShmemPmdMapped"]
@@ -70,13 +70,13 @@ def test_all_of_its_pages_are_large_or_none() -> None:
 
 
 def lays_together() -> bool:
-    """Whether this system has huge pages for those who ask for them."""
+    """Return whether this system gives huge pages on request."""
     setting = Path("/sys/kernel/mm/transparent_hugepage/shmem_enabled")
     version = tuple(map(int, os.uname().release.split(".")[:2]))
     return version >= (6, 1) and setting.is_file() and "[deny]" not in setting.read_text()
 
 
-def test_of_a_very_large_one_only_that_is_had_which_is_written() -> None:
+def test_a_very_large_array_takes_memory_only_where_it_is_written() -> None:
     array = huge_shared_zeros(MOST_BYTES + 1, np.uint8)
     before = mapped(array.ctypes.data)["Rss"]
     array[:HUGE_BYTES] = 1
@@ -85,7 +85,7 @@ def test_of_a_very_large_one_only_that_is_had_which_is_written() -> None:
     assert HUGE_BYTES <= after < 2 * HUGE_BYTES
 
 
-def test_what_is_forgotten_is_given_back() -> None:
+def test_memory_of_a_deleted_array_is_freed() -> None:
     array = huge_shared_zeros(4 * HUGE_BYTES, np.uint8)
     view, address = array[5:], array.ctypes.data
     del array
@@ -96,14 +96,14 @@ def test_what_is_forgotten_is_given_back() -> None:
     assert not mapped(address)
 
 
-def test_that_there_is_no_room_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_memory_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shared_huge_pages, "MOST_BYTES", 1 << 62)
     with pytest.raises(MemoryError, match=f"no room for {1 << 60} bytes"):
         huge_shared_zeros(1 << 60, np.uint8)
 
 
-def test_a_heap_in_huge_pages_holds_what_it_held() -> None:
-    words = [bytes([n % 251]) * 100 for n in range(100_000)]  # small, so they lie in the heap
+def test_a_heap_in_huge_pages_keeps_its_content() -> None:
+    words = [bytes([n % 251]) * 100 for n in range(100_000)]  # small objects are in the heap
     collapse_heap()
     if lays_together():
         heap = int(re.search(r"^(\w+)-.*\[heap\]$", MAPS.read_text(), re.MULTILINE)[1], 16)

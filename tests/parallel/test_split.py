@@ -1,4 +1,4 @@
-"""A world that several workers run together is the undivided one, whichever worker dies."""
+"""A world that several workers run together equals the undivided one, whichever worker dies."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from cavmarl import ConfigError, make_vec
 from cavmarl.core.errors import WorkerFailureError
 from cavmarl.engine.world_setup import load_world
-from cavmarl.parallel import pooled_worlds as pooled
-from cavmarl.parallel.work_shares import make_plans, parts_of
+from cavmarl.parallel.placement.work_shares import make_plans, parts_of
+from cavmarl.parallel.workers import pooled_worlds as pooled
 from tests.support.actuated import actuated_grid
 from tests.support.pools import alive
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
@@ -30,7 +30,7 @@ SEATS = {"population.mode": "respawn", "action.kind": "discrete"}
 
 @pytest.mark.parametrize(
     ("env", "zones", "workers", "overrides"),
-    [  # each value beside each value of the others
+    [  # all pairs of values
         ("grid4x4", 4, 1, {}),
         ("grid4x4", 9, 2, SEATS),
         ("grid4x4", 4, 3, SEATS),
@@ -50,13 +50,13 @@ def test_split_worlds_equal_the_undivided_one(
     assert same(drive(make(env, zones=zones, workers=workers, **wanted)), whole)
 
 
-def test_rows_that_change_their_side_do_so_for_all(make: Make) -> None:
+def test_rows_change_their_side_for_all_workers(make: Make) -> None:
     wanted = {"agents": 3, "background": 60, "max_cycles": 50}
     whole = drive(make("grid4x4", **wanted), steps=80)
     assert same(drive(make("grid4x4", zones=4, workers=2, **wanted), steps=80), whole)
 
 
-def test_worlds_that_begin_anew_a_step_later(make: Make) -> None:
+def test_worlds_that_are_reset_a_step_later(make: Make) -> None:
     wanted = {"agents": 4, "background": 10, "max_cycles": 5, "autoreset_mode": "NextStep"}
     whole = drive(make("town", **wanted))
     assert same(drive(make("town", zones=4, workers=2, **wanted)), whole)
@@ -73,7 +73,7 @@ def test_some_worlds_are_divided_and_others_not(make: Make) -> None:
     )
 
 
-def test_all_that_can_be_checked_is(make: Make) -> None:
+def test_all_checks_are_on(make: Make) -> None:
     wanted = {"agents": 5, "background": 30}
     whole = drive(make("grid4x4", **wanted))
     checked = make(
@@ -134,9 +134,11 @@ def test_the_process_that_forks_may_die(make: Make) -> None:
     assert same(drive(vec, before=strike), whole)
 
 
-def test_a_follower_that_fails(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("phase", ["move", "resolve"])
+def test_a_member_that_fails(make: Make, phase: str, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = {"agents": 5, "background": 20}
     whole = drive(make("grid4x4", **wanted))
+    monkeypatch.setenv("FAILING_PHASE", phase)
     monkeypatch.setattr(pooled, "PROGRAM", "tests.support.failing_worker")
     vec = make("grid4x4", zones=4, workers=2, **wanted)
     failures: list[WorkerFailureError] = []
@@ -154,7 +156,7 @@ def test_a_follower_that_fails(make: Make, monkeypatch: pytest.MonkeyPatch) -> N
     (failure,) = failures
     assert (failure.kind, failure.worker) == ("ZeroDivisionError", 1)
     assert "world 0, zone" in str(failure)
-    assert failure.text == "a follower's own"
+    assert failure.text == "of a member"
     trace = failure.traceback
     assert trace.startswith("Traceback (most recent call last)")
     assert "in perform" in trace
@@ -172,7 +174,7 @@ def test_actuated_signals(make: Make, tmp_path: Path) -> None:
     assert same(drive(make(net, zones=4, workers=2, **wanted), steps=40), whole)
 
 
-def test_vehicles_that_look_for_another_way(make: Make, tmp_path: Path) -> None:
+def test_rerouting_vehicles(make: Make, tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     wanted = {
@@ -207,7 +209,7 @@ def test_more_workers_than_zones() -> None:
 
 
 @pytest.mark.parametrize(("worlds", "workers"), [(1, 2), (2, 3), (3, 7), (4, 2), (5, 5), (1, 9)])
-def test_everything_has_one_worker(worlds: int, workers: int) -> None:
+def test_each_world_and_zone_has_one_worker(worlds: int, workers: int) -> None:
     world = load_world("town", zones=9)
     parts = parts_of(make_plans(world, worlds, workers), world.partition.count)
     assert [w for part in parts for w in range(part.first, part.last)] == list(range(worlds))

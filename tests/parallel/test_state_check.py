@@ -1,4 +1,4 @@
-"""Forged states are refused by a typed error, and worlds stay as they were."""
+"""Forged states are refused with a typed error, and worlds do not change."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.traffic.departure_queue import DEPARTURE
 from tests.support.actuated import actuated_grid
 from tests.support.replayed import BUSY
@@ -87,7 +87,7 @@ def _worlds(vec: CavVectorEnv) -> LocalWorlds:
 
 
 def _refused(vec: CavVectorEnv, forge: Forge) -> None:
-    """A state is refused that is like the present one but for what `forge` changes."""
+    """Expect the refusal of the present state with a change by `forge`."""
     worlds = _worlds(vec)
     before = [array.copy() for array in worlds.save()]
     forged = [array.copy() for array in before]
@@ -102,7 +102,7 @@ def _same(one: State, other: State) -> bool:
 
 
 def _content(array: Array) -> list[bytes]:
-    """The bytes of each field; what lies between fields is not copied."""
+    """Return the bytes of each field, without padding."""
     names = array.dtype.names
     return [array.tobytes()] if names is None else [array[name].tobytes() for name in names]
 
@@ -207,7 +207,7 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
     words = len(worlds.save()) - 2 * 2 - 2
     rng = np.random.default_rng(0)
     size = worlds.save()[words].shape[1]
-    for n in range(9):  # how long its parts are
+    for n in range(9):  # the lengths of its parts
 
         def lengthen(state: State, n: int = n) -> None:
             state[words][0, n] = MANY
@@ -217,7 +217,7 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
 
         _refused(vec, lengthen)
         _refused(vec, deny)
-    for _ in range(200):  # refused, or of no consequence for the vehicles
+    for _ in range(200):  # each change is refused, or does not matter for the vehicles
         state = [array.copy() for array in worlds.save()]
         state[words][0, rng.integers(size)] = rng.integers(-MANY, MANY)
         hashes = [vec.state_hash(w) for w in range(2)]
@@ -230,7 +230,7 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
         worlds.load(before)
 
 
-def test_ways_that_were_found(make: Make, tmp_path: Path) -> None:
+def test_found_routes_out_of_range(make: Make, tmp_path: Path) -> None:
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
         "traffic.demand": [str(path) for path in files],
@@ -256,7 +256,7 @@ def test_ways_that_were_found(make: Make, tmp_path: Path) -> None:
         _refused(vec, forge)
 
 
-def test_messages_with_reports_that_are_not_there(make: Make) -> None:
+def test_messages_with_missing_reports(make: Make) -> None:
     overrides = {"v2x.enabled": True}
     vec = make("grid4x4", agents=4, background=20, overrides=overrides)
     vec.reset(seed=1)

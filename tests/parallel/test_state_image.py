@@ -1,4 +1,4 @@
-"""What is written into an image is read from it, whatever was there before."""
+"""Arrays are read from an image as they were written, whatever was there before."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.processes.shared_memory import Segment
-from cavmarl.parallel.processes.state_image import Image
+from cavmarl.parallel.memory.shared_memory import Segment
+from cavmarl.parallel.state.state_image import Image
 
-RECORD = np.dtype([("a", np.float64), ("b", np.int32)])  # 12 bytes: no whole number of words
+RECORD = np.dtype([("a", np.float64), ("b", np.int32)])  # 12 bytes, no whole number of words
 
 
 def arrays(lengths: list[int], seed: int) -> list[NDArray[Any]]:
-    """Of three kinds by turns, of these lengths."""
+    """Return arrays of these lengths, with three dtypes in turn."""
     rng = np.random.default_rng(seed)
     found: list[NDArray[Any]] = []
     for n, length in enumerate(lengths):
@@ -41,7 +41,7 @@ def arrays(lengths: list[int], seed: int) -> list[NDArray[Any]]:
         )
     )
 )
-def test_whatever_is_written_is_read(rounds: list[list[int]]) -> None:
+def test_arrays_are_read_as_they_were_written(rounds: list[list[int]]) -> None:
     segment = Segment.make(64)
     image, successor = Image(segment), Image(segment)
     for seed, lengths in enumerate(rounds):
@@ -53,7 +53,7 @@ def test_whatever_is_written_is_read(rounds: list[list[int]]) -> None:
     segment.close()
 
 
-def test_the_same_arrays_with_other_numbers() -> None:
+def test_the_same_arrays_with_other_values() -> None:
     segment = Segment.make(64)
     image, successor = Image(segment), Image(segment)
     written = arrays([3, 4, 5], 0)
@@ -63,10 +63,6 @@ def test_the_same_arrays_with_other_numbers() -> None:
         assert all((a == b).all() for a, b in zip(read, written, strict=True))
         written[0]["b"] += 1
         written[1][...] = ~written[1]
-    successor.put(image.content().copy())
-    image.write(written)
-    read = list(successor.read([array.dtype for array in written]))
-    assert all((a == b).all() for a, b in zip(read, written, strict=True))
     segment.close()
 
 
@@ -93,11 +89,11 @@ def test_an_array_of_more_dimensions() -> None:
     segment.close()
 
 
-def test_what_somebody_else_has_changed_is_noticed() -> None:
+def test_a_changed_image_is_noticed() -> None:
     segment = Segment.make(64)
     image = Image(segment)
     image.write(arrays([30], 0))
     np.frombuffer(segment.map(), dtype=np.int64)[20] += 1
-    with pytest.raises(WorkerError, match="not what it wrote"):
+    with pytest.raises(WorkerError, match="is damaged"):
         list(image.read([RECORD]))
     segment.close()

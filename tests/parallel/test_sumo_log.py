@@ -1,4 +1,4 @@
-"""What a SUMO was told, kept in memory that outlives a process: only what is new is copied."""
+"""Copies of SUMO logs, in memory that outlives a process: only additions are copied."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import SumoError, WorkerError
-from cavmarl.parallel.checkpoint.sumo_log import FIRST_LOG_BYTES, KeptLog
-from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.memory.shared_memory import Segment
+from cavmarl.parallel.state.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.traffic.sumo.sumo_history import MOVED, ToldLog
 
 
 def told(number: int, vehicles: int) -> np.ndarray:
-    """MOVED of a tick in which every value tells which one it is."""
+    """Return MOVED of a tick with distinct values."""
     moved = np.zeros(vehicles, dtype=MOVED)
     moved["id"] = np.arange(vehicles)
     moved["x"], moved["y"], moved["angle"] = 0.1 * number, -number, number / 7.0
@@ -31,14 +31,14 @@ def bytes_of(log: ToldLog, ticks: int) -> list[bytes]:
     return [moved.tobytes() for moved in log.ticks(ticks)]
 
 
-def test_a_log_says_what_was_told() -> None:
+def test_a_log_has_the_commands() -> None:
     log = log_of(500)
     assert bytes_of(log, 500) == [told(n, n % 5).tobytes() for n in range(500)]
     assert bytes_of(log, 3) == bytes_of(log, 500)[:3]
     assert bytes_of(log, 0) == []
 
 
-def test_a_log_that_is_begun_anew_leaves_what_it_gave() -> None:
+def test_a_restarted_log_leaves_returned_words_alone() -> None:
     log = log_of(40)
     before = log.ticks(40)
     log.begin()
@@ -47,22 +47,22 @@ def test_a_log_that_is_begun_anew_leaves_what_it_gave() -> None:
     assert [moved.tobytes() for moved in before] == [told(n, n % 5).tobytes() for n in range(40)]
 
 
-def test_more_ticks_than_were_noted_are_refused() -> None:
+def test_more_ticks_than_were_logged_are_refused() -> None:
     with pytest.raises(SumoError, match=r"of 4 ticks of a SUMO 3 are on record.*reset"):
         log_of(3).ticks(4)
 
 
 @pytest.mark.parametrize("most_bytes", [0, 100, 4000])
-def test_a_log_that_would_be_too_long_is_given_up_until_it_is_begun_anew(most_bytes: int) -> None:
+def test_a_log_that_is_too_long_is_given_up_until_its_restart(most_bytes: int) -> None:
     log = log_of(200, most_bytes)
     assert log.words.nbytes < 100
-    with pytest.raises(SumoError, match=r"more than .* MiB.*sumo\.replay_mib"):
+    with pytest.raises(SumoError, match=r"exceeds .* MiB.*sumo\.replay_mib"):
         log.ticks(1)
     log.begin()
     assert bytes_of(log, 0) == []
 
 
-def test_a_copy_is_the_log_however_often_it_is_brought_up_to_date() -> None:
+def test_a_copy_equals_the_log_after_any_number_of_updates() -> None:
     segment = Segment.make(FIRST_LOG_BYTES)
     kept, log = KeptLog(segment), log_of(10)
     for number in range(200):
@@ -72,7 +72,7 @@ def test_a_copy_is_the_log_however_often_it_is_brought_up_to_date() -> None:
             other = ToldLog(1 << 20)
             other.take_up(KeptLog(Segment(segment.fd, 0)).read())
             assert other.words.tobytes() == log.words.tobytes()
-    other.note(told(3, 2))  # which is its own
+    other.note(told(3, 2))  # of its own tick
     assert other.words.size != kept.read().size
     segment.close()
 
@@ -82,17 +82,17 @@ def test_a_copy_of_another_episode_is_written_anew() -> None:
     kept, log = KeptLog(segment), log_of(50)
     kept.write(log)
     log.begin()
-    for number in range(60):  # longer than what is there, and not the same
+    for number in range(60):  # longer than the first copy, with other content
         log.note(told(1000 + number, number % 5))
     kept.write(log)
     assert kept.read().tobytes() == log.words.tobytes()
-    KeptLog(Segment(segment.fd, 0)).write(log_of(55, first=7))  # another process's
+    KeptLog(Segment(segment.fd, 0)).write(log_of(55, first=7))  # as another process
     assert kept.read().tobytes() == log_of(55, first=7).words.tobytes()
     segment.close()
 
 
-def test_what_nobody_has_written_is_refused() -> None:
+def test_a_copy_that_was_never_written_is_refused() -> None:
     segment = Segment.make(FIRST_LOG_BYTES)
-    with pytest.raises(WorkerError, match="not what was written"):
+    with pytest.raises(WorkerError, match="is damaged"):
         KeptLog(segment).read()
     segment.close()

@@ -1,4 +1,4 @@
-"""Who waits for a process of its own that works is no sleeper."""
+"""A process that waits for a working child does not count as asleep."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ subprocess.run([sys.executable, "-c", sys.argv[1]])
 
 
 def verdict(child: str) -> str | None:
-    """Of a process that waits for one that runs `child`."""
+    """Return the verdicts on a process that waits for one that runs `child`."""
     words = [sys.executable, "-c", PARENT, f"print(flush=True)\n{child}"]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -48,9 +48,9 @@ def test_a_process_whose_child_sleeps_too_is_noticed() -> None:
 def test_a_child_that_waits_for_the_processor_is_at_work(
     monkeypatch: pytest.MonkeyPatch, state: str, is_at_work: bool
 ) -> None:
-    """Other programs may leave it none for seconds; nothing of it sleeps."""
-    monkeypatch.setattr(watchdog, "_look", lambda pid: ("S" if pid == 1 else state, 7))
-    monkeypatch.setattr(watchdog, "_started_by", lambda pid: [2])
+    """Other programs may take the processor for seconds, but the child does not sleep."""
+    monkeypatch.setattr(watchdog, "read_state", lambda pid: ("S" if pid == 1 else state, 7))
+    monkeypatch.setattr(watchdog, "descendants", lambda pid: [2])
     dog = Watchdog(1, 60.0)
     found = [dog.verdict() for _ in range(3 * STILL_CHECKS)]
     assert (found[-1] is None) == is_at_work

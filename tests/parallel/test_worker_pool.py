@@ -1,4 +1,4 @@
-"""Processes that are killed, stopped, interrupted and left behind: none is missed."""
+"""Processes that are killed, stopped, interrupted or left behind: the pool survives."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from tests.support.pools import (
     MORE,
     Make,
     alive,
+    committed_image,
     gone,
     gone_soon,
     in_time,
@@ -37,7 +38,7 @@ from tests.support.toy_job import ADD, DIE, DOZE, FAIL, FALL, POINTS, RUN_OUT, T
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """Ctrl-C arrives, also where these tests were started in the background of a shell."""
+    """Let Ctrl-C arrive, also if these tests run in the background of a shell."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -53,7 +54,7 @@ def interrupt() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-def test_all_work_and_answer(make: Make) -> None:
+def test_all_workers_work_and_answer(make: Make) -> None:
     pool = make(workers=2)
     for _ in range(3):
         pool.run(ADD)
@@ -63,7 +64,7 @@ def test_all_work_and_answer(make: Make) -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
-def test_one_that_dies_while_nobody_waits(make: Make, how: signal.Signals) -> None:
+def test_a_worker_that_dies_between_commands(make: Make, how: signal.Signals) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     os.kill(pool.pids[1], how)
@@ -73,14 +74,14 @@ def test_one_that_dies_while_nobody_waits(make: Make, how: signal.Signals) -> No
     assert how.name in pool.deaths[0].cause
 
 
-def test_one_that_dies_before_the_first_order(make: Make) -> None:
+def test_a_worker_that_dies_before_the_first_command(make: Make) -> None:
     pool = make(workers=1)
     os.kill(pool.pids[0], signal.SIGKILL)
     pool.run(ADD)
     assert totals(pool) == [[3.0, MORE]]
 
 
-def test_all_that_die_at_work(make: Make, tmp_path: Path) -> None:
+def test_all_workers_die_at_work(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     pids = pool.pids
@@ -93,7 +94,7 @@ def test_all_that_die_at_work(make: Make, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)), ids=POINTS)
-def test_one_that_dies_at_a_point_of_an_order(make: Make, point: int, tmp_path: Path) -> None:
+def test_a_worker_that_dies_at_a_point_of_a_command(make: Make, point: int, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     (tmp_path / "trap").touch()
@@ -104,22 +105,22 @@ def test_one_that_dies_at_a_point_of_an_order(make: Make, point: int, tmp_path: 
     assert totals(pool) == [[9.0, 3 * MORE]] * 2
 
 
-def test_an_image_that_is_not_what_was_written_is_refused(make: Make) -> None:
+def test_a_damaged_image_is_refused(make: Make) -> None:
     pool = make(workers=1)
     pool.run(ADD)
-    image = pool._processes._held.segments[2 + pool._committed].map()
+    image = committed_image(pool)
     image[200] ^= 1
     os.kill(pool.pids[0], signal.SIGKILL)
-    with pytest.raises(WorkerFailureError, match="not what it wrote"):
+    with pytest.raises(WorkerFailureError, match="is damaged"):
         pool.run(ADD)
 
 
-def test_the_answer_of_one_that_dies_after_it_is_not_lost(make: Make, tmp_path: Path) -> None:
+def test_the_answer_of_a_worker_that_dies_after_it_is_kept(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     first, second = pool.pids
     with toiling(tmp_path, 1, lambda: os.kill(first, signal.SIGKILL)) as place:
-        pool.ask(1, TOIL, place)  # it counts in the second alone, and is not committed
+        pool.ask(1, TOIL, place)  # it counts in the second worker alone, and is not committed
     assert pool.pids[1] == second
     assert pool.ask(0, TOTAL) == [3.0, MORE]
 
@@ -137,7 +138,7 @@ def test_a_team_is_replaced_as_a_whole(make: Make, dying: int, tmp_path: Path) -
     assert alive(before[:2]) == []
 
 
-def test_who_has_no_order_gets_none_when_its_team_is_replaced(make: Make) -> None:
+def test_a_worker_without_a_command_gets_none_when_its_team_is_replaced(make: Make) -> None:
     pool = make(workers=2, teams=((0, 1),))
     pool.run(ADD)
     os.kill(pool.pids[1], signal.SIGKILL)
@@ -147,7 +148,9 @@ def test_who_has_no_order_gets_none_when_its_team_is_replaced(make: Make) -> Non
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_a_team_that_loses_somebody_while_its_order_is_given_up(make: Make, tmp_path: Path) -> None:
+def test_a_team_that_loses_a_worker_while_its_command_is_given_up(
+    make: Make, tmp_path: Path
+) -> None:
     pool = make(workers=2, teams=((0, 1),))
     pool.run(ADD)
     pids = pool.pids
@@ -158,19 +161,19 @@ def test_a_team_that_loses_somebody_while_its_order_is_given_up(make: Make, tmp_
     assert totals(pool) == [[3.0, MORE]] * 2
 
 
-def test_one_that_is_slow_is_let_be(make: Make) -> None:
+def test_a_slow_worker_is_not_killed(make: Make) -> None:
     pool = make(workers=1)
     pool.run(TOIL, 1.5)
     assert pool.deaths == []
 
 
-def test_one_that_hangs_is_noticed_after_less_than_a_second_of_sleep(make: Make) -> None:
+def test_a_hanging_worker_is_noticed_within_a_second(make: Make) -> None:
     pool = make(workers=2, repeats=0)
     with pytest.raises(WorkerDeathError, match=r"worker 0 \(part 0\).*doze.*asleep for 0\.8 s"):
         pool.run(DOZE, 60.0)
 
 
-def test_one_that_toils_too_long_is_noticed(make: Make) -> None:
+def test_a_worker_that_works_too_long_is_noticed(make: Make) -> None:
     pool = make(workers=1, timeout_s=0.5, repeats=0)
     with pytest.raises(WorkerDeathError, match=r"workers\.timeout_s = 0\.5"):
         pool.run(TOIL, 60.0)
@@ -180,7 +183,7 @@ def test_one_that_toils_too_long_is_noticed(make: Make) -> None:
     ("task", "payload", "cause"),
     [(DIE, int(signal.SIGKILL), "SIGKILL"), (RUN_OUT, None, "out of memory")],
 )
-def test_a_task_that_everybody_dies_of(
+def test_a_task_that_kills_all_workers(
     make: Make, task: int, payload: int | None, cause: str
 ) -> None:
     pool = make(workers=2, repeats=2)
@@ -193,7 +196,7 @@ def test_a_task_that_everybody_dies_of(
         pool.run(ADD)
 
 
-def test_an_exception_arrives_whole_and_changes_nothing(make: Make) -> None:
+def test_an_exception_arrives_completely_and_changes_nothing(make: Make) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     with pytest.raises(WorkerFailureError, match="as told: so it goes") as caught:
@@ -206,7 +209,7 @@ def test_an_exception_arrives_whole_and_changes_nothing(make: Make) -> None:
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interrupted_order_is_not_committed(make: Make, tmp_path: Path) -> None:
+def test_an_interrupted_command_is_not_committed(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     with toiling(tmp_path, 2, interrupt, ends=False) as place, pytest.raises(KeyboardInterrupt):
@@ -231,16 +234,16 @@ def test_the_process_that_forks_may_die_or_be_stopped(
     assert totals(pool) == [[9.0, 3 * MORE]] * 2
 
 
-def test_a_server_whose_pool_has_gone_says_nothing() -> None:
-    """Ctrl-C ends the pool while the server starts: no traceback of it is shown."""
+def test_a_server_whose_pool_has_gone_prints_nothing() -> None:
+    """Ctrl-C ends the pool while the server starts, which shows no traceback."""
     pool, server = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     pool.close()
-    worker_loop._say(server, {"ready": 1})
-    assert server.recv(10) == b""  # by which the server ends
+    worker_loop.send_to_pool(server, {"ready": 1})
+    assert server.recv(10) == b""  # then the server ends
     server.close()
 
 
-def test_a_start_that_is_killed_is_begun_again(tmp_path: Path) -> None:
+def test_a_killed_start_is_repeated(tmp_path: Path) -> None:
     files = [str(tmp_path / name) for name in "abc"]
     for file in files[:2]:
         Path(file).touch()
@@ -259,7 +262,7 @@ def test_a_start_that_is_killed_is_begun_again(tmp_path: Path) -> None:
     assert len(os.listdir("/proc/self/fd")) < descriptors
 
 
-def test_a_start_that_is_stopped_is_begun_again(tmp_path: Path) -> None:
+def test_a_stopped_start_is_repeated(tmp_path: Path) -> None:
     file = tmp_path / "a"
     file.touch()
     start = program(2, dies_while=[str(file)], dies_by=signal.SIGSTOP)
@@ -273,10 +276,10 @@ def test_a_start_that_is_stopped_is_begun_again(tmp_path: Path) -> None:
     pool.close()
 
 
-def test_no_call_to_wake_up_is_missed(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_wake_up_is_missed(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(barrier, "SHORT_S", 0.0)
     monkeypatch.setattr(barrier, "LONG_S", 0.0)
-    monkeypatch.setattr(barrier, "_look", lambda theirs, number, yields: False)
+    monkeypatch.setattr(barrier, "look", lambda theirs, number, yields: False)
     pool = make(workers=2)
     rng = random.Random(0)
     for _ in range(400):
@@ -285,12 +288,12 @@ def test_no_call_to_wake_up_is_missed(make: Make, monkeypatch: pytest.MonkeyPatc
     assert pool.deaths == []
 
 
-def test_nothing_is_burnt_while_nobody_asks(make: Make) -> None:
+def test_idle_workers_take_no_processor_time(make: Make) -> None:
     pool = make(workers=2)
     for _ in range(1000):
         pool.ping()
     while any(stat_of(pid)[0] != "S" for pid in pool.pids):
-        time.sleep(0.001)  # they look for orders for a while before they sleep
+        time.sleep(0.001)  # workers poll for a while before they sleep
     before = [ticks(pid) for pid in pool.pids]
     time.sleep(0.5)
     assert [ticks(pid) for pid in pool.pids] == before
@@ -301,5 +304,5 @@ def ticks(pid: int) -> int:
 
 
 def stat_of(pid: int) -> list[str]:
-    """Of a process: state, parent and so on."""
+    """Return the figures of a process: state, parent and so on."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

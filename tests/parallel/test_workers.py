@@ -1,4 +1,4 @@
-"""Worlds over worker processes are the worlds of one process, whichever worker dies."""
+"""Worlds over worker processes equal those of one process, whichever worker dies."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 pytestmark = pytest.mark.filterwarnings("ignore:workers = 3:RuntimeWarning")
 
 
-# The small ones are first, and so in every run.
+# Small environments come first, and so are part of each run.
 SMALL_FIRST = sorted(entries(), key=lambda env: (env not in ("grid4x4", "merge", "ring"), env))
 
 
 @pytest.mark.parametrize(("number", "env"), list(enumerate(SMALL_FIRST)))
-def test_workers_change_nothing(make: Make, number: int, env: str) -> None:
-    """Their number takes turns over the entries; all are there with zones, too."""
+def test_workers_change_no_result(make: Make, number: int, env: str) -> None:
+    """The number of workers alternates over the entries, with and without zones."""
     wanted = {"num_envs": 5, "max_cycles": 8}
     whole = drive(make(env, **wanted))
     for zones, workers in ((1, 1 + number % 3), (4, 2)):
         assert same(drive(make(env, zones=zones, workers=workers, **wanted)), whole), zones
 
 
-def test_worlds_begin_anew_in_the_next_step_whoever_dies(make: Make) -> None:
+def test_worlds_are_reset_in_the_next_step_although_workers_die(make: Make) -> None:
     wanted = {"num_envs": 3, "agents": 2, "max_cycles": 3, "autoreset_mode": "NextStep"}
     whole = drive(make("merge", **wanted))
     vec = make("merge", workers=2, **wanted)
@@ -40,7 +40,7 @@ def test_worlds_begin_anew_in_the_next_step_whoever_dies(make: Make) -> None:
     assert len(pool.deaths) == STEPS
 
 
-def test_chosen_worlds_begin_anew_in_their_workers(make: Make) -> None:
+def test_chosen_worlds_are_reset_in_their_workers(make: Make) -> None:
     chosen = np.array([False, True, False, True, True])
     found = []
     for workers in (0, 2):
@@ -71,7 +71,7 @@ def test_a_tensor_of_the_same_memory_shows_each_step(make: Make) -> None:
         assert np.array_equal(tensor.numpy(), observations)
 
 
-def test_what_was_returned_outlives_the_workers(make: Make) -> None:
+def test_returned_arrays_outlive_the_workers(make: Make) -> None:
     vec = make("ring", num_envs=2, workers=1, copy=False)
     observations, _ = vec.reset(seed=1)
     vec.close()
@@ -82,7 +82,7 @@ def test_what_was_returned_outlives_the_workers(make: Make) -> None:
 
 @pytest.mark.parametrize("zones", [1, 4])
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_worker_that_dies_between_steps_is_not_missed(
+def test_a_worker_that_dies_between_steps_changes_no_result(
     make: Make, how: signal.Signals, zones: int
 ) -> None:
     wanted = {"num_envs": 3, "agents": 4, "background": 12, "zones": zones, "max_cycles": 8}
@@ -149,18 +149,18 @@ def test_errors_are_those_of_one_process(make: Make) -> None:
         ({"workers": 1, "overrides": {"horizon_s": print}}, ("horizon_s",)),
     ],
 )
-def test_settings_that_cannot_be(arguments: dict[str, Any], words: tuple[str, ...]) -> None:
+def test_bad_settings_are_refused(arguments: dict[str, Any], words: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError) as caught:
         make_vec("ring", **arguments)
     assert all(word in str(caught.value) for word in words), caught.value
 
 
-def test_memory_that_cannot_be_had() -> None:
+def test_too_little_memory_is_reported() -> None:
     with pytest.raises(WorkerError, match="num_envs"):
         make_vec("rush", num_envs=65_536, workers=2, agents=1000)
 
 
-def test_more_workers_than_cores_are_warned_of(make: Make) -> None:
+def test_more_workers_than_cores_cause_a_warning(make: Make) -> None:
     cores = len(os.sched_getaffinity(0))
     with pytest.warns(RuntimeWarning, match=f"there are {cores} cores"):
         make("ring", num_envs=cores + 1, workers=cores + 1)
@@ -174,18 +174,18 @@ def test_workers_may_have_cores_of_their_own(make: Make) -> None:
     assert [os.sched_getaffinity(pid) for pid in pool_of(vec).pids] == wanted
 
 
-def test_a_step_that_everybody_dies_of(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_that_kills_all_workers(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     vec = make("ring", num_envs=2, workers=2, overrides={"workers.max_retries": 1})
     vec.reset(seed=0)
     actions = vec.suggest_actions()
     pool = pool_of(vec)
-    fork = WorkerProcesses._fork
+    fork = WorkerProcesses.fork
 
     def fork_and_kill(self: WorkerProcesses, k: int) -> None:
         fork(self, k)
         os.kill(self.processes[k].pid, signal.SIGKILL)
 
-    monkeypatch.setattr(WorkerProcesses, "_fork", fork_and_kill)
+    monkeypatch.setattr(WorkerProcesses, "fork", fork_and_kill)
     os.kill(pool.pids[1], signal.SIGKILL)
     with pytest.raises(
         WorkerDeathError, match=r"worker 1 \(world 1\).*step.*2 .*SIGKILL"

@@ -24,11 +24,7 @@ CODE = "from tests.policies.test_network_kernels import run_all_kinds; print(run
 def test_kernels_for_other_processors_give_the_same_bytes(
     processor: str, has_avx: str, tmp_path: Path
 ) -> None:
-    environment = {
-        **os.environ,
-        "CAVMARL_CACHE_DIR": str(tmp_path),
-        "CAVMARL_KERNELS": "native",
-    }
+    environment = {**os.environ, "CAVMARL_CACHE_DIR": str(tmp_path), "CAVMARL_KERNELS": "native"}
     if processor != "host":
         # Without the second setting, Numba takes the features of this processor for the other one.
         environment |= {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": ""}

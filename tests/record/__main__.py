@@ -65,11 +65,8 @@ def blocks(names: Sequence[str], given: argparse.Namespace) -> None:
 
 
 PARTS: dict[str, Callable[[Sequence[str], argparse.Namespace], None]] = {
-    "golden": golden,
-    "zoo": zoo,
-    "scores": scores,
-    "blocks": blocks,
-}
+    "golden": golden, "zoo": zoo, "scores": scores, "blocks": blocks,
+}  # fmt: skip
 
 
 def block_tests() -> list[str]:

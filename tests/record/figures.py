@@ -27,12 +27,7 @@ def trips(report: EvaluationReport) -> str:
 
 
 def figure(
-    name: str,
-    unit: str = "",
-    *,
-    decimals: int = 1,
-    interval: str = "",
-    interval_decimals: int = 1,
+    name: str, unit: str = "", *, decimals: int = 1, interval: str = "", interval_decimals: int = 1
 ) -> Figure:
     """Return the figure of a metric: its mean, and its 95 % interval in a given style.
 

@@ -83,14 +83,17 @@ def gone(name: str) -> Callable[[Path], object]:
     [
         (gone("recording.json"), ["no recording.json", "give the path"]),
         (cut("recording.json"), ["recording.json", "cannot be read", "record the run again"]),
-        (replaced("recording.json", '"cavmarl_recording": 2', '"other": 1'), ["does not belong"]),
+        (
+            replaced("recording.json", '"cavmarl_recording": 2', '"other": 1'),
+            ["not the head of a recording"],
+        ),
         (
             replaced("recording.json", '"cavmarl_recording": 2', '"cavmarl_recording": 9'),
             ["format 9", "reads 2", "use the version of cavmarl that wrote it"],
         ),
         (replaced("recording.json", '"sim_dt_s"', '"dt"'), ["recording.json", "is damaged"]),
         (replaced("recording.json", '"rects"', '"rects_"'), ["recording.json", "is damaged"]),
-        (gone("network.bin"), ["network.bin", "without its map", "put the file back"]),
+        (gone("network.bin"), ["network.bin", "has no map", "put the file back"]),
         (flipped("network.bin", 0.5), ["network.bin", "put the file back"]),
         (
             replaced("recording.json", '"layout": "', '"layout": "x'),
@@ -101,7 +104,7 @@ def gone(name: str) -> Callable[[Path], object]:
         (flipped("world-0/vehicles/000001.parquet", 0.3), ["000001.parquet", "is damaged"]),
         (cut("world-0/events/000001.parquet"), ["events/000001.parquet", "is damaged"]),
         (gone("world-0/vehicles/000002.parquet"), ["000002.parquet", "is missing", "restore it"]),
-        (gone("world-0/frames/000001.parquet"), ["000001.parquet", "is missing, though later"]),
+        (gone("world-0/frames/000001.parquet"), ["000001.parquet", "is missing, although later"]),
     ],
 )
 def test_a_spoilt_recording_is_refused(
@@ -132,7 +135,7 @@ def test_what_is_not_committed_does_not_count(good: Path, bad: Path) -> None:
 def test_vehicles_of_another_part_are_noticed(bad: Path) -> None:
     vehicles = bad / "world-0" / "vehicles"
     shutil.copy(vehicles / "000000.parquet", vehicles / "000001.parquet")
-    with pytest.raises(RecordingError, match="of other ticks"):
+    with pytest.raises(RecordingError, match="have other ticks"):
         read(bad)
 
 
@@ -152,10 +155,10 @@ def test_a_recording_takes_no_others_place(good: Path, tmp_path: Path) -> None:
         parallel_env("ring", record=good)
     assert json.loads((good / "recording.json").read_text()) == before
     (tmp_path / "file").write_text("no")
-    with pytest.raises(RecordingError, match="cannot be recorded there"):
+    with pytest.raises(RecordingError, match="cannot record there"):
         make_vec("ring", record=tmp_path / "file")
     env = parallel_env("ring", record=tmp_path / "one")
-    with pytest.raises(EpisodeError, match="recorded already"):
+    with pytest.raises(EpisodeError, match="is being recorded"):
         env.record(tmp_path / "two")
     env.close()
 
@@ -179,7 +182,7 @@ def test_a_full_disk_is_told_at_the_next_step(
     env = parallel_env("ring", record=tmp_path / "run")
     env.reset(seed=1)
     monkeypatch.setattr(recording_writer, "write_whole", full)
-    with pytest.raises(RecordingError, match=r"No space left .*make room"):
+    with pytest.raises(RecordingError, match=r"No space left .*free space"):
         env.close()
     monkeypatch.undo()
     assert Recording.open(tmp_path / "run").worlds == []

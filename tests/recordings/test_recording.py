@@ -97,7 +97,7 @@ def test_worlds_of_a_vector_have_folders_of_their_own_and_episodes_are_counted(
         assert between.tick == ticks[2]
     with pytest.raises(RecordingError, match="no frame at tick -1"):
         recording.at(-1)
-    with pytest.raises(RecordingError, match="no world 7; there are 0, 1"):
+    with pytest.raises(RecordingError, match="no world 7; the worlds are 0, 1"):
         next(recording.frames(7))
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.mapped_file import file_of
+from cavmarl.engine.world_setup import find_map
 from cavmarl.roads import cache
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
@@ -36,7 +38,6 @@ def test_a_second_load_restores_every_array(
 ) -> None:
     path = crossing()
     reads = count_reads(monkeypatch)
-
     first, second = load_network(path), load_network(path)
     assert len(reads) == 1
     assert first.content_hash == second.content_hash == read_network(path).content_hash
@@ -71,7 +72,6 @@ def test_a_large_map_stays_in_its_file(
 def test_a_changed_source_is_read_again(crossing: Callable[..., Path], cache_folder: Path) -> None:
     before = load_network(crossing())
     after = load_network(crossing(('speed="5"', 'speed="6"')))
-
     assert before.content_hash != after.content_hash
     assert len(list(cache_folder.iterdir())) == 2
 
@@ -84,7 +84,6 @@ def test_a_broken_entry_is_built_again(
     whole = load_network(path)
     (entry,) = cache_folder.iterdir()
     entry.write_bytes(content)
-
     assert load_network(path).content_hash == whole.content_hash
     assert entry.read_bytes() != content
 
@@ -96,7 +95,6 @@ def test_a_truncated_entry_is_built_again(
     whole = load_network(path)
     (entry,) = cache_folder.iterdir()
     entry.write_bytes(entry.read_bytes()[:-500])
-
     assert load_network(path).content_hash == whole.content_hash
 
 
@@ -106,5 +104,22 @@ def test_the_name_is_the_files_and_not_the_caches(
     path = crossing()
     load_network(path)
     renamed = path.rename(path.with_name("other.net.xml"))
-
     assert load_network(renamed).name == "other"
+
+
+# Raise `FORMAT` together with these, and record golden rows and results again (`make record`).
+OF_FORMAT = 49
+ROWS_SHA256 = {
+    "merge": "2306899fd71f4dcfb40a199b3205e8d96babc4bcc392db1e47fc0b896e846ae0",
+    "grid4x4": "0579bf6dbd8486be3dc902df8e16bbe63dbec6f5ff822aaefccbc50cd7190ede",
+    "ring": "1b6ac6cc52fd982d9c900d815c869959a8d0a89d5a00bccd17dba1ae66b1beff",
+}
+
+
+@pytest.mark.parametrize("name", ROWS_SHA256)
+def test_other_rows_of_a_map_have_another_format(name: str) -> None:
+    network = read_network(find_map(name))
+    digest = hashlib.sha256()
+    for array in network.arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    assert (cache.FORMAT, digest.hexdigest()) == (OF_FORMAT, ROWS_SHA256[name])

@@ -12,7 +12,7 @@ from cavmarl import CavVectorEnv, make_vec
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.core.math.rng import world_key
 from cavmarl.engine.world_setup import load_world
-from cavmarl.roads.joined_maps import _POINTERS, join
+from cavmarl.roads.joined_maps import POINTERS, join
 from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.verify.equivalence import verify_zones
 from tests.support.traffic import network
@@ -88,10 +88,8 @@ def test_rows_of_a_map_point_to_rows_of_the_same_map() -> None:
     parts = [network("ring"), network("grid4x4"), network("ring")]
     whole = join(parts)
     assert len(set(whole.map_names)) == 3
-    starts = {
-        key: np.cumsum([0, *(len(getattr(part, key)) for part in parts)]) for key in _POINTERS
-    }
-    for key, fields in _POINTERS.items():
+    starts = {key: np.cumsum([0, *(len(getattr(part, key)) for part in parts)]) for key in POINTERS}
+    for key, fields in POINTERS.items():
         for number, part in enumerate(parts):
             rows = slice(starts[key][number], starts[key][number + 1])
             for field, target in fields.items():

@@ -101,9 +101,7 @@ def test_the_steps_of_a_route_take_the_least_time_along_its_edges(
     check_route(network(name), edges, PASSENGER)
 
 
-def test_lanes_that_the_class_may_not_use_are_no_part_of_a_route(
-    shared_maps: Path,
-) -> None:
+def test_lanes_that_the_class_may_not_use_are_no_part_of_a_route(shared_maps: Path) -> None:
     roads = read_network(shared_maps / "net" / "bologna_acosta" / "acosta_buslanes.net.xml")
     forbidden = np.flatnonzero(
         ~roads.lanes["internal"] & (roads.lanes["permissions"] & PASSENGER == 0)

@@ -88,7 +88,6 @@ def test_the_program_loaded_last_is_on(
 ) -> None:
     plain = read_network(crossing())
     network = with_programs(plain, [additional()])
-
     assert network.program_ids == ("0", "night")
     assert states(network, [0, 4, 5, 9, 10]) == ["Grr", "Grr", "rGG", "rGG", "Grr"]
     assert plain.program_ids == ("0",), "the network given is not changed"
@@ -119,7 +118,6 @@ def test_of_several_programs_in_a_map_the_last_is_on(crossing: Callable[..., Pat
         '<tlLogic id="c" type="static" programID="1"><phase duration="9" state="ggg"/></tlLogic>'
     )
     network = read_network(crossing(("</tlLogic>", f"</tlLogic>{second}")))
-
     assert network.program_ids == ("0", "1")
     assert states(network, [0, 7]) == ["ggg", "ggg"]
 
@@ -128,7 +126,6 @@ def test_a_choice_stands_above_all(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     plain = read_network(crossing())
-
     assert states(with_programs(plain, [additional(WEEK)], {"c": "0"}), [3, 45, 70]) == [
         "Grr",
         "rGg",
@@ -142,7 +139,6 @@ def test_a_signal_goes_dark_and_stays_so(
 ) -> None:
     plain = read_network(crossing())
     dark = with_outages(plain, {"c": 4.0})
-
     assert states(dark, [3, 4, 5, 500]) == [*states(plain, [3]), "Ooo", "Ooo", "Ooo"]
     assert states(with_outages(plain, {"c": 0.0}), [0]) == ["Ooo"]
     assert dark.source_hash not in (plain.source_hash, with_outages(plain, {"c": 5.0}).source_hash)
@@ -158,7 +154,6 @@ def test_a_timetable_switches_programs(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     network = with_programs(read_network(crossing()), [additional(WEEK)])
-
     expected = ["rGg", "Grr", "rGg", "Grr", "rGG", "Ooo", "Ooo"]
     assert states(network, [0, 3, 39, 40, 45, 60, 99]) == expected
 
@@ -169,8 +164,8 @@ BROKEN = {
     "name taken": ("", ('programID="night"', 'programID="0"'), "two programs '0'"),
     "no duration": ("", ('<phase duration="5"', "<phase"), "line 4: <phase> has no attribute"),
     "no number": ("", ('duration="5"', 'duration="inf"'), "duration='inf'"),
-    "no phase": ("", ('state="Grr"', 'state="Grr" next="7"'), "leads to phase 7"),
-    "unknown program": (WEEK, ('to="night"', 'to="day"'), "no program 'day'; there are 0, night"),
+    "no phase": ("", ('state="Grr"', 'state="Grr" next="7"'), "leads to the missing phase 7"),
+    "unknown program": (WEEK, ('to="night"', 'to="day"'), "no program 'day'; use one of 0, night"),
     "unknown timetable": (WEEK, ('wautID="week"', 'wautID="year"'), "unknown WAUT 'year'"),
 }
 
@@ -190,7 +185,6 @@ def test_actuated_programs_get_detectors_where_the_green_empties(
     text = ('type="static" programID="0" offset="3"', 'type="actuated" programID="0" offset="3"')
     green = ('duration="30"', 'duration="30" minDur="5" maxDur="50"')
     network = read_network(crossing(text, green))
-
     # 2 s at 10 m/s before the end of the 95 m lane: nearer than 5 s of queue.
     assert network.detectors["s_m"].tolist() == [75.0]
     assert [network.lane_ids[row] for row in network.detectors["lane"]] == ["w_1"]
@@ -207,7 +201,6 @@ def test_an_actuated_green_ends_at_its_longest_to_the_millisecond(
     green = ('duration="30"', 'duration="30" minDur="5" maxDur="12.5"')
     network = read_network(crossing(text, green))
     ticks = [*range(0, 12_400, 100), *range(12_400, 12_510)]
-
     shown = states(network, ticks, 0.001, stands_m=75.0)
     assert ticks[shown.index("yrr")] == 12_500
     assert ticks[states(network, ticks, 0.001).index("yrr")] == 5_000, "nobody prolongs it"

@@ -18,13 +18,10 @@ from tests.sensors.test_hidden_neighbors import blocked
 
 COUNT, RANGE_M, SIZE = 12, 120.0, 11
 SETTINGS = {
-    "observation.kind": "flat",
-    "sensors.conflicts.count": COUNT,
-    "sensors.conflicts.range_m": RANGE_M,
-    "sensors.conflicts.through_walls": False,
-    "sensors.conflicts.heard": True,
-    "v2x.cam.rate_hz": 2.0,
-}
+    "observation.kind": "flat", "sensors.conflicts.count": COUNT,
+    "sensors.conflicts.range_m": RANGE_M, "sensors.conflicts.through_walls": False,
+    "sensors.conflicts.heard": True, "v2x.cam.rate_hz": 2.0,
+}  # fmt: skip
 
 
 def made(overrides: dict[str, Any] | None = None, **keywords: Any) -> Any:

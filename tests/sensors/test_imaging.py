@@ -1,5 +1,4 @@
-"""Lidars, radars, cameras and grids in worlds: what they read of a wall, and that no division,
-worker or death of a host changes a byte of it."""
+"""What lidars, radars, cameras and grids in worlds read of a wall."""
 
 from __future__ import annotations
 
@@ -27,46 +26,9 @@ from cavmarl.sensors.kernels.panorama import (
 )
 from cavmarl.sensors.mounted.backdrop import lane_strips
 from cavmarl.sensors.mounted.lidar import lidar_fan
-from cavmarl.verify.equivalence import verify_zones
-from tests.support.replayed import BUSY
 
 FRONT = {"x_m": 1.0, "z_m": 1.3}
-TILTED = {"x_m": -1.0, "y_m": 0.4, "z_m": 1.5, "yaw_deg": 100.0, "pitch_deg": -8.0, "roll_deg": 5.0}
 SMALL = {"width": 40, "height": 24, "rate_hz": 5}
-RIG: dict[str, Any] = {
-    "plane": {"type": "lidar", "rate_hz": 5, "rays": 64, "noise": [0.05], **FRONT},
-    "layers": {"type": "lidar", "rate_hz": 2.5, "rays": 90, "layers": 8, "dropout": 0.2, **TILTED},
-    "radar": {"type": "radar", "rate_hz": 5, "noise": [0.2, 0.01, 0.1], "bias": [0.1], **FRONT},
-    "depth": {"type": "depth_camera", "noise": [0.1], **SMALL, **FRONT},
-    "classes": {"type": "semantic_camera", **SMALL, **TILTED},
-    "colours": {"type": "rgb_camera", "noise": [3.0], **SMALL, **FRONT},
-    "grid": {"type": "bev_grid", "rate_hz": 5, "cell_m": 1.0, "yaw_deg": 30.0},
-}
-WORLD = {**BUSY, "rig": RIG}
-
-
-def test_divided_worlds_see_what_the_undivided_one_does() -> None:
-    found = verify_zones("grid4x4", (2, 4, 9), overrides=WORLD, steps=20, seed=3)
-    for result in found.results:
-        assert result.difference is None, result
-        assert result.steps == 20
-    assert sum(result.crossings for result in found.results) > 10
-
-
-def test_workers_see_the_same() -> None:
-    def drive(workers: int) -> list[bytes]:
-        vec = make_vec("grid4x4", zones=2, workers=workers, overrides=WORLD)
-        try:
-            vec.reset(seed=7)
-            for _ in range(4):
-                vec.step(vec.suggest_actions())
-            return [array.tobytes() for frames in vec.frames().values() for array in frames]
-        finally:
-            vec.close()
-
-    assert drive(2) == drive(0)
-
-
 DISTANCE_M = 10.0
 WALL_RIG: dict[str, Any] = {
     "plane": {"type": "lidar", "rate_hz": 5, "rays": 4, **FRONT},
@@ -153,7 +115,7 @@ def test_every_class_of_vehicles_has_a_semantic_class() -> None:
     [
         ({"type": "semantic_camera", "noise": [0.1]}, r"rig\.wrong\.noise = .*must be 0"),
         ({"type": "bev_grid", "bias": [0.1]}, r"rig\.wrong\.bias = .*must be 0"),
-        ({"type": "bev_grid", "roll_deg": 1.0}, r"rig\.wrong\.roll_deg = 1.*straight down"),
+        ({"type": "bev_grid", "roll_deg": 1.0}, r"rig\.wrong\.roll_deg = 1.*is horizontal"),
         ({"type": "depth_camera", "fov_deg": 180.0}, r"rig\.wrong\.fov_deg"),
         ({"type": "depth_camera", "width": 4096, "height": 4096}, "more than"),
         ({"type": "lidar", "rays": 0}, r"rig\.wrong\.rays"),

@@ -44,11 +44,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
     "behind": {"vehicles_count": 15, "see_behind": True},
     "absolute": {"vehicles_count": 40, "absolute": True, "clip": False},
     "raw": {"vehicles_count": 8, "normalize": False, "features": VEHICLE_FEATURES},
-    "intentions": {
-        "vehicles_count": 8,
-        "observe_intentions": True,
-        "features": VEHICLE_FEATURES,
-    },
+    "intentions": {"vehicles_count": 8, "observe_intentions": True, "features": VEHICLE_FEATURES},
     "ranges": {
         "vehicles_count": 4,
         "features": ("presence", "heading", "x", "y"),

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from cavmarl.config.rig import OdometryConfig
 from cavmarl.core.errors import ConfigError
@@ -21,18 +18,7 @@ from cavmarl.sensors.mounted.mount_transforms import (
     vehicle_to_world,
     world_to_vehicle,
 )
-
-Matrix = NDArray[np.float64]
-
-
-def _naive_turn(yaw: float, pitch: float, roll: float) -> Matrix:
-    """Yaw about z, then pitch upwards (about -y), then roll about x."""
-    cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw, pitch, roll) for f in (math.cos, math.sin))
-    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    about_y = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    turn: Matrix = about_z @ about_y @ about_x
-    return turn
+from tests.naive.rig import turn
 
 
 def _some(seed: int) -> tuple[OdometryConfig, np.void]:
@@ -52,7 +38,7 @@ def _some(seed: int) -> tuple[OdometryConfig, np.void]:
 def test_turns_are_yaw_then_pitch_then_roll(seed: int) -> None:
     config, _ = _some(seed)
     angles = np.radians([config.yaw_deg, config.pitch_deg, config.roll_deg]).tolist()
-    np.testing.assert_allclose(mount_of(config).turn, _naive_turn(*angles), atol=1e-15)
+    np.testing.assert_allclose(mount_of(config).turn, turn(*angles), atol=1e-15)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -78,5 +64,5 @@ def test_pitch_looks_up_and_uphill() -> None:
 def test_a_place_outside_of_the_body_is_refused(place: dict[str, float]) -> None:
     car = generated_types()[0]
     check_place("a", OdometryConfig(rate_hz=1.0, x_m=2.5, y_m=-1.0, z_m=1.6), car)
-    with pytest.raises(ConfigError, match=r"rig\.a\.[xyz]_m = .*outside of the vehicle"):
+    with pytest.raises(ConfigError, match=r"rig\.a\.[xyz]_m = .*outside the vehicle's body"):
         check_place("a", OdometryConfig(rate_hz=1.0, **place), car)

@@ -45,13 +45,9 @@ EVERYTHING = {
 }
 IMAGE = {**EVERYTHING, "sensors.occupancy_grid.as_image": True}
 NOTHING = {
-    "sensors.ego.enabled": False,
-    "sensors.route.points": 0,
-    "sensors.neighbors.count": 0,
-    "sensors.signal.enabled": False,
-    "sensors.lanes.range_m": 0,
-    "sensors.lidar.rays": 0,
-}
+    "sensors.ego.enabled": False, "sensors.route.points": 0, "sensors.neighbors.count": 0,
+    "sensors.signal.enabled": False, "sensors.lanes.range_m": 0, "sensors.lidar.rays": 0,
+}  # fmt: skip
 ONLY_HIGHWAY = {**NOTHING, "sensors.kinematics.vehicles_count": 5}
 
 

@@ -20,10 +20,7 @@ AZIMUTHS = (-0.5, 0.05, 21)
 
 
 def echoes(
-    rows: NDArray[np.void],
-    matrix: Floats,
-    walls: NDArray[np.void] = NO_WALLS,
-    row: int = 0,
+    rows: NDArray[np.void], matrix: Floats, walls: NDArray[np.void] = NO_WALLS, row: int = 0
 ) -> NDArray[np.void]:
     """TARGET, nearest first."""
     fan = make_fan(matrix, AZIMUTHS, np.zeros(1), 60.0)

@@ -14,7 +14,7 @@ from cavmarl.config.rig import GnssConfig
 from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 from cavmarl.verify.equivalence import verify_zones
 from tests.support.replayed import BUSY
@@ -163,7 +163,9 @@ def test_a_rig_has_a_name_or_a_file(tmp_path: Path) -> None:
     entry.write_text("{name: mine, map: {source: a.net.xml}, rig: own.yaml}", encoding="utf-8")
     assert list(load_config(tmp_path)[0].rig) == ["wheels"]
     assert list(load_config("merge", overrides={"rig": str(own)})[0].rig) == ["wheels"]
-    with pytest.raises(ConfigError, match=r"rig = 'eleven': no such rig; there are .*ten_sensors"):
+    with pytest.raises(
+        ConfigError, match=r"rig = 'eleven': no such rig; give one of .*ten_sensors"
+    ):
         load_config("merge", overrides={"rig": "eleven"})
     with pytest.raises(ConfigError, match="No such file"):
         load_config("merge", overrides={"rig": "nowhere.yaml"})

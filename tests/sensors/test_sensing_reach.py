@@ -26,12 +26,9 @@ RADIUS_M = 0.5 * float(np.hypot(16.0, 3.0))  # of the largest ones
 EVERYWHERE = np.ones(1, dtype=np.bool_)
 
 OFF: dict[str, Any] = {
-    "sensors.route.points": 0,
-    "sensors.neighbors.count": 0,
-    "sensors.signal.enabled": False,
-    "sensors.lanes.range_m": 0.0,
-    "sensors.lidar.rays": 0,
-}
+    "sensors.route.points": 0, "sensors.neighbors.count": 0, "sensors.signal.enabled": False,
+    "sensors.lanes.range_m": 0.0, "sensors.lidar.rays": 0,
+}  # fmt: skip
 # What switches each sensor on. Reaches that can be set are larger than that of the terms.
 ON: dict[str, dict[str, Any]] = {
     TERMS_ALONE: {},

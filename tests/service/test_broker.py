@@ -113,8 +113,7 @@ def test_a_node_with_a_little_less_load_is_not_stampeded(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize(
-    ("busy", "reason"),
-    [({"cpu": 0.851}, "cpu"), ({"ram": 0.901}, "ram"), ({"gpu": 0.951}, "gpu")],
+    ("busy", "reason"), [({"cpu": 0.851}, "cpu"), ({"ram": 0.901}, "ram"), ({"gpu": 0.951}, "gpu")]
 )
 def test_one_overloaded_resource_excludes_a_node(
     fleet: Fleet, busy: dict[str, float], reason: str

@@ -186,7 +186,8 @@ def test_nothing_is_acknowledged_that_could_not_be_written(tmp_path: Path) -> No
     fleet = Fleet(tmp_path / "store.sqlite")
     fleet.log.flush()
     before = fleet.log.durable
-    fleet.log.store._connection.close()
+    full = "BEGIN SELECT RAISE(FAIL, 'the disk is full'); END"
+    damage(tmp_path / "store.sqlite", f"CREATE TRIGGER full BEFORE INSERT ON events {full}")
     fleet.register("a")
     with pytest.raises(ServiceError, match="cannot be written"):
         fleet.log.flush()

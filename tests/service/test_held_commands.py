@@ -14,15 +14,24 @@ from cavmarl.client.world_protocol import WorldFlows
 def test_while_a_page_has_paused_commands_are_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cavmarl.client.world_protocol.AGAIN_S", 0.0)
     paused = {"title": "paused", "detail": "a page has paused the session"}
-    answers = [httpx.Response(503, json=paused), httpx.Response(200, json={"hashes": ["1"]})]
+    lease = {
+        "session": "s", "assigned": "n", "token": "", "scheme": "http", "address": "nowhere",
+        "client_port": 1, "lease_s": 60.0,
+    }  # fmt: skip
+    answers = [
+        httpx.Response(200, json={"access_token": "", "expires_in": 60.0}),
+        httpx.Response(200, json=lease),
+        httpx.Response(503, json=paused),
+        httpx.Response(200, json={"hashes": ["1"]}),
+    ]
     flows = WorldFlows(ServiceFlows("http://nowhere", ""))
-    flows.assignment, flows._renew_s = {"token": ""}, float("inf")
+    flows.assignment = lease
     flow, said = flows.look("hash"), None
     asked: list[Any] = []
     while answers:
         asked.append(flow.send(said))
         said = answers.pop(0) if isinstance(asked[-1], Ask) else None
-    assert [type(one) for one in asked] == [Ask, Rest, Ask]
+    assert [type(one) for one in asked] == [Ask, Ask, Ask, Rest, Ask]
     with pytest.raises(StopIteration) as ended:
         flow.send(said)
     assert ended.value.value == {"hashes": ["1"]}

@@ -63,7 +63,6 @@ def test_members_are_replaced_and_called_to_their_leader_s_door(fleet: Fleet) ->
     assert fleet.beat("a")["without_door"] == []
     task = {"session": session.id, **DOOR.model_dump()}
     assert [fleet.beat(name)["zones_of"] for name in (first, second)] == [[task], [task]]
-
     fleet.broker.drain(fleet.nodes, second)
     fleet.broker.sweep()
     assert second not in session.members

@@ -85,12 +85,9 @@ def test_a_session_goes_on_bit_for_bit_when_its_node_is_killed(
     events = client.get("/events", limit=1000)["events"]  # of this client alone
     kinds = [one["kind"] for one in events]
     assert kinds == [
-        "configuration.added",
-        "session.opened",
-        "session.assigned",
-        "session.saved",
+        "configuration.added", "session.opened", "session.assigned", "session.saved",
         "session.redirected",
-    ]
+    ]  # fmt: skip
     remote.close()
     assert client.get(f"/sessions/{remote.flows.session}")["state"] == "closed"
 

@@ -49,7 +49,6 @@ def test_zones_are_at_nodes_that_are_killed(cluster: Cluster, client: Client) ->
     local.reset(seed=3)
     assert_same(remote, local, range(55))  # past a saved state
     assert_told(client, session, remote, local)
-
     found = client.get(session)
     assert len(set(found["members"])) == 2
     victim = next(name for name in found["members"] if name != found["node"])
@@ -57,7 +56,6 @@ def test_zones_are_at_nodes_that_are_killed(cluster: Cluster, client: Client) ->
     assert_same(remote, local, range(55, 65))
     wait_for(lambda: victim not in client.get(session)["members"])
     assert_same(remote, local, range(65, 70))
-
     cluster.processes[found["node"]].kill()
     assert_same(remote, local, range(70, 80))
     assert remote.flows.moves == 1

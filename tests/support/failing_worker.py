@@ -1,41 +1,41 @@
-"""Workers of which a follower fails once, in a phase of its own; run as a program."""
+"""A program of workers of a team, whose members fail once in a phase that FAILING_PHASE names."""
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
-from cavmarl.parallel.job_factory import make_jobs
 from cavmarl.parallel.processes.worker_loop import serve
-from cavmarl.parallel.team.team import TeamFollower
+from cavmarl.parallel.workers.job_factory import make_jobs
+from cavmarl.parallel.workers.team import TeamMember
 from cavmarl.shards.shard_group import ShardGroup
 
-PHASE = "resolve"
-AT = 9  # the call of it that fails
+PHASE = os.environ["FAILING_PHASE"]
+AT = 9  # the call that fails
 
-follows = TeamFollower.follow
-resolves = ShardGroup.resolve
+run_unchanged = TeamMember.run_phases
+phase_unchanged = getattr(ShardGroup, PHASE)
 calls = 0
 
 
-def follow(follower: TeamFollower) -> None:
-    """As it is, but what it runs fails once."""
+def run_phases(member: TeamMember) -> None:
+    """Run the phases, and fail once in one of them."""
 
-    def resolve(group: ShardGroup) -> None:
+    def fail_once(group: ShardGroup, *arguments: Any) -> None:
         global calls
         calls += 1
         if calls == AT:
-            raise ZeroDivisionError("a follower's own")
-        resolves(group)
+            raise ZeroDivisionError("of a member")
+        phase_unchanged(group, *arguments)
 
-    put: Any = ShardGroup
-    put.resolve = resolve
+    setattr(ShardGroup, PHASE, fail_once)
     try:
-        follows(follower)
+        run_unchanged(member)
     finally:
-        put.resolve = resolves
+        setattr(ShardGroup, PHASE, phase_unchanged)
 
 
 if __name__ == "__main__":
-    replaced: Any = TeamFollower
-    replaced.follow = follow
+    replaced: Any = TeamMember
+    replaced.run_phases = run_phases
     serve(make_jobs)

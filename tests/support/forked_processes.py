@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from cavmarl.core.processes import start_python
 from cavmarl.evaluate.subprocess_calls import PROGRAM
-from tests.support.world_hosts import FORKS
+from tests.support.local_actors import FORKS
 
 __all__ = ["FORKS", "ForkedProcess", "start_forked"]
 

@@ -83,10 +83,7 @@ def backdrop(
 
 
 def look_around(
-    rows: NDArray[np.void],
-    row: int = 0,
-    scenery: Backdrop | None = None,
-    reach_m: float = 100.0,
+    rows: NDArray[np.void], row: int = 0, scenery: Backdrop | None = None, reach_m: float = 100.0
 ) -> tuple[Panorama, Counts]:
     """What stands around a vehicle."""
     scenery = scenery or backdrop()

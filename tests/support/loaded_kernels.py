@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from cavmarl.engine.world_setup import load_world
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 LocalWorlds(load_world("grid4x4", zones=4), 1, warm=True)

@@ -21,9 +21,11 @@ MORE = 1000  # numbers that each task adds
 Make = Callable[..., Pool]
 
 
-def program(workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **recipe: object) -> Program:
+def program(
+    workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **message: object
+) -> Program:
     names = tuple(f"part {k}" for k in range(workers))
-    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS, teams=teams)
+    return Program(MODULE, {"workers": workers, **message}, names, (), TASKS, teams=teams)
 
 
 @contextmanager
@@ -47,6 +49,11 @@ def toy_pools() -> Iterator[Make]:
 
 def totals(pool: Pool) -> list[list[float]]:
     return pool.run(TOTAL, commits=False)
+
+
+def committed_image(pool: Pool) -> memoryview:
+    """Return the memory in which the last state of the workers was committed, to damage it."""
+    return pool._processes._resources.segments[2 + pool._committed].map()
 
 
 def alive(pids: list[int]) -> list[int]:

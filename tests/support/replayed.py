@@ -23,11 +23,8 @@ QUICK: Mapping[str, Any] = {
     "zones.approach_ticks": 4,
 }
 BUSY: Mapping[str, Any] = {
-    **QUICK,
-    "population.mode": "respawn",
-    "population.agents": 6,
-    "population.background": 110,
-}
+    **QUICK, "population.mode": "respawn", "population.agents": 6, "population.background": 110,
+}  # fmt: skip
 
 
 class Checked:
@@ -74,11 +71,7 @@ def record(
     return found
 
 
-def replay(
-    run: Recorded,
-    zones: int,
-    settings: Mapping[str, Any] | None = None,
-) -> CavVectorEnv:
+def replay(run: Recorded, zones: int, settings: Mapping[str, Any] | None = None) -> CavVectorEnv:
     """Drive a divided world through the same run; it is the same after every step.
 
     The trace of each world is checked, too, and hand-overs happen.

@@ -83,10 +83,7 @@ def two_ways(
     """Worlds on that map, from their reset on unless the seed is None."""
     clock = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 1.0, "horizon_s": 1200.0}
     simulation = make(
-        net,
-        write_demand(folder, body, additional),
-        num_worlds=num_worlds,
-        overrides=clock,
+        net, write_demand(folder, body, additional), num_worlds=num_worlds, overrides=clock
     )
     if seed is not None:
         start(simulation, seed)

@@ -49,10 +49,10 @@ class Adder:
         self.more = np.zeros(0)  # another one each time
         self.falls_at = ""
 
-    def afterwards(self) -> None:
+    def on_idle(self) -> None:
         """Nothing to do."""
 
-    def prepare(self) -> None:
+    def before_fork(self) -> None:
         """Nothing is shared."""
 
     def perform(self, task: int, payload: Any) -> Any:
@@ -94,16 +94,16 @@ class Adder:
         self.more = saved[1].copy()
 
 
-def make_jobs(recipe: Mapping[str, Any]) -> list[Adder]:
-    if "fails" in recipe:
-        raise RuntimeError(recipe["fails"])
-    for file in recipe.get("dies_while", ()):
+def make_jobs(message: Mapping[str, Any]) -> list[Adder]:
+    if "fails" in message:
+        raise RuntimeError(message["fails"])
+    for file in message.get("dies_while", ()):
         with suppress(FileNotFoundError):  # each of these files ends one start
             os.unlink(file)
-            os.kill(os.getpid(), recipe.get("dies_by", signal.SIGKILL))
-    if "ends" in recipe:
-        os._exit(recipe["ends"])
-    return [Adder() for _ in range(recipe["workers"])]
+            os.kill(os.getpid(), message.get("dies_by", signal.SIGKILL))
+    if "ends" in message:
+        os._exit(message["ends"])
+    return [Adder() for _ in range(message["workers"])]
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
-from cavmarl.shards.shard import _make_scratch
+from cavmarl.shards.shard import make_shard_scratch
 from cavmarl.traffic.demand import STOP
 from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
 
@@ -67,7 +67,7 @@ def travel(name: str) -> TripTables:
 
 def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
     """Room for the kernels; as long as no vehicle is listed, buses are looked for at junctions."""
-    room = _make_scratch(roads, capacity)
+    room = make_shard_scratch(roads, capacity)
     room.largest[:] = len(SIZE_LENGTHS_M)
     return room
 

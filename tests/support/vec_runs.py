@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl import CavVectorEnv
-from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 
 __all__ = ["STEPS", "Make", "Run", "drive", "pool_of", "same"]
 

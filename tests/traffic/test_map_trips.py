@@ -12,7 +12,7 @@ from tests.support.world import traffic_of
 
 def test_where_no_way_in_can_be_followed_vehicles_enter_anywhere() -> None:
     traffic = traffic_of(make_traffic("grid4x4", background=4, overrides={"traffic.origins": []}))
-    trips, num_goals = traffic._trips_of(0), traffic.goal_edges.shape[1]
+    trips, num_goals = traffic.trips_of(0), traffic.goal_edges.shape[1]
     ways_in = np.flatnonzero(
         ~traffic.network.lanes["internal"] & (traffic.network.lanes["num_into"] == 0)
     )

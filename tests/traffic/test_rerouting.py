@@ -94,12 +94,7 @@ def test_a_closed_edge_is_driven_around_as_in_sumo(net: Path, tmp_path: Path) ->
         ('<closingReroute id="out"/>', "", 0, 0),  # no way around: it drives on
         ('<closingReroute id="out"/><destProbReroute id="long2"/>', "", 65, 75),
         ('<destProbReroute id="long2"/>', "", 65, 75),
-        (
-            '<destProbReroute id="long2"/><destProbReroute id="keepDestination"/>',
-            "",
-            22,
-            48,
-        ),
+        ('<destProbReroute id="long2"/><destProbReroute id="keepDestination"/>', "", 22, 48),
         ('<routeProbReroute id="far"/>', "", 65, 75),
         ('<routeProbReroute id="far"/><routeProbReroute id="near" probability="3"/>', "", 8, 30),
     ],
@@ -190,14 +185,9 @@ def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: 
     before = simulation.state_hash()
     rerouting = traffic_of(simulation).rerouting
     assert rerouting is not None
-    slots = rerouting._slots
-    for array in (
-        rerouting._past,
-        rerouting._speed_sums,
-        rerouting._looks["next"],
-        rerouting._looks["goal"],
-        simulation.travel.steps["to_go"][slots.first :],  # somebody drives there
-    ):
+    past, speed_sums, looks, steps = rerouting.arrays()
+    # A vehicle drives on the first of these steps.
+    for array in (past, speed_sums, looks["next"], looks["goal"], steps["to_go"]):
         value = array.reshape(-1)[:1].copy()
         array[(0,) * array.ndim] -= 1
         assert simulation.state_hash() != before
@@ -208,14 +198,15 @@ def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: 
 def test_room_does_not_grow_and_slots_serve_many(net: Path, tmp_path: Path) -> None:
     simulation = two_ways(net, tmp_path, cars(DEVICE) + FLOW)
     traffic = traffic_of(simulation)
-    assert traffic._slots is not None
-    size, looks = traffic.travel.steps.size, traffic.rerouting._looks.size
+    assert traffic.slots is not None
+    assert traffic.rerouting is not None
+    sizes = [array.size for array in (traffic.travel.steps, *traffic.rerouting.arrays())]
     while simulation.traffic_stats().rerouted < 90:
         drive(simulation)
-    assert (traffic.travel.steps.size, traffic.rerouting._looks.size) == (size, looks)
+    arrays = (traffic.travel.steps, *traffic.rerouting.arrays())
+    assert [array.size for array in arrays] == sizes
     # Fewer ever had a way of their own at a time than there were ways.
-    steps = traffic.travel.steps[traffic._slots.first :]
-    written = (steps["to_go"].reshape(-1, traffic._slots.steps) > 0.0).any(axis=1)
+    written = (arrays[-1]["to_go"].reshape(-1, traffic.slots.steps) > 0.0).any(axis=1)
     assert 0 < np.count_nonzero(written) < 60
 
 

@@ -22,14 +22,9 @@ from cavmarl.traffic.scenarios.library import load_scenario, scenario_names, sum
 from cavmarl.traffic.scenarios.scene import describe
 
 NAMES = (
-    "failed_u_turn",
-    "intersection_blockage",
-    "merge_conflict",
-    "pedestrian_crossing",
-    "road_closure",
-    "signal_outage",
-    "unprotected_left_turn",
-)
+    "failed_u_turn", "intersection_blockage", "merge_conflict", "pedestrian_crossing",
+    "road_closure", "signal_outage", "unprotected_left_turn",
+)  # fmt: skip
 VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
     *((name, {}) for name in NAMES),
     ("pedestrian_crossing", {"occluded": True}),
@@ -246,7 +241,7 @@ def test_agents_of_a_parallel_env_play_it_too() -> None:
 
 
 def test_a_scene_has_room_for_so_many_agents() -> None:
-    with pytest.raises(ConfigError, match=r"population\.agents = 400: .* ask for at most \d+"):
+    with pytest.raises(ConfigError, match=r"population\.agents = 400: .* set at most \d+"):
         make_scenario("merge_conflict", agents=400)
     with pytest.raises(ConfigError, match=r"population\.agents = 0: must be 1 or more"):
         make_vec("grid4x4", agents=0, overrides={"scenario.name": "failed_u_turn"})
@@ -292,7 +287,7 @@ def test_anybody_can_add_one_in_a_file(tmp_path: Path) -> None:
         make_scenario(str(path))
     path = tmp_path / "half.py"
     path.write_text("NEEDS = 'a road'", encoding="utf-8")
-    with pytest.raises(ConfigError, match="does not define Parameters, places, stage"):
+    with pytest.raises(ConfigError, match="not a scenario; define Parameters, places, stage"):
         make_scenario(str(path))
 
 

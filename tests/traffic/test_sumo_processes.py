@@ -14,11 +14,7 @@ import psutil
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.core.errors import (
-    ConfigError,
-    DemandError,
-    SumoError,
-)
+from cavmarl.core.errors import ConfigError, DemandError, SumoError
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.traffic.sumo.sumo_input import free_libsumo
@@ -169,7 +165,7 @@ def test_1000_resets_leak_nothing(tmp_path: Path) -> None:
 def test_a_second_start_in_one_process_is_refused(tmp_path: Path) -> None:
     with coupled("grid4x4", [tiny_file(tmp_path)]) as simulation:
         with alone(simulation, tmp_path):
-            with pytest.raises(SumoError, match="one simulation a process"):
+            with pytest.raises(SumoError, match="one simulation per process"):
                 free_libsumo()
             drive(simulation)  # a process of its own
         free_libsumo()
@@ -211,7 +207,7 @@ def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     with (
-        pytest.raises(ConfigError, match=r"names .*none\.rou\.xml, which is not there"),
+        pytest.raises(ConfigError, match=r"names .*none\.rou\.xml, which does not exist"),
         coupled("grid4x4", [path]),
     ):
         pass
@@ -223,7 +219,7 @@ def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
         ({"traffic.demand": []}, "traffic.source"),
         ({"sensors.signal.timing": True}, "sensors.signal.timing"),
         ({"clock.sim_dt_s": 0.0125, "clock.ctrl_dt_s": 0.1}, "whole milliseconds"),
-        ({"map.program": {"A0": "1"}}, "SUMO has the signals"),
+        ({"map.program": {"A0": "1"}}, "SUMO runs the signals"),
         ({"sumo.interface": "telnet"}, "sumo.interface"),
         ({"sumo.max_vehicles": 0}, "sumo.max_vehicles"),
         ({"sumo.replay_mib": -1}, "sumo.replay_mib"),
@@ -332,7 +328,7 @@ def test_a_worker_dies_whose_sumo_was_told_too_much_to_keep(tmp_path: Path) -> N
             vec.step(actions)
         os.kill(vec.worlds.pool.pids[0], signal.SIGKILL)
         for _ in range(2):
-            with pytest.raises(SumoError, match=r"(?s)more than 0 MiB.*reset.*sumo\.replay_mib"):
+            with pytest.raises(SumoError, match=r"(?s)exceeds 0 MiB.*reset.*sumo\.replay_mib"):
                 vec.step(actions)
         vec.reset(seed=6)
         vec.step(vec.suggest_actions())

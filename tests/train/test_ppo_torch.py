@@ -24,7 +24,7 @@ from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
 from cavmarl.learning.actor_critic import load_network
 from cavmarl.learning.checkpoint import read_checkpoint, write_checkpoint
 from cavmarl.learning.run_folder import parse_run
-from cavmarl.parallel.pooled_worlds import PooledWorlds
+from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.policies.loading import load_policy
 from tests.support.training import TRAIN, load_program
 
@@ -202,7 +202,7 @@ def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None
         (["--keep", "0"], "--keep 0.0: must be above 0"),
         (["--gamma", "1.5"], "--gamma 1.5: must be from 0 to 1"),
         (["--agents", "-1"], "--agents -1: must be at least 0"),
-        (["--resume", "nowhere"], "--resume nowhere: no checkpoint there"),
+        (["--resume", "nowhere"], "--resume nowhere: has no checkpoint"),
     ],
 )
 def test_wrong_settings_are_refused(

@@ -190,9 +190,9 @@ def test_a_folder_has_one_run_and_one_process(
 
     monkeypatch.setattr(ippo.Run, "update", update_beside_another)
     assert ippo.main(words) == 0
-    assert locked[0].count(f"runs/run: process {os.getpid()} trains here: wait until") == 2
+    assert locked[0].count(f"runs/run: process {os.getpid()} trains here; wait until") == 2
     before = learnt(here / "runs" / "run")
-    assert "runs/run: a run has begun here, which is not overwritten: go on" in refusal(*words)
+    assert "runs/run: contains a run, which is not overwritten; continue" in refusal(*words)
     assert learnt(here / "runs" / "run") == before
 
 
@@ -244,7 +244,7 @@ def test_a_run_that_found_no_room_at_all_can_be_begun_again(
     with monkeypatch.context() as patch:
         patch.setattr("cavmarl.learning.run_folder.write_checkpoint", no_room)
         assert "checkpoint.pt: cannot be written" in refusal(*words)
-    assert "--resume runs/run: no checkpoint there" in refusal("--resume", "runs/run")
+    assert "--resume runs/run: has no checkpoint" in refusal("--resume", "runs/run")
     assert ippo.main(words) == 0
 
 
@@ -262,10 +262,10 @@ def test_what_is_damaged_or_of_another_run_is_refused(
         assert "runs/run/checkpoint.pt: is damaged, or of another version" in refusal(*resume)
     path.write_bytes(written)
     other = load_program("ppo_gymnasium")
-    with pytest.raises(ConfigError, match=r"is a run of ppo\.py: go on with that one"):
+    with pytest.raises(ConfigError, match=r"is a run of ppo\.py; use that program"):
         parse_run(other.Args, resume, "")
     (path.parent / "progress.csv").write_text("rows\n")
-    assert "progress.csv: rows are missing that were there at the checkpoint" in refusal(*resume)
+    assert "progress.csv: rows written before the checkpoint are missing" in refusal(*resume)
 
 
 def test_another_world_is_refused(

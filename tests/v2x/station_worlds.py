@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
+from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.v2x.bus import Bus
 
 CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
@@ -23,10 +26,18 @@ class Standing:
         agents: seats; vehicle k < agents is driven by agent k.
         env: whose map it is.
         rays: of the agents' lidar.
+        walls: (n, 4) ends of the buildings' walls, ax, ay, bx, by.
         settings: keys under `v2x`.
     """
 
-    def __init__(self, agents: int, env: str = "grid4x4", rays: int = 0, **settings: Any) -> None:
+    def __init__(
+        self,
+        agents: int,
+        env: str = "grid4x4",
+        rays: int = 0,
+        walls: Sequence[tuple[float, float, float, float]] = (),
+        **settings: Any,
+    ) -> None:
         overrides = {f"v2x.{key.replace('__', '.')}": value for key, value in settings.items()}
         config, network, demand, partition = load_world(
             env,
@@ -37,6 +48,8 @@ class Standing:
             | overrides
             | {"sensors.lidar.rays": rays},
         )
+        if walls:
+            network = replace(network, walls=np.array([(*wall, 9.0, 0) for wall in walls], WALL))
         self.config = config
         self.agents = agents
         self.simulation = Simulation(config, network, 1, demand, partition)

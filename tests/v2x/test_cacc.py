@@ -15,11 +15,7 @@ from cavmarl.core.errors import PolicyError
 from tests.support.rerouting import sumo_binary
 
 AGENTS = 8
-HEARS = {
-    "v2x.enabled": True,
-    "sensors.messages.objects": 8,
-    "sensors.lanes.range_m": 100.0,
-}
+HEARS = {"v2x.enabled": True, "sensors.messages.objects": 8, "sensors.lanes.range_m": 100.0}
 ROAD = {
     "population.mode": "closed",
     "clock.ctrl_dt_s": 0.1,

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.core.math.walls import make_walls
 from cavmarl.sensors.observed import layout
 from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, KIND_CAM, KIND_CPM
 from tests.support.world import tick_of
@@ -79,14 +78,14 @@ def test_lidar_does_not_meet_it_while_messages_tell_of_it() -> None:
 
 def test_a_car_without_radio_is_told_of_by_those_who_see_it() -> None:
     # Only the agent and the roadside unit are equipped; a wall hides the car from the agent.
-    world = Standing(
-        1, equipped=0.0, perception__rate_hz=10.0,
-        roadside__signals=["all"], roadside__perception_hz=10.0, roadside__range_m=60.0,
-    )  # fmt: skip
-    unit = world.bus.units[5]
-    world.put(np.array([[unit["x"] - 40.0, unit["y"]], [unit["x"] + 3.0, unit["y"] + 30.0]]))
-    wall = [[unit["x"] - 15.0, unit["y"] + 5.0, unit["x"] - 15.0, unit["y"] + 200.0]]
-    world.bus._channel = world.bus._channel._replace(walls=make_walls(np.array(wall)))
+    settings: dict[str, Any] = {
+        "equipped": 0.0, "perception__rate_hz": 10.0, "roadside__signals": ["all"],
+        "roadside__perception_hz": 10.0, "roadside__range_m": 60.0,
+    }  # fmt: skip
+    unit = Standing(1, **settings).bus.units[5]
+    x, y = float(unit["x"]), float(unit["y"])
+    world = Standing(1, walls=[(x - 15.0, y + 5.0, x - 15.0, y + 200.0)], **settings)
+    world.put(np.array([[x - 40.0, y], [x + 3.0, y + 30.0]]))
     world.tick()
     world.tick()
     assert known(world) == {1: (FIRST_ROADSIDE_ID + 5, KIND_CPM)}
@@ -96,11 +95,9 @@ def test_buildings_weaken_what_goes_through_them() -> None:
     ratios = []
     for building_db in (0.0, 12.0, 60.0):
         world = Standing(
-            1, channel__path_loss_exponent=2.75, channel__building_db=building_db,
-            inbox__objects=1,
+            1, walls=[(150.0, -500.0, 150.0, 500.0)], channel__path_loss_exponent=2.75,
+            channel__building_db=building_db, inbox__objects=1,
         )  # fmt: skip
-        wall = make_walls(np.array([[150.0, -500.0, 150.0, 500.0]]))
-        world.bus._channel = world.bus._channel._replace(walls=wall)
         # 20 cars behind the wall, 60 m away: without it nearly all is received.
         ring = np.linspace(-0.5, 0.5, 20)
         behind = 100.0 + 60.0 * np.stack([np.cos(ring), np.sin(ring)], 1)

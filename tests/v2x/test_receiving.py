@@ -28,13 +28,10 @@ CHANNELS: dict[str, dict[str, Any]] = {
     "loss": {"channel__loss": 0.3},
     "path loss": {"channel__path_loss_exponent": 2.75, "channel__range_m": 300.0},
     "all": {
-        "channel__path_loss_exponent": 2.3,
-        "channel__range_m": 400.0,
-        "channel__loss": 0.1,
-        "channel__data_rate_mbps": 1.0,
-        "channel__latency_ticks": 2,
+        "channel__path_loss_exponent": 2.3, "channel__range_m": 400.0, "channel__loss": 0.1,
+        "channel__data_rate_mbps": 1.0, "channel__latency_ticks": 2,
     },
-}
+}  # fmt: skip
 
 
 def heard_by(

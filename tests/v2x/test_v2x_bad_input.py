@@ -33,10 +33,13 @@ from cavmarl.engine.world_setup import load_world
         ({"v2x.inbox.objects": 0}, r"v2x\.inbox\.objects = 0"),
         ({"v2x.inbox.memory_s": 0.0}, r"v2x\.inbox\.memory_s"),
         ({"v2x.roadside.signals": ["A0", "A0"]}, r"name each signal once"),
-        ({"v2x.roadside.signals": ["all", "A0"]}, r"'all' stands alone"),
-        ({"v2x.roadside.signals": ["A9"]}, r"no signal 'A9' on the map '.*There are: A0, A1"),
+        ({"v2x.roadside.signals": ["all", "A0"]}, r"'all' must be the only name"),
+        ({"v2x.roadside.signals": ["A9"]}, r"no signal 'A9' on the map '.*The map has: A0, A1"),
         ({"v2x.perception.objects": 33}, r"v2x\.perception\.objects = 33"),
-        ({"sensors.messages.objects": 9}, r"sensors\.messages\.objects = 9: .*objects = 8 keeps"),
+        (
+            {"sensors.messages.objects": 9},
+            r"sensors\.messages\.objects = 9: .*at most v2x\.inbox\.objects",
+        ),
         ({"sensors.messages.range_m": 0.0}, r"sensors\.messages\.range_m"),
         ({"v2x.cam.rate": 10.0}, r"v2x\.cam\.rate.*use rate_hz"),
         ({"observation.mode": "messages"}, r"observation\.mode.*set sensors\.messages\.objects"),
@@ -70,13 +73,9 @@ def test_it_is_off_by_default_and_every_effect_of_the_channel_too() -> None:
 
 def test_the_mode_messages_shows_nothing_else_of_others() -> None:
     overrides = {
-        "v2x.enabled": True,
-        "sensors.messages.objects": 3,
-        "sensors.messages.events": 1,
-        "sensors.messages.signal": True,
-        "observation.mode": "messages",
-        "observation.kind": "dict",
-    }
+        "v2x.enabled": True, "sensors.messages.objects": 3, "sensors.messages.events": 1,
+        "sensors.messages.signal": True, "observation.mode": "messages", "observation.kind": "dict",
+    }  # fmt: skip
     env = parallel_env("grid4x4", overrides=overrides)
     observations, _ = env.reset(seed=0)
     assert set(observations[env.agents[0]]) == {"ego", "route", "messages"}

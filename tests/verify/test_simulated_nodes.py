@@ -58,7 +58,7 @@ def exchange(
         links.add(COORDINATOR, system.open(listener.place, bytes(32), 0, None))
         for n in range(5):
             links.send(COORDINATOR, FrameKind.SHARE, n)
-            links.take([COORDINATOR])
+            links.receive([COORDINATOR])
         heard.append(f"node at {machine.now_s:.9f}")
         links.close()
 
@@ -70,7 +70,7 @@ def exchange(
     links = Links(lambda number, frame: None, system)
     links.add(number, connection)
     for n in range(5):
-        links.take([number])
+        links.receive([number])
         links.send(number, FrameKind.SYNC, n)
     assert machine.outlived(60.0) == []
     machine.close()
@@ -202,7 +202,7 @@ def test_a_node_that_is_given_up_without_need(monkeypatch: pytest.MonkeyPatch) -
 
 def test_nodes_that_do_not_heed_an_order_to_go_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: they wait for ever for a node that only the caller misses."""
-    monkeypatch.setattr(Links, "heed", lambda self: None)
+    monkeypatch.setattr(Links, "check_recovery", lambda self: None)
     assert one_line("partition", seeds=3).wrong
 
 
@@ -229,7 +229,7 @@ def test_a_state_that_is_not_gone_back_to(monkeypatch: pytest.MonkeyPatch) -> No
     def present(data: Bytes, like: list[Any]) -> list[Any]:
         return [array.copy() for array in like]
 
-    monkeypatch.setattr("cavmarl.parallel.nodes.kept_states.from_bytes", present)
+    monkeypatch.setattr("cavmarl.parallel.nodes.state_replicas.from_bytes", present)
     assert one_line("kill", seeds=3).wrong
 
 
@@ -289,7 +289,7 @@ def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(OwnerChanges, "take_over", later)
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **checked)
-    assert "on record are" in found.lines[0].wrong[0]
+    assert "the records have" in found.lines[0].wrong[0]
     unchecked = {**checked, "overrides": {}}
     assert verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **unchecked).holds
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from cavmarl.env.parallel import parallel_env
+from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.policies.loading import load_policy
 from cavmarl.viewer.live_run import ShownRun
 from cavmarl.viewer.subscribers import Audience
@@ -18,20 +18,34 @@ from cavmarl.viewer.vehicle_details import hello_of
 from cavmarl.viewer.viewed_world import first_stage
 from cavmarl.viewer.web_options import WebOptions
 from cavmarl.viewer.web_server import WebServer
+from tests.support.chromium import chromium
 
 
 @dataclass
 class Served:
     """A world that is driven in a thread, and its server."""
 
+    env: CavEnv
     run: ShownRun
     audience: Audience
     server: WebServer
     map_bytes: bytes
 
+    def note_actions(self, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+        """Return a list of the actions of the first agent, to which each step adds."""
+        noted: list[Any] = []
+        step = self.env.step
+
+        def noting(actions: dict[str, Any]) -> Any:
+            noted.append(actions.get("car_0"))
+            return step(actions)
+
+        monkeypatch.setattr(self.env, "step", noting)
+        return noted
+
 
 @contextmanager
-def served(env: Any, options: WebOptions, drives: bool = True) -> Iterator[Served]:
+def served(env: CavEnv, options: WebOptions, drives: bool = True) -> Iterator[Served]:
     """Serve a world; it runs unless `drives` is false, as then turns are the caller's."""
     with ExitStack() as stack:
         stack.callback(env.close)
@@ -44,12 +58,26 @@ def served(env: Any, options: WebOptions, drives: bool = True) -> Iterator[Serve
             thread.start()
             stack.callback(thread.join)
             stack.callback(over.set)
-        yield Served(run, stage.audience, server, stage.map_bytes)
+        yield Served(env, run, stage.audience, server, stage.map_bytes)
 
 
 def _drive(run: ShownRun, over: threading.Event) -> None:
     while not over.is_set():
         over.wait(min(run.turn(), 0.02))
+
+
+@pytest.fixture(scope="module")
+def chromium_browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def browser(chromium_browser: Any) -> Iterator[Any]:
+    """A browser whose pages are closed after the test."""
+    yield chromium_browser
+    for context in chromium_browser.contexts:
+        context.close()
 
 
 @pytest.fixture

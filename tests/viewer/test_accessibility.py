@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +11,10 @@ import pytest
 
 from cavmarl.evaluate import evaluate
 from cavmarl.viewer.web_options import WebOptions
-from tests.support.chromium import chromium, until
+from tests.support.chromium import until
 from tests.viewer.conftest import Served
 
 Serve = Callable[..., Served]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(autouse=True)
-def closed_pages(browser: Any) -> Iterator[None]:
-    """No page of one test is drawn any more during the next."""
-    yield
-    for context in browser.contexts:
-        context.close()
 
 
 @pytest.fixture(scope="module")

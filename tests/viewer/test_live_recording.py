@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -34,32 +37,51 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def loop() -> Iterator[asyncio.AbstractEventLoop]:
+    """Stands for the server's: what waits for it is carried out in each turn."""
+    with closing(asyncio.new_event_loop()) as made:
+        yield made
+
+
 class Heard:
     """A watcher of a stage, without a server."""
 
-    def __init__(self, path: Path, world: int = 1) -> None:
+    def __init__(self, path: Path, loop: asyncio.AbstractEventLoop, world: int = 1) -> None:
         recording = Recording(path)
         (found,) = [one for one in recording_stages(recording) if one[:2] == (world, 0)]
         self.stage = found[2]
         self.shown = ShownRecording(recording, *found)
-        self.events: list[Any] = []
-        audience: Any = self.stage.audience
-        audience._call = lambda function, *arguments: function(*arguments)
-        self.watcher = audience.join()
+        self._loop = loop
+        self.stage.audience.begin(loop)
+        self.watcher = self.stage.audience.join()
 
     def ask(self, kind: str, number: float | None = None) -> None:
-        self.stage.audience.ask(self.watcher, PageRequest(kind, number))
+        self.stage.audience.ask(self.watcher, PageRequest(kind, number, sensors=True))
 
     def turn(self) -> tuple[int, bool] | None:
         """Tick of a frame that came, and whether it is paused."""
         time.sleep(0.06)
         self.shown.turn()
+        self._loop.run_until_complete(asyncio.sleep(0.0))
         newest: Publication | None = self.watcher.newest
         self.watcher.newest = None
         if newest is None:
             return None
         head = FRAME_HEAD.unpack_from(newest.frame)
         return head[5], bool(head[1])
+
+    def told_of(self, vehicle: int, tick: int) -> Any:
+        """What the page is told of a vehicle at a tick."""
+        self.ask("pause")
+        self.ask("seek", tick)
+        self.ask("watch", vehicle)
+        self.watcher.texts.clear()
+        turns(self, lambda found: found[0] == tick)
+        (told,) = (
+            each for each in map(json.loads, self.watcher.texts) if each["kind"] == "vehicle"
+        )
+        return told
 
 
 def turns(heard: Heard, is_so: Callable[[tuple[int, bool]], bool]) -> tuple[int, bool]:
@@ -70,8 +92,10 @@ def turns(heard: Heard, is_so: Callable[[tuple[int, bool]], bool]) -> tuple[int,
     raise AssertionError("it never came")
 
 
-def test_it_plays_to_its_end_pauses_and_begins_again(path: Path) -> None:
-    heard = Heard(path)
+def test_it_plays_to_its_end_pauses_and_begins_again(
+    path: Path, loop: asyncio.AbstractEventLoop
+) -> None:
+    heard = Heard(path, loop)
     heard.ask("pace", 10.0)
     first, last = heard.stage.hello["span"]
     assert turns(heard, lambda found: True)[0] < last
@@ -81,8 +105,8 @@ def test_it_plays_to_its_end_pauses_and_begins_again(path: Path) -> None:
     assert first < last
 
 
-def test_a_page_goes_to_any_moment(path: Path) -> None:
-    heard = Heard(path)
+def test_a_page_goes_to_any_moment(path: Path, loop: asyncio.AbstractEventLoop) -> None:
+    heard = Heard(path, loop)
     heard.ask("pause")
     ticks = Recording(path).ticks(1, 0)
     for wanted, shown in ((ticks[17] + 1, ticks[17]), (0, ticks[0]), (10**9, ticks[-1])):
@@ -90,35 +114,37 @@ def test_a_page_goes_to_any_moment(path: Path) -> None:
         assert turns(heard, lambda found: True) == (shown, True)
 
 
-def test_a_vehicle_is_told_as_it_was(path: Path) -> None:
-    heard = Heard(path, world=0)
+def test_a_vehicle_is_told_as_it_was(path: Path, loop: asyncio.AbstractEventLoop) -> None:
+    heard = Heard(path, loop, world=0)
     frame: WorldFrame = Recording(path).at(10, 0, 0)
     row = frame.vehicles[0]
-    found = heard.shown._tell(frame, int(row["id"]), True)
+    found = heard.told_of(int(row["id"]), frame.tick)
     assert found["here"]
     assert dict(found["rows"])["speed"].startswith(f"{row['speed']:.2f} m/s")
-    assert not heard.shown._tell(frame, 10**6, True)["here"]
+    assert not heard.told_of(10**6, frame.tick)["here"]
 
 
-def test_an_agent_is_told_with_what_it_observed(path: Path) -> None:
-    heard, recording = Heard(path, world=1), Recording(path)
+def test_an_agent_is_told_with_what_it_observed(
+    path: Path, loop: asyncio.AbstractEventLoop
+) -> None:
+    heard, recording = Heard(path, loop, world=1), Recording(path)
     tick = recording.ticks(1, 0)[5]
     frame = recording.at(tick, 1, 0)
     row = recording.extra_at("observations", tick, 1)[0]
-    found = heard.shown._tell(frame, int(row["vehicle"]), True)
+    found = heard.told_of(int(row["vehicle"]), tick)
     names = [tuple(told[:2]) for told in found["observation"]]
     assert names == [tuple(name) for name in recording.head.features]
     numbers = [told[2] for told in found["observation"]]
     assert numbers == pytest.approx(row["values"].tolist(), abs=1e-4)
     assert [name for name, _ in found["terms"]] == list(recording.head.terms)
     others = frame.vehicles[frame.vehicles["agent"] < 0]
-    assert "observation" not in heard.shown._tell(frame, int(others["id"][0]), True)
+    assert "observation" not in heard.told_of(int(others["id"][0]), tick)
 
 
 def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) -> None:
     (path / "network.bin").rename(tmp_path / "network.bin")
     try:
-        with pytest.raises(RecordingError, match="without its map"):
+        with pytest.raises(RecordingError, match="has no map"):
             recording_stages(Recording(path))
     finally:
         (tmp_path / "network.bin").rename(path / "network.bin")
@@ -126,5 +152,5 @@ def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) 
     empty.mkdir()
     for name in ("recording.json", "network.bin"):
         (empty / name).write_bytes((path / name).read_bytes())
-    with pytest.raises(RecordingError, match="no frame was committed"):
+    with pytest.raises(RecordingError, match="the recording has no frames"):
         recording_stages(Recording(empty))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.live_recording import ShownRecording, recording_stages
 from cavmarl.viewer.show_world import serve_stages
 from cavmarl.viewer.web_options import WebOptions
-from tests.support.chromium import chromium, until
+from tests.support.chromium import until
 from tests.viewer.conftest import Served
 
 Serve = Callable[..., Served]
@@ -26,20 +26,6 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
   return kind === "webgl2" ? null : real.call(this, kind, ...more);
 };
 """
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(autouse=True)
-def closed_pages(browser: Any) -> Iterator[None]:
-    """No page of one test is drawn any more during the next."""
-    yield
-    for context in browser.contexts:
-        context.close()
 
 
 def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[str], set[str]]:
@@ -84,8 +70,11 @@ def test_the_page_draws_follows_and_asks_no_other_host(browser: Any, serve: Serv
     assert hosts == {f"127.0.0.1:{served.server.port}"}
 
 
-def test_a_seat_is_driven_with_the_arrow_keys(browser: Any, serve: Serve) -> None:
+def test_a_seat_is_driven_with_the_arrow_keys(
+    browser: Any, serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
     served = serve()
+    noted = served.note_actions(monkeypatch)
     page, problems, _ = opened(browser, served)
     page.fill("#wanted", "car_0")
     page.press("#wanted", "Enter")
@@ -93,14 +82,12 @@ def test_a_seat_is_driven_with_the_arrow_keys(browser: Any, serve: Serve) -> Non
     page.keyboard.down("ArrowUp")
     page.keyboard.down("ArrowLeft")
     page.wait_for_timeout(600)
-    (driven,) = served.run._driving.values()
-    assert served.run._seats.keys() == {0}
-    assert driven[1] == 1.0
-    assert driven[2] > 0.3
+    assert served.run.seats.keys() == {0}
+    assert any(throttle == 1.0 and steering > 0.3 for throttle, steering in noted)
     page.keyboard.up("ArrowUp")
     page.keyboard.press("Escape")
     page.wait_for_timeout(400)
-    assert not served.run._seats
+    assert not served.run.seats
     assert not problems
 
 
@@ -159,7 +146,7 @@ def test_names_of_maps_are_text(
 ) -> None:
     nasty = "<script>alert(1)</script><img src=x onerror=alert(1)>"
     served = serve()
-    network = served.run._env.network
+    network = served.env.network
     # To be undone: worlds of one process share the network of a map.
     monkeypatch.setitem(vars(network), "lane_ids", (nasty,) * len(network.lane_ids))
     page, problems, _ = opened(browser, served)

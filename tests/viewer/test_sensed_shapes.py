@@ -28,10 +28,7 @@ RIG = {
 def told() -> Any:
     """Details of an agent with all kinds of sensors, its frame and its environment."""
     grid = {"features": ["presence", "on_road"], "align_to_vehicle_axes": True}
-    sensors = {
-        "sensors.lidar.rays": 72,
-        "sensors.occupancy_grid": grid,
-    }
+    sensors = {"sensors.lidar.rays": 72, "sensors.occupancy_grid": grid}
     env = parallel_env("merge", agents=4, background=20, overrides={"rig": RIG, **sensors})
     env.reset(seed=3)
     for _ in range(20):

@@ -92,8 +92,8 @@ def test_requests_reach_the_world(serve: Serve) -> None:
         assert told["here"]
         rows = dict(told["rows"])
         assert rows["agent"] == "car_0"
-        assert [name for name, _ in told["terms"]] == list(served.run._env.config.terms.names)
-        assert len(told["observation"]) == served.run._env.observation_space("car_0").shape[0]
+        assert [name for name, _ in told["terms"]] == list(served.env.config.terms.names)
+        assert len(told["observation"]) == served.env.observation_space("car_0").shape[0]
         client.send('{"kind": "watch", "number": 99999}')
         assert first_of(client, "vehicle") == {
             "kind": "vehicle", "id": 99999, "here": False, "rows": [],
@@ -103,25 +103,21 @@ def test_requests_reach_the_world(serve: Serve) -> None:
             pass
 
 
-def test_a_seat_is_driven_by_one_page_and_given_back(serve: Serve) -> None:
+def test_a_seat_is_driven_by_one_page_and_given_back(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
     served = serve(drives=False)
-    run = served.run
+    noted, run = served.note_actions(monkeypatch), served.run
     with welcome(served.server) as one, welcome(served.server) as other:
         for client, number in ((one, 1), (other, 2)):
             first_of(client, 1)
             client.send('{"kind": "seat", "number": 0}')
-            turns_until(served, lambda: bool(run._seats))
+            turns_until(served, lambda: bool(run.seats))
             told = first_of_turning(served, client)
             assert (told["agent"], bool(told["reason"])) == ((0, False), (None, True))[number - 1]
         one.send('{"kind": "drive", "throttle": 1.0, "steering": 0.5}')
-        turns_until(served, lambda: bool(run._driving))
-        watcher = run._seats[0]
-        assert run._driving[watcher][1:] == (1.0, 0.5)
-        actions: dict[str, Any] = {"car_0": None, "car_1": None}
-        run._take_seats(actions)
-        assert actions["car_0"].tolist() == [1.0, 0.5]
-        assert actions["car_1"] is None
-    turns_until(served, lambda: not run._seats)
+        turns_until(served, lambda: [1.0, 0.5] in [action.tolist() for action in noted])
+    turns_until(served, lambda: not run.seats)
 
 
 def turns_until(served: Served, is_so: Callable[[], bool]) -> None:
@@ -225,14 +221,16 @@ def test_a_token_to_watch_gives_no_control(serve: Serve) -> None:
 
 
 def test_other_machines_are_only_served_with_a_token() -> None:
-    with pytest.raises(ServiceError, match=r"--host 0\.0\.0\.0: others can reach it; give a --to"):
+    with pytest.raises(
+        ServiceError, match=r"--host 0\.0\.0\.0: reachable from outside; give a --to"
+    ):
         WebServer(WebOptions(host="0.0.0.0", port=0), [])
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("nonsense", "no JSON"),
+        ("nonsense", "not valid JSON"),
         ("[1]", "a list"),
         ('{"kind": "fly"}', "'fly'"),
         ('{"kind": "watch", "number": -1}', "whole number"),

@@ -76,11 +76,7 @@ def test_who_has_crossed_or_soon_will_is_told_of(
 
 
 def _margins(
-    partition: ZonePartition,
-    zone: int,
-    hysteresis_m: float,
-    ahead_s: float,
-    rows: NDArray[np.void],
+    partition: ZonePartition, zone: int, hysteresis_m: float, ahead_s: float, rows: NDArray[np.void]
 ) -> list[float]:
     """How far each vehicle is from where the answer changes."""
     rect = partition.reaching[zone]

@@ -26,10 +26,7 @@ def equal_around(place: Place, net: Path, folder: Path, *, crossings: int, steps
     """Four zones that meet at the place, and nine whose cuts lie around it."""
     x, y = (float(v) for v in place[:2])
     bounds = bounds_around(load_network(net))
-    for name, xs, ys in (
-        ("four", [x], [y]),
-        ("nine", [x - 6.0, x + 6.0], [y - 6.0, y + 6.0]),
-    ):
+    for name, xs, ys in (("four", [x], [y]), ("nine", [x - 6.0, x + 6.0], [y - 6.0, y + 6.0])):
         layout = cut_at(folder / f"{name}.json", bounds, xs, ys)
         found = verify_zones(
             net, layout=layout, steps=steps, agents=12, background=100, overrides=FAST

@@ -79,11 +79,7 @@ def spread(data: st.DataObject, partition: ZonePartition) -> list[NDArray[np.voi
     st.sampled_from([0.0, 3.0]),
 )
 def test_exchange_equals_twin(
-    data: st.DataObject,
-    partition: ZonePartition,
-    halo_m: float,
-    touching_m: float,
-    border_m: float,
+    data: st.DataObject, partition: ZonePartition, halo_m: float, touching_m: float, border_m: float
 ) -> None:
     parts = spread(data, partition)
     zoned = exchanged(partition, halo_m, parts, touching_m, Borders(2.0, 1.0, border_m))

@@ -19,13 +19,7 @@ from cavmarl.zones.kernels.visibility_scratch import make_scratch
 from cavmarl.zones.kernels.visibility_tests import farthest_m, find_looks
 from cavmarl.zones.kernels.zone_lookup import LOOK
 from cavmarl.zones.partition.zone_layouts import cut_map
-from cavmarl.zones.reach import (
-    APPROACH_M,
-    ASIDE_M,
-    driving_reach_m,
-    longest_move_m,
-    off_lane_m,
-)
+from cavmarl.zones.reach import APPROACH_M, ASIDE_M, driving_reach_m, longest_move_m, off_lane_m
 from cavmarl.zones.visibility import Visibility
 from tests.support.driving import drive, make_traffic, start
 from tests.support.netgenerate import netgenerate

@@ -17,12 +17,7 @@ from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.zones.kernels.visibility_scratch import make_scratch
-from cavmarl.zones.kernels.visibility_tests import (
-    ASIDE_M,
-    ROUNDING_M,
-    farthest_m,
-    find_looks,
-)
+from cavmarl.zones.kernels.visibility_tests import ASIDE_M, ROUNDING_M, farthest_m, find_looks
 from cavmarl.zones.kernels.zone_lookup import LOOK
 from tests.naive.looks import STEP_M, Looks
 from tests.support.junction_scenes import build_crossing, with_shorter_lane

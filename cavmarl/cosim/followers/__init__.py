@@ -1,1 +1,1 @@
-"""External stacks that follow a world's clock: a socket, its messages, and both of its ends."""
+"""External stacks that follow a world's clock: a socket, its messages, and both ends."""

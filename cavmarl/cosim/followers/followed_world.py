@@ -1,12 +1,12 @@
-"""`FollowedWorld`: one world whose time a master advances and whose agents followers drive.
+"""`FollowedWorld`: one world whose time a master advances and whose agents are driven by followers.
 
-A cycle is that of Algorithm 1 of the co-simulation paper: the controls that were queued take
-effect, the world ticks, sensors deliver the frame of t + Δt, each follower computes u from it, and
-u is queued for the next cycle. The cycle ends when every follower has answered, so that a slow one
-holds the world and no frame is left out.
+A cycle is that of Algorithm 1 of the co-simulation paper: the queued controls take effect, the
+world ticks, sensors deliver the frame of t + Δt, each follower computes u from it, and u is queued
+for the next cycle. The cycle ends when every follower has answered. So a slow follower holds the
+world, and no frame is skipped.
 
-Followers are served in the order of the first agent that they drive, those that drive none behind,
-by name. Answers may arrive in any order: nothing depends on it.
+Followers are served in the order of their first agent; followers without agents come last, by name.
+Answers may arrive in any order without effect on the result.
 """
 
 from __future__ import annotations
@@ -35,30 +35,29 @@ from cavmarl.env.parallel import CavEnv
 class FollowedWorld:
     """A master, its world, and a socket for followers.
 
-    Agents that no follower drives are driven by the built-in driver, those too whose follower is
-    gone.
+    The built-in driver drives all agents without a follower, including those whose follower has
+    left.
 
     Args:
-        env: the world, in this process or run by workers; it is mastered until `close`.
-        address: path of a Unix socket, or a port of this machine, 0: any.
-        secret: that followers have to say; a port needs one, for all users can call it.
-        timeout_s: for so long a step waits for its followers, by the wall clock.
-        own_ticks: what becomes of a follower's own tick; see `TimeMaster`.
+        env: the world, in this process or run by workers; it has a master until `close`.
+        address: path of a Unix socket, or a port of this machine, 0: any free port.
+        secret: required from followers; necessary for a port, which all users can connect to.
+        timeout_s: maximum time that a step waits for its followers, by the wall clock.
+        own_ticks: handling of a follower's own ticks; see `TimeMaster`.
         on_drift: see `TimeMaster`.
-        bad_controls: what becomes of controls that cannot be carried out: `error`: its follower is
-            let go with a `FollowerError`; `hold`: the vehicle's last ones are used, and it is
-            counted.
-        pacer: how fast by the wall clock; None: as fast as it goes.
-        trace: notes the phases of each step.
+        bad_controls: handling of invalid controls: `error`: the follower is dropped with a
+            `FollowerError`; `hold`: the vehicle's last controls are used, and counted.
+        pacer: pace by the wall clock; None: as fast as possible.
+        trace: records the phases of each step.
 
     Attributes:
-        master: of the time.
-        address: where followers call.
+        master: the master of the time.
+        address: where followers connect.
 
     Raises:
-        ConfigError: no process can listen there, a port without a secret, or a trace of a world
-            that workers run.
-        ClockError: the environment has a master.
+        ConfigError: the address cannot be opened, a port has no secret, or a trace is given for a
+            world that workers run.
+        ClockError: the environment already has a master.
     """
 
     def __init__(
@@ -109,9 +108,9 @@ class FollowedWorld:
         return not self.env.agents
 
     def wait_for(self, followers: int, within_s: float) -> None:
-        """Wait until so many follow.
+        """Wait until this many followers have joined.
 
-        Raises FollowerLostError: they have not come in time.
+        Raises FollowerLostError: too few have joined in time.
         """
         until_s = time.monotonic() + within_s
         while len(self._seats) < followers:
@@ -119,18 +118,18 @@ class FollowedWorld:
             if left_s <= 0.0:
                 raise FollowerLostError(
                     f"{len(self._seats)} of {followers} followers have called {self.address} "
-                    f"within {within_s:g} s: start them with `cavmarl follow "
+                    f"within {within_s:g} s; start them with `cavmarl follow "
                     f"ENV --at {self.address}`",
                     is_late=True,
                 )
-            self._admit(left_s)
+            self.admit(left_s)
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin an episode, and let followers see it.
+        """Start an episode and send its first snapshot to the followers.
 
         Raises FollowerError: see `step`.
         """
-        self._admit(0.0)
+        self.admit(0.0)
         self.master.reset(seed)
         self._episode += 1
         self._queued.clear()
@@ -138,20 +137,19 @@ class FollowedWorld:
         self._exchange(self._seats)
 
     def step(self) -> dict[str, float]:
-        """One cycle; rewards by agent.
+        """Run one cycle and return the rewards by agent.
 
         Raises:
-            EpisodeError: no follower is left to go on with.
-            FollowerLostError: a follower has not answered in time; it is let go. The world has gone
-                on by one step, and the next call goes on from there; the same, where a follower has
-                ended.
-            FollowerError: the same, where its words cannot be read, or its controls cannot be
-                carried out.
+            EpisodeError: the episode is over.
+            FollowerLostError: a follower has not answered in time, or has ended; it is dropped. The
+                world has advanced by one step, and the next call continues from there.
+            FollowerError: as before, but the follower's messages are invalid, or its controls
+                cannot be carried out.
             ClockError: another caller has advanced the world.
         """
         if self.is_over:
-            raise EpisodeError("the episode is over: call FollowedWorld.reset()")
-        self._admit(0.0)
+            raise EpisodeError("the episode is over; call FollowedWorld.reset()")
+        self.admit(0.0)
         self._exchange([seat for seat in self._seats if seat.frame < self._frame])
         agents = self.env.agents
         actions = {agent: self._queued[agent] for agent in agents if agent in self._queued}
@@ -164,12 +162,12 @@ class FollowedWorld:
         return dict(rewards)
 
     def manifest(self) -> dict[str, Any]:
-        """What a result depends on: the followers, and when controls take effect."""
+        """Return what a result depends on: the followers, and when controls take effect."""
         clock = self.env.config.clock
         return {
             "sim_dt_s": clock.sim_dt_s,
             "ctrl_dt_s": clock.ctrl_dt_s,
-            "control_latency_steps": 1,  # queued for the next cycle, as Algorithm 1 has it
+            "control_latency_steps": 1,  # queued for the next cycle, as in Algorithm 1
             "control_latency_ticks": clock.control_latency_ticks,
             "followers": [
                 {"name": seat.clock.name, "agents": self._names(seat.agents)}
@@ -178,7 +176,7 @@ class FollowedWorld:
         }
 
     def close(self) -> None:
-        """Say goodbye to all followers, and let the environment go; again: nothing to do."""
+        """Send goodbye to all followers and release the environment; repeated calls do nothing."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -194,7 +192,8 @@ class FollowedWorld:
         if not isinstance(self.address, int):
             Path(self.address).unlink(missing_ok=True)
 
-    def _admit(self, within_s: float) -> None:
+    def admit(self, within_s: float) -> None:
+        """Seat followers that have introduced themselves; wait up to `within_s` for the first."""
         for line, hello in self._reception.callers(within_s):
             try:
                 self._seat(line, hello)
@@ -209,24 +208,24 @@ class FollowedWorld:
         self._seats.sort(key=lambda each: each.rank)
 
     def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:
-        """The agents that a newcomer wants.
+        """Return the indices of the agents that a new follower requests.
 
-        Raises FollowerError: there are none of that name, or another follower drives them.
+        Raises FollowerError: an agent does not exist, or another follower drives it.
         """
         known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
         taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}
         for agent in vehicles:
             if agent not in known:
                 raise FollowerError(
-                    f"no agent '{agent[:80]}': there are {self.env.possible_agents[0]} to "
+                    f"no agent '{agent[:80]}'; choose among {self.env.possible_agents[0]} to "
                     f"{self.env.possible_agents[-1]}"
                 )
             if known[agent] in taken:
                 raise FollowerError(
-                    f"{agent} is driven by '{taken[known[agent]]}': ask for another one"
+                    f"{agent} is driven by '{taken[known[agent]]}'; request another agent"
                 )
         if len(set(vehicles)) < len(vehicles):
-            raise FollowerError("an agent was asked for twice")
+            raise FollowerError("an agent is requested twice; name each once")
         return tuple(sorted(known[agent] for agent in vehicles))
 
     def _names(self, agents: Iterable[int]) -> list[str]:
@@ -244,10 +243,10 @@ class FollowedWorld:
         self._moment = SnapshotTime(self._frame, self._episode, tick, self.is_over)
 
     def _exchange(self, seats: Sequence[FollowerSeat]) -> None:
-        """Let followers see the world as it is, and queue what they do.
+        """Send snapshots of the world and queue the followers' controls.
 
-        Raises FollowerError: of the first one, in their order, with which it cannot go on; what the
-        others do is queued all the same.
+        Raises FollowerError: that of the first follower, in their order, with which the world
+        cannot continue; the controls of the others are queued anyway.
         """
         if self._episode < 0 or not seats:
             return

@@ -1,4 +1,4 @@
-"""`Barrier` sends every follower its snapshot and waits for all of their controls."""
+"""`Barrier` sends every follower its snapshot and waits for the controls of all."""
 
 from __future__ import annotations
 
@@ -22,40 +22,40 @@ BadControls = Literal["error", "hold"]
 
 @dataclass(eq=False)
 class FollowerSeat:
-    """A follower, as the world knows it."""
+    """A follower as seen by the world."""
 
     line: FollowerConnection
-    clock: TimeFollower  # its place at the master's clock
-    agents: tuple[int, ...]  # indices of the agents that it drives, rising
-    frame: int = -1  # of the last snapshot that it was sent; -1: none yet
-    held: dict[str, Any] = field(default_factory=dict)  # the last controls of its vehicles
-    answers: int = 0  # controls that it has sent in time
-    late: int = 0  # answers to earlier snapshots, which were thrown away
-    bad: int = 0  # controls of a vehicle that could not be carried out
-    wait_wall_s: float = 0.0  # how long the world has waited for it, by the wall clock
-    slowest: int = 0  # in how many steps it was the last one to answer
+    clock: TimeFollower  # its view of the master's clock
+    agents: tuple[int, ...]  # indices of the agents that it drives, ascending
+    frame: int = -1  # of the last snapshot sent to it; -1: none yet
+    held: dict[str, Any] = field(default_factory=dict)  # last controls of its vehicles
+    answers: int = 0  # number of controls sent in time
+    late: int = 0  # number of answers to earlier snapshots, which are discarded
+    bad: int = 0  # number of invalid controls of a vehicle
+    wait_wall_s: float = 0.0  # time that the world has waited for it, by the wall clock
+    slowest: int = 0  # number of steps in which it was the last to answer
 
     @property
     def rank(self) -> tuple[float, str]:
-        """What followers are ordered by: their first agent, then the name."""
+        """Sort key of followers: their first agent, then the name."""
         return (self.agents[0] if self.agents else float("inf"), self.clock.name)
 
 
 @dataclass
 class BarrierOutcome:
-    """What has come of one barrier."""
+    """The result of one barrier."""
 
     actions: dict[str, Any] = field(default_factory=dict)  # by agent
-    # followers with which the world cannot go on, and why
+    # followers with which the world cannot continue, and the reasons
     failed: dict[FollowerSeat, FollowerError] = field(default_factory=dict)
-    left: list[FollowerSeat] = field(default_factory=list)  # followers that have said goodbye
+    left: list[FollowerSeat] = field(default_factory=list)  # followers that have sent goodbye
 
 
 class Barrier:
-    """Asks followers and waits for them.
+    """Sends snapshots and waits for the followers' answers.
 
-    `timeout_s`: for so long all of them together may take, by the wall clock. `bad_controls`:
-    `error`: a follower that sends them fails; `hold`: the vehicle's last ones are used.
+    `timeout_s`: maximum time for all of them together, by the wall clock. `bad_controls`:
+    `error`: a follower that sends invalid controls fails; `hold`: the vehicle's last ones are used.
     """
 
     def __init__(self, env: CavEnv, timeout_s: float, bad_controls: BadControls) -> None:
@@ -64,9 +64,9 @@ class Barrier:
         self._bad_controls = bad_controls
 
     def pass_through(self, seats: Sequence[FollowerSeat], moment: SnapshotTime) -> BarrierOutcome:
-        """Send each its snapshot, and hear what its vehicles do.
+        """Send each follower its snapshot and receive its controls.
 
-        `seats`: in the order in which they are served. `moment`: of the snapshots.
+        `seats`: in the order of service. `moment`: time of the snapshots.
         """
         found = BarrierOutcome()
         asked: dict[FollowerSeat, list[str]] = {}
@@ -77,7 +77,7 @@ class Barrier:
             try:
                 seat.line.say(Say.SNAPSHOT, snapshot, arrays, self._timeout_s)
             except FollowerLostError as error:
-                if error.is_late:  # else its last words are heard below: it may have said goodbye
+                if error.is_late:  # else the messages read below may contain its goodbye
                     found.failed[seat] = error
                     del asked[seat]
         if moment.is_over or not asked:
@@ -95,7 +95,7 @@ class Barrier:
     def _collect(
         self, asked: Mapping[FollowerSeat, list[str]], moment: SnapshotTime, found: BarrierOutcome
     ) -> dict[FollowerSeat, Mapping[str, Any]]:
-        """Hear all followers' controls, in the order in which they come."""
+        """Receive the controls of all followers in the order in which they arrive."""
         answers: dict[FollowerSeat, Mapping[str, Any]] = {}
         began = time.monotonic()
         with selectors.DefaultSelector() as selector:
@@ -108,7 +108,7 @@ class Barrier:
                     try:
                         if not ready:
                             raise seat.line.too_late("answered", self._timeout_s)
-                        if not self._hear(seat, moment, answers, found, left_s):
+                        if not self._receive(seat, moment, answers, found, left_s):
                             continue
                     except FollowerError as error:
                         found.failed[seat] = error
@@ -118,7 +118,7 @@ class Barrier:
         last.slowest += 1
         return answers
 
-    def _hear(
+    def _receive(
         self,
         seat: FollowerSeat,
         moment: SnapshotTime,
@@ -126,15 +126,15 @@ class Barrier:
         found: BarrierOutcome,
         within_s: float,
     ) -> bool:
-        """One frame of a follower; whether it is done.
+        """Receive one frame of a follower; return whether the follower is done.
 
-        Raises FollowerError: the world cannot go on with it.
+        Raises FollowerError: the world cannot continue with it.
         """
-        # What has arrived in time is read even if that was just before the end.
+        # A frame that arrived just before the deadline is still read.
         within_s = max(within_s, 1e-3)
-        heard = seat.line.hear(within_s)
-        seat.line.skip(heard)
-        match heard.kind:
+        frame = seat.line.hear(within_s)
+        seat.line.skip(frame)
+        match frame.kind:
             case Say.TICK:
                 self._answer_tick(seat, within_s)
                 return False
@@ -142,10 +142,10 @@ class Barrier:
                 found.left.append(seat)
                 return True
             case Say.CONTROL:
-                control = read_payload(Control, heard.payload)
+                control = read_payload(Control, frame.payload)
             case kind:
                 raise FollowerError(
-                    f"{seat.line.name} says {kind.name}: controls of frame {moment.frame} are due"
+                    f"{seat.line.name} sent {kind.name}; controls of frame {moment.frame} are due"
                 )
         if control.frame > moment.frame:
             raise FollowerError(
@@ -169,14 +169,14 @@ class Barrier:
     def _checked(
         self, seat: FollowerSeat, controls: Mapping[str, Any], vehicles: Sequence[str]
     ) -> dict[str, Any]:
-        """The actions of a follower's vehicles.
+        """Return the actions of a follower's vehicles.
 
-        Raises FollowerError: they cannot be carried out, and `bad_controls` is `error`.
+        Raises FollowerError: an action is invalid, and `bad_controls` is `error`.
         """
-        strangers = controls.keys() - set(vehicles)
-        if strangers:
+        unknown = controls.keys() - set(vehicles)
+        if unknown:
             raise FollowerError(
-                f"{seat.line.name}: controls of {min(strangers)[:80]}, which is not in the frame"
+                f"{seat.line.name}: controls of {min(unknown)[:80]}, which is not in the frame"
             )
         checked: dict[str, Any] = {}
         for vehicle in vehicles:
@@ -195,9 +195,9 @@ class Barrier:
 
 
 def _action(vehicle: str, controls: Mapping[str, Any]) -> Any:
-    """One vehicle's action.
+    """Return one vehicle's action.
 
-    Raises FollowerError: there is none.
+    Raises FollowerError: it is missing.
     """
     if vehicle not in controls:
         raise FollowerError(f"no controls of {vehicle}, which is in the frame")

@@ -1,4 +1,4 @@
-"""`Follower`: the stack's end of the connection to a world."""
+"""`Follower`: a stack's end of the connection to a world."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ CALL_S = 10.0
 
 @dataclass(frozen=True)
 class Samples:
-    """What one sensor has since the last snapshot."""
+    """The samples of one sensor since the last snapshot."""
 
-    values: NDArray[Any]  # (n, …) one sample a row, the newest last
-    stamps_s: NDArray[np.float64]  # (n,) when each was taken, in simulated time since the reset
-    lost: NDArray[np.bool_]  # (n,) which were lost: zeros
+    values: NDArray[Any]  # (n, …) one sample per row, the newest last
+    stamps_s: NDArray[np.float64]  # (n,) time of each, in simulated time since the reset
+    lost: NDArray[np.bool_]  # (n,) which samples were lost; their values are 0
 
 
 @dataclass(frozen=True)
 class FollowerView:
-    """One snapshot."""
+    """One snapshot, with its arrays by vehicle and sensor."""
 
-    snapshot: FollowerSnapshot  # the clock, and the vehicles that have to be driven
-    # by vehicle and name of the sensor; those that are due. What is of the whole map stands under
-    # no name.
+    snapshot: FollowerSnapshot  # the clock, and the vehicles to drive
+    # sensors with new samples, by vehicle and sensor name. Data of the whole map have the vehicle
+    # name "".
     sensors: Mapping[str, Mapping[str, Samples]]
 
 
@@ -48,20 +48,20 @@ class Follower:
     """Follows a world's clock: waits for snapshots and answers them.
 
         with Follower("/tmp/town.sock", vehicles=["car_0"]) as follower:
-            for sight in follower:
+            for view in follower:
                 follower.answer({"car_0": [0.2, 0.0]})
 
     `address`: path of a Unix socket, or a port of this machine. `vehicles`: agents to drive; none:
-    it follows the clock only, and answers with {}. `joins_s`: how long the world may take to
-    welcome us, which it does between two steps; None: for ever. `secret`: of the world, if it
+    it only follows the clock and answers with {}. `joins_s`: maximum time for the world to accept
+    the follower, which it does between two steps; None: no limit. `secret`: of the world, if it
     listens at a port.
 
     Attributes:
-        welcome: how time goes in that world.
+        welcome: the world's clock and sensors.
 
     Raises:
         FollowerLostError: no process listens there.
-        FollowerError: the listener there refuses this follower, or speaks another version.
+        FollowerError: the world refuses this follower, or uses another version of the protocol.
     """
 
     def __init__(
@@ -88,45 +88,45 @@ class Follower:
         self.close()
 
     def __iter__(self) -> Iterator[FollowerView]:
-        """Snapshots, until the world says goodbye; each but those of an end has to be answered.
+        """Yield snapshots until the world sends goodbye; answer each unless its episode is over.
 
-        Raises FollowerLostError: the world has ended without a goodbye; FollowerError: what it says
-        cannot be understood, or a frame is missing; it does not go on with us.
+        Raises FollowerLostError: the world has ended without a goodbye; FollowerError: the world
+        refuses this follower, its message is invalid, or a frame is missing.
         """
-        while (sight := self.wait()) is not None:
-            yield sight
+        while (view := self.wait()) is not None:
+            yield view
 
     def wait(self) -> FollowerView | None:
-        """The next snapshot, however long it takes; None: the world has said goodbye.
+        """Return the next snapshot without time limit; None: the world has sent goodbye.
 
-        Raises FollowerError: as of `__iter__`.
+        Raises FollowerError: as in `__iter__`.
         """
-        heard = self._expect(None, Say.SNAPSHOT, Say.GOODBYE)
-        if heard.kind is Say.GOODBYE:
+        frame = self._expect(None, Say.SNAPSHOT, Say.GOODBYE)
+        if frame.kind is Say.GOODBYE:
             return None
-        snapshot, arrays = self._line.take(heard)
+        snapshot, arrays = self._line.take(frame)
         if self._frame is not None and snapshot.frame != self._frame + 1:
-            raise FollowerError(f"frame {snapshot.frame} follows {self._frame}: one was left out")
+            raise FollowerError(f"frame {snapshot.frame} follows {self._frame}; a frame is missing")
         self._frame = snapshot.frame
         return sight_of(snapshot, arrays)
 
     def answer(self, controls: Mapping[str, Any]) -> None:
-        """Say what the vehicles of the last snapshot do in the next step.
+        """Send the controls of the last snapshot's vehicles for the next step.
 
         Args:
             controls: by vehicle: two numbers in [-1, 1], or the number of a choice.
 
         Raises:
-            FollowerLostError: the world is gone.
-            FollowerError: there was no snapshot.
+            FollowerLostError: the world has ended.
+            FollowerError: there has been no snapshot.
         """
         if self._frame is None:
-            raise FollowerError("answer() before the first snapshot: call wait()")
+            raise FollowerError("answer() before the first snapshot; call wait()")
         plain = {vehicle: _plain(given) for vehicle, given in controls.items()}
         self._line.say(Say.CONTROL, Control(self._frame, plain))
 
     def tick(self) -> Ticked:
-        """Try to advance the world, which a follower should not do; what has become of it.
+        """Try to advance the world, which a follower should not do; return the result.
 
         Raises ClockError: the world's master refuses.
         """
@@ -137,7 +137,7 @@ class Follower:
         return ticked
 
     def leave(self) -> None:
-        """Say goodbye in the place of an answer: the built-in driver goes on with the vehicles."""
+        """Send goodbye instead of an answer: the built-in driver takes over the vehicles."""
         self._line.say(Say.GOODBYE)
         self._line.close()
 
@@ -145,15 +145,15 @@ class Follower:
         self._line.close()
 
     def _expect(self, within_s: float | None, *kinds: Say) -> ReceivedFrame:
-        heard = self._line.hear(within_s)
-        if heard.kind in kinds:
-            if heard.kind is not Say.SNAPSHOT:
-                self._line.skip(heard)
-            return heard
-        if heard.kind is Say.REFUSAL:
-            self._line.skip(heard)
-            raise FollowerError(read_payload(FollowerRefusal, heard.payload).reason)
-        raise FollowerError(f"{self._line.name} says {heard.kind.name}, which is not due")
+        frame = self._line.hear(within_s)
+        if frame.kind in kinds:
+            if frame.kind is not Say.SNAPSHOT:
+                self._line.skip(frame)
+            return frame
+        if frame.kind is Say.REFUSAL:
+            self._line.skip(frame)
+            raise FollowerError(read_payload(FollowerRefusal, frame.payload).reason)
+        raise FollowerError(f"{self._line.name} sent {frame.kind.name}, which is not expected now")
 
 
 def sight_of(snapshot: FollowerSnapshot, arrays: Sequence[NDArray[Any]]) -> FollowerView:

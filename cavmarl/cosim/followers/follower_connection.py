@@ -1,6 +1,6 @@
 """`FollowerConnection`: one end of the connection between a world and a follower.
 
-`Reception` accepts followers while a world runs, without waiting for any of them.
+`Reception` accepts followers while a world runs, without waiting for them.
 """
 
 from __future__ import annotations
@@ -33,50 +33,50 @@ from cavmarl.cosim.followers.follower_messages import (
     payload_of,
     read_payload,
 )
-from cavmarl.parallel.network.framed_socket import HEAD_BYTES, FramedSocket, bytes_before_data
+from cavmarl.cosim.followers.framed_socket import HEAD_BYTES, FramedSocket, bytes_before_data
 
 Array = NDArray[Any]
 
-# A path of a Unix socket, or a port of this machine.
+# Path of a Unix socket, or a port of this machine.
 Address = str | Path | int
 
 LOOPBACK = "127.0.0.1"
-MAX_PATH = 100  # bytes that every system takes for a Unix socket
-# Dtypes of arrays, as NumPy writes them: numbers, and nothing that points anywhere.
+MAX_PATH = 100  # maximum number of bytes of a Unix socket's path on every system
+# Dtypes of arrays in NumPy's notation: only numbers, no pointers.
 _DTYPES = {np.dtype(code).newbyteorder("<").str for code in "?bBhHiIqQefd"}
 _MAX_AXES = 8
 
 
 class ReceivedFrame(NamedTuple):
-    """One frame."""
+    """One received frame."""
 
-    kind: Say  # what it says
-    payload: Any  # as msgpack knows it
-    size: int  # bytes of its data
+    kind: Say  # kind of the frame
+    payload: Any  # as decoded by msgpack
+    size: int  # number of bytes of its data
 
 
-class _Patient(socket.socket):
-    """A socket that has until a deadline for all calls together, and can read ahead."""
+class _DeadlineSocket(socket.socket):
+    """A socket with one deadline for all calls, and with a buffer for reading ahead."""
 
-    until_s: float | None = None  # by `time.monotonic`; None: for ever
-    ahead = b""  # has been read, and is taken next
+    until_s: float | None = None  # by `time.monotonic`; None: no deadline
+    ahead = b""  # bytes that have been read and are returned next
 
     def read_ahead(self, size: int) -> bool:
-        """Whether so many bytes have come by now, which are kept; this does not wait.
+        """Return whether `size` bytes have arrived, without waiting; they are kept for reading.
 
         Raises:
-            EOFError: the other end has ended.
+            EOFError: the other end has closed.
         """
         self.settimeout(0.0)
         with suppress(BlockingIOError):
             while len(self.ahead) < size:
                 more = self.recv(size - len(self.ahead))
                 if not more:
-                    raise EOFError("the connection has ended")
+                    raise EOFError("the connection is closed")
                 self.ahead += more
         return len(self.ahead) >= size
 
-    def _hurry(self) -> None:
+    def _set_timeout(self) -> None:
         if self.until_s is None:
             self.settimeout(None)
             return
@@ -90,23 +90,23 @@ class _Patient(socket.socket):
             count = min(len(buffer), len(self.ahead))
             buffer[:count], self.ahead = self.ahead[:count], self.ahead[count:]
             return count
-        self._hurry()
+        self._set_timeout()
         return super().recv_into(buffer, *arguments, **named)
 
     def sendmsg(self, *arguments: Any, **named: Any) -> int:
-        self._hurry()
+        self._set_timeout()
         return super().sendmsg(*arguments, **named)
 
 
 class FollowerConnection:
-    """Sends and hears frames; whatever goes wrong with the other end is a `FollowerError`.
+    """Sends and receives frames; any fault of the other end is raised as a `FollowerError`.
 
-    `connection`: a connected socket, which the line owns from here on. `name`: of the other end,
-    for people. `cure`: what can be done when that is gone, as the end of a sentence.
+    `connection`: a connected socket, owned by this object from now on. `name`: of the other end,
+    for messages. `cure`: advice for when the other end is lost, as the end of a sentence.
     """
 
     def __init__(self, connection: socket.socket, name: str, cure: str = "") -> None:
-        self._socket = _Patient(fileno=connection.detach())
+        self._socket = _DeadlineSocket(fileno=connection.detach())
         self._wire = FramedSocket(self._socket, FOLLOWERS)
         self.name = name
         self._cure = f"; {cure}" if cure else ""
@@ -124,62 +124,62 @@ class FollowerConnection:
         """Send one frame.
 
         Args:
-            kind: what it says.
-            message: one of `messages`; None: nothing.
-            arrays: contiguous.
-            within_s: for so long it may take.
+            kind: kind of the frame.
+            message: one of `follower_messages`; None: no payload.
+            arrays: contiguous arrays.
+            within_s: time limit.
 
         Raises:
-            FollowerLostError: the other end does not read; the other end is gone.
+            FollowerLostError: the other end does not read, or has ended.
         """
-        self._allow(within_s)
+        self._set_deadline(within_s)
         payload = None if message is None else payload_of(message)
-        with self._blaming("read", within_s):
+        with self._peer_errors("read", within_s):
             self._wire.send(kind, 0, payload, arrays)
 
     def hear(self, within_s: float | None = None) -> ReceivedFrame:
-        """The next frame; its data then have to be taken (`take`) or left out (`skip`).
+        """Receive the next frame; then read its data with `take` or `skip`.
 
-        Raises FollowerLostError: there is none in time; the other end is gone; FollowerError: this
-        is no frame, or one of another version.
+        Raises FollowerLostError: none arrives in time, or the other end has ended; FollowerError:
+        the frame is invalid or of another version.
         """
-        self._allow(within_s)
-        with self._blaming("answered", within_s):
+        self._set_deadline(within_s)
+        with self._peer_errors("answered", within_s):
             frame = self._wire.receive()
         return ReceivedFrame(Say(frame.kind), frame.payload, frame.size)
 
     def has_come(self) -> bool:
-        """Whether the next frame is here but for its data, so that `hear` does not wait.
+        """Return whether the next frame has arrived except for its data; then `hear` does not wait.
 
-        Raises FollowerError: as of `hear`.
+        Raises FollowerError: as in `hear`.
         """
-        with self._blaming("introduced itself", None):
+        with self._peer_errors("introduced itself", None):
             if not self._socket.read_ahead(HEAD_BYTES):
                 return False
             head = self._socket.ahead[:HEAD_BYTES]
             return self._socket.read_ahead(bytes_before_data(head, FOLLOWERS))
 
-    def skip(self, heard: ReceivedFrame) -> None:
-        """Leave out the data of what was heard.
+    def skip(self, frame: ReceivedFrame) -> None:
+        """Check that a frame has no data, and finish reading it.
 
-        Raises FollowerError: as of `hear`; and there are some, where none belong.
+        Raises FollowerError: as in `hear`; or the frame has data.
         """
-        if heard.size:
+        if frame.size:
             raise FollowerError(
-                f"{self.name}: {heard.size} bytes of data with a {heard.kind.name}: it has none"
+                f"{self.name}: {frame.size} bytes of data with a {frame.kind.name}, which has none"
             )
         self._take([])
 
-    def take(self, heard: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
-        """The snapshot that was heard, with its arrays.
+    def take(self, frame: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
+        """Return the snapshot of a frame, with its arrays.
 
-        Raises FollowerError: as of `hear`.
+        Raises FollowerError: as in `hear`.
         """
-        snapshot = read_payload(FollowerSnapshot, heard.payload)
+        snapshot = read_payload(FollowerSnapshot, frame.payload)
         sizes = [_size(view) for view in snapshot.arrays]
-        if sum(sizes) != heard.size:
+        if sum(sizes) != frame.size:
             raise FollowerError(
-                f"{self.name}: {heard.size} bytes of data, but its arrays have {sum(sizes)}"
+                f"{self.name}: {frame.size} bytes of data, but its arrays have {sum(sizes)}"
             )
         arrays = [np.empty(view.shape, dtype=view.dtype) for view in snapshot.arrays]
         self._take(arrays)
@@ -189,12 +189,12 @@ class FollowerConnection:
         self._wire.close()
 
     def _take(self, arrays: list[Array]) -> None:
-        with self._blaming("sent its data", None):
+        with self._peer_errors("sent its data", None):
             self._wire.take(arrays)
 
     @contextmanager
-    def _blaming(self, what: str, within_s: float | None) -> Iterator[None]:
-        """Say of the other end what goes wrong while it should do `what`."""
+    def _peer_errors(self, what: str, within_s: float | None) -> Iterator[None]:
+        """Raise errors of the connection as errors of the other end, which had to do `what`."""
         try:
             yield
         except TimeoutError as error:
@@ -204,31 +204,31 @@ class FollowerConnection:
         except MessageError as error:
             raise FollowerError(f"{self.name}: {error}") from error
 
-    def _allow(self, within_s: float | None) -> None:
+    def _set_deadline(self, within_s: float | None) -> None:
         self._socket.until_s = None if within_s is None else time.monotonic() + within_s
 
     def too_late(self, what: str, within_s: float | None) -> FollowerLostError:
-        """The error that says that the other end has not done `what` in time."""
+        """Return the error of a peer that has not done `what` in time."""
         span = "in time" if within_s is None else f"within {within_s:.3g} s"
         return FollowerLostError(
-            f"{self.name} has not {what} {span}: it is dead, stopped or too slow{self._cure}",
+            f"{self.name} has not {what} {span}; it is dead, stopped or too slow{self._cure}",
             is_late=True,
         )
 
 
 def _size(view: ArrayView) -> int:
-    """Bytes of an array.
+    """Return the number of bytes of an array.
 
-    Raises FollowerError: of a dtype that holds no plain numbers, a shape that no array has, or
-    stamps of other samples.
+    Raises FollowerError: the dtype is not a plain number, the shape is invalid, or the number of
+    stamps differs from the number of samples.
     """
     shape, name = view.shape, view.name[:80]
     if view.dtype not in _DTYPES:
         known = ", ".join(sorted(_DTYPES))
-        raise FollowerError(f"{name}: dtype '{view.dtype[:80]}' is none of {known}")
+        raise FollowerError(f"{name}: dtype '{view.dtype[:80]}': must be one of {known}")
     is_shape = 1 <= len(shape) <= _MAX_AXES and all(length >= 0 for length in shape)
     if not is_shape or prod(length or 1 for length in shape) > FOLLOWERS.max_data:
-        raise FollowerError(f"{name}: no array has the shape {str(shape)[:80]}")
+        raise FollowerError(f"{name}: invalid shape {str(shape)[:80]}")
     if not len(view.stamps_s) == len(view.lost) == shape[0]:
         raise FollowerError(
             f"{name}: {shape[0]} samples with {len(view.stamps_s)} stamps, {len(view.lost)} marks"
@@ -239,11 +239,11 @@ def _size(view: ArrayView) -> int:
 def listen(address: Address) -> socket.socket:
     """Listen for followers, on this machine only.
 
-    A Unix socket lets in the users that the file system lets in, at first its owner. A port of the
-    loopback lets in every user on this machine.
+    A Unix socket admits the users that the file system admits, initially its owner. A port of the
+    loopback interface admits every user of this machine.
 
     Args:
-        address: a path for a Unix socket, which must not be there; or a port, 0: any that is free.
+        address: a path for a Unix socket, which must not exist; or a port, 0: any free port.
 
     Raises:
         ConfigError: the socket cannot be opened.
@@ -252,9 +252,9 @@ def listen(address: Address) -> socket.socket:
         try:
             return socket.create_server((LOOPBACK, address))
         except (OSError, OverflowError) as error:
-            raise ConfigError(f"port {address}: cannot listen there ({error})") from error
+            raise ConfigError(f"port {address}: cannot be opened ({error}); use another") from error
     path = _path_of(address)
-    _remove_leftover(path)
+    _remove_dead_socket(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     before = os.umask(0o177)
     try:
@@ -262,7 +262,7 @@ def listen(address: Address) -> socket.socket:
         listener.listen()
     except OSError as error:
         listener.close()
-        raise ConfigError(f"{path}: cannot listen there ({error})") from error
+        raise ConfigError(f"{path}: cannot be opened ({error}); use another path") from error
     finally:
         os.umask(before)
     return listener
@@ -271,7 +271,7 @@ def listen(address: Address) -> socket.socket:
 def call(address: Address, within_s: float) -> FollowerConnection:
     """Connect to a world that listens at an address.
 
-    Raises FollowerLostError: no process listens there; ConfigError: a path that no socket can have.
+    Raises FollowerLostError: no process listens there; ConfigError: the path is too long.
     """
     family = socket.AF_INET if isinstance(address, int) else socket.AF_UNIX
     place = (LOOPBACK, address) if isinstance(address, int) else str(_path_of(address))
@@ -282,7 +282,7 @@ def call(address: Address, within_s: float) -> FollowerConnection:
         connection.connect(place)
     except (OSError, OverflowError) as error:
         connection.close()
-        raise FollowerLostError(f"{where} does not answer ({error}): is it running?") from error
+        raise FollowerLostError(f"{where} does not answer ({error}); start it first") from error
     return FollowerConnection(connection, where)
 
 
@@ -293,8 +293,8 @@ def _path_of(address: str | Path) -> Path:
     return path
 
 
-def _remove_leftover(path: Path) -> None:
-    """Remove the socket of a world that has died, and nothing else."""
+def _remove_dead_socket(path: Path) -> None:
+    """Remove the socket of a world that has died, but no other file."""
     if not path.exists() or not stat.S_ISSOCK(path.stat().st_mode):
         return
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
@@ -304,26 +304,26 @@ def _remove_leftover(path: Path) -> None:
             path.unlink()
 
 
-GREETING_S = 5.0  # for a caller to introduce itself
-REFUSING_S = 0.01  # for the words of a refusal, which the system takes at once
-NO_DESCRIPTORS_S = 0.05  # until the next attempt to accept
-MAX_CALLERS = 64  # not introduced yet
+GREETING_S = 5.0  # time for a caller to introduce itself
+REFUSING_S = 0.01  # time for sending a refusal, which the system buffers at once
+NO_DESCRIPTORS_S = 0.05  # wait before the next attempt to accept
+MAX_CALLERS = 64  # maximum number of callers that have not introduced themselves
 GOES_ON = (
-    "the world is whole and can be stepped on, with the built-in driver in its place or another "
+    "the world is intact and can continue, with the built-in driver in its place or another "
     "follower"
 )
 
 
 class Reception:
-    """Listens at an address.
+    """Accepts followers at an address.
 
     Args:
         address: path of a Unix socket, or a port of this machine.
-        secret: that callers have to say; empty: none.
+        secret: required from callers; empty: none.
 
     Attributes:
-        address: where it listens; the port that was found, where any would do.
-        turned_away: how many callers were not understood, or said nothing.
+        address: where it listens; the chosen port if the given one was 0.
+        turned_away: number of callers that were refused.
 
     Raises:
         ConfigError: the socket cannot be opened.
@@ -346,18 +346,18 @@ class Reception:
         self._since: dict[FollowerConnection, float] = {}
 
     def callers(self, within_s: float = 0.0) -> Iterator[tuple[FollowerConnection, Hello]]:
-        """Followers that have introduced themselves since the last call, in order.
+        """Yield followers that have introduced themselves since the last call, in order.
 
         Args:
             within_s: how long to wait for the first; 0: not at all.
         """
-        heard = self._selector.select(within_s)
-        for key, _ in sorted(heard, key=lambda found: found[0].fd):
+        ready = self._selector.select(within_s)
+        for key, _ in sorted(ready, key=lambda found: found[0].fd):
             if key.fileobj is self._listener:
                 self._open()
                 continue
             line = key.data
-            if line not in self._since:  # made room for another one
+            if line not in self._since:  # already dropped to make room for another caller
                 continue
             try:
                 if not line.has_come():
@@ -369,14 +369,14 @@ class Reception:
                 continue
             self._forget(line)
             yield line, hello
-        self._dismiss_the_silent()
+        self._drop_silent_callers()
 
     def turn_away(self, line: FollowerConnection, reason: str) -> None:
         self.turned_away += 1
         refuse(line, reason)
 
     def close(self) -> None:
-        """Listen no more; a Unix socket's path is removed."""
+        """Stop listening."""
         for line in list(self._since):
             self._forget(line)
             line.close()
@@ -384,48 +384,50 @@ class Reception:
         self._listener.close()
 
     def _open(self) -> None:
-        """Accept all that call now; one too many takes the place of the one that waits longest."""
+        """Accept all present callers; if there are too many, the longest-waiting one is dropped."""
         for _ in range(MAX_CALLERS):
             try:
                 connection, _ = self._listener.accept()
-            except OSError as error:  # none calls any more, or it is gone already
+            except OSError as error:  # no more callers, or the caller has already gone
                 if error.errno in (errno.EMFILE, errno.ENFILE):
-                    self._find_descriptor()
+                    self._free_descriptor()
                 return
             line = FollowerConnection(connection, "a caller", GOES_ON)
             if len(self._since) == MAX_CALLERS:
-                self._dismiss_the_oldest("too many callers have not introduced themselves")
+                self._drop_oldest_caller("too many callers have not introduced themselves")
             self._since[line] = time.monotonic()
             self._selector.register(line, selectors.EVENT_READ, line)
 
-    def _find_descriptor(self) -> None:
-        """This process has none left: the next caller gets one of another caller, or waits."""
+    def _free_descriptor(self) -> None:
+        """Free a file descriptor by dropping a caller; without callers, wait."""
         if self._since:
-            self._dismiss_the_oldest("this process has no descriptors left")
+            self._drop_oldest_caller("this process has no descriptors left")
         else:
             time.sleep(NO_DESCRIPTORS_S)
 
-    def _dismiss_the_oldest(self, reason: str) -> None:
+    def _drop_oldest_caller(self, reason: str) -> None:
         line = next(iter(self._since))
         self._forget(line)
         self.turn_away(line, reason)
 
     def _greeting(self, line: FollowerConnection) -> Hello:
-        heard = line.hear()
-        if heard.kind is not Say.HELLO:
-            raise FollowerError(f"a caller begins with {heard.kind.name}: HELLO comes first")
-        line.skip(heard)
-        hello = read_payload(Hello, heard.payload)
+        frame = line.hear()
+        if frame.kind is not Say.HELLO:
+            raise FollowerError(f"a caller sent {frame.kind.name} first; it must be HELLO")
+        line.skip(frame)
+        hello = read_payload(Hello, frame.payload)
         if self._secret and not compare_digest(hello.secret.encode(), self._secret):
             raise FollowerError("a caller does not know the secret of this world")
         if not hello.name.isprintable():
             raise FollowerError("a caller's name has characters that cannot be printed")
         if len(hello.vehicles) > MAX_VEHICLES:
-            raise FollowerError(f"a caller wants {len(hello.vehicles)} vehicles")
+            raise FollowerError(
+                f"a caller requests {len(hello.vehicles)} vehicles; the limit is {MAX_VEHICLES}"
+            )
         line.name = f"follower '{hello.name[:80]}'"
         return hello
 
-    def _dismiss_the_silent(self) -> None:
+    def _drop_silent_callers(self) -> None:
         for line, since in list(self._since.items()):
             if time.monotonic() - since > GREETING_S:
                 self._forget(line)
@@ -437,7 +439,7 @@ class Reception:
 
 
 def refuse(line: FollowerConnection, reason: str) -> None:
-    """Tell a follower why it is not gone on with, if it still listens, and hang up."""
+    """Send a follower the reason why it is dropped, if it still listens, and close."""
     with suppress(FollowerError):
         line.say(Say.REFUSAL, FollowerRefusal(reason), within_s=REFUSING_S)
     line.close()

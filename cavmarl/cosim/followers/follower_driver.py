@@ -1,4 +1,4 @@
-"""`StackDriver`: one stack a vehicle, from snapshots to controls, wherever these come from."""
+"""`StackDriver`: one stack per vehicle, from snapshots to controls."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ from cavmarl.roads.network import RoadNetwork
 class StackDriver:
     """Drives the vehicles of a follower.
 
-    `network`: the map, which has to be the world's. `welcome`: how time goes there, and what the
-    vehicles carry.
+    `network`: the map, which must be the world's. `welcome`: the world's clock, and the sensors of
+    the vehicles.
 
     Attributes:
-        stacks: of the vehicles that are driven now, by agent.
+        stacks: of the present vehicles, by agent.
 
     Raises:
-        ConfigError: another map, sensors that a stage needs and does not have, or no
-            continuous actions.
+        ConfigError: the map differs, a stage lacks a sensor, or the actions are not continuous.
     """
 
     def __init__(
@@ -34,7 +33,7 @@ class StackDriver:
     ) -> None:
         if welcome.map_hash != network.source_hash:
             raise ConfigError(
-                f"{welcome.environment} is on another map than '{network.name}': give the stack "
+                f"{welcome.environment} is on another map than '{network.name}'; give the stack "
                 "the environment or the map file that the world was made from, and its keys of "
                 "`map` (--set map.buildings=…)"
             )
@@ -50,24 +49,24 @@ class StackDriver:
         self._scale = (welcome.acceleration_mps2, welcome.steering_rad)
         self._driven: dict[str, tuple[int, int]] = {}
         self.stacks: dict[str, Stack] = {}
-        Stack(self._vehicle, self._config)  # to know now what it lacks
+        Stack(self._vehicle, self._config)  # reports missing sensors before the first snapshot
 
-    def drive(self, sight: FollowerView) -> dict[str, list[float]]:
-        """What the vehicles of a snapshot do; a new vehicle gets a new stack."""
-        signals = sight.sensors.get("", {}).get("signals")
+    def drive(self, snapshot_view: FollowerView) -> dict[str, list[float]]:
+        """Return the controls of a snapshot's vehicles; a new vehicle gets a new stack."""
+        signals = snapshot_view.sensors.get("", {}).get("signals")
         shown = None if signals is None else np.asarray(signals.values[-1], dtype=np.uint8)
         controls = {}
-        for agent, view in sight.snapshot.vehicles.items():
-            stack = self._stack_of(agent, sight.snapshot.episode, view.vehicle_id)
+        for agent, view in snapshot_view.snapshot.vehicles.items():
+            stack = self._stack_of(agent, snapshot_view.snapshot.episode, view.vehicle_id)
             mission = self._mission(view)
-            readings = sight.sensors.get(agent, {})
-            driven = stack.drive(readings, shown, mission, sight.snapshot.time_s)
+            readings = snapshot_view.sensors.get(agent, {})
+            driven = stack.drive(readings, shown, mission, snapshot_view.snapshot.time_s)
             numbers = np.array(driven) / self._scale
             controls[agent] = np.clip(numbers, -1.0, 1.0).tolist()
         return controls
 
     def report(self) -> Mapping[str, Mapping[str, float]]:
-        """Mean and worst wall time of the stages, in ms, over the stacks of now."""
+        """Return mean and maximum wall time of each stage in ms, over the present stacks."""
         found: dict[str, dict[str, float]] = {}
         for stack in self.stacks.values():
             for stage, seconds in stack.times.wall_s.items():
@@ -88,5 +87,5 @@ class StackDriver:
 
     def _mission(self, view: VehicleView) -> Mission:
         if view.goal_edge not in self._edges:
-            raise FollowerError(f"no edge '{view.goal_edge[:80]}' on this map to drive to")
+            raise FollowerError(f"goal '{view.goal_edge[:80]}': this map has no such edge")
         return Mission(self._edges[view.goal_edge], view.vclass, view.length_m, view.width_m)

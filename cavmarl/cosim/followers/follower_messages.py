@@ -1,8 +1,8 @@
 """The messages between a world and its followers; docs/guides/cosimulation.md specifies them.
 
 A frame is that of `framed_socket`: a head, a payload in msgpack, and the bytes of arrays. A payload
-is data and never code. Each is one of these classes, as a map of its fields; a payload with other
-fields, or with values of other types, is refused.
+is data and never code. Each payload is one of these classes, as a map of its fields. A payload with
+other fields, or with values of other types, is refused.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from pydantic import (
 )
 
 from cavmarl.core.errors import FollowerError, require
-from cavmarl.parallel.network.framed_socket import Dialect
+from cavmarl.cosim.followers.framed_socket import Dialect
 
 T = TypeVar("T")
 
 _msgpack: Any = require("msgpack", "followers")
-_ADAPTERS: dict[type, TypeAdapter[Any]] = {}  # slow to make
+_ADAPTERS: dict[type, TypeAdapter[Any]] = {}  # cached, as they are slow to construct
 _CLOSED = ConfigDict(extra="forbid")
 
 VERSION = 1
@@ -40,14 +40,14 @@ MAX_VEHICLES = 4096
 class Say(IntEnum):
     """Kinds of frames, and their senders."""
 
-    HELLO = 0  # follower: I want these vehicles
-    WELCOME = 1  # world: they are yours, and this is how time goes here
-    SNAPSHOT = 2  # world: the clock, and what the sensors have
-    CONTROL = 3  # follower: what the vehicles do in the next step
-    TICK = 4  # follower: I want to tick by myself
-    TICKED = 5  # world: what has become of that
-    REFUSAL = 6  # world: why it does not go on with you
-    GOODBYE = 7  # either: there is nothing more to come
+    HELLO = 0  # follower: requests vehicles
+    WELCOME = 1  # world: accepts the request and describes its clock and sensors
+    SNAPSHOT = 2  # world: the clock, and the sensors' new samples
+    CONTROL = 3  # follower: controls of its vehicles for the next step
+    TICK = 4  # follower: requests a tick of its own
+    TICKED = 5  # world: result of that tick
+    REFUSAL = 6  # world: reason why it drops the follower
+    GOODBYE = 7  # either: end of the connection
 
 
 FOLLOWERS = Dialect(
@@ -65,10 +65,10 @@ FOLLOWERS = Dialect(
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class Hello:
-    """The first words of a follower."""
+    """The first message of a follower."""
 
     name: StrictStr
-    # agents that it wants to drive; none: it follows the clock only
+    # agents to drive; none: it only follows the clock
     vehicles: list[StrictStr] = field(default_factory=list)
     secret: StrictStr = ""  # of the world, if it listens at a port
 
@@ -76,75 +76,75 @@ class Hello:
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class SensorView:
-    """One sensor of every vehicle."""
+    """A sensor that every vehicle has."""
 
     name: StrictStr
     units: list[StrictStr]  # of its channels
-    # its keys in `env.yaml`: type, place on the vehicle, rate, range and so on
+    # its keys in `env.yaml`: type, mounting, rate, range and so on
     settings: dict[StrictStr, Any]
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class Welcome:
-    """The answer."""
+    """The world's answer to HELLO."""
 
     environment: StrictStr  # name and version
-    map_hash: StrictStr  # of the roads' source: a stack needs the same map
-    vehicles: list[StrictStr]  # those that the follower has been given
-    tick: StrictInt  # the master's, now
+    map_hash: StrictStr  # hash of the roads' source; a stack needs the same map
+    vehicles: list[StrictStr]  # agents assigned to the follower
+    tick: StrictInt  # the master's present tick
     dt_s: StrictFloat
     ticks_per_step: StrictInt  # ticks from one snapshot to the next
-    # that controls wait in the vehicle, after the step that they are for has begun
+    # ticks by which the vehicle delays controls after the start of their step
     control_latency_ticks: StrictInt
     action: StrictStr  # `continuous`, `discrete` or `grid`
-    acceleration_mps2: StrictFloat  # what 1 means as the first number of a control
-    steering_rad: StrictFloat  # what 1 means as the second
-    # of every vehicle; none: a snapshot has the `observation` of the environment
+    acceleration_mps2: StrictFloat  # acceleration for the first control at 1
+    steering_rad: StrictFloat  # steering angle for the second control at 1
+    # of every vehicle; none: snapshots contain the `observation` of the environment
     sensors: list[SensorView]
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class ArrayView:
-    """One array of a snapshot; its bytes lie in the frame's data, in the order of the list."""
+    """One array of a snapshot; its bytes are in the frame's data, in the order of the list."""
 
-    # whose; nothing: it is of the whole map, as `signals`: (1, links) what the signal of each link
-    # shows, as a SIGNAL_* code (255: it has none)
+    # its vehicle; empty: the whole map, as for `signals`: (1, links) the SIGNAL_* code that each
+    # link's signal shows (255: no signal)
     vehicle: StrictStr
     name: StrictStr
-    dtype: StrictStr  # as NumPy writes it, little-endian
-    shape: list[StrictInt]  # of the array; the first axis are samples
-    stamps_s: list[StrictFloat]  # when each was taken, in simulated time since the reset
-    lost: list[StrictBool]  # which of them were lost: zeros
+    dtype: StrictStr  # NumPy's notation, little-endian
+    shape: list[StrictInt]  # the first axis counts samples
+    stamps_s: list[StrictFloat]  # time of each sample, in simulated time since the reset
+    lost: list[StrictBool]  # which samples were lost; their values are 0
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class VehicleView:
-    """One of the follower's vehicles that is in the world."""
+    """A vehicle of the follower that is in the world."""
 
-    vehicle_id: StrictInt  # of the vehicle; another one: the agent drives a new vehicle
-    vclass: StrictStr  # SUMO's class of it
+    vehicle_id: StrictInt  # a new id: the agent drives a new vehicle
+    vclass: StrictStr  # SUMO's class
     length_m: StrictFloat  # of its body
     width_m: StrictFloat  # of its body
-    goal_edge: StrictStr  # where it is to go, an edge of the map
-    goal_m: list[StrictFloat]  # the end of that way: x and y on the map
+    goal_edge: StrictStr  # destination, an edge of the map
+    goal_m: list[StrictFloat]  # end of the destination edge: x and y on the map
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class FollowerSnapshot:
-    """What a follower gets after each step."""
+    """The state of the world for a follower, sent after each step."""
 
-    frame: StrictInt  # its number; the next one's is one more
-    episode: StrictInt  # goes up with each reset
+    frame: StrictInt  # consecutive number
+    episode: StrictInt  # increases with each reset
     tick: StrictInt  # of the world, since its reset
     time_s: StrictFloat  # tick · dt_s, simulated time
-    is_over: StrictBool  # the episode has ended; no controls are due
-    # those of the follower's that are in the world, and have to be driven
+    is_over: StrictBool  # whether the episode has ended; then no controls are due
+    # the follower's vehicles in the world, which have to be driven
     vehicles: dict[StrictStr, VehicleView]
-    arrays: list[ArrayView]  # what their sensors have that is due
+    arrays: list[ArrayView]  # new samples of their sensors
 
 
 @with_config(_CLOSED)
@@ -153,37 +153,37 @@ class Control:
     """The answer to a snapshot."""
 
     frame: StrictInt  # of the snapshot
-    # of each vehicle in it: two numbers in [-1, 1], or the number of a meta-action
+    # of each vehicle: two numbers in [-1, 1], or the number of a meta-action
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class Ticked:
-    """What has become of a follower's own tick."""
+    """The result of a follower's own tick."""
 
-    done: StrictBool  # whether the world has gone on
-    refused: StrictStr  # why it was refused; nothing if it was not
-    tick: StrictInt  # of the world now, since its reset
+    done: StrictBool  # whether the world has advanced
+    refused: StrictStr  # reason of a refusal; empty if not refused
+    tick: StrictInt  # present tick of the world, since its reset
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class FollowerRefusal:
-    """Why the world does not go on with a follower."""
+    """The reason why the world drops a follower."""
 
     reason: StrictStr
 
 
 def payload_of(message: Any) -> dict[str, Any]:
-    """A message as the map that is sent."""
+    """Return a message as the map that is sent."""
     return asdict(message)
 
 
 def read_payload(kind: type[T], payload: object) -> T:
-    """The message of a class that a payload is.
+    """Convert a payload to a message of a class.
 
-    Raises FollowerError: it is none: a field is missing, unknown or of another type.
+    Raises FollowerError: a field is missing, unknown or of another type.
     """
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)
@@ -193,6 +193,6 @@ def read_payload(kind: type[T], payload: object) -> T:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the payload"
         raise FollowerError(
-            f"no {kind.__name__} of protocol version {VERSION}: {place}: {first['msg']}"
+            f"not a {kind.__name__} of protocol version {VERSION}: {place}: {first['msg']}"
         ) from error
     return checked

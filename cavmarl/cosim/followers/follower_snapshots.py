@@ -1,4 +1,4 @@
-"""What followers see of a world: which of their vehicles are in it, and what their sensors have."""
+"""Snapshots for followers: their vehicles in the world, and new samples of the sensors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cavmarl.cosim.followers.follower_messages import (
 from cavmarl.cosim.stack.signal_reading import SPAT
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.step_arrays import Driven
+from cavmarl.parallel.worlds.step_arrays import Driven
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.mounted.frames import SensorFrames
 
@@ -27,9 +27,9 @@ NO_SIGNAL = 255
 
 
 def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -> Welcome:
-    """How time goes in a world, and what its vehicles carry.
+    """Return the world's clock and the sensors of its vehicles.
 
-    `vehicles`: that a follower has been given. `tick`: the master's.
+    `vehicles`: assigned to the follower. `tick`: the master's tick.
     """
     action, clock = env.config.action, env.config.clock
     return Welcome(
@@ -51,22 +51,21 @@ def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -
 
 
 class SnapshotTime(NamedTuple):
-    """When a snapshot is taken."""
+    """The time of a snapshot."""
 
-    frame: int  # its number
-    episode: int  # goes up with each reset
+    frame: int  # consecutive number
+    episode: int  # increases with each reset
     tick: int  # of the world, since its reset
-    is_over: bool  # the episode has ended
+    is_over: bool  # whether the episode has ended
 
 
 def take_snapshot(
     env: CavEnv | CavVectorEnv, agents: Sequence[int], moment: SnapshotTime, world: int = 0
 ) -> tuple[FollowerSnapshot, list[NDArray[Any]]]:
-    """What a follower is sent.
+    """Return the snapshot for a follower, and its arrays.
 
-    `env`: the world or worlds. `agents`: indices of the follower's. `moment`: when that is.
-
-    Returns the message, and its arrays.
+    `env`: the world or worlds. `agents`: indices of the follower's agents. `moment`: time of the
+    snapshot.
     """
     worlds = env.worlds.arrays
     due = [k for k in agents if worlds.mask[world, k] and not moment.is_over]
@@ -83,9 +82,9 @@ def take_snapshot(
                 data = np.ascontiguousarray(seen.data)
                 views.append(_array(name, sensor, data, seen.stamp_s, seen.lost))
                 arrays.append(data)
-            heard = by_agent[k].heard
-            if heard is not None:
-                data = np.array(heard, dtype=np.int32).reshape(1, -1, 3)
+            messages = by_agent[k].heard
+            if messages is not None:
+                data = np.array(messages, dtype=np.int32).reshape(1, -1, 3)
                 views.append(_array(name, SPAT, data, np.array([time_s]), np.zeros(1, np.bool_)))
                 arrays.append(data)
         shown = _signals(env, world)
@@ -99,7 +98,7 @@ def take_snapshot(
 def _due(
     env: CavEnv | CavVectorEnv, world: int, agent: int, time_s: float
 ) -> dict[str, SensorFrames]:
-    """What an agent's sensors have taken in the last step; without a rig, its observation."""
+    """Return an agent's sensor samples of the last step; without a rig, its observation."""
     arrays = env.worlds.arrays
     if not arrays.frames:
         seen = arrays.observations[world, agent : agent + 1]
@@ -125,7 +124,7 @@ def _array(
 
 
 def _signals(env: CavEnv | CavVectorEnv, world: int) -> NDArray[np.uint8]:
-    """(1, num_links) what the signal of each link shows, as SIGNAL_* codes."""
+    """Return (1, num_links) the SIGNAL_* code that each link's signal shows."""
     network = env.network
     shown = np.full((1, len(network.links)), NO_SIGNAL, dtype=np.uint8)
     signal = network.links["signal"]

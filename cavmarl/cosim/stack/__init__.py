@@ -1,1 +1,1 @@
-"""A reference stack of four replaceable stages, which drives from sensors and a map alone."""
+"""A reference stack of replaceable stages that drives by sensors and a map alone."""

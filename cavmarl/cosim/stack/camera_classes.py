@@ -1,9 +1,9 @@
-"""Perception by lidar and camera: what a lidar groups to objects, a camera's classes name.
+"""Perception by lidar and camera: the lidar groups echoes, the camera's classes name the objects.
 
-Echoes of an object are projected into the newest picture of each camera that shows classes, at
-three heights of a body; the class that most of these pixels have is the object's (late fusion, as
-in Vora et al.: "PointPainting", CVPR 2020, with a picture that is segmented already). A camera that
-is not where the lidar is sees nearer objects in front of some echoes: these have no say.
+Echoes of an object are projected into the newest picture of each semantic camera, at three heights
+of a body. The most frequent class of these pixels is the object's class (late fusion, as in Vora
+et al.: "PointPainting", CVPR 2020, with a segmented picture). From the camera's place, nearer
+objects may hide some echoes; these are not counted.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Readings, StackSensor
 from cavmarl.sensors.kernels.panorama import SEMANTIC_NAMES
 from cavmarl.sensors.kernels.rig_frames import rotation
 
-_HEIGHTS_M = (0.3, 0.7, 1.1)  # of a body, above the ground
-_NEAREST_M = 0.5  # before the camera
-_BEHIND_M = 2.0  # farther than the nearest echo that way: it may be covered
+_HEIGHTS_M = (0.3, 0.7, 1.1)  # above the ground
+_NEAREST_M = 0.5  # minimum depth before the camera
+_BEHIND_M = 2.0  # echoes this much deeper than the nearest one in their column may be hidden
 _KINDS = {
     "building": "building",
     "car": "vehicle",
@@ -38,8 +38,8 @@ _KINDS = {
 KIND_OF_CLASS = tuple(_KINDS.get(name, "") for name in SEMANTIC_NAMES)
 
 
-class _Eye(NamedTuple):
-    """A camera: where it is on its vehicle, and its focal length in pixels."""
+class _Camera(NamedTuple):
+    """A camera: its pose on the vehicle, and its focal length in pixels."""
 
     sensor: StackSensor
     turn: NDArray[np.float64]
@@ -48,57 +48,57 @@ class _Eye(NamedTuple):
 
 
 class LidarCamera(LidarObjects):
-    """The stage.
+    """The perception stage `lidar_camera`.
 
-    `sensors`: of the vehicle: lidars, and semantic cameras, one at least.
+    `sensors`: of the vehicle: lidars, and at least one semantic camera.
 
-    Raises ConfigError: there is no such camera.
+    Raises ConfigError: there is no semantic camera.
     """
 
     def __init__(self, sensors: Sequence[StackSensor], hd_map: HdMap) -> None:
         super().__init__(sensors, hd_map)
-        self._eyes = [_eye(sensor) for sensor in sensors if sensor.type == "semantic_camera"]
-        if not self._eyes:
+        self._cameras = [_camera(sensor) for sensor in sensors if sensor.type == "semantic_camera"]
+        if not self._cameras:
             raise ConfigError(
                 "perception = lidar_camera: there is no semantic_camera among the sensors; mount "
                 "one under `rig`, as {eyes: {type: semantic_camera, rate_hz: 10, z_m: 1.4}}"
             )
         self._pictures: dict[str, NDArray[np.uint8]] = {}
-        self._covered_m: dict[str, NDArray[np.float64]] = {}  # of each column of a picture
+        self._covered_m: dict[str, NDArray[np.float64]] = {}  # by column, see `_pixels`
         self._pose = EgoPose(0.0, 0.0, 0.0, 0.0)
 
-    def _look(
+    def _read_others(
         self, readings: Readings, pose: EgoPose, groups: Sequence[NDArray[np.float64]]
     ) -> None:
         self._pose = pose
         echoes = self._in_vehicle(np.concatenate(groups))
-        for eye in self._eyes:
-            samples = readings.get(eye.sensor.name)
+        for camera in self._cameras:
+            samples = readings.get(camera.sensor.name)
             if samples is not None and not samples.lost.all():
                 newest = samples.values[~samples.lost][-1]
-                self._pictures[eye.sensor.name] = np.asarray(newest, dtype=np.uint8)
-            width = int(eye.sensor.settings["width"])
-            ahead_m, column, _ = _projected(eye, echoes)
-            nearest_m = np.full(width + 2, np.inf)  # and a column to either side
+                self._pictures[camera.sensor.name] = np.asarray(newest, dtype=np.uint8)
+            width = int(camera.sensor.settings["width"])
+            ahead_m, column, _ = _projected(camera, echoes)
+            nearest_m = np.full(width + 2, np.inf)  # plus one column on either side
             np.minimum.at(nearest_m, np.clip(column, -1, width) + 1, ahead_m)
-            self._covered_m[eye.sensor.name] = _BEHIND_M + np.minimum.reduce(
+            self._covered_m[camera.sensor.name] = _BEHIND_M + np.minimum.reduce(
                 [nearest_m[:-2], nearest_m[1:-1], nearest_m[2:]]
             )
 
     def _kind(self, group: NDArray[np.float64]) -> str:
-        """The kind that most pixels of echoes (n, 2) on the map show; unknown where none does."""
+        """Return the most frequent kind in the pixels of echoes (n, 2) on the map, or unknown."""
         votes = np.zeros(len(SEMANTIC_NAMES), np.int64)
-        for eye in self._eyes:
-            picture = self._pictures.get(eye.sensor.name)
+        for camera in self._cameras:
+            picture = self._pictures.get(camera.sensor.name)
             if picture is not None:
-                covered_m = self._covered_m[eye.sensor.name]
-                classes = _pixels(eye, picture, covered_m, self._in_vehicle(group))
+                covered_m = self._covered_m[camera.sensor.name]
+                classes = _pixels(camera, picture, covered_m, self._in_vehicle(group))
                 votes += np.bincount(classes, minlength=len(votes))[: len(votes)]
         votes[[number for number, kind in enumerate(KIND_OF_CLASS) if not kind]] = 0
         return KIND_OF_CLASS[int(votes.argmax())] if votes.any() else "unknown"
 
     def _in_vehicle(self, group: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Echoes in the frame of the vehicle, (3 n, 3), at three heights each."""
+        """Return echoes in the frame of the vehicle, (3 n, 3), at three heights each."""
         cos, sin = math.cos(self._pose.heading_rad), math.sin(self._pose.heading_rad)
         plane = (group - (self._pose.x_m, self._pose.y_m)) @ np.array([[cos, -sin], [sin, cos]])
         return np.concatenate(
@@ -106,39 +106,39 @@ class LidarCamera(LidarObjects):
         )
 
 
-def _eye(sensor: StackSensor) -> _Eye:
+def _camera(sensor: StackSensor) -> _Camera:
     settings = sensor.settings
     yaw, pitch, roll = (math.radians(settings[key]) for key in ("yaw_deg", "pitch_deg", "roll_deg"))
     turn = np.zeros((3, 3))
     rotation(yaw, pitch, roll, turn)
     place_m = np.array([settings["x_m"], settings["y_m"], settings["z_m"]])
     focal_px = 0.5 * settings["width"] / math.tan(0.5 * math.radians(settings["fov_deg"]))
-    return _Eye(sensor, turn, place_m, focal_px)
+    return _Camera(sensor, turn, place_m, focal_px)
 
 
 def _projected(
-    eye: _Eye, points: NDArray[np.float64]
+    camera: _Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Depth in m, column and row of points (n, 3) of the vehicle's frame before a camera."""
-    ahead, left, up = ((points - eye.place_m) @ eye.turn).T
+    """Return depth in m, column and row of points (n, 3) of the vehicle's frame in a picture."""
+    ahead, left, up = ((points - camera.place_m) @ camera.turn).T
     seen = ahead > _NEAREST_M
-    settings = eye.sensor.settings
-    column = np.floor(0.5 * settings["width"] - eye.focal_px * left[seen] / ahead[seen])
-    row = np.floor(0.5 * settings["height"] - eye.focal_px * up[seen] / ahead[seen])
+    settings = camera.sensor.settings
+    column = np.floor(0.5 * settings["width"] - camera.focal_px * left[seen] / ahead[seen])
+    row = np.floor(0.5 * settings["height"] - camera.focal_px * up[seen] / ahead[seen])
     return ahead[seen], column.astype(np.int64), row.astype(np.int64)
 
 
 def _pixels(
-    eye: _Eye,
+    camera: _Camera,
     picture: NDArray[np.uint8],
     covered_m: NDArray[np.float64],
     points: NDArray[np.float64],
 ) -> NDArray[np.uint8]:
-    """The classes of the pixels onto which points (n, 3) of the vehicle's frame fall.
+    """Return the classes of the pixels that points (n, 3) of the vehicle's frame project to.
 
-    `covered_m`: by column, the depth from which on a point may lie behind another one.
+    `covered_m`: by column, the depth beyond which a point may be hidden behind another one.
     """
-    ahead_m, column, row = _projected(eye, points)
+    ahead_m, column, row = _projected(camera, points)
     height, width = picture.shape
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     inside[inside] = ahead_m[inside] <= covered_m[column[inside]]

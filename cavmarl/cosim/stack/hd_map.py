@@ -1,4 +1,4 @@
-"""`HdMap`: the road network for a stack: which lanes are near, and places on them."""
+"""`HdMap`: the road network for a stack: nearby lanes, and places on them."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ def wrap(angle: float) -> float:
 
 
 class OnLane(NamedTuple):
-    """A place beside a lane."""
+    """A place relative to a lane."""
 
     lane: int
-    s_m: float  # along it
-    d_m: float  # from its centre, positive to the left
-    heading_rad: float  # of the lane there
+    s_m: float  # along the lane
+    d_m: float  # from the centre of the lane, positive to the left
+    heading_rad: float  # direction of the lane there
 
 
 class HdMap:
-    """Lanes by place."""
+    """Lanes indexed by place."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
@@ -47,7 +47,7 @@ class HdMap:
         self._cells = self._by_cell()
 
     def _by_cell(self) -> dict[tuple[int, int], NDArray[np.intp]]:
-        """Segments by the cell of the map that they may be near to."""
+        """Return segments by the cells of the map that they may be near."""
         members: dict[tuple[int, int], list[int]] = {}
         for k, length in enumerate(self._length.tolist()):
             at = np.arange(0.0, length + _CELL_M, 0.5 * _CELL_M).clip(max=length)
@@ -64,7 +64,7 @@ class HdMap:
         return {cell: np.array(found) for cell, found in members.items()}
 
     def near(self, x_m: float, y_m: float, within_m: float) -> list[OnLane]:
-        """Lanes whose centre is at most `within_m` away, up to 20 m; nearest first."""
+        """Return lanes whose centre is at most `within_m` away (up to 20 m), nearest first."""
         rows = self._cells.get((int(x_m // _CELL_M), int(y_m // _CELL_M)))
         if rows is None:
             return []
@@ -77,7 +77,7 @@ class HdMap:
         return list(found.values())
 
     def on_lane(self, lane: int, x_m: float, y_m: float) -> OnLane:
-        """A place beside one lane, however far away."""
+        """Return a place relative to one lane, at any distance."""
         rows = np.arange(self._first[lane], self._first[lane + 1])
         places, off = self._project(rows, x_m, y_m)
         return places(int(np.argmin(off)))
@@ -85,7 +85,7 @@ class HdMap:
     def _project(
         self, rows: NDArray[np.intp], x_m: float, y_m: float
     ) -> tuple[Callable[[int], OnLane], NDArray[np.float64]]:
-        """The place beside each of some segments, by its position among them, and how far away."""
+        """Return a function from the index of a segment to the place on it, and all distances."""
         from_x, from_y = x_m - self._x[rows], y_m - self._y[rows]
         cos, sin = self._cos[rows], self._sin[rows]
         along = np.clip(from_x * cos + from_y * sin, 0.0, self._length[rows])
@@ -102,7 +102,7 @@ class HdMap:
         return place, off
 
     def polyline(self, lane: int, from_m: float) -> NDArray[np.float64]:
-        """(n, 2) the centre of a lane from a place on to its end."""
+        """Return (n, 2) the centre line of a lane from a place to its end."""
         points = self.network.lane_points(lane)
         s = np.concatenate([[from_m], points["s"][points["s"] > from_m + 1e-6]])
         return np.stack(

@@ -1,4 +1,4 @@
-"""Echoes of a lidar as points of the vehicle's frame."""
+"""Converts a lidar's echoes to points in the vehicle's frame."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from cavmarl.sensors.kernels.rig_frames import rotation
 
 Points = NDArray[np.float64]
 
-RANGE_MARGIN_M = 0.05  # what is nearer than so much to the range is an echo
+RANGE_MARGIN_M = 0.05  # distances at least this much below the range are echoes
 
 
 def lidar_points(lidar: StackSensor, scan: Points, range_m: float = math.inf) -> Points:
-    """Echoes (n, 3), the lowest layer first; x ahead, y to the left, z above the ground.
+    """Return echoes (n, 3), the lowest layer first; x ahead, y to the left, z above the ground.
 
-    `scan`: (layers, rays) distances in m, see `docs/reference/imaging.md`. `range_m`: of
-    those that are used.
+    `scan`: (layers, rays) distances in m, see `docs/reference/imaging.md`. `range_m`: maximum
+    range of used echoes.
     """
     settings = lidar.settings
     layers, rays = scan.shape

@@ -1,13 +1,13 @@
 """Localisation by GNSS, IMU and odometry: an extended Kalman filter of x, y, heading and speed.
 
-The bias of the fixes, east and north, is part of the state; here it is taken to be 0, because
-nothing tells it from the place.
+The bias of the fixes, east and north, is part of the state. This class assumes that it is 0,
+because GNSS alone cannot separate it from the position.
 
 The model is that of Thrun, Burgard, Fox: "Probabilistic Robotics", 2005, chapter 3.3, with the
 kinematic bicycle's slip angle: the centre moves at heading + asin(r L / 2 v) where r is the yaw
-rate and L the length between the axles. The first fix tells the place; the heading comes from the
-lane there, and is turned round if the fixes go the other way. Where a sensor sees lane markings,
-these say how far from the middle of its lane the vehicle is.
+rate and L the length between the axles. The first fix gives the position. The heading is that of
+the lane there; it is reversed if the fixes move the other way. If a sensor detects lane markings,
+they give the distance from the centre of the lane.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from cavmarl.cosim.stack.stack_types import (
 from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
 from cavmarl.sensors.mounted.geodesy import Geodesy
 
-# Standard deviations: of what the model leaves out, a square root of a second, and of sensors
-# whose settings give none.
+# Standard deviations of the model's error per square root of a second, and of sensors without
+# noise in their settings.
 _DRIFT = (0.1, 0.1, 0.01, 0.5)
 _LEAST = {"gnss": 0.05, "odometry": 0.02, "lane_d": 0.05, "lane_heading": 0.02}
 _FIRST_HEADING_RAD = 0.3
 _LANE_SEARCH_M = 8.0
 _LANE_MATCH_M = 4.0
-_LANE_SURE_M = 0.6  # lateral deviation below which lanes can be told apart
-_GATE = 9.0  # squared deviations beyond which what a camera says of lanes is not believed
-_COURSE_M = 8.0  # driven before the fixes' course is compared with the heading
+_LANE_SURE_M = 0.6  # deviation of the position below which neighbouring lanes can be distinguished
+_GATE = 9.0  # squared deviations beyond which a measurement of lanes is rejected
+_COURSE_M = 8.0  # distance driven before the course of the fixes is compared with the heading
 _STRAIGHT_RAD = 0.5
 _SIZE = 6  # x, y, heading, speed, bias of the fixes east and north
 
 
 class GnssInertial:
-    """The filter.
+    """The localisation stage `gnss_imu`.
 
-    `sensors`: of the vehicle; one GNSS at least. `geodesy`: where the map is on the earth.
+    `sensors`: of the vehicle, with at least one GNSS. `geodesy`: the map's place on the earth.
     """
 
     bias_m = 0.0  # standard deviation of the bias of fixes
-    bias_drift_m = 0.0  # of its change in a second
+    bias_drift_m = 0.0  # standard deviation of its change per second
 
     def __init__(
         self, sensors: Sequence[StackSensor], geodesy: Geodesy, hd_map: HdMap, tick_s: float
@@ -69,17 +69,17 @@ class GnssInertial:
 
     @property
     def bias(self) -> tuple[float, float]:
-        """Of the fixes east and north, in m, as far as it is known."""
+        """Estimated bias of the fixes east and north, in m."""
         east, north = self._get()[4:].tolist()
         return east, north
 
     def reset_pose(self, pose: EgoPose) -> None:
-        """Be told where the vehicle is, to within some centimetres."""
+        """Set the pose of the vehicle, known to within some centimetres."""
         self._set((pose.x_m, pose.y_m, pose.heading_rad, pose.speed_mps), (0.05, 0.05, 0.02, 0.2))
         self._anchor = None
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
-        """Predict to `time_s` and take in what the sensors have."""
+        """Predict the state at `time_s` and update it by the sensors' samples."""
         elapsed_s = 0.0 if self._before_s is None else time_s - self._before_s
         self._before_s = time_s
         fix = self._fix(readings)
@@ -90,13 +90,13 @@ class GnssInertial:
         elif elapsed_s > 0.0:
             self._predict(readings, mission, elapsed_s)
         if fix is not None:
-            self._take_fix(fix)
+            self._update_by_fix(fix)
         speed = self._newest(readings, "odometry")
         if speed is not None:
             deviation = self._deviation("odometry", 0, _LEAST["odometry"])
             ahead = float(speed[0]) - float(self._get()[3])
-            self._take(np.array([0.0, 0.0, 0.0, 1.0]), ahead, deviation, gate=math.inf)
-        self._take_lane(readings)
+            self._update(np.array([0.0, 0.0, 0.0, 1.0]), ahead, deviation, gate=math.inf)
+        self._update_by_lane(readings)
         return self._pose()
 
     def _pose(self) -> EgoPose:
@@ -104,12 +104,12 @@ class GnssInertial:
         return EgoPose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
 
     def _set(self, place: Sequence[float], deviations: Sequence[float]) -> None:
-        """Begin anew: x, y, heading and speed, and their standard deviations; the bias unknown."""
+        """Set x, y, heading and speed with their standard deviations; the bias is unknown."""
         self._state = np.array([*place, 0.0, 0.0])
         self._spread = np.diag([*deviations, self.bias_m, self.bias_m]) ** 2
 
     def _set_by_fix(self, place: Sequence[float], deviations: Sequence[float]) -> None:
-        """The same, with a place from a fix: it is off by the bias, too."""
+        """Set the state as `_set`, by the position of a fix, whose error includes the bias."""
         self._set(place, deviations)
         for axis in (0, 1):
             self._spread[axis, axis] += self.bias_m**2
@@ -120,7 +120,7 @@ class GnssInertial:
         return self._state
 
     def _newest(self, readings: Readings, kind: str) -> NDArray[np.float64] | None:
-        """The newest sample of a type of sensor that was not lost."""
+        """Return the newest sample of a type of sensor that was not lost."""
         samples = self._samples(readings, kind)
         if samples is None or samples.lost.all():
             return None
@@ -131,7 +131,7 @@ class GnssInertial:
         return None if sensor is None else readings.get(sensor.name)
 
     def _deviation(self, kind: str, channel: int, least: float) -> float:
-        """What a sensor's settings say of its noise."""
+        """Return the noise in a sensor's settings, at least `least`."""
         noise = self._by_type[kind].settings["noise"]
         return max(least, float(noise[min(channel, len(noise) - 1)]))
 
@@ -159,7 +159,7 @@ class GnssInertial:
         self._driven_m = self._turned_rad = 0.0
 
     def _predict(self, readings: Readings, mission: Mission, elapsed_s: float) -> None:
-        """Where the model and the inertial sensors say that it is now."""
+        """Predict the state by the model and the inertial sensors."""
         state = self._get()
         accel, self._yaw_rate = self._inertia(readings)
         x_m, y_m, heading, speed = state[:4].tolist()
@@ -186,25 +186,25 @@ class GnssInertial:
         self._turned_rad += abs(self._yaw_rate) * elapsed_s
 
     def _inertia(self, readings: Readings) -> tuple[float, float]:
-        """Acceleration along the body and yaw rate, the means of what came since the last step."""
+        """Return acceleration along the body and yaw rate, averaged over the new samples."""
         samples = self._samples(readings, "imu")
         if samples is not None and not samples.lost.all():
             force_x, _, force_z, _, _, turn = samples.values[~samples.lost].mean(axis=0).tolist()
             pitch = math.acos(max(-1.0, min(1.0, force_z / GRAVITY_MPS2)))
-            # A pitch as small as the noise of the force along z would be no more than noise.
+            # A pitch below this is within the noise of the force along z.
             climbs = math.copysign(GRAVITY_MPS2 * math.sin(pitch), force_x) if pitch > 0.15 else 0.0
             return force_x - climbs, turn
         wheels = self._newest(readings, "odometry")
         return 0.0, self._yaw_rate if wheels is None else float(wheels[1])
 
-    def _take_fix(self, fix: tuple[float, float]) -> None:
+    def _update_by_fix(self, fix: tuple[float, float]) -> None:
         state = self._get()
         x_m, y_m = _centre(fix, self._by_type["gnss"].mount, float(state[2]))
         for axis, seen in enumerate((x_m, y_m)):
             row = np.zeros(_SIZE)
             row[axis] = row[4 + axis] = 1.0
             deviation = self._deviation("gnss", axis, _LEAST["gnss"])
-            self._take(row, seen - float(row @ self._get()), deviation, gate=math.inf)
+            self._update(row, seen - float(row @ self._get()), deviation, gate=math.inf)
         self._compare_course(fix)
 
     def _compare_course(self, fix: tuple[float, float]) -> None:
@@ -220,7 +220,7 @@ class GnssInertial:
         self._anchor = fix
         self._driven_m = self._turned_rad = 0.0
 
-    def _take_lane(self, readings: Readings) -> None:
+    def _update_by_lane(self, readings: Readings) -> None:
         seen = self._newest(readings, "lane_boundary")
         if seen is None:
             return
@@ -235,24 +235,24 @@ class GnssInertial:
             for place in near
             if abs(wrap(heading - float(seen[3]) - place.heading_rad)) < _FIRST_HEADING_RAD
         ]
-        # Within junctions lanes lie across each other, and the one seen is ambiguous.
+        # Lanes overlap within junctions, so the observed lane would be ambiguous.
         if not candidates or any(internal[place.lane] for place in near):
             return
         _, place = min(candidates, key=lambda found: found[0])
         row = np.array([-math.sin(place.heading_rad), math.cos(place.heading_rad), 0.0, 0.0])
         deviation = self._deviation("lane_boundary", 0, _LEAST["lane_d"])
-        if self._take(row, offset - place.d_m, deviation):
+        if self._update(row, offset - place.d_m, deviation):
             turn = wrap(place.heading_rad + float(seen[3]) - float(self._get()[2]))
             deviation = self._deviation("lane_boundary", 3, _LEAST["lane_heading"])
-            self._take(np.array([0.0, 0.0, 1.0, 0.0]), turn, deviation)
+            self._update(np.array([0.0, 0.0, 1.0, 0.0]), turn, deviation)
 
-    def _take(
+    def _update(
         self, row: NDArray[np.float64], surprise: float, deviation: float, gate: float = _GATE
     ) -> bool:
-        """Take in one number; whether it was believed.
+        """Update the state by one number; return whether it was accepted.
 
-        `row`: how it depends on the first numbers of the state, as many as it has. `surprise`: the
-        number less what was expected. `gate`: squared deviations beyond which it is not believed.
+        `row`: its derivatives by the first numbers of the state. `surprise`: the number less its
+        expected value. `gate`: squared deviations beyond which it is rejected.
         """
         row = np.concatenate([row, np.zeros(_SIZE - len(row))])
         spread = float(row @ self._spread @ row) + deviation**2
@@ -265,6 +265,6 @@ class GnssInertial:
 
 
 def _centre(fix: tuple[float, float], mount: StackMount, heading: float) -> tuple[float, float]:
-    """Where the vehicle's centre is when its antenna is at a place."""
+    """Return the vehicle's centre for a place of its antenna."""
     cos, sin = math.cos(heading), math.sin(heading)
     return (fix[0] - mount.x_m * cos + mount.y_m * sin, fix[1] - mount.x_m * sin - mount.y_m * cos)

@@ -1,8 +1,8 @@
-"""Perception from a lidar: echoes near roads are grouped into objects, which are followed.
+"""Perception by lidar: echoes near roads are grouped into objects, which are tracked.
 
-Neighbouring echoes belong together where they are no farther apart than `_GAP_M` and the distance
-between two rays there. What lies off the lanes is a building or a parked thing and is left out. An
-object is a box along the lane that it is on; its velocity comes from an alpha-beta filter
+Neighbouring echoes belong to one object if their distance is at most `_GAP_M` plus the distance
+between two rays there. Echoes off the lanes are ignored, as buildings or parked objects. An
+object is a box along its lane. Its velocity comes from an alpha-beta filter
 (Kalata: "The tracking index", IEEE Trans. AES 20, 1984) over the boxes of the last steps.
 """
 
@@ -20,19 +20,19 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Obstacle, Readings, StackSe
 
 _GAP_M = 0.8
 _ROAD_M = 2.5  # from the centre of a lane
-_BESIDE_ROAD_M = 6.0  # the same, for pedestrians: they may step onto it
+_BESIDE_ROAD_M = 6.0  # the same for pedestrians: they may step onto the road
 _RANGE_MARGIN_M = 0.05
-_MATCH_M = 3.0  # between an object and where it was expected
-_SAME_M = 0.5  # the same, for an object that takes its kind from an earlier sight: 0.1 s before
+_MATCH_M = 3.0  # between an object and its predicted position
+_SAME_M = 0.5  # the same for an object that keeps the kind of an earlier detection: 0.1 s before
 _ALPHA, _BETA = 0.5, 0.2
 _FORGET_S = 0.5
 _STILL_MPS = 0.6
-_FEW = 3  # steps before a velocity is believed
+_FEW = 3  # detections before a velocity is used
 
 
 @dataclass
 class _Track:
-    """An object that has been seen before."""
+    """An object that has been detected before."""
 
     x_m: float
     y_m: float
@@ -44,9 +44,9 @@ class _Track:
 
 
 class LidarObjects:
-    """The stage.
+    """The perception stage `lidar`.
 
-    `sensors`: of the vehicle; those that are lidars are used.
+    `sensors`: of the vehicle; only lidars are used.
     """
 
     def __init__(self, sensors: Sequence[StackSensor], hd_map: HdMap) -> None:
@@ -56,7 +56,7 @@ class LidarObjects:
         self._last: list[Obstacle] = []
 
     def perceive(self, readings: Readings, pose: EgoPose, time_s: float) -> list[Obstacle]:
-        """Objects on the road; between two scans, those of the last one, moved on."""
+        """Return objects on the road; without a new scan, those of the last scan."""
         echoes = []
         for lidar in self._lidars:
             samples = readings.get(lidar.name)
@@ -64,23 +64,23 @@ class LidarObjects:
                 scan = np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
                 echoes.extend(_groups(lidar, scan, pose))
         if echoes:
-            self._look(readings, pose, echoes)
+            self._read_others(readings, pose, echoes)
             boxes = [box for group in echoes if (box := self._box(group, pose)) is not None]
             self._last = [self._follow(box, time_s) for box in boxes]
             self._tracks = [track for track in self._tracks if time_s - track.seen_s < _FORGET_S]
         return self._last
 
-    def _look(
+    def _read_others(
         self, readings: Readings, pose: EgoPose, groups: Sequence[NDArray[np.float64]]
     ) -> None:
-        """Take in what other sensors have before groups of echoes (n, 2) are told apart."""
+        """Read other sensors before groups of echoes (n, 2) are classified."""
 
     def _kind(self, group: NDArray[np.float64]) -> str:
-        """What echoes (n, 2) belong to: by a lidar alone it is not known."""
+        """Return the kind of an object with echoes (n, 2); a lidar alone does not know it."""
         return "unknown"
 
     def _box(self, group: NDArray[np.float64], pose: EgoPose) -> Obstacle | None:
-        """The box around echoes (n, 2), along the lane that they are on; None: off the road."""
+        """Return the box around echoes (n, 2), along their lane; None: off the road."""
         x_m, y_m = group.mean(axis=0).tolist()
         kind = self._kind(group)
         beside_m = _BESIDE_ROAD_M if kind == "pedestrian" else _ROAD_M
@@ -104,7 +104,7 @@ class LidarObjects:
         )
 
     def _follow(self, box: Obstacle, time_s: float) -> Obstacle:
-        """The box with the velocity of the object that it is taken for."""
+        """Return the box with the velocity of the track that it matches."""
         best, nearest = None, _MATCH_M
         for track in self._tracks:
             elapsed = time_s - track.seen_s
@@ -123,7 +123,7 @@ class LidarObjects:
         for axis, speed, seen in (("x_m", "vx_mps", box.x_m), ("y_m", "vy_mps", box.y_m)):
             expected = getattr(best, axis) + getattr(best, speed) * elapsed
             surprise = seen - expected
-            # The first two sightings are the best guess of a velocity that there is.
+            # The difference of the first two detections is the best estimate of a velocity.
             beta = 1.0 if best.times == 1 else _BETA
             setattr(best, axis, expected + _ALPHA * surprise)
             setattr(best, speed, getattr(best, speed) + beta * surprise / elapsed)
@@ -139,12 +139,12 @@ class LidarObjects:
 
 
 def _differ(one: str, other: str) -> bool:
-    """Whether two kinds are known, and not the same."""
+    """Return whether two kinds are known and differ."""
     return one != other and "unknown" not in (one, other)
 
 
 def _along(lanes: Sequence[OnLane], pose: EgoPose) -> float:
-    """The direction of the nearest lane; of two in opposite directions the one of our own."""
+    """Return the direction of the nearest lane, reversed if the own heading is opposite."""
     nearest = lanes[0].heading_rad
     apart = abs(wrap(nearest - pose.heading_rad))
     return nearest if apart < 0.5 * math.pi else wrap(nearest + math.pi)
@@ -153,7 +153,7 @@ def _along(lanes: Sequence[OnLane], pose: EgoPose) -> float:
 def _groups(
     lidar: StackSensor, scan: NDArray[np.float64], pose: EgoPose
 ) -> list[NDArray[np.float64]]:
-    """Echoes on the map, (n, 2) each group.
+    """Return groups of echoes on the map, (n, 2) each.
 
     `scan`: (layers, rays) distances in m.
     """

@@ -1,9 +1,9 @@
-"""Planning over the lane graph: the way to the goal, and how fast along it.
+"""Planning over the lane graph: the way to the goal, and the acceleration along it.
 
-The way is that of `roads.routing.make_plans`, the map as it is. Along it the acceleration is the
-least of what the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) asks for behind
-whatever is on the way, and behind a standing obstacle at each line where a signal or a vehicle with
-the right of way says to stop.
+The way is that of `roads.routing.make_plans`, without traffic. The acceleration along it is the
+minimum of what the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) gives behind every
+obstacle on the way, and behind a standing obstacle at each line where a signal or a vehicle with
+the right of way requires a stop.
 """
 
 from __future__ import annotations
@@ -30,19 +30,20 @@ from cavmarl.roads.routing import make_plans
 
 _AHEAD_M = 70.0
 _MATCH_M = 5.0
-_HEADING_COST_M = 3.0  # of a radian, against metres beside a lane
-_EXPECTED_M = 1.5  # by which a lane on the way is preferred
+_HEADING_COST_M = 3.0  # cost of a radian, compared with metres beside a lane
+_EXPECTED_M = 1.5  # preference for a lane on the previous way
 _ACCEL, _DECEL, _HEADWAY_S, _GAP_M = 1.5, 2.5, 1.4, 2.0
 _HARDEST = 6.0
-_BESIDE_M = 0.3  # that is left to a body beside the way
-_BESIDE_WALKER_M = 0.8  # the same, of a pedestrian
-_WALK_S = 3.0  # that a pedestrian is taken to walk on
-_BEND_MPS2 = 2.0  # sideways, in a bend
+_BESIDE_M = 0.3  # lateral distance kept to an obstacle beside the way
+_BESIDE_WALKER_M = 0.8  # the same for a pedestrian
+_WALK_S = 3.0  # time for which a pedestrian's walk is extrapolated
+_BEND_MPS2 = 2.0  # maximum lateral acceleration
 _BRAKE_FOR_YELLOW = 3.0
-_CLEAR_S = 4.0  # that vehicles that go first are away from where the ways meet
+# Yield to a vehicle with the right of way that is nearer to its line, in time or in distance.
+_CLEAR_S = 4.0
 _CLEAR_M = 12.0
 _CHANGE_BEHIND_M, _CHANGE_AHEAD_M = 10.0, 6.0
-_SIGHT_M = 50.0  # before a line, from where on it is looked at
+_SIGHT_M = 50.0  # distance before a line from which it is considered
 _STANDS_MPS = 0.7
 
 
@@ -52,7 +53,7 @@ class _Limit(NamedTuple):
 
 
 class LaneRoute:
-    """The stage."""
+    """The planning stage `lane_route`."""
 
     def __init__(self, hd_map: HdMap) -> None:
         self._map = hd_map
@@ -85,7 +86,7 @@ class LaneRoute:
         return Trajectory(points, max(hardest.accel, -_HARDEST), hardest.reason, lanes)
 
     def _here(self, pose: EgoPose, plan: NDArray[np.void]) -> OnLane | None:
-        """The lane that the vehicle is on, of those that lead to the goal."""
+        """Return the vehicle's lane, among those that lead to the goal."""
         best, least = None, math.inf
         for place in self._map.near(pose.x_m, pose.y_m, _MATCH_M):
             apart = abs(wrap(pose.heading_rad - place.heading_rad))
@@ -100,7 +101,7 @@ class LaneRoute:
     def _change_lane(
         self, here: OnLane, pose: EgoPose, plan: NDArray[np.void], obstacles: Sequence[Obstacle]
     ) -> OnLane:
-        """The lane beside, where the way needs it and there is room."""
+        """Return the lane beside the present one if the way needs it and there is room."""
         change = int(plan["change"][here.lane])
         row = self._network.lanes[here.lane]
         if change == 0 or row["internal"]:
@@ -123,7 +124,7 @@ class LaneRoute:
     def _way(
         self, here: OnLane, plan: NDArray[np.void]
     ) -> tuple[list[int], list[float], NDArray[np.float64], float | None]:
-        """Lanes ahead, where each begins, their points, and where the way ends, all from here."""
+        """Return the lanes ahead, their starts, their points, and the end of the way."""
         lanes, starts = [here.lane], [-here.s_m]
         pieces = [self._map.polyline(here.lane, here.s_m)]
         reached = float(self._network.lanes["length_m"][here.lane]) - here.s_m
@@ -131,7 +132,7 @@ class LaneRoute:
         while reached < _AHEAD_M:
             following = int(plan["next"][lanes[-1]])
             if plan["change"][lanes[-1]] != 0 or following < 0:
-                # Of a lane that has to be left, the end is a place to wait; so is the goal's.
+                # If a lane has to be left, its end is a place to wait.
                 ends = reached if plan["change"][lanes[-1]] != 0 else None
                 break
             lanes.append(following)
@@ -155,7 +156,7 @@ class LaneRoute:
         starts: Sequence[float],
         points: NDArray[np.float64],
     ) -> _Limit:
-        """Towards the limits of the lanes, and slowly enough for the bends."""
+        """Return the acceleration for the lanes' speed limits and for bends."""
         speed = max(pose.speed_mps, 0.1)
         limit = float(self._network.lanes["speed_mps"][here.lane])
         accel = _ACCEL * (1.0 - (speed / limit) ** 4)
@@ -180,7 +181,7 @@ class LaneRoute:
             on_foot = obstacle.kind == "pedestrian"
             free = 0.5 * mission.width_m + half_width + (_BESIDE_WALKER_M if on_foot else _BESIDE_M)
             least = abs(d)
-            if on_foot:  # where it will be when we are there
+            if on_foot:  # its position when the vehicle reaches it
                 aside = obstacle.vy_mps * cos - obstacle.vx_mps * sin
                 soon = d + aside * min(s / max(pose.speed_mps, 1.0), _WALK_S)
                 least = 0.0 if d * soon < 0.0 else min(least, abs(soon))
@@ -215,7 +216,7 @@ class LaneRoute:
             code = SIGNAL_NONE if signals is None else int(signals[link])
             reason = self._stops(link, code, pose, gap, obstacles)
             if reason:
-                # The gap of the model is kept from cars; before a line half a metre is enough.
+                # The model keeps _GAP_M from vehicles; half a metre suffices before a line.
                 room = gap + _GAP_M - 0.5
                 found.append(_Limit(_behind(pose.speed_mps, 0.0, room), reason))
         return found
@@ -233,7 +234,7 @@ class LaneRoute:
         return ""
 
     def _must_yield(self, link: int, obstacles: Sequence[Obstacle]) -> bool:
-        """Whether a vehicle with the right of way is inside the junction or about to be."""
+        """Return whether a vehicle with the right of way is in the junction or about to enter."""
         network = self._network
         row = network.links[link]
         conflicts = network.conflicts[
@@ -262,7 +263,7 @@ class LaneRoute:
 
 @lru_cache(maxsize=64)
 def _plan_of(hd_map: HdMap, goal_edge: int, vclass: str) -> NDArray[np.void]:
-    """PLAN (L,) to a goal."""
+    """Return PLAN (L,) to a goal."""
     plan: NDArray[np.void] = make_plans(hd_map.network, [goal_edge], vclass)[0]
     return plan
 
@@ -273,14 +274,14 @@ def _turn(heading: float) -> NDArray[np.float64]:
 
 
 def _behind(speed: float, ahead_mps: float, gap: float) -> float:
-    """The IDM's acceleration behind something, without its wish for speed."""
+    """Return the IDM's acceleration behind an obstacle, without its free-road term."""
     closing = speed * (speed - ahead_mps) / (2.0 * math.sqrt(_ACCEL * _DECEL))
     wanted = _GAP_M + max(0.0, speed * _HEADWAY_S + closing)
     return _ACCEL * (1.0 - (wanted / max(gap, 0.1)) ** 2)
 
 
 def _slow_to(speed: float, allowed: float, distance: float) -> float:
-    """The acceleration with which a lower speed is reached in time; _ACCEL: no need yet."""
+    """Return the acceleration to reach a lower speed in time; _ACCEL: braking is not needed yet."""
     if speed <= allowed:
         return _ACCEL if distance > 0.0 else min(_ACCEL, allowed - speed)
     needed = (speed**2 - allowed**2) / (2.0 * max(distance, 1.0))
@@ -288,7 +289,7 @@ def _slow_to(speed: float, allowed: float, distance: float) -> float:
 
 
 def _bends(points: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """Where the way bends, in m from its begin, and the speed there."""
+    """Return bends as pairs of distance in m from the start of the way, and speed."""
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
@@ -305,7 +306,7 @@ def _bends(points: NDArray[np.float64]) -> list[tuple[float, float]]:
 def _beside(
     points: NDArray[np.float64], x_m: float, y_m: float
 ) -> tuple[float, float, float, float]:
-    """The s and d of a place beside a way, and the way's direction there; s below 0: behind it."""
+    """Return s and d of a place relative to a way, and the way's direction there."""
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     units = steps / lengths[:, None]

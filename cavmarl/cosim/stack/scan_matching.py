@@ -1,12 +1,12 @@
-"""Localisation against a point-cloud map: lidar scans matched with its walls, in the filter.
+"""Localisation by a point-cloud map: lidar scans matched with walls, combined with the filter.
 
-Between scans the filter of `localisation` goes on from GNSS, IMU and odometry. Each scan is laid
-onto the map's upright surfaces by generalized ICP (small_gicp), from where the filter takes the
-vehicle to be. What the pairs of points say of place and heading goes into the filter with the
-information that their normals have: along a street without ends it says nothing, and GNSS stays.
+Between scans, the filter of `localisation` uses GNSS, IMU and odometry. Each scan is aligned with
+the map's upright surfaces by generalized ICP (small_gicp), starting from the filter's pose. The
+matched pose updates the filter with the information of the pairs' normals. Along an endless street
+this information is zero, and only GNSS gives the position.
 
-Fixes have a bias of some metres, which the filter learns from the scans. As long as the place is
-not known, and where scans no longer fit, a scan is tried at many places around it.
+Fixes have a bias of some metres, which the filter learns from the scans. While the position is
+uncertain, or if scans no longer fit, a scan is tried at many places around it.
 """
 
 from __future__ import annotations
@@ -30,38 +30,39 @@ from cavmarl.sensors.mounted.geodesy import Geodesy
 
 Points = NDArray[np.float64]
 
-_RANGE_M = 50.0  # of echoes that are used
-_LOWEST_M, _HIGHEST_M = 0.3, 4.0  # above the road: no ground, nothing that only trees reach
-_UPRIGHT = 0.5  # most of a normal's vertical part
-_AROUND_M = 60.0  # of the map, for a scan
-_EXTRUDED_M = (-0.2, 0.0, 0.2)  # a plane scan is taken for upright walls
-_GATE = 16.0  # squared deviations from what the filter says, beyond which a match is another place
-_GATE_M = 1.5  # farther pairs are other things
-_PAIR_M = 0.4  # pairs that are nearer say where the vehicle is
+_RANGE_M = 50.0  # maximum range of used echoes
+_LOWEST_M, _HIGHEST_M = 0.3, 4.0  # above the road: no ground, and no treetops
+_UPRIGHT = 0.5  # maximum vertical part of a wall's normal
+_AROUND_M = 60.0  # extent of the map around a scan
+_EXTRUDED_M = (-0.2, 0.0, 0.2)  # copies of a single-layer scan, as for upright walls
+_GATE = 16.0  # squared deviations from the filter's pose beyond which a match is rejected
+_GATE_M = 1.5  # pairs farther apart are other objects
+_PAIR_M = 0.4  # pairs nearer than this are used for the pose
 _FEWEST_PAIRS, _LEAST_SHARE = 30, 0.5
-_DEVIATION_M = 0.08  # of a pair, map and scan
-_CORRELATED = 9.0  # so many pairs are worth one: neighbours err alike
-_WEAKEST = 1e-3  # of the information along the best axis, below which an axis says nothing
-# Along the best axis; scans err alike, and along others noise of normals looks like information.
+_DEVIATION_M = 0.08  # standard deviation of a pair, for map and scan
+_CORRELATED = 9.0  # this many pairs count as one, since neighbouring errors are correlated
+_WEAKEST = 1e-3  # share of the best axis's information below which an axis is ignored
+# Minimum deviation along the best axis: errors of scans are correlated, and noise of normals looks
+# like information along the other axes.
 _LEAST_M = 0.1
-_BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # of fixes; and how it changes in a second
-_SURE_M = 0.5  # standard deviation of the place, below which a scan is tried there alone
-_SIGMAS, _STEPS = 2.5, 6  # how far around it is tried otherwise, in how many steps to a side
-_TRIED, _TRY_EVERY = 150, 5  # echoes of a scan; and which scans
-_FIRST_TRIED = 3  # places that are then matched in full
-_FAR_COST = 0.05  # of the share of echoes that fit, at the edge of what is tried
-_LOST_SCANS = 20  # that fit nowhere, one after another: the place is not known
-_ASIDE_M, _WORSE = 0.5, 3.0  # so far to the side a match is worse by so much, or it slides
-_TURN_M = 10.0  # a radian, against metres
+_BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # of fixes, and its change per second
+_SURE_M = 0.5  # standard deviation of the position below which a scan is tried only there
+_SIGMAS, _STEPS = 2.5, 6  # else: radius of the search in deviations, steps to each side
+_TRIED, _TRY_EVERY = 150, 5  # echoes used per try, and scans between tries
+_FIRST_TRIED = 3  # best places that are then matched fully
+_FAR_COST = 0.05  # penalty at the edge of the tried area, as a share of fitting echoes
+_LOST_SCANS = 20  # consecutive scans without a fit after which the position is unknown
+_ASIDE_M, _WORSE = 0.5, 3.0  # a match must be worse by _WORSE when shifted sideways, or it slides
+_TURN_M = 10.0  # metres that count like a radian
 
 
 class ScanMatching(GnssInertial):
-    """The stage.
+    """The localisation stage `scan_matching`.
 
-    `sensors`: of the vehicle; a GNSS and a lidar at least. `cloud`: the map's file, in its frame.
+    `sensors`: of the vehicle, with a GNSS and a lidar at least. `cloud`: file in the map's frame.
 
     Raises:
-        ConfigError: no lidar, no file, or a cloud without walls.
+        ConfigError: there is no lidar or no file, or the cloud has no walls.
         MapError: the file cannot be read.
     """
 
@@ -78,17 +79,17 @@ class ScanMatching(GnssInertial):
         super().__init__(sensors, geodesy, hd_map, tick_s)
         lidars = [sensor for sensor in sensors if sensor.type == "lidar"]
         if not lidars:
-            raise ConfigError("localisation = scan_matching: there is no lidar among the sensors")
+            raise ConfigError("localisation = scan_matching: needs a lidar; mount one under `rig`")
         if cloud is None:
             raise ConfigError(
-                "localisation = scan_matching: needs a point-cloud map: give its file (--cloud), "
+                "localisation = scan_matching: needs a point-cloud map; give its file (--cloud), "
                 "as `cavmarl map survey` writes it"
             )
         self._lidar = max(lidars, key=lambda sensor: int(sensor.settings["layers"]))
         self._walls = _Walls(cloud)
-        self.matched = self.refused = 0  # scans
-        self.lost = 0  # how often the place had to be found anew
-        self._astray = 0  # scans that fit nowhere, the last ones
+        self.matched = self.refused = 0  # number of scans
+        self.lost = 0  # number of times that the position was lost
+        self._num_unmatched = 0  # consecutive scans without a fit
         self._next_try = 0  # scans until one is tried at many places
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
@@ -100,21 +101,21 @@ class ScanMatching(GnssInertial):
         fits = self._match(lidar_points(self._lidar, scan, _RANGE_M))
         self.matched += fits
         self.refused += not fits
-        self._astray = 0 if fits else self._astray + 1
-        if self._astray >= _LOST_SCANS:
+        self._num_unmatched = 0 if fits else self._num_unmatched + 1
+        if self._num_unmatched >= _LOST_SCANS:
             self._forget()
         return self._pose()
 
     def _forget(self) -> None:
-        """The place is off by as much as a fix may be."""
+        """Reset the position's uncertainty to that of a fix."""
         state = self._get()
         place = (state[:2] + self.bias).tolist()
         self._set_by_fix((*place, float(state[2]), float(state[3])), (1.0, 1.0, 0.1, 1.0))
-        self._astray = self._next_try = 0
+        self._num_unmatched = self._next_try = 0
         self.lost += 1
 
     def _match(self, echoes: Points) -> bool:
-        """Take in what echoes (n, 3) of the vehicle's frame say; whether they fit the map."""
+        """Update the pose by echoes (n, 3) of the vehicle's frame; return whether they fit."""
         upright = echoes[(echoes[:, 2] > _LOWEST_M) & (echoes[:, 2] < _HIGHEST_M)]
         if len(upright) and float(np.ptp(upright[:, 2])) < 1e-6:
             upright = np.concatenate([upright + np.array([0.0, 0.0, up]) for up in _EXTRUDED_M])
@@ -129,18 +130,18 @@ class ScanMatching(GnssInertial):
             return False
         if self._apart(best.pose) > _GATE:
             return False
-        self._take_match(target, best)
+        self._update_by_match(target, best)
         return True
 
     def _apart(self, pose: Points) -> float:
-        """Squared deviations by which a place and a heading (3,) are off what the filter says."""
+        """Return the squared deviations of x, y and heading (3,) from the filter's pose."""
         off = pose - self._get()[:3]
         off[2] = wrap(float(off[2]))
         spread = self._spread[:3, :3] + np.diag([_PAIR_M, _PAIR_M, _PAIR_M / _TURN_M]) ** 2
         return float(off @ np.linalg.solve(spread, off))
 
     def _starts(self, target: Target, echoes: Points, begin: Points) -> list[Points]:
-        """Motions (4, 4) to match from: of where the vehicle may be, those that fit best."""
+        """Return start motions (4, 4) for matching: the possible ones with the best fit."""
         deviation_m = math.sqrt(float(np.linalg.eigvalsh(self._spread[:2, :2])[-1]))
         self._next_try -= 1
         if deviation_m < _SURE_M or self._next_try > 0:
@@ -160,13 +161,13 @@ class ScanMatching(GnssInertial):
             starts.append(start)
         return starts
 
-    def _take_match(self, target: Target, fit: _Fit) -> None:
-        """Take in a place and a heading, as far as the normals of pairs tell them."""
+    def _update_by_match(self, target: Target, fit: _Fit) -> None:
+        """Update position and heading, as far as the normals of pairs determine them."""
         normals = _normals(target, fit)
         free = [
             axis for axis in np.linalg.eigh(normals.T @ normals)[1].T if _slides(target, fit, axis)
         ]
-        for axis in free:  # stays where the filter has it
+        for axis in free:  # keep the filter's value along this axis
             fit = fit.shifted(target, axis * float(axis @ (self._get()[:2] - fit.pose[:2])))
         normals = _normals(target, fit)
         for axis in free:
@@ -178,17 +179,17 @@ class ScanMatching(GnssInertial):
         information = slopes.T @ slopes / (_CORRELATED * _DEVIATION_M**2)
         strength, axes = np.linalg.eigh(information)
         for share, axis in zip(strength.tolist(), axes.T, strict=True):
-            if share < _WEAKEST * strength[-1] or share < 1.0:  # a metre
+            if share < _WEAKEST * strength[-1] or share < 1.0:  # 1: a deviation of a metre
                 continue
             off = seen - self._get()[:3]
             off[2] = wrap(float(off[2]))
             row = axis * (1.0, 1.0, _TURN_M)
             deviation = max(1.0 / math.sqrt(share), _LEAST_M * math.sqrt(strength[-1] / share))
-            self._take(row, float(row @ off), deviation, gate=math.inf)
+            self._update(row, float(row @ off), deviation, gate=math.inf)
 
 
 class _Walls:
-    """The upright part of a cloud, by place, and how high its ground lies."""
+    """The walls of a cloud, by place, and the height of its ground."""
 
     def __init__(self, path: Path) -> None:
         points = read_cloud(path).points
@@ -198,7 +199,7 @@ class _Walls:
         ground = points[~upright]
         if len(self._points) < FEWEST_POINTS:
             raise ConfigError(
-                f"{path}: has no walls to match scans with ({len(self._points)} upright points): "
+                f"{path}: has no walls to match scans with ({len(self._points)} upright points); "
                 "survey a map with buildings (map.buildings), or use localisation=gnss_imu"
             )
         gicp: Any = require("small_gicp", "maps")
@@ -208,12 +209,12 @@ class _Walls:
         self._held: tuple[float, float, Target | None] | None = None
 
     def ground_m(self, x_m: float, y_m: float) -> float:
-        """The height of the ground of the cloud that is nearest to a place."""
+        """Return the height of the cloud's ground nearest to a place."""
         rows, _ = self._tree.batch_nearest_neighbor_search(np.array([[x_m, y_m, 0.0]]))
         return float(self._ground[int(np.asarray(rows)[0]), 2])
 
     def around(self, x_m: float, y_m: float) -> Target | None:
-        """The walls around a place; None: there are too few. It is kept while one is near."""
+        """Return the walls around a place, cached while they suffice; None: there are too few."""
         held = self._held
         if held is None or math.hypot(held[0] - x_m, held[1] - y_m) > 0.25 * _AROUND_M:
             apart = np.abs(self._points[:, :2] - (x_m, y_m)).max(axis=1)
@@ -231,15 +232,15 @@ def _motion(x_m: float, y_m: float, z_m: float, heading: float) -> Points:
 
 
 class _Fit(NamedTuple):
-    """A scan that was laid onto walls."""
+    """A scan aligned with walls."""
 
     motion: Points  # (4, 4) from the vehicle's frame to the map's
-    placed: Points  # (n, 3) the echoes on the map
-    rows: NDArray[np.int64]  # the wall point that is nearest to each
-    distance_m: Points  # (n,) how far away that is
+    placed: Points  # (n, 3) echoes on the map
+    rows: NDArray[np.int64]  # nearest wall point of each echo
+    distance_m: Points  # (n,) distance to it
 
     def shifted(self, target: Target, by_m: Points) -> _Fit:
-        """Laid elsewhere in the plane, by (2,)."""
+        """Return the scan shifted by (2,) in the plane."""
         motion, placed = self.motion.copy(), self.placed.copy()
         motion[:2, 3] += by_m
         placed[:, :2] += by_m
@@ -258,40 +259,40 @@ class _Fit(NamedTuple):
 
     @property
     def paired(self) -> NDArray[np.bool_]:
-        """Echoes that say where the vehicle is."""
+        """Echoes that are used for the pose."""
         near: NDArray[np.bool_] = self.distance_m < _PAIR_M
         return near
 
 
 def _likelihood(distance_m: Points) -> float:
-    """Its logarithm, with a worst distance for what the map does not have."""
+    """Return the log likelihood, with a maximum distance for objects missing in the map."""
     near = np.minimum(distance_m, _PAIR_M) / (0.5 * _PAIR_M)
     return -0.5 * float(np.square(near).sum()) / _CORRELATED
 
 
 def _slides(target: Target, fit: _Fit, axis: Points) -> bool:
-    """Whether a scan fits about as well to one side along an axis (2,) of the plane.
+    """Return whether a scan fits about as well when shifted along an axis (2,) of the plane.
 
-    Normals alone do not say so: those of a rough wall point along it, too.
+    Normals alone are not sufficient: those of a rough wall also point along the wall.
     """
     sides = [fit.shifted(target, way * axis).likelihood for way in (-_ASIDE_M, _ASIDE_M)]
     return fit.likelihood - max(sides) < _WORSE
 
 
 def _normals(target: Target, fit: _Fit) -> Points:
-    """(n, 2) of the walls that echoes lie on."""
+    """Return the normals (n, 2) of the walls that used echoes lie on."""
     found: Points = np.asarray(target.cloud.normals())[fit.rows[fit.paired], :2]
     return found
 
 
 def _fit(target: Target, points: Points, start: Points) -> _Fit:
-    motion = _laid(target, points, start)
+    motion = _align(target, points, start)
     placed = moved(points, motion)
     return _Fit(motion, placed, *target.nearest(placed))
 
 
-def _laid(target: Target, points: Points, begin: Points) -> Points:
-    """The motion (4, 4) that lays points of the vehicle's frame onto walls, from a guess on."""
+def _align(target: Target, points: Points, begin: Points) -> Points:
+    """Return the motion (4, 4) that aligns the vehicle's points with walls, from a guess."""
     gicp: Any = require("small_gicp", "maps")
     shift = np.eye(4)
     shift[:3, 3] = -target.middle_m
@@ -304,5 +305,5 @@ def _laid(target: Target, points: Points, begin: Points) -> Points:
         )
         motion = np.asarray(found.T_target_source)
     shift[:3, 3] = target.middle_m
-    laid: Points = shift @ motion
-    return laid
+    aligned: Points = shift @ motion
+    return aligned

@@ -1,6 +1,6 @@
-"""`Stack`: perception, localisation, planning and control, each chosen by name and timed.
+"""`Stack`: localisation, perception, signals, planning and control, chosen by name and timed.
 
-Control is pure pursuit for the steering, within limits of the vehicle's type for the acceleration.
+Control uses pure pursuit for the steering, and limits of the vehicle class for the acceleration.
 Coulter: "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992: the
 circle through the vehicle's centre, tangent to its motion, that meets a point of the path ahead has
 the curvature 2 sin(alpha) / distance. The kinematic bicycle turns with that curvature at the slip
@@ -49,24 +49,24 @@ R = TypeVar("R")
 
 
 class Gains(NamedTuple):
-    """How one type of vehicle is controlled."""
+    """The control parameters of a vehicle class."""
 
-    lookahead_s: float  # how far ahead the steering looks, at the present speed
-    least_lookahead_m: float  # and at least
-    accel_mps2: float  # the most that it accelerates
-    brake_mps2: float  # the most that it brakes, positive
-    steering_radps: float  # how fast its front wheels are turned
+    lookahead_s: float  # lookahead of the steering in time at the present speed
+    least_lookahead_m: float  # minimum lookahead
+    accel_mps2: float  # maximum acceleration
+    brake_mps2: float  # maximum braking, positive
+    steering_radps: float  # maximum rate of the front wheels
 
 
 _CAR = Gains(0.5, 3.5, 2.5, 6.0, 1.2)
 _HEAVY = Gains(0.7, 6.0, 1.2, 5.0, 0.6)
 
-# By SUMO's class; others drive as cars do.
+# By SUMO's class; other classes use those of cars.
 GAINS = {"passenger": _CAR, "truck": _HEAVY, "bus": _HEAVY}
 
 
 class PurePursuit:
-    """The controller."""
+    """The control stage `pure_pursuit`."""
 
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s
@@ -90,7 +90,7 @@ class PurePursuit:
 
 
 def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[float, float]:
-    """The place on the way that lies so far ahead of the one beside the vehicle."""
+    """Return the point of the way `ahead_m` beyond the place beside the vehicle."""
     points = trajectory.points
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -101,7 +101,7 @@ def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[fl
     off = np.hypot(*(offset - share[:, None] * steps).T)
     beside = int(np.argmin(off))
     s = along[beside] + share[beside] * lengths[beside] + ahead_m
-    if s > along[-1]:  # beyond the end the last direction goes on
+    if s > along[-1]:  # extend the way in its last direction
         past = (s - along[-1]) / safe[-1]
         end = points[-1] + past * steps[-1]
         return float(end[0]), float(end[1])
@@ -109,7 +109,7 @@ def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[fl
 
 
 # Noise of consumer-grade parts: a GNSS receiver without corrections, a MEMS inertial unit, wheel
-# encoders, a camera that looks for lane markings, and a lidar at the height of a bumper.
+# encoders, a camera that detects lane markings, and a lidar at the height of a bumper.
 REFERENCE_RIG: dict[str, dict[str, Any]] = {
     "gnss": {"type": "gnss", "rate_hz": 10, "noise": [1.0, 1.0, 2.0], "z_m": 1.5},
     "imu": {"type": "imu", "rate_hz": 100, "noise": [0.05, 0.05, 0.05, 0.003, 0.003, 0.003]},
@@ -134,17 +134,17 @@ RIGS = {"reference": REFERENCE_RIG, "camera": CAMERA_RIG}
 
 
 class Vehicle(NamedTuple):
-    """What a stage may know of the vehicle that it is made for."""
+    """The vehicle data that stages are made from."""
 
     hd_map: HdMap
-    sensors: Sequence[StackSensor]  # that are mounted
-    geodesy: Geodesy | None  # where the map is on the earth; None: there is no GNSS
+    sensors: Sequence[StackSensor]  # mounted sensors
+    geodesy: Geodesy | None  # the map's place on the earth; None: there is no GNSS
     tick_s: float
     cloud: Path | None = None  # a point-cloud map, in the frame of the map
 
 
 class Blind:
-    """A perception that sees nothing."""
+    """A perception stage that detects nothing."""
 
     def perceive(self, readings: Readings, pose: EgoPose, time_s: float) -> list[Obstacle]:
         return []
@@ -171,7 +171,7 @@ def _scan_matching(vehicle: Vehicle) -> Localisation:
     return ScanMatching(vehicle.sensors, geodesy, vehicle.hd_map, vehicle.tick_s, vehicle.cloud)
 
 
-# Stage → name → how it is made. A stage of one's own is one more entry.
+# Stage → name → factory. Custom stages are added as further entries.
 STAGES: dict[str, dict[str, Callable[[Vehicle], Any]]] = {
     "perception": {
         "lidar": lambda vehicle: LidarObjects(vehicle.sensors, vehicle.hd_map),
@@ -190,11 +190,11 @@ STAGES: dict[str, dict[str, Callable[[Vehicle], Any]]] = {
 
 @dataclass(frozen=True)
 class StackConfig:
-    """Which stages a stack is made of."""
+    """The choice of the stages of a stack."""
 
     perception: str = "lidar"  # `lidar`, `lidar_camera`, or `blind`
     localisation: str = "gnss_imu"  # `gnss_imu`, or `scan_matching` against `cloud`
-    signals: str = "told"  # by the world; or `spat`, by what roadside units send
+    signals: str = "told"  # `told`: given by the world; `spat`: sent by roadside units
     planning: str = "lane_route"  # `lane_route`
     control: str = "pure_pursuit"  # `pure_pursuit`
     cloud: Path | None = None  # a point-cloud map
@@ -208,12 +208,12 @@ class StackConfig:
 
 @dataclass
 class StageTimes:
-    """How long stages took, by the wall clock."""
+    """Durations of stages, by the wall clock."""
 
-    steps: int = 0  # of the stack
-    # sum of each stage
+    steps: int = 0  # number of steps of the stack
+    # sum over all steps, by stage
     wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
-    # of one step
+    # maximum of one step, by stage
     worst_wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
 
     def add(self, stage: str, seconds: float) -> None:
@@ -224,13 +224,13 @@ class StageTimes:
 class Stack:
     """Drives one vehicle.
 
-    `vehicle`: that is driven. `config`: of which stages.
+    `vehicle`: the vehicle. `config`: the choice of stages.
 
     Attributes:
-        times: how long the stages took.
-        pose: where the vehicle is taken to be; None: not known yet.
-        obstacles: what is on the road.
-        reason: of the acceleration; see `Trajectory`.
+        times: durations of the stages.
+        pose: estimated pose of the vehicle; None: unknown.
+        obstacles: detected objects on the road.
+        reason: reason for the acceleration; see `Trajectory`.
     """
 
     def __init__(self, vehicle: Vehicle, config: StackConfig | None = None) -> None:
@@ -247,16 +247,16 @@ class Stack:
         self.reason = ""
 
     def reset_pose(self, pose: EgoPose) -> None:
-        """Tell the localisation where the vehicle is; optional."""
+        """Set the pose of the vehicle in the localisation; optional."""
         self._localisation.reset_pose(pose)
 
     def drive(
         self, readings: Readings, signals: NDArray[np.uint8] | None, mission: Mission, time_s: float
     ) -> Control2D:
-        """One step of all stages; without a pose the vehicle brakes.
+        """Run all stages once; without a pose the vehicle brakes.
 
-        `readings`: what the sensors have that is due. `signals`: what the world says of signals;
-        see `SignalReading`. `time_s`: simulated.
+        `readings`: new samples of the sensors. `signals`: signals as given by the world; see
+        `SignalReading`. `time_s`: simulated time.
         """
         self.times.steps += 1
         pose = self.pose = self._timed(
@@ -284,7 +284,7 @@ class Stack:
 
 
 def sensor_of(name: str, settings: Mapping[str, Any]) -> StackSensor:
-    """A sensor by its keys in `env.yaml`."""
+    """Return a sensor for its keys in `env.yaml`."""
     mount = StackMount(settings["x_m"], settings["y_m"], math.radians(settings["yaw_deg"]))
     return StackSensor(name, settings["type"], mount, settings)
 
@@ -292,9 +292,9 @@ def sensor_of(name: str, settings: Mapping[str, Any]) -> StackSensor:
 def vehicle_of(
     hd_map: HdMap, sensors: Sequence[StackSensor], tick_s: float, cloud: Path | None = None
 ) -> Vehicle:
-    """What stages may know.
+    """Return the vehicle data for stages.
 
-    `sensors`: that are mounted. `cloud`: a point-cloud map.
+    `sensors`: mounted sensors. `cloud`: a point-cloud map.
 
     Raises MissingExtraError: the map is projected, and pyproj is not installed; MapError: its
     projection is unknown.

@@ -1,6 +1,6 @@
 """The data that the stages of a stack exchange.
 
-Places are those of the map: x east, y north, in m; headings counter-clockwise from east, in rad.
+Positions are x east and y north on the map in m; headings are counter-clockwise from east in rad.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from numpy.typing import NDArray
 
 
 class SensorSamples(Protocol):
-    """What one sensor has since the last step."""
+    """The samples of one sensor since the last step."""
 
     @property
-    def values(self) -> NDArray[Any]: ...  # (n, …) one sample a row, the newest last
+    def values(self) -> NDArray[Any]: ...  # (n, …) one sample per row, the newest last
     @property
-    def stamps_s(self) -> NDArray[np.float64]: ...  # (n,) when each was taken
+    def stamps_s(self) -> NDArray[np.float64]: ...  # (n,) time of each sample
     @property
-    def lost(self) -> NDArray[np.bool_]: ...  # (n,) which were lost
+    def lost(self) -> NDArray[np.bool_]: ...  # (n,) which samples were lost
 
 
 Readings = Mapping[str, SensorSamples]
-"""By the sensor's name; those that are due."""
+"""New samples by the sensor's name."""
 
 
 class StackMount(NamedTuple):
-    """Where a sensor is on its vehicle, in the plane."""
+    """The place of a sensor on its vehicle, in the plane."""
 
     x_m: float
     y_m: float
@@ -46,7 +46,7 @@ class StackSensor(NamedTuple):
 
 
 class EgoPose(NamedTuple):
-    """Where the vehicle's centre is, and how it moves."""
+    """The pose and the motion of the vehicle's centre."""
 
     x_m: float
     y_m: float
@@ -56,29 +56,29 @@ class EgoPose(NamedTuple):
 
 
 class Obstacle(NamedTuple):
-    """Something on the road, as far as it is seen."""
+    """A detected object on the road."""
 
-    x_m: float  # its middle
+    x_m: float  # of the centre
     y_m: float
     heading_rad: float  # of its longer axis, along the road
     length_m: float
     width_m: float
     vx_mps: float
     vy_mps: float
-    kind: str = "unknown"  # or `vehicle`, `cyclist`, `pedestrian`, where a camera tells
+    kind: str = "unknown"  # or `vehicle`, `cyclist`, `pedestrian`, if a camera detects it
 
 
 class Mission(NamedTuple):
-    """What the vehicle is to do, and what it is."""
+    """The destination and the body of the vehicle."""
 
-    goal_edge: int  # EDGE row; the vehicle is to go to the end of that edge
+    goal_edge: int  # EDGE row; the end of this edge is the destination
     vclass: str  # SUMO's
     length_m: float
     width_m: float
 
 
 class Control2D(NamedTuple):
-    """What the vehicle does: acceleration, and the angle of the front wheels."""
+    """Controls of a vehicle: acceleration, and the angle of the front wheels."""
 
     accel_mps2: float
     steering_rad: float
@@ -86,41 +86,41 @@ class Control2D(NamedTuple):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where to drive, and how fast."""
+    """The way to drive, and the acceleration along it."""
 
-    points: NDArray[np.float64]  # (n, 2) the way ahead, from beside the vehicle on; at least two
-    accel_mps2: float  # along it, now
-    # what that is for: `free`, `gap`, `pedestrian`, `stop_line`, `yield` or `end`
+    points: NDArray[np.float64]  # (n, 2) the way from beside the vehicle; at least two points
+    accel_mps2: float  # along the way, at present
+    # reason of the acceleration: `free`, `gap`, `pedestrian`, `stop_line`, `yield` or `end`
     reason: str = "free"
     lanes: Sequence[int] = field(default_factory=tuple)
 
 
 class Perception(Protocol):
-    """Sensors → what is on the road."""
+    """Detects objects on the road by sensors."""
 
     def perceive(self, readings: Readings, pose: EgoPose, time_s: float) -> list[Obstacle]: ...
 
 
 class Localisation(Protocol):
-    """Sensors → where the vehicle is."""
+    """Estimates the vehicle's pose by sensors."""
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
-        """Where it is now; None: not known yet."""
+        """Return the present pose; None: unknown."""
         ...
 
     def reset_pose(self, pose: EgoPose) -> None: ...
 
 
 class SignalReading(Protocol):
-    """Messages, or what the world says → what signals show."""
+    """Reads the state of signals from messages or from the world."""
 
     def read(self, readings: Readings, told: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
-        """(num_links,) SIGNAL_* codes, 255: none; None: unknown."""
+        """Return (num_links,) SIGNAL_* codes, 255: no signal; None: unknown."""
         ...
 
 
 class Planning(Protocol):
-    """Where the vehicle is, what is on the road and what signals show → where to drive."""
+    """Plans the way and the acceleration from pose, objects and signals."""
 
     def plan(
         self,
@@ -129,15 +129,15 @@ class Planning(Protocol):
         signals: NDArray[np.uint8] | None,
         mission: Mission,
     ) -> Trajectory:
-        """The way from here on.
+        """Return the way from the present pose.
 
-        `obstacles`: what is on the road. `signals`: (num_links,) SIGNAL_* codes, 255: none; None:
-        unknown. `mission`: where it is to go.
+        `obstacles`: objects on the road. `signals`: (num_links,) SIGNAL_* codes, 255: no signal;
+        None: unknown. `mission`: the destination.
         """
         ...
 
 
 class ControlStage(Protocol):
-    """Where to drive → what the vehicle does."""
+    """Computes controls for a trajectory."""
 
     def control(self, pose: EgoPose, trajectory: Trajectory, mission: Mission) -> Control2D: ...

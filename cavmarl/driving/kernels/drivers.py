@@ -132,7 +132,7 @@ def _is_askew(row: np.void, leader: np.void) -> bool:
 
 
 @kernel
-def _at_line(
+def decide_at_line(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -280,7 +280,7 @@ def _road_ahead(
         stops = False
         if link >= 0 and distance < see:
             fork = behind_fork(roads, kind, row, before, link, distance, scratch)
-            at_line, found, to_stop = _at_line(
+            at_line, found, to_stop = decide_at_line(
                 roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
             )
             stops = to_stop < math.inf

@@ -1,1 +1,1 @@
-"""Compiled loops over what is recorded of a run."""
+"""Kernels that record agents and near misses of a run."""

@@ -1,9 +1,11 @@
-"""What evaluation reads from the traffic after each step: places of agents, near misses.
+"""Kernels for places of agents and post-encroachment times after each step.
 
 A conflict area is the stretch that the paths of two movements over a junction share (a CONFLICT
-row). Post-encroachment time is what passes between the moment at which the first vehicle's rear
-leaves it and the moment at which the second one's front enters it from the other path (Allen, Shin
-and Cooper 1978).
+row).
+Post-encroachment time is the time from the moment at which the first vehicle's rear leaves the area
+to
+the moment at which the second vehicle's front enters it from the other path (Allen, Shin and Cooper
+1978).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 
-MIN_SPEED_MPS = 1.0  # of a front that is followed back to where it entered
+MIN_SPEED_MPS = 1.0  # longest way that a front is followed back to its entry
 
 
 @kernel
@@ -28,7 +30,7 @@ def locate_agents(
     Args:
         rows: VEHICLE (W, C).
         num_rows: (W,) live rows of each world.
-        out: (W, A, 2) x and y in m; those of absent agents are left as they are.
+        out: (W, A, 2) x and y in m; values of absent agents stay unchanged.
     """
     for w in range(rows.shape[0]):
         for i in range(num_rows[w]):
@@ -40,9 +42,9 @@ def locate_agents(
 
 @kernel
 def _place_on_link(roads: RoadArrays, row: np.void) -> tuple[int, float]:
-    """The link that a vehicle is on, or has just left, and its centre's way from the stop line.
+    """Return a vehicle's current or last link, and its centre's distance from the stop line.
 
-    (-1, 0) before the stop line and one length behind the junction.
+    (-1, 0) before the stop line and from one length behind the junction.
     """
     lane = roads.lanes[row["lane"]]
     if lane["internal"]:
@@ -55,10 +57,12 @@ def _place_on_link(roads: RoadArrays, row: np.void) -> tuple[int, float]:
 
 @kernel
 def _stay(conflict: np.void, row: np.void, centre_m: float, dt: float) -> tuple[float, float]:
-    """Since when and for how long from now a vehicle covers an area, in s; (-1, -1) if it does not.
+    """Return the times from now, in s, between which a vehicle covers an area, else (-1, -1).
 
-    At its present speed, and within the step: what lies further off is another observation's. Only
-    a vehicle whose centre has just passed the stop line may have entered earlier with its front.
+    The vehicle keeps its present speed. Only times within the step count, as other steps observe
+    the rest.
+    Only a vehicle whose centre has just passed the stop line may have entered earlier with its
+    front.
     """
     half = 0.5 * row["length"]
     ahead = centre_m + half - conflict["enter_m"]
@@ -87,24 +91,26 @@ def watch_encroachments(
     seen_agent: NDArray[np.int32],
     least_s: NDArray[np.float64],
 ) -> None:
-    """Take in one step: lower the agents' least post-encroachment times where a vehicle passed.
+    """Lower the least post-encroachment times of agents by the passes of one step.
 
-    First all vehicles leave their mark on the areas that they cover, then each looks at the marks
-    of the other paths: so the order of rows does not matter. Vehicles that are in an area together
-    have a time of 0.
+    All vehicles first mark the areas that they cover. Then each vehicle reads the marks of the
+    other
+    paths, so the order of rows does not matter. Vehicles in an area at the same time have a time of
+    0.
 
     Args:
         roads: the road arrays.
-        mirror: (num_conflicts,) the same area's row from the other path, -1: not watched.
+        mirror: (num_conflicts,) row of the same area on the other path, -1: not watched.
         rows: VEHICLE (W, C).
         num_rows: (W,) live rows.
         chosen: (W,) worlds to watch.
         agent_ids: (W, A) id of each agent's vehicle, -1: none.
-        now_s: time of this step, rising from call to call.
-        dt: s, between calls.
-        seen_s: (W, num_conflicts) when an area was last covered from this path; -inf: never.
-        seen_id: (W, num_conflicts) by which vehicle.
-        seen_agent: (W, num_conflicts) the agent that drove it, -1: none.
+        now_s: time of this step, increasing from call to call.
+        dt: time between calls in s.
+        seen_s: (W, num_conflicts) time at which an area was last covered from this path; -inf:
+            never.
+        seen_id: (W, num_conflicts) vehicle that covered it.
+        seen_agent: (W, num_conflicts) agent that drove this vehicle, -1: none.
         least_s: (W, A) lowered.
     """
     for w in range(rows.shape[0]):

@@ -1,1 +1,1 @@
-"""What a result was made with: hardware, versions, hashes, training runs."""
+"""Provenance of results: hardware, versions, hashes, training runs."""

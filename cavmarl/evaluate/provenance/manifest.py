@@ -1,8 +1,10 @@
-"""The manifest of an evaluation: what a result is made with, on record before there is one.
+"""The manifest of an evaluation: how results are made, written before the results.
 
-`open_manifest` writes it before the first step, `close_manifest` when all results lie beside it,
-with their hashes. A process that dies in between leaves an open one. `read_closed` is the door
-through which every report goes: results without a closed manifest that knows them are refused.
+`open_manifest` writes the manifest before the first step. `close_manifest` completes it with the
+hashes
+of all results. If the process dies in between, the manifest stays open. Every report is read
+through
+`read_closed`, which refuses results without a closed manifest that lists them.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ Document = dict[str, Any]
 
 
 def describe_policies(policies: Mapping[str, str]) -> Document:
-    """Each policy's name or path as given, and the hashes of its files."""
+    """Return each policy's name or path as given, and the hashes of its files."""
     return {
         name: {
             "given": given,
@@ -40,7 +42,7 @@ def describe_policies(policies: Mapping[str, str]) -> Document:
 
 
 def _hashes(files: Sequence[Path]) -> dict[str, str]:
-    """By name, with the folder in front where two files have one name."""
+    """Return hashes by file name, preceded by the folder if two files have the same name."""
     names = Counter(file.name for file in files)
     return {
         file.name if names[file.name] == 1 else f"{file.parent.name}/{file.name}": hash_of_file(
@@ -51,18 +53,18 @@ def _hashes(files: Sequence[Path]) -> dict[str, str]:
 
 
 def open_manifest(folder: Path, document: Mapping[str, Any]) -> Document:
-    """Write the manifest of results that are about to be made into `folder`.
+    """Write the manifest of future results into `folder`.
 
     Args:
-        folder: of the results; it exists and holds no manifest.
-        document: what this evaluation is; machine, versions, commit and time are added.
+        folder: folder of the results; it exists and holds no manifest.
+        document: description of the evaluation; machine, versions, commit and time are added.
 
     Raises:
-        ManifestError: there is a manifest already.
+        ManifestError: the folder has a manifest already.
     """
     path = folder / MANIFEST_FILE
     if path.exists():
-        raise ManifestError(f"{path}: there are results of another run here; give a new folder")
+        raise ManifestError(f"{path}: holds the results of another run; name a new folder")
     opened = {
         "schema": SCHEMA,
         "status": "open",
@@ -94,10 +96,10 @@ def close_manifest(
 
 
 def read_closed(folder: Path) -> Document:
-    """The manifest of a folder of results that can be trusted to belong to it.
+    """Return the closed manifest of a results folder after checking all hashes.
 
     Raises:
-        ManifestError: no manifest, an open one, or results that it does not know.
+        ManifestError: the manifest is missing or open, or a result is not listed in it.
     """
     path = folder / MANIFEST_FILE
     if not path.is_file():
@@ -113,7 +115,7 @@ def read_closed(folder: Path) -> Document:
         )
     for name, known in document["results_sha256"].items():
         file = folder / name
-        if not isfile(file):  # unlike Path's, it takes names that no file can have
+        if not isfile(file):  # unlike methods of Path, it accepts impossible file names
             raise ManifestError(f"{file}: is missing, though {path} lists it; run it again")
         if hash_of_file(file) != known:
             raise ManifestError(
@@ -123,18 +125,18 @@ def read_closed(folder: Path) -> Document:
 
 
 def hash_of_file(path: Path) -> str:
-    """SHA-256 of a file, hex."""
+    """Return the SHA-256 of a file in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that is there whole or not at all."""
+    """Write a file atomically."""
     write_whole(path, text.encode())
 
 
 def _is_typed(document: Document) -> bool:
-    """Whether the keys that are read again hold what they are written with."""
+    """Return whether the keys that are read again have the expected types."""
     command, known = document["command"], document["results_sha256"]
     return (
         isinstance(command, list)
@@ -153,7 +155,7 @@ def _read(path: Path) -> Document:
         ) from error
     needed = {"schema", "status", "started", "command", "results_sha256"}
     if not isinstance(document, dict) or not needed <= document.keys() or not _is_typed(document):
-        raise ManifestError(f"{path}: not a manifest of an evaluation; run it again")
+        raise ManifestError(f"{path}: is not a manifest of an evaluation; run the evaluation again")
     if document["schema"] != SCHEMA:
         raise ManifestError(
             f"{path}: schema {document['schema']}, but this version reads {SCHEMA}; use the "

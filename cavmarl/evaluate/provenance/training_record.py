@@ -1,7 +1,8 @@
-"""The manifest of a training run: what a driver was trained with, beside its checkpoint.
+"""The manifest of a training run, which lies beside the driver's checkpoint.
 
-It is written before the first update and closed after the last one, with the hashes of what the run
-left; a run that died has an open one.
+It is written before the first update and closed after the last one with the hashes of the results.
+If
+the run dies, the manifest stays open.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from cavmarl.evaluate.provenance.manifest import (
     read_closed,
 )
 
-CHECKPOINT_FILE = "checkpoint.pt"  # what a run goes on from; see `learning.checkpoint`
+CHECKPOINT_FILE = "checkpoint.pt"  # from which a run resumes; see `learning.checkpoint`
 
 
 def begin_training(
@@ -33,10 +34,11 @@ def begin_training(
     world: World | Simulation,
     plans: Sequence[Plan] = (),
 ) -> None:
-    """Put on record what is about to be trained, in place of the record of an earlier run there.
+    """Write the manifest of a training run, replacing that of an earlier run there.
 
-    `plans` say which worker hosts what; `cavmarl plan --again FOLDER/manifest.json` makes them
-    again. `seed` is one of the settings.
+    `plans` say which worker hosts which shards; `cavmarl plan --again FOLDER/manifest.json`
+    recomputes
+    them. `seed` is one of the settings.
     """
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
     open_manifest(
@@ -57,7 +59,7 @@ def end_training(folder: Path, files: Sequence[str], plans: Sequence[Plan] = ())
 
 
 def is_trained(folder: Path) -> bool:
-    """Whether a run has ended there and its files are what it left."""
+    """Return whether a run has ended there and its files are unchanged."""
     try:
         read_closed(folder)
     except ManifestError:

@@ -1,1 +1,1 @@
-"""Scenarios as tests: criticality, verdicts, films, sweeps over maps."""
+"""Tests of drivers in scenarios: criticality, verdicts, films, sweeps over maps."""

@@ -1,6 +1,6 @@
-"""How close it was: time to collision and post-encroachment time between two bodies.
+"""Criticality of an encounter: time to collision (TTC) and post-encroachment time (PET).
 
-Both are measured on rectangles in the plane, wherever the bodies are, on lanes or off them.
+Both are computed for rectangles in the plane, on lanes or off them.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ TRACE = np.dtype(
 
 
 def trace_of(row: np.void, time_s: float) -> tuple[float, ...]:
-    """What a TRACE keeps of a VEHICLE row."""
+    """Return the fields of a VEHICLE row that a TRACE keeps."""
     _, *names = TRACE.names or ()
     return (time_s, *(float(row[name]) for name in names))
 
 
 def least_ttc_s(one: NDArray[np.void], other: NDArray[np.void]) -> float:
-    """The least `time_to_collision_s` of TRACE (n,) and (m,) over the moments that both have."""
+    """Return the least `time_to_collision_s` of TRACE (n,) and (m,) over their common moments."""
     _, here, there = np.intersect1d(one["time_s"], other["time_s"], return_indices=True)
     least = math.inf
     for i, j in zip(here.tolist(), there.tolist(), strict=True):
-        x1, y1, cos1, sin1, length1, width1 = _box(one[i])
-        x2, y2, cos2, sin2, length2, width2 = _box(other[j])
+        x1, y1, cos1, sin1, length1, width1 = box(one[i])
+        x2, y2, cos2, sin2, length2, width2 = box(other[j])
         speed1, speed2 = float(one[i]["speed"]), float(other[j]["speed"])
         ttc = time_to_collision_s(
             x2 - x1, y2 - y1, speed2 * cos2 - speed1 * cos1, speed2 * sin2 - speed1 * sin1,
@@ -51,12 +51,16 @@ def least_ttc_s(one: NDArray[np.void], other: NDArray[np.void]) -> float:
 
 
 def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float:
-    """The shortest time between one body's leaving a place and the other's being there, in s.
+    """Return the post-encroachment time of two bodies, in s.
 
-    Post-encroachment time (Allen, Shin, Cooper: "Analysis of traffic conflicts and collisions",
-    Transportation Research Record 667, 1978) of TRACE (n,) and (m,), with the ground that a body
-    covers as the place: inf if no place was covered by both, 0 if both were there at a time. As
-    bodies are known at moments only, it is too long by at most twice the time between two of them.
+    It is the shortest time between one body's leaving a place and the other body's presence there
+    (Allen,
+    Shin, Cooper: "Analysis of traffic conflicts and collisions", Transportation Research Record
+    667, 1978).
+    The arguments are TRACE (n,) and (m,), and the place is the ground that a body covers. The value
+    is inf if no place was covered by both bodies, and 0 if both were there at the same time. As
+    bodies are known at discrete moments, it is too long by at most twice the time between two of
+    them.
     """
     reach = 0.5 * (hypot_all(one["length"], one["width"]).max(initial=0.0)
                    + hypot_all(other["length"], other["width"]).max(initial=0.0))  # fmt: skip
@@ -66,12 +70,13 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
     near = np.argwhere(dx * dx + dy * dy < reach * reach)
     near = near[np.argsort(apart_s[near[:, 0], near[:, 1]], kind="stable")]
     for i, j in near.tolist():
-        if boxes_overlap(*_box(one[i]), *_box(other[j])):
+        if boxes_overlap(*box(one[i]), *box(other[j])):
             return float(apart_s[i, j])
     return math.inf
 
 
-def _box(body: np.void) -> tuple[float, float, float, float, float, float]:
+def box(body: np.void) -> tuple[float, float, float, float, float, float]:
+    """Return the arguments of `boxes_overlap` for a body: centre, cos, sin and half sizes."""
     return (
         float(body["x"]), float(body["y"]), *cos_sin(float(body["heading"])),
         0.5 * float(body["length"]), 0.5 * float(body["width"]),

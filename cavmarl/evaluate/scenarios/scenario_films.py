@@ -1,4 +1,4 @@
-"""`ScenarioCamera`: a scenario seen from above, as a video and as a picture of its worst moment."""
+"""`ScenarioCamera`: a video of a scenario from above, and a picture of its closest moment."""
 
 from __future__ import annotations
 
@@ -21,22 +21,24 @@ if TYPE_CHECKING:
     from pygame import Surface
 
 SIZE = (1280, 720)
-HALF_M = (64.0, 36.0)  # of what is shown around the middle of the scene
+HALF_M = (64.0, 36.0)  # shown around the centre of the scene
 
 
 class ScenarioCamera:
-    """Films the first world after `make_scenario`; use it in a `with` block.
+    """A camera on the first world of `make_scenario`, for use in a `with` block.
 
-    `picture` is of the moment in which an agent was closest to an actor that has moved, `video` of
-    everything; None: it goes nowhere.
+    `picture` shows the moment in which an agent was closest to a moving actor, `video` the whole
+    run. None: neither is written.
     """
 
     def __init__(self, vec: CavVectorEnv, picture: Path | None, video: Path | None) -> None:
         scene = vec.simulation.scene
         if scene is None:
-            raise ConfigError("scenario.name = '': there is no scenario to film in this world")
+            raise ConfigError(
+                "scenario.name = '': this world has no scenario to film; set scenario.name"
+            )
         if picture is not None and picture.suffix != ".png":
-            raise ConfigError(f"{picture}: a picture's name ends in .png")
+            raise ConfigError(f"{picture}: the name of a picture must end in .png")
         focus = (scene.x - HALF_M[0], scene.y - HALF_M[1], scene.x + HALF_M[0], scene.y + HALF_M[1])
         self._vec = vec
         self._renderer = TopDownRenderer(vec.network, SIZE, focus)

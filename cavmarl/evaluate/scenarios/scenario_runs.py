@@ -1,4 +1,4 @@
-"""A scenario, played to agents of one driver: how critical it was, and whether all have passed."""
+"""Runs of a scenario with agents of one driver: criticality and verdicts."""
 
 from __future__ import annotations
 
@@ -48,36 +48,38 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class ScenarioRun:
-    """What became of one run."""
+    """The result of one run."""
 
     scenario: str  # its name
-    environment: str  # whose map it was played on
+    environment: str  # environment whose map was used
     place: str  # where
     driver: str  # of the agents
     seed: int  # of place and traffic
-    zones: int  # into which the world was divided
+    zones: int  # number of zones of the world
     agents: int  # how many
-    background: int  # vehicles beside the agents and the actors
+    background: int  # vehicles other than agents and actors
     # `passed` (all through, and none hurt), or what became of the worst of the agents: `collided`,
     # `off road`, or `stuck`; `actors collided`, with one another and not with an agent: the scene
     # was not what it should be
     verdict: str
-    verdicts: tuple[str, ...]  # of each agent, that to which the scene is played first
-    clash: str  # which actors were the first to touch one another, and when; empty: none
+    verdicts: tuple[str, ...]  # verdict of each agent, that in the conflict first
+    clash: str  # the first contact of two actors, with its time; empty: none
     # least time to collision of an agent with an actor, 0 after a collision with one; None: they
     # were never about to
     min_ttc_s: float | None
-    pet_s: float | None  # least post-encroachment time likewise; None: no place was used by both
-    collisions: int  # vehicles and actors that began to touch another one, agents among them
+    pet_s: (
+        float | None
+    )  # least post-encroachment time of an agent and an actor; None: no common place
+    collisions: int  # contacts of vehicles and actors, agents included
     red_lights: int  # steps in which an agent entered a junction at red
-    delay_s: float  # of the first agent, above what its way takes at the speed that it started with
-    longest_wait_s: float  # for which any other vehicle had stood when the run was over
-    time_s: float  # the run took
+    delay_s: float  # of the first agent, compared with its initial speed
+    longest_wait_s: float  # longest wait of another vehicle at the end of the run
+    time_s: float  # duration of the run
     state_hash: str  # of the world at the end
 
     @property
     def passed(self) -> bool:
-        """Whether all agents came through and hurt no one."""
+        """Whether all agents reached their goals and caused no collision."""
         return self.verdict == "passed"
 
 
@@ -91,21 +93,21 @@ def make_scenario(
     zones: int | None = None,
     **keys: Unpack[WorldKeys],
 ) -> CavVectorEnv:
-    """One world in which a scenario is played to its agents, which steer and accelerate.
+    """Return one world with a scenario for its agents, which steer and accelerate.
 
     Args:
         scenario: name, or path of a file.
         env: as in `make_vec`, like the other keywords.
-        params: of the scenario.
-        place: where; empty: drawn by the seed, which is that of the first reset, too.
-        density: of the other traffic, of `DENSITIES`.
-        zones: into which the world is divided; None: as the environment says.
-        keys: of the world; of the agents, by default 1, the first is in the conflict, the others
-            come after it.
+        params: parameters of the scenario.
+        place: place on the map; empty: drawn by the seed, which is also that of the first reset.
+        density: density of the other traffic, one of `DENSITIES`.
+        zones: number of zones; None: as configured by the environment.
+        keys: of the world; of the agents (default 1), the first is in the conflict and the others
+            follow it.
 
     Raises:
-        ConfigError: no such scenario, no place for it on the map, or no room for the agents; a
-            parameter, a density or a key that cannot work.
+        ConfigError: no such scenario, no place for it on the map, no room for the agents, or a
+            wrong parameter, density or key.
     """
     spec = WorldSpec.of(env, **keys)
     if density not in DENSITIES:
@@ -143,7 +145,7 @@ def run_scenario(
     seed: int = 0,
     look: Callable[[], None] | None = None,
 ) -> ScenarioRun:
-    """Play the scenario of a world once, from its reset to its end; `look` is called each step."""
+    """Run the scenario of a world from reset to end; `look` is called at each step."""
     policy = load_policy(driver, vec)
     observations, infos = vec.reset(seed=seed)
     policy.reset(seed)
@@ -161,12 +163,14 @@ def run_scenario(
 
 
 class _Record:
-    """What is kept of a run, step by step."""
+    """Values of a run, collected step by step."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
         simulation = vec.simulation
         if simulation.scene is None:
-            raise ConfigError("scenario.name = '': there is no scenario to play in this world")
+            raise ConfigError(
+                "scenario.name = '': this world has no scenario to run; set scenario.name"
+            )
         self._vec, self._simulation, self._scene = vec, simulation, simulation.scene
         rows = simulation.vehicles()
         agents = np.sort(rows[rows["agent"] >= 0], order="agent")
@@ -201,7 +205,7 @@ class _Record:
         own = [traces.pop(agent) for agent in self._agents]
         touched = verdict == "collided"
         self._watch_actors(simulation.vehicles())
-        # Over all agents and actors, and all moments in which both are there.
+        # Over all agents and actors, and all their common moments.
         ttcs = [least_ttc_s(one, other) for one in own for other in traces.values()]
         pets = [post_encroachment_s(one, other) for one in own for other in traces.values()]
         rows = simulation.vehicles()

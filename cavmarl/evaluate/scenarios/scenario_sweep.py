@@ -1,7 +1,7 @@
-"""All scenarios on several maps and seeds: results, as `cavmarl scenario sweep` prints them.
+"""Sweeps of scenarios over maps and seeds, as `cavmarl scenario sweep` prints them.
 
-One driver is to pass, another one, that ignores others, is not: a scenario that lets it pass asks
-nothing of a driver.
+One driver must pass. Another driver, which ignores all others, must fail: a scenario that it passes
+tests nothing.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ class SweepRow(NamedTuple):
 
     scenario: str  # its name
     environment: str  # name, folder or map file
-    # runs of the driver that is to pass; none where the map has no place for it
+    # runs of the driver that must pass; empty if the map has no place
     passing: list[ScenarioRun]
-    failing: list[ScenarioRun]  # runs of the one that is not
+    failing: list[ScenarioRun]  # runs of the driver that must fail
 
     @property
     def holds(self) -> bool:
-        """Whether the one has passed all runs, and the other none."""
+        """Whether one driver passed all runs and the other none."""
         return all(run.passed for run in self.passing) and not any(
             run.passed for run in self.failing
         )
 
     @staticmethod
     def verdicts(runs: Sequence[ScenarioRun]) -> str:
-        """How often which verdict was given, as in `5 passed`."""
+        """Return the counts of verdicts, for example `5 passed`."""
         counts = Counter(run.verdict for run in runs)
         return ", ".join(f"{number} {verdict}" for verdict, number in sorted(counts.items()))
 
     def least(self, name: str) -> float | None:
-        """The least of a measure over the runs that are to pass; None: it was never defined."""
+        """Return the least value of a measure over the runs that must pass; None: never defined."""
         values = [getattr(run, name) for run in self.passing]
         return min((value for value in values if value is not None), default=None)
 
@@ -60,19 +60,19 @@ def sweep_scenarios(
     density: str = "none",
     agents: int = 1,
 ) -> Iterator[SweepRow]:
-    """Play each scenario on each map once with each seed, to two drivers.
+    """Run each scenario on each map once per seed, with two drivers.
 
     Args:
         scenarios: names, or paths of files.
         maps: names, folders or map files of environments.
         seeds: of place and traffic.
-        passes: the driver that is to pass.
-        fails: the one that is not.
-        density: of the other traffic.
-        agents: how many each time.
+        passes: driver that must pass.
+        fails: driver that must fail.
+        density: density of the other traffic.
+        agents: number of agents in each run.
 
     Raises:
-        ConfigError: an unknown scenario, or no room for the agents; as of `make_scenario`.
+        ConfigError: an unknown scenario, or no room for the agents; as in `make_scenario`.
     """
     for scenario in scenarios:
         for env in maps:

@@ -1,1 +1,1 @@
-"""Our traffic beside SUMO's, measured by one meter."""
+"""Comparison of traffic with SUMO by the same metrics."""

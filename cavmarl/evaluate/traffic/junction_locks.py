@@ -1,4 +1,4 @@
-"""Locked junctions: vehicles could go, but none goes."""
+"""Gridlocks of junctions: vehicles could move, but none does."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from numpy.typing import NDArray
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.roads.network import RoadNetwork
 
-STOP_LINE_M = 10.0  # a front nearer to the end of its lane than this stands at the stop line
+STOP_LINE_M = 10.0  # a front this near to the end of its lane is at the stop line
 
 
 class JunctionLocks:
-    """How long each junction was locked, from samples taken once a second.
+    """The duration of locks of each junction, from samples once per second.
 
-    A vehicle *waits* at a junction if it stands inside it, or at the stop line of a lane into it of
-    which a link has no red signal. A lock is the number of seconds with a vehicle waiting since
-    a vehicle has last entered or left the junction; it also ends when none waits there, unless
-    they are only held by red. So time at red neither counts nor ends a lock.
+    A vehicle *waits* at a junction if it stands inside it, or at the stop line of a lane with a
+    link into the
+    junction that has no red signal. A lock is the time with a waiting vehicle since a vehicle last
+    entered or
+    left the junction. It also ends when no vehicle waits there, unless all are held only by red. So
+    time at
+    red neither counts nor ends a lock.
     """
 
     def __init__(self, network: RoadNetwork) -> None:
@@ -36,12 +39,12 @@ class JunctionLocks:
     def sample(
         self, rows: NDArray[np.void], standing: NDArray[np.bool_], codes: NDArray[np.uint8]
     ) -> None:
-        """Take the sample of a second.
+        """Add the sample of a second.
 
         Args:
             rows: VEHICLE (num_vehicles,), all on lanes of the map.
-            standing: (num_vehicles,) which stand.
-            codes: (num_links,) what the links' signals show.
+            standing: (num_vehicles,) whether a vehicle stands.
+            codes: (num_links,) signal states of the links.
         """
         lanes = rows["lane"]
         front_to_end = self._network.lanes["length_m"][lanes] - rows["s"] - 0.5 * rows["length"]
@@ -57,14 +60,14 @@ class JunctionLocks:
         np.maximum(self._longest_s, self._lock_s, out=self._longest_s)
 
     def longest_s(self) -> dict[str, float]:
-        """Junction → its longest lock in seconds, of those that had one."""
+        """The longest lock in s of each junction that had one."""
         return {
             self._network.junction_ids[row]: float(self._longest_s[row])
             for row in np.flatnonzero(self._longest_s)
         }
 
     def _passed(self, rows: NDArray[np.void]) -> NDArray[np.bool_]:
-        """(num_junctions,) where a vehicle entered or left since the sample before."""
+        """Return (num_junctions,) whether a vehicle entered or left since the last sample."""
         order = np.argsort(rows["id"])
         ids, lanes = rows["id"][order], rows["lane"][order].astype(np.int64)
         _, now, before = np.intersect1d(ids, self._ids, assume_unique=True, return_indices=True)
@@ -80,7 +83,7 @@ class JunctionLocks:
         return passed
 
     def _marks(self, junctions: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """(num_junctions,) true at the rows given; -1 marks none."""
+        """Return (num_junctions,) true at the given rows; -1 marks none."""
         found = np.zeros(len(self._lock_s), dtype=np.bool_)
         found[junctions[junctions >= 0]] = True
         return found

@@ -1,4 +1,4 @@
-"""Our run of a demand, measured by the meter that measures SUMO's."""
+"""A run of a demand in cavmarl, measured like SUMO's run."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def load_demand(
     dt_s: float,
     overrides: Mapping[str, Any] | None = None,
 ) -> World:
-    """What a world with background traffic and no agents is made of, with ticks of `dt_s`.
+    """Return the parts of a world with background traffic and no agents, with ticks of `dt_s`.
 
-    The signal programs that additional files of the demand have count, too.
+    Signal programs in additional files of the demand are used, too.
     """
     own = {
         "clock.sim_dt_s": dt_s,
@@ -49,13 +49,13 @@ def make_world(
 
 
 def idle_commands(simulation: Simulation) -> Commands:
-    """Commands of a step in which no agent does anything."""
+    """Return the commands of a step without actions."""
     shape = simulation.outputs.present.shape
     return Commands(np.zeros((*shape, 2)), np.full(shape, ACTION_IDLE, dtype=np.int64))
 
 
 def run_native(simulation: Simulation, seconds: int) -> TrafficRun:
-    """Run the world of `make_world` and measure it; a whole number of its ticks is a second."""
+    """Run and measure the world of `make_world`; a second must be a whole number of ticks."""
     meter = TrafficMeter(simulation.network)
     commands = idle_commands(simulation)
     ticks_per_s = round(1.0 / simulation.config.clock.sim_dt_s)

@@ -1,7 +1,8 @@
-"""SUMO's own run of a demand, measured by the meter that measures ours.
+"""A run of a demand in SUMO, measured like the run in cavmarl.
 
-libsumo holds one simulation a process, and a second start silently replaces the first; so every run
-has a process of its own.
+libsumo supports one simulation per process, and a second start silently replaces the first.
+Therefore
+every run has its own process.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ class SumoJob:
 
     map_file: Path  # a SUMO network
     demand: SumoInput  # what drives on it
-    seconds: int  # how long, from `demand.begin_s`
+    seconds: int  # duration from `demand.begin_s`
     dt_s: float  # step length
-    seed: int  # of SUMO's random numbers
+    seed: int  # seed of SUMO's random numbers
     # whether SUMO may put vehicles elsewhere that stand for too long (300 s unless the demand's
     # configuration says otherwise)
     teleports: bool = True
@@ -47,14 +48,14 @@ class SumoJob:
     shared: frozenset[str] | None = None
 
     def is_shared(self, vehicle: str) -> bool:
-        """Whether ours drives a vehicle, or the flow that it is of, too."""
+        """Return whether cavmarl drives this vehicle, or its flow, too."""
         if self.shared is None:
             return True
         return vehicle in self.shared or vehicle.rpartition(".")[0] in self.shared
 
 
 def run_seeds(job: SumoJob, more_seeds: Sequence[int]) -> tuple[TrafficRun, list[TrafficRun]]:
-    """Run it in a process of its own, then again with more seeds; contacts of those: 0."""
+    """Run the job and further seeds, each in its own process; contacts of the others are 0."""
     with sumo_process(job) as process:
         run = process.submit(_measure, job, True).result()
         others = (replace(job, seed=seed) for seed in more_seeds)
@@ -63,7 +64,7 @@ def run_seeds(job: SumoJob, more_seeds: Sequence[int]) -> tuple[TrafficRun, list
 
 @contextmanager
 def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
-    """A fresh process for one simulation of SUMO's; what is submitted runs there."""
+    """Return an executor with a new process for one simulation of SUMO."""
     require("libsumo", "sumo")
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
         try:
@@ -75,7 +76,7 @@ def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
 def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
     """Load the job into this process's libsumo and return it; `more` are options of SUMO.
 
-    Its log, and copies of additional files, go into the folder.
+    SUMO's log and copies of additional files go into the folder.
     """
     libsumo: Any = free_libsumo()
     log = folder / "errors.log"
@@ -86,7 +87,7 @@ def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
     try:
         libsumo.start(["sumo", *words, *more])
     except libsumo.TraCIException as error:
-        raise _refusal(job, log, error) from None  # SUMO's own cannot leave this process
+        raise _refusal(job, log, error) from None  # SUMO's exceptions cannot be pickled
     return libsumo
 
 
@@ -107,7 +108,7 @@ def _measure(job: SumoJob, contacts: bool) -> TrafficRun:
         trips = folder / "trips.xml"
         libsumo = start_sumo(job, folder, f"--tripinfo-output={trips}")
         meter = TrafficMeter(network)
-        reader = _VehicleReader(libsumo, network)
+        reader = VehicleReader(libsumo, network)
         departed = arrived = teleports = 0
         ticks_per_s = round(1.0 / job.dt_s)
         try:
@@ -139,7 +140,7 @@ def _measure(job: SumoJob, contacts: bool) -> TrafficRun:
 
 
 def _keep_shared(libsumo: Any, job: SumoJob) -> int:
-    """Take out what has entered and is not shared; how many vehicles have entered that are."""
+    """Remove new vehicles that are not shared; return how many shared vehicles have entered."""
     entered = libsumo.simulation.getDepartedIDList()
     for vehicle in entered:
         if not job.is_shared(vehicle):
@@ -150,10 +151,10 @@ def _keep_shared(libsumo: Any, job: SumoJob) -> int:
     return sum(map(job.is_shared, entered))
 
 
-class _VehicleReader:
-    """SUMO's vehicles as VEHICLE records.
+class VehicleReader:
+    """Reads SUMO's vehicles as VEHICLE records.
 
-    SUMO speaks of the middle of the front bumper and of degrees clockwise from north.
+    SUMO reports the middle of the front bumper, and angles in degrees clockwise from north.
     """
 
     def __init__(self, libsumo: Any, network: RoadNetwork) -> None:
@@ -164,7 +165,7 @@ class _VehicleReader:
         self._names: list[str] = []
 
     def rows(self) -> NDArray[np.void]:
-        """VEHICLE rows with place, heading and size of all that are on the road now."""
+        """Return VEHICLE rows with place, heading and size of all vehicles on the road."""
         vehicle = self._libsumo.vehicle
         self._names = list(vehicle.getIDList())
         rows = np.zeros(len(self._names), VEHICLE)
@@ -183,7 +184,7 @@ class _VehicleReader:
         return rows
 
     def fill_lanes(self, rows: NDArray[np.void]) -> None:
-        """Add speed and the place on the lane to what `rows()` gave last."""
+        """Add speed and lane position to the last result of `rows()`."""
         vehicle = self._libsumo.vehicle
         for i, name in enumerate(self._names):
             rows[i]["speed"] = vehicle.getSpeed(name)
@@ -191,7 +192,7 @@ class _VehicleReader:
             rows[i]["s"] = vehicle.getLanePosition(name) - 0.5 * rows[i]["length"]
 
     def signal_codes(self) -> NDArray[np.uint8]:
-        """(num_links,) what the links' signals show now."""
+        """Return (num_links,) the signal states of the links."""
         links = self._network.links
         codes = np.full(len(links), SIGNAL_NONE, dtype=np.uint8)
         for row, name in enumerate(self._network.signal_ids):
@@ -202,7 +203,7 @@ class _VehicleReader:
         return codes
 
     def _blank(self, name: str) -> NDArray[np.void]:
-        """VEHICLE (1,) that this vehicle starts from, with a number for its name."""
+        """Return the initial VEHICLE (1,) of this vehicle, with a number for its name."""
         if name not in self._known:
             vehicle = self._libsumo.vehicle
             row = blank_vehicle()

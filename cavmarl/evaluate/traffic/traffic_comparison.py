@@ -1,4 +1,4 @@
-"""Ours and SUMO's run of the same demand, side by side."""
+"""Runs of the same demand in cavmarl and in SUMO, side by side."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class TrafficComparison:
     ours: TrafficRun  # our run
     sumo: TrafficRun  # SUMO's
     edge_ids: tuple[str, ...]  # of the map, by the rows that `edge_minutes` name
-    # what ours left out of the demand or took for something near, with counts
+    # parts of the demand that were left out or approximated, with counts
     tolerated: tuple[str, ...] = ()
     sumo_others: tuple[TrafficFigures, ...] = ()  # SUMO's with further seeds, contacts not counted
 
     def ratio(self, figure: str) -> float | None:
-        """Ours over SUMO's; None where that says nothing: SUMO's is zero or one has none."""
+        """Return our value over SUMO's; None if SUMO's is zero or a value is missing."""
         ours, sumo = getattr(self.ours.figures, figure), getattr(self.sumo.figures, figure)
         return ours / sumo if figure in RATIOS and ours is not None and sumo else None
 
@@ -71,22 +71,22 @@ def compare_traffic(
     finished: Callable[[Simulation], None] = lambda world: None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> TrafficComparison:
-    """Run both and measure both alike: SUMO without what ours leaves out of the demand.
+    """Run and measure both simulators; SUMO gets only the demand that cavmarl supports.
 
     Args:
-        map_name: an environment's name or folder, or a map file.
-        demand: files of routes and additional files, or one `.sumocfg`.
-        seconds: how long, from the demand's beginning.
+        map_name: name or folder of an environment, or a map file.
+        demand: route files and additional files, or one `.sumocfg`.
+        seconds: duration from the beginning of the demand.
         dt_s: step length; a second is a whole number of steps.
         seed: of both.
-        teleports: whether SUMO may put vehicles elsewhere that stand for too long.
-        sumo_seeds: with how many seeds SUMO runs, from `seed` on.
-        finished: shown our world at its end.
-        progress: told what is going on.
+        teleports: whether SUMO may teleport vehicles that wait too long.
+        sumo_seeds: number of seeds of SUMO, from `seed` on.
+        finished: called with our world at its end.
+        progress: called with a text about the current work.
 
     Raises:
-        ConfigError: a number that cannot work, or a demand that SUMO refuses.
-        DemandError: a demand that cannot be, or not on this map.
+        ConfigError: a wrong number, or a demand that SUMO rejects.
+        DemandError: an invalid demand, or a demand that does not fit the map.
         MapError: the map cannot be read or driven.
         MissingExtraError: SUMO is not installed.
     """
@@ -97,7 +97,7 @@ def compare_traffic(
     given = read_input(demand)
     path = find_map(map_name)
     progress("the demand")
-    # Ours first: it names file and line of what neither can drive.
+    # Run cavmarl first: its errors name file and line.
     world = make_world(path, demand, seconds, seed, dt_s)
     progress("SUMO's run")
     shared = frozenset(world.demand.element_ids) if isinstance(world.demand, DemandFile) else None

@@ -1,7 +1,7 @@
-"""What traffic is measured by, the same for every simulator: it takes VEHICLE records.
+"""Traffic metrics, computed from VEHICLE records in the same way for every simulator.
 
-The meter is shown the vehicles after every tick, to see them touch, and once a simulated second,
-for everything else. Definitions stand with the fields of `TrafficFigures`.
+Contacts are checked after every tick; all other metrics are sampled once per simulated second. The
+fields of `TrafficFigures` define the metrics.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from cavmarl.driving.kernels.motion.contacts import find_contacts
 from cavmarl.evaluate.traffic.junction_locks import JunctionLocks
 from cavmarl.roads.network import RoadNetwork
 
-STANDING_MPS = 0.1  # slower is standing, as in SUMO's waiting time
+STANDING_MPS = 0.1  # slower vehicles stand, as in SUMO's waiting time
 SAMPLES_PER_S = 1
 MINUTE_S = 60
-CELL_M = 10.0  # of the grid in which vehicles that touch are looked for
+CELL_M = 10.0  # cell size of the grid for finding contacts
 
 EDGE_MINUTE = np.dtype(
     [
-        ("edge", np.int32),  # EDGE row, none inside junctions
+        ("edge", np.int32),  # EDGE row; never inside a junction
         ("minute", np.int32),  # since the beginning
         ("length_m", np.float64),  # of the edge
         ("density_per_km", np.float64),  # vehicles on a kilometre of one lane
@@ -36,58 +36,58 @@ EDGE_MINUTE = np.dtype(
 
 @dataclass(frozen=True)
 class TrafficCounts:
-    """What only the simulator itself can count, from the beginning to the end."""
+    """Counts that only the simulator itself has, from beginning to end."""
 
     departed: int  # vehicles that have entered
-    waiting: int  # vehicles whose time to depart has come and that have not entered
+    waiting: int  # vehicles whose departure time has passed but that have not entered
     arrived: int  # vehicles that reached the end of their trip
-    # over the arrived ones, time above that of the same way at the speed which the driver wants
-    # there; None where none arrived
+    # mean over arrived vehicles of the time above that of the same route at the desired speed;
+    # None if no vehicle arrived
     mean_delay_s: float | None
-    teleports: int = 0  # vehicles that were put elsewhere because they stood for too long
+    teleports: int = 0  # vehicles that were teleported because they waited too long
 
 
 @dataclass(frozen=True)
 class TrafficFigures:
-    """One simulator's row of the table."""
+    """The metrics of one simulator."""
 
     departed: int  # see `TrafficCounts`
     waiting: int  # see `TrafficCounts`
     arrived: int  # see `TrafficCounts`
-    mean_speed_mps: float | None  # over all vehicles of all samples; None where there was none
+    mean_speed_mps: float | None  # mean over all vehicles and samples; None without vehicles
     mean_delay_s: float | None  # see `TrafficCounts`
-    # vehicles that stand (below 0.1 m/s) on lanes that end at a signal, mean of the samples
+    # standing vehicles (below 0.1 m/s) on lanes that end at a signal, mean of the samples
     queue: float
     contacts: int  # pairs of vehicles whose rectangles began to overlap on the same level
     longest_lock_s: float  # the longest lock of any junction, see `JunctionLocks`
-    locked_junction: str  # whose that was; empty where no junction was ever locked
+    locked_junction: str  # junction of the longest lock; empty: none was locked
     teleports: int  # see `TrafficCounts`
 
 
 @dataclass(frozen=True)
 class TrafficRun:
-    """What came out of one run."""
+    """The results of one run."""
 
-    figures: TrafficFigures  # the row of the table
-    locks_s: dict[str, float]  # junction → its longest lock in seconds, of those that had one
+    figures: TrafficFigures  # metrics of the run
+    locks_s: dict[str, float]  # junction → its longest lock in s, for junctions that had one
     edge_minutes: NDArray[np.void]  # EDGE_MINUTE rows of all edges and minutes with a vehicle
 
 
 class TouchCounter:
-    """Counts the pairs that began to touch, tick by tick, on a map of these bounds (m).
+    """Counts pairs of vehicles that begin to touch, on a map of these bounds (m).
 
-    Of several that touch one vehicle at once, only its pair with the lowest id counts.
+    If several vehicles touch one vehicle at once, only the pair with the lowest id counts.
     """
 
     def __init__(self, bounds: tuple[float, float, float, float], floating: bool = False) -> None:
-        self.count = 0  # pairs so far; one that parts and touches again counts again
+        self.count = 0  # pairs so far; a pair that separates and touches again counts twice
         self._bounds = bounds
         self._floating = floating
         self._make_room(0)
         self._touching: set[tuple[int, int]] = set()
 
     def see(self, rows: NDArray[np.void]) -> None:
-        """Look at VEHICLE (num_vehicles,) of the next tick."""
+        """Add VEHICLE (num_vehicles,) of the next tick."""
         if len(rows) > len(self._hit):
             self._make_room(2 * len(rows))
         find_contacts(rows, len(rows), self._grid, self._hit)
@@ -120,15 +120,15 @@ class TrafficMeter:
         self._metres: list[NDArray[np.float64]] = []
 
     def see(self, rows: NDArray[np.void]) -> None:
-        """Look for contacts of VEHICLE (num_vehicles,) after a tick."""
+        """Check VEHICLE (num_vehicles,) for contacts after a tick."""
         self._touches.see(rows)
 
     def sample(self, rows: NDArray[np.void], codes: NDArray[np.uint8]) -> None:
-        """Take the sample of a second that is over.
+        """Add the sample of a second.
 
         Args:
-            rows: VEHICLE (num_vehicles,); a `lane` of -1 is one that the map does not have.
-            codes: (num_links,) what the links' signals show, as from `signal_codes`.
+            rows: VEHICLE (num_vehicles,); `lane` is -1 on lanes that the map does not have.
+            codes: (num_links,) signal states of the links, as from `signal_codes`.
         """
         on_map = rows[rows["lane"] >= 0]
         lanes = on_map["lane"]
@@ -159,11 +159,13 @@ class TrafficMeter:
         return TrafficRun(figures, locks, self._edge_minutes())
 
     def _edge_minutes(self) -> NDArray[np.void]:
-        """Flow and density of lanes by Edie's definitions.
+        """Return flow and density of lanes by Edie's definitions.
 
-        Over an area of road and time, density is the time that vehicles spend in it and flow the
-        distance that they cover in it, each over the area (Edie: "Discussion of traffic stream
-        measurements and definitions", 1963).
+        In an area of road and time, density is the time that vehicles spend in it, and flow the
+        distance that
+        they cover in it, each divided by the area (Edie: "Discussion of traffic stream measurements
+        and
+        definitions", 1963).
         """
         edges = self._network.edges
         lane_km = edges["length_m"] * edges["num_lanes"] / 1000.0

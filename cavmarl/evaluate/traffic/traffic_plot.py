@@ -1,4 +1,4 @@
-"""The fundamental diagram: how flow and speed depend on density, ours and SUMO's."""
+"""The fundamental diagram: flow and speed over density, in cavmarl and in SUMO."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 
-LEAST_EDGE_M = 50.0  # one vehicle on a shorter edge is a density of a jam
-BIN_PER_KM = 10.0  # a line joins the means of bins this wide
+LEAST_EDGE_M = 50.0  # on a shorter edge, one vehicle would be the density of a jam
+BIN_PER_KM = 10.0  # width of the bins whose means a line joins
 LEAST_IN_BIN = 5
 COLORS = {"SUMO": "#d1793b", "cavmarl": "#2f6db5"}
 
 
 def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
-    """Write flow and speed over density; a point is an edge of 50 m or more in a minute."""
+    """Plot flow and speed over density; a point is a minute of an edge of 50 m or more."""
     figure = require("matplotlib.figure", "report").Figure(
         figsize=(10.0, 4.2), layout="constrained"
     )
@@ -54,7 +54,7 @@ def save_figure(figure: Any, path: Path) -> None:
 def binned_means(
     density: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean density and mean value of each bin of density with enough points, by rising density."""
+    """Return mean density and mean value of each bin with enough points, by density."""
     bins = (density / BIN_PER_KM).astype(np.int64)
     counts = np.bincount(bins)
     enough = counts >= LEAST_IN_BIN

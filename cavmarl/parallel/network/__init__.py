@@ -1,1 +1,1 @@
-"""Connections between processes over TCP or MPI, and the Ray cluster that may start them."""
+"""Connections between processes over TCP or MPI, and actors of a Ray cluster."""

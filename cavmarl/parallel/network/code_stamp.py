@@ -1,4 +1,4 @@
-"""What a process runs, in words; processes that differ in it give other results."""
+"""`code_stamp`: identifies the code of a process; another code may give other results."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 
 @cache
 def code_stamp() -> str:
-    """What this machine runs: digest of all sources, and the libraries that compute."""
+    """Return the digest of all sources and the versions of numeric libraries, as text."""
     package = Path(__file__).resolve().parents[2]
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
         name = source.relative_to(package).as_posix()
-        if not name.startswith("data/"):  # which only a wheel has
+        if not name.startswith("data/"):  # only a wheel has it
             digest.update(name.encode() + b"\0" + source.read_bytes())
     sources = digest.hexdigest()[:12]
     return f"cavmarl of sources {sources}, numpy {np.__version__}"

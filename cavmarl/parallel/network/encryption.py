@@ -1,7 +1,7 @@
-"""Encryption of connections that leave this machine: TLS 1.3 between two that know a secret.
+"""Encryption of connections that leave this machine: TLS 1.3 between two ends with one secret.
 
-Both work out the same key and certificate from the secret, show it, and take no other. No third
-party signs anything, and each connection's own keys are drawn anew.
+Both ends derive the same key and certificate from the secret, present the certificate and accept no
+other. No third party signs anything, and each connection has session keys of its own.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from typing import Any
 
 from cavmarl.core.errors import require
 
-ENOUGH = 1 << 16  # bytes that are encrypted in one call
+MAX_CALL_BYTES = 1 << 16  # bytes that one call encrypts
 _VALID = datetime(2000, 1, 1, tzinfo=UTC), datetime(2100, 1, 1, tzinfo=UTC)
 _WAITS = (ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
 class EncryptedSocket(ssl.SSLSocket):
-    """Sends and receives as a plain socket does that does not wait."""
+    """A TLS socket that raises `BlockingIOError` like a plain non-blocking socket."""
 
     def sendmsg(self, buffers: Iterable[Any], *_: Any) -> int:  # type: ignore[override]
-        """Send the first bytes; what is not taken has to be sent again as it is."""
+        """Send the first bytes and return how many; pass the rest again, unchanged."""
         pieces, size = [], 0
         for piece in buffers:
             pieces.append(piece)
             size += len(piece)
-            if size >= ENOUGH:
+            if size >= MAX_CALL_BYTES:
                 break
         try:
             return self.send(pieces[0] if len(pieces) == 1 else b"".join(pieces))
@@ -53,14 +53,14 @@ class EncryptedSocket(ssl.SSLSocket):
 
 
 def leaves_this_machine(connection: socket.socket) -> bool:
-    """Whether the other end is elsewhere, as its address says."""
+    """Return whether the address of the other end is not this machine."""
     if connection.family not in (socket.AF_INET, socket.AF_INET6):
         return False
     return not _is_loopback(connection.getpeername()[0])
 
 
 def prepare(address: str, secret: bytes) -> None:
-    """Make ready to encrypt what comes to an address, if others than this machine can call there.
+    """Prepare to encrypt calls to a listener, if other machines can reach its address.
 
     Raises:
         MissingExtraError: cryptography is not installed.
@@ -74,9 +74,9 @@ def _is_loopback(address: str) -> bool:
 
 
 def encrypted(connection: socket.socket, secret: bytes, calls: bool) -> EncryptedSocket:
-    """A connection that is encrypted from here on.
+    """Return an encrypted connection, which owns the socket.
 
-    It owns the socket. One end calls and shakes hands at once; the other has to do it.
+    The end that calls does the handshake here; the other end has to do it later.
 
     Raises:
         ssl.SSLError: the other end does not know the secret.
@@ -95,12 +95,14 @@ def _context(secret: bytes, calls: bool) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT if calls else ssl.PROTOCOL_TLS_SERVER)
     context.sslsocket_class = EncryptedSocket
     context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False  # the holder of the key may be anywhere
+    context.check_hostname = False  # any machine may hold the key
     context.verify_mode = ssl.CERT_REQUIRED
     context.load_verify_locations(cadata=certificate.decode())
     if not calls:
-        context.num_tickets = 0  # each connection is made from nothing
-    with tempfile.NamedTemporaryFile() as file:  # this user's alone; OpenSSL reads files only
+        context.num_tickets = 0  # no connection resumes an earlier session
+    with (
+        tempfile.NamedTemporaryFile() as file
+    ):  # readable by this user alone; OpenSSL reads files only
         file.write(certificate + key)
         file.flush()
         context.load_cert_chain(file.name)
@@ -108,7 +110,7 @@ def _context(secret: bytes, calls: bool) -> ssl.SSLContext:
 
 
 def _identity(secret: bytes) -> tuple[bytes, bytes]:
-    """The certificate and the key of a secret, as PEM."""
+    """Return the certificate and the private key of a secret, as PEM."""
     require("cryptography", "nodes")
     from cryptography import x509
     from cryptography.hazmat.primitives import serialization

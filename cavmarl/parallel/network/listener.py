@@ -1,14 +1,14 @@
-"""Accepts hosts and nodes: only processes that know the secret get in.
+"""`Listener`: accepts connections of processes that know a secret.
 
-One process listens, and others call there. Both prove that they know the secret without sending
-it: each answers the other's random number with its HMAC. Until that is done nothing else is read,
-and no more than a few bytes. What leaves this machine is encrypted before.
+Both ends prove that they know the secret without sending it: each answers the random number of the
+other end with an HMAC. Before that, the listener reads only these few bytes. Connections that leave
+this machine are encrypted first.
 
-    host → caller   HELLO: magic, version, number of the host, random number
-    caller → host   random number, proof
-    host → caller   proof
+    caller → listener   HELLO: magic, version, number of the caller, random number
+    listener → caller   random number, proof
+    caller → listener   proof
 
-A caller of another version is told which one is spoken here.
+A caller of another version receives the version of the listener.
 """
 
 from __future__ import annotations
@@ -31,84 +31,89 @@ from cavmarl.parallel.network.encryption import (
     leaves_this_machine,
     prepare,
 )
-from cavmarl.parallel.network.framed_socket import MAGIC, VERSION, FramedSocket
 
+MAGIC = b"cavW"
+VERSION = 1  # of this handshake
 NONCE = 16  # bytes of a random number
-PROOF = 32  # of an HMAC
-SECRET = 32
-GREETING_S = 5.0  # for a caller to prove its identity
-CALL_S = 5.0  # for the system to connect
-MAX_CALLERS = 64  # not authenticated yet
+PROOF = 32  # bytes of an HMAC
+SECRET = 32  # bytes
+HANDSHAKE_S = 5.0  # time for each part of the handshake
+CALL_S = 5.0  # time to connect
+MAX_CALLERS = 64  # callers that are not authenticated yet
 BACKLOG = 1024  # callers that the system holds until they are accepted
-NO_DESCRIPTORS_S = 0.05  # until the next attempt to have a descriptor
-_SPOKEN = struct.Struct("<4sH")
-_HELLO = struct.Struct(f"<4sHI{NONCE}s")
+NO_DESCRIPTORS_S = 0.05  # pause if another thread takes the last descriptor
+_VERSION = struct.Struct("<4sH")
+HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
 class PendingConnection:
-    """A caller that has not proved its identity yet."""
+    """A caller that has not proved yet that it knows the secret."""
 
     def __init__(self, connection: socket.socket, secret: bytes) -> None:
         connection.setblocking(False)
-        self.until_s = time.monotonic() + GREETING_S  # for so long it may take, by `time.monotonic`
-        self.number = -1  # that it says it has; -1: it has said nothing
+        self.until_s = time.monotonic() + HANDSHAKE_S  # deadline, by `time.monotonic`
+        self.number = -1  # that the caller claims to have; -1: HELLO has not come
         self._socket = connection
         if leaves_this_machine(connection):
             self._socket = encrypted(connection, secret, calls=False)
         self._secret = secret
-        self._heard = b""
+        self._received = b""
         self._expected = b""
 
     def fileno(self) -> int:
         return self._socket.fileno()
 
     def listen(self) -> socket.socket | None:
-        """Take what it has said; its connection, once it has proved that it knows the secret.
+        """Read what has come; return the connection once the caller has proved the secret.
 
         Raises:
-            OSError: it is gone.
+            OSError: the caller has gone.
+            EOFError: the caller has ended the connection.
+            MessageError: the caller is a stranger.
         """
         if isinstance(self._socket, EncryptedSocket) and self._socket.version() is None:
             try:
                 self._socket.do_handshake()
             except (ssl.SSLWantReadError, ssl.SSLWantWriteError):
                 return None
-            self._go_on()
-        wanted = PROOF if self._expected else _HELLO.size
+            self._extend()
+        wanted = PROOF if self._expected else HELLO.size
         try:
-            heard = self._socket.recv(wanted - len(self._heard))
+            received = self._socket.recv(wanted - len(self._received))
         except BlockingIOError:
             return None
-        if not heard:
+        if not received:
             raise EOFError("the connection has ended")
-        self._heard += heard
-        if len(self._heard) < wanted:
+        self._received += received
+        if len(self._received) < wanted:
             return None
-        said, self._heard = self._heard, b""
+        data, self._received = self._received, b""
         if not self._expected:
-            self._answer(said)
-            self._go_on()
+            self._answer(data)
+            self._extend()
             return None
-        if not hmac.compare_digest(said, self._expected):
+        if not hmac.compare_digest(data, self._expected):
             raise MessageError("a caller does not know the secret")
         return self._socket
 
     def close(self) -> None:
         self._socket.close()
 
-    def _go_on(self) -> None:
-        """It may take as long again: the listener may be busy in between."""
-        self.until_s = time.monotonic() + GREETING_S
+    def _extend(self) -> None:
+        """Renew the deadline: the listener may have been busy in the meantime."""
+        self.until_s = time.monotonic() + HANDSHAKE_S
 
     def _answer(self, hello: bytes) -> None:
-        magic, version, self.number, _ = _HELLO.unpack(hello)
+        magic, version, self.number, _ = HELLO.unpack(hello)
         if magic != MAGIC:
-            raise MessageError(f"a caller says {hello[:4]!r}")
-        if version != VERSION:
-            self._socket.sendall(_SPOKEN.pack(MAGIC, VERSION))
             raise MessageError(
-                f"host {self.number} speaks version {version}, this is {VERSION}: install the same "
-                "cavmarl on all machines"
+                f"a caller sends {hello[:4]!r}, which starts no handshake of cavmarl"
+            )
+        if version != VERSION:
+            self._socket.sendall(_VERSION.pack(MAGIC, VERSION))
+            raise MessageError(
+                f"caller {self.number} has version {version} of the handshake, this process has "
+                f"{VERSION}: install the same cavmarl on all machines"
             )
         ours = secrets.token_bytes(NONCE)
         self._expected = _proof(self._secret, b"host", hello + ours)
@@ -116,17 +121,17 @@ class PendingConnection:
 
 
 class Listener:
-    """Lets in callers that know the secret; strangers cost little and are disconnected.
+    """Admits callers that know the secret; strangers cost little and are disconnected.
 
     Raises:
-        WorkerError: the port cannot be listened on.
-        MissingExtraError: others than this machine can call there, and cryptography is missing.
+        WorkerError: the process cannot listen on the port.
+        MissingExtraError: other machines can call, and cryptography is not installed.
     """
 
     def __init__(
         self,
         address: str,
-        secret: bytes | None = None,  # that callers have to know; None: one is drawn
+        secret: bytes | None = None,  # that callers have to know; None: a random one
         port: int = 0,  # 0: the system chooses
     ) -> None:
         self.secret = secrets.token_bytes(SECRET) if secret is None else secret
@@ -146,27 +151,26 @@ class Listener:
             self._listener.close()
             raise
         self._callers: list[PendingConnection] = []
-        self._spare = socket.socket()  # a descriptor for a caller that is hung up on
+        self._spare = socket.socket()  # its descriptor serves to accept and reject a caller
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
 
     def fileno(self) -> int:
-        """Readable when there is something to `admit`."""
+        """Return a descriptor that is readable when `admit` has something to do."""
         return self._selector.fileno()
 
     def admit(self) -> list[tuple[int, socket.socket]]:
-        """Hear all callers, without waiting.
+        """Serve all callers, without waiting.
 
         Returns:
-            callers that have proved that they know the secret: the number that each says, its
-                connection.
+            number and connection of each caller that has proved that it knows the secret.
         """
         admitted: list[tuple[int, socket.socket]] = []
         for key, _ in self._selector.select(0.0):
             if key.fileobj is self._listener:
                 for caller in self._welcome():
                     self._listen(caller, admitted)
-            elif key.fileobj in self._callers:  # not disconnected meanwhile
+            elif key.fileobj in self._callers:  # it was not disconnected just now
                 self._listen(key.fileobj, admitted)
         now = time.monotonic()
         for caller in [caller for caller in self._callers if caller.until_s < now]:
@@ -174,20 +178,20 @@ class Listener:
         return admitted
 
     def _welcome(self) -> Iterator[PendingConnection]:
-        """Accept all that call; where they are too many, the silent ones leave first."""
+        """Accept new callers; if there are too many callers, disconnect silent ones first."""
         for _ in range(MAX_CALLERS):
             try:
                 connection, _ = self._listener.accept()
             except OSError as error:
                 if error.errno not in (errno.EMFILE, errno.ENFILE):
                     return
-                self._find_descriptor()
+                self._free_descriptor()
                 continue
             if len(self._callers) == MAX_CALLERS:
                 self._disconnect_the_first()
             try:
                 caller = PendingConnection(connection, self.secret)
-            except OSError:  # it is gone already
+            except OSError:  # the caller has gone
                 connection.close()
                 continue
             self._callers.append(caller)
@@ -205,10 +209,10 @@ class Listener:
             self._selector.unregister(caller)
             admitted.append((caller.number, connection))
 
-    def _find_descriptor(self) -> None:
-        """This process has none left: the next caller gets that of another one, or is hung up on.
+    def _free_descriptor(self) -> None:
+        """Free a descriptor for the next caller, or reject that caller.
 
-        If it were left to wait, the listener would wake this process again at once.
+        A caller that stayed in the queue would wake this process again at once.
         """
         if self._callers:
             self._disconnect_the_first()
@@ -218,11 +222,11 @@ class Listener:
             self._listener.accept()[0].close()
         try:
             self._spare = socket.socket()
-        except OSError:  # a thread has taken it meanwhile
+        except OSError:  # another thread has taken the descriptor
             time.sleep(NO_DESCRIPTORS_S)
 
     def _disconnect_the_first(self) -> None:
-        """Of the silent ones that which has waited longest; where all have spoken, of all."""
+        """Disconnect the oldest caller without a HELLO, or else the oldest one."""
         self._disconnect(min(self._callers, key=lambda each: (each.number >= 0, each.until_s)))
 
     def _disconnect(self, caller: PendingConnection) -> None:
@@ -238,27 +242,18 @@ class Listener:
         self._listener.close()
 
 
-def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
-    """Call as a host; the caller may be busy for long before it answers.
-
-    Raises:
-        OSError: no process listens there.
-    """
-    return FramedSocket(call(place, secret, number))
-
-
 def call(
     place: tuple[str, int],
     secret: bytes,
     number: int,
-    answer_s: float | None = None,  # for the listener to answer; None: as long as it takes
+    answer_s: float | None = None,  # time for the listener to answer; None: unlimited
 ) -> socket.socket:
-    """A connection to a `Listener` on which both ends have proved that they know the secret.
+    """Call a `Listener`, and return the connection once both ends have proved the secret.
 
     Raises:
-        OSError: nothing listens there.
-        EOFError: the listener wants no more callers.
-        MessageError: it does not know the secret, or speaks another version.
+        OSError: nothing listens at the place.
+        EOFError: the listener has ended the connection.
+        MessageError: the listener does not know the secret, or has another version.
     """
     connection = socket.create_connection(place, CALL_S)
     try:
@@ -279,30 +274,31 @@ def _encrypted(connection: socket.socket, place: tuple[str, int], secret: bytes)
     except ssl.SSLCertVerificationError as error:
         raise _foreign(place) from error
     except ssl.SSLEOFError as error:
-        raise EOFError(f"the process that listens at {place} has ended the connection") from error
+        raise EOFError(f"the process at {place} has ended the connection") from error
     except ssl.SSLError as error:
         raise MessageError(
-            f"what listens at {place[0]}:{place[1]} does not encrypt as cavmarl does: {error}"
+            f"the process at {place[0]}:{place[1]} does not use the encryption of cavmarl: {error}"
         ) from error
 
 
 def _prove(connection: socket.socket, place: tuple[str, int], secret: bytes, number: int) -> None:
-    hello = _HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
+    hello = HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
     connection.sendall(hello)
-    heard = b""
-    while len(heard) < NONCE + PROOF:
+    received = b""
+    while len(received) < NONCE + PROOF:
         more = b""
         with suppress(ConnectionError, ssl.SSLError):
-            more = connection.recv(NONCE + PROOF - len(heard))
-        if not more and len(heard) == _SPOKEN.size and heard[:4] == MAGIC:
+            more = connection.recv(NONCE + PROOF - len(received))
+        if not more and len(received) == _VERSION.size and received[:4] == MAGIC:
+            (version,) = _VERSION.unpack(received)[1:]
             raise MessageError(
-                f"what listens at {place[0]}:{place[1]} speaks version {_SPOKEN.unpack(heard)[1]}, "
-                f"this is {VERSION}: install the same cavmarl on all machines"
+                f"the process at {place[0]}:{place[1]} has version {version} of the handshake, "
+                f"this one has {VERSION}: install the same cavmarl on all machines"
             )
         if not more:
-            raise EOFError(f"the process that listens at {place} has ended the connection")
-        heard += more
-    nonce, proof = heard[:NONCE], heard[NONCE:]
+            raise EOFError(f"the process at {place} has ended the connection")
+        received += more
+    nonce, proof = received[:NONCE], received[NONCE:]
     if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):
         raise _foreign(place)
     connection.sendall(_proof(secret, b"host", hello + nonce))
@@ -310,9 +306,9 @@ def _prove(connection: socket.socket, place: tuple[str, int], secret: bytes, num
 
 def _foreign(place: tuple[str, int]) -> MessageError:
     return MessageError(
-        f"what listens at {place[0]}:{place[1]} does not know the secret: give both the same key"
+        f"the process at {place[0]}:{place[1]} does not know the secret: give both the same key"
     )
 
 
-def _proof(secret: bytes, side: bytes, said: bytes) -> bytes:
-    return hmac.digest(secret, side + said, "sha256")
+def _proof(secret: bytes, side: bytes, content: bytes) -> bytes:
+    return hmac.digest(secret, side + content, "sha256")

@@ -1,10 +1,10 @@
 """`MpiTransport`: connections between the ranks of an MPI run.
 
-A place is `mpi` and a rank. Ranks trust each other: MPI has started all of them, and no secret is
-asked for. MPI has no failover: when it loses a rank it ends the run.
+A place is `mpi` and a rank. Ranks trust each other, since MPI has started all of them; there is no
+secret. MPI has no failover: when it loses a rank, it ends the run.
 
-A message with the tag 0 is about connections; another one has bytes, and its tag is the number of
-the connection's end at the rank that it goes to.
+A message with the tag 0 is a notice about a connection. Every other message carries bytes; its tag
+is the number of the end of the connection at the receiving rank.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from cavmarl.parallel.network.transport import (
 
 MPI: Literal["mpi"] = "mpi"
 CALLER = 0  # the rank of the program whose worlds the other ranks host
-ABOUT = 0  # the tag of messages about connections
-LISTENER = 0  # the number by which a poll tells of the listener
-LOOKS = 500  # without a nap between them
+NOTICE = 0  # tag of notices
+LISTENER = 0  # number by which a poll reports the listener
+LOOKS = 500  # polls before the process naps between polls
 NAP_S = 50e-6
-END_S = 60.0  # for the others to end after the caller
-PRINTED_S = 0.3  # for what this process has printed to come through, before the run is ended
+END_S = 60.0  # time for the other ranks to end after the caller
+PRINTED_S = 0.3  # time for printed text to arrive before the run is aborted
 HOW = f"mpirun -n 1 python PROGRAM : -n NODES cavmarl node --{MPI}"
-_ABOUT = struct.Struct("<IIII")
+_NOTICE = struct.Struct("<IIII")
 _SHARED = re.compile(r"/dev/shm/mpich_shm_\w+(?= *$)", re.MULTILINE)
 
 
-class _About(IntEnum):
-    """What a message says of a connection."""
+class _Notice(IntEnum):
+    """Kinds of notices, each with two numbers."""
 
-    OPEN = 0  # a number that is said to the listener; the opener's end
-    ACCEPT = 1  # the end here; the opener's end
-    CLOSE = 2  # nothing; the end that it is said to
-    GONE = 3  # nothing: the whole process ends
+    OPEN = 0  # number for the listener; end of the opener
+    ACCEPT = 1  # end of the sender; end of the opener
+    CLOSE = 2  # unused; end of the receiver
+    GONE = 3  # unused: the process of the sender ends
 
 
 class MpiConnection:
@@ -62,7 +62,7 @@ class MpiConnection:
     def __init__(self, transport: MpiTransport, rank: int, number: int, far: int) -> None:
         self.rank, self.number, self.far = rank, number, far
         self.come: deque[memoryview] = deque()
-        self.has_ended = False  # the other end
+        self.has_ended = False  # whether the other end has closed
         self._transport = transport
 
     @property
@@ -99,7 +99,7 @@ class MpiConnection:
 
 
 class MpiListener:
-    """A `TransportListener`: every rank may call."""
+    """A `TransportListener` for all ranks."""
 
     def __init__(self, place: Place) -> None:
         self.place = place
@@ -123,17 +123,17 @@ class MpiListener:
 
 
 class MpiPoll:
-    """A `TransportPoll`. MPI has nothing that a process can sleep on: it looks again and again."""
+    """A `TransportPoll`. A process cannot sleep on MPI, so it looks again and again."""
 
-    def __init__(self, take: Callable[[], None]) -> None:
-        self._take = take  # takes what has come
+    def __init__(self, receive_all: Callable[[], None]) -> None:
+        self._receive_all = receive_all
         self._ones: dict[int, MpiConnection | MpiListener] = {}
 
     def register(self, one: Any, events: int) -> None:
         self._ones[one.fileno()] = one
 
     def modify(self, one: Any, events: int) -> None:
-        """All that is sent is taken at once."""
+        """Do nothing: MPI accepts all bytes at once."""
 
     def unregister(self, one: Any) -> None:
         del self._ones[one.fileno()]
@@ -141,7 +141,7 @@ class MpiPoll:
     def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
         until_s = None if timeout_ms is None else time.monotonic() + 1e-3 * timeout_ms
         for look in count():
-            self._take()
+            self._receive_all()
             ready = [(number, READS) for number, one in self._ones.items() if one.is_ready()]
             if ready or (until_s is not None and time.monotonic() >= until_s):
                 return ready
@@ -154,9 +154,9 @@ class MpiTransport:
 
     Attributes:
         rank: of this process.
-        ranks: how many there are.
-        wait_s: for a rank to answer the first call of this one; None: as long as it takes.
-        is_broken: whether a rank is lost, so that the run has to be ended when this process ends.
+        ranks: number of ranks.
+        wait_s: time for a rank to answer a call without a limit of its own; None: unlimited.
+        is_broken: whether a rank is lost, so that this process aborts the run when it ends.
 
     Raises:
         MissingExtraError: mpi4py is not installed.
@@ -174,21 +174,21 @@ class MpiTransport:
         self._numbers = count(1)
         self._ends: dict[int, MpiConnection] = {}
         self._gone: set[int] = set()  # ranks that have ended
-        self._sent: deque[tuple[Any, bytes]] = deque()  # requests, and what they send
+        self._sent: deque[tuple[Any, bytes]] = deque()  # requests, and the bytes that they send
         _unlink_shared_memory()
         atexit.register(self._end)
 
     def open(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Connection:
         end = self._new(place[1], far=0)
-        self._say(end.rank, _About.OPEN, number, end.number)
+        self._send_notice(end.rank, _Notice.OPEN, number, end.number)
         answer_s = self.wait_s if answer_s is None else answer_s
         until_s = None if answer_s is None else time.monotonic() + answer_s
         for look in count():
-            self.take()
+            self.receive_all()
             if end.far:
                 break
             if end.has_ended:
-                raise EOFError(f"rank {end.rank} of MPI has ended, or wants no more")
+                raise EOFError(f"rank {end.rank} of MPI has ended, or does not listen")
             if until_s is not None and time.monotonic() > until_s:
                 end.close()
                 raise ConnectionRefusedError(f"rank {end.rank} of MPI does not answer")
@@ -201,7 +201,7 @@ class MpiTransport:
         return self._listener
 
     def poll(self) -> TransportPoll:
-        return MpiPoll(self.take)
+        return MpiPoll(self.receive_all)
 
     def _new(self, rank: int, far: int) -> MpiConnection:
         end = MpiConnection(self, rank, next(self._numbers), far)
@@ -210,19 +210,19 @@ class MpiTransport:
         return end
 
     def forget(self, end: MpiConnection) -> None:
-        """End a connection; what still comes for it is dropped."""
+        """Close a connection, and drop what still comes for it."""
         if self._ends.pop(end.number, None) is not None and end.far and not end.has_ended:
-            self._say(end.rank, _About.CLOSE, 0, end.far)
+            self._send_notice(end.rank, _Notice.CLOSE, 0, end.far)
 
-    def _say(self, rank: int, what: _About, first: int, second: int) -> None:
+    def _send_notice(self, rank: int, what: _Notice, first: int, second: int) -> None:
         if not self._has_left:
-            self.send(rank, ABOUT, _ABOUT.pack(what, first, second, 0))
+            self.send(rank, NOTICE, _NOTICE.pack(what, first, second, 0))
 
     def send(self, rank: int, tag: int, data: bytes) -> None:
         """Send a message.
 
         Raises:
-            OSError: MPI cannot, or this process ends.
+            OSError: MPI cannot send it, or this process ends.
         """
         if self._has_left:
             raise BrokenPipeError("this process ends")
@@ -231,8 +231,8 @@ class MpiTransport:
         except self._mpi.Exception as error:
             raise OSError(f"rank {rank} cannot be reached: {error}") from error
 
-    def take(self) -> None:
-        """Take all messages that have come.
+    def receive_all(self) -> None:
+        """Receive all messages that are there.
 
         Raises:
             WorkerError: MPI has lost a rank.
@@ -245,61 +245,60 @@ class MpiTransport:
                 data = bytearray(status.Get_count(mpi.BYTE))
                 rank, tag = status.Get_source(), status.Get_tag()
                 message.Recv([data, mpi.BYTE])
-                if tag != ABOUT:
+                if tag != NOTICE:
                     if tag in self._ends:
                         self._ends[tag].come.append(memoryview(data))
                 else:
-                    self._hear(rank, *_ABOUT.unpack(data)[:3])
+                    self._receive_notice(rank, *_NOTICE.unpack(data)[:3])
             while self._sent and self._sent[0][0].Test():
                 self._sent.popleft()
         except mpi.Exception as error:
             self.is_broken = True
             raise WorkerError(f"MPI has lost a rank, and has no failover: {error}") from error
 
-    def _hear(self, rank: int, what: int, first: int, second: int) -> None:
-        """Take what is said of a connection."""
+    def _receive_notice(self, rank: int, what: int, first: int, second: int) -> None:
+        """Apply a notice about a connection."""
         end = self._ends.get(second)
-        if what == _About.OPEN:
+        if what == _Notice.OPEN:
             end = self._new(rank, far=second)
-            self._say(rank, _About.ACCEPT, end.number, second)
+            self._send_notice(rank, _Notice.ACCEPT, end.number, second)
             if self._listener.is_open:
                 self._listener.callers.append((first, end))
             else:
                 end.close()
-        elif what == _About.ACCEPT and end is not None:
+        elif what == _Notice.ACCEPT and end is not None:
             end.far = first
-        elif what == _About.ACCEPT:  # it has been waited for too long
-            self._say(rank, _About.CLOSE, 0, first)
-        elif what == _About.CLOSE and end is not None:
+        elif what == _Notice.ACCEPT:  # `open` has given up
+            self._send_notice(rank, _Notice.CLOSE, 0, first)
+        elif what == _Notice.CLOSE and end is not None:
             end.has_ended = True
-        elif what == _About.GONE:
+        elif what == _Notice.GONE:
             self._gone.add(rank)
             for one in self._ends.values():
                 one.has_ended |= one.rank == rank
 
     def check_caller(self, nodes: int) -> None:
-        """Refuse a rank that cannot be the caller of so many nodes.
+        """Refuse a rank that cannot be the caller of this number of nodes.
 
         Raises:
-            ConfigError: it is another rank than the caller's, or there are too few beside it.
+            ConfigError: this is not the rank of the caller, or there are too few other ranks.
         """
         if self.rank != CALLER:
             raise ConfigError(
                 f"backend = 'nodes:{nodes}@{MPI}': this is rank {self.rank}, the caller is rank "
-                f"{CALLER}; "
-                f"start the others as nodes: {HOW}"
+                f"{CALLER}; start the others as nodes: {HOW}"
             )
         if nodes >= self.ranks:
             raise ConfigError(
-                f"backend = 'nodes:{nodes}@{MPI}': {self.ranks - 1} ranks are beside this "
-                f"one; start as many as nodes: {HOW}"
+                f"backend = 'nodes:{nodes}@{MPI}': there are {self.ranks - 1} other ranks; "
+                f"start one for each node: {HOW}"
             )
 
     def _end(self) -> None:
-        """End with all other ranks; end them, if one of them is lost.
+        """Finalize MPI together with all other ranks, or abort the run if a rank is lost.
 
-        MPI ends well only when each message has been received, and a rank says nothing after GONE.
-        What Python destroys later, as environments that were not closed, finds MPI at its end.
+        MPI ends cleanly only if each message was received, so a rank sends nothing after GONE.
+        Objects that Python destroys later, like environments left open, find MPI finalized.
         """
         mpi = self._mpi
         if mpi.Is_finalized():
@@ -308,10 +307,10 @@ class MpiTransport:
         until_s = None
         try:
             for rank in others:
-                self._say(rank, _About.GONE, 0, 0)
+                self._send_notice(rank, _Notice.GONE, 0, 0)
             self._has_left = True
             for look in count():
-                self.take()
+                self.receive_all()
                 if self.is_broken or (others <= self._gone and not self._sent):
                     break
                 if until_s is None and CALLER in (self.rank, *self._gone):
@@ -329,8 +328,8 @@ class MpiTransport:
 def _unlink_shared_memory() -> None:
     """Remove the names of the memory that the ranks of this machine share.
 
-    All ranks have attached it when MPI has started. MPICH removes the names when it ends well, and
-    leaves them behind when a rank is killed or the run is aborted.
+    All ranks have attached the memory when MPI has started. MPICH removes the names at a clean end,
+    and leaves them behind if a rank is killed or the run is aborted.
     """
     maps = Path("/proc/self/maps")
     if maps.exists():  # Linux
@@ -340,12 +339,12 @@ def _unlink_shared_memory() -> None:
 
 @cache
 def mpi_transport() -> MpiTransport:
-    """That of this process."""
+    """Return the transport of this process."""
     return MpiTransport()
 
 
 def _rest(look: int) -> None:
-    """Leave the core to others, for longer after many looks."""
+    """Yield the core, and after many looks sleep for a moment."""
     if look < LOOKS:
         os.sched_yield()
     else:

@@ -1,4 +1,4 @@
-"""The Ray cluster that hosts run on: joins it, and assigns nodes to hosts."""
+"""Joins a Ray cluster, and chooses its nodes for actors."""
 
 from __future__ import annotations
 
@@ -12,40 +12,42 @@ from typing import Any
 from cavmarl.balance.load_score import Candidate, Utilisation, select
 from cavmarl.core.errors import ConfigError, WorkerError, require
 
-ADDRESS = "RAY_ADDRESS"  # the environment's variable that Ray itself reads
+ADDRESS = "RAY_ADDRESS"  # environment variable that Ray itself reads
 CALL_S = 5.0
-RELEASE_S = 2.0  # Ray hears of an actor's end by and by
+RELEASE_S = 2.0  # Ray notices the end of an actor with a delay
 _RESOURCES = ("CPU", "memory", "GPU")
-_joined = 0  # how many have joined by `join`, where the program itself had not
+_joined = 0  # calls of `join` that have not left, if the program itself had not joined
 
 
 @dataclass(frozen=True)
 class Node:
-    """A node of the cluster; shares are those reserved with Ray."""
+    """A node of the cluster. Its use is the share of each resource that is reserved."""
 
     name: str
-    cpus: int  # free ones
-    use: Utilisation  # what is reserved
-    hosted: int = 0  # how many hosts it has been given
+    cpus: int  # free CPUs
+    use: Utilisation  # reserved shares
+    hosted: int = 0  # actors that were assigned to it
 
 
 def join() -> bool:  # whether `leave` has to be called
-    """Join the cluster that this program belongs to, or start one on this machine.
+    """Join the cluster of this program, or start one on this machine.
 
-    A program that has called `ray.init` is a member already. Else it is the cluster of
-    `RAY_ADDRESS`, the one that `ray start` has started here, or a new one that ends with its last
-    user.
+    A program that has called `ray.init` is a member already. Otherwise the cluster is that of
+    `RAY_ADDRESS`, or the one that `ray start` has started here, or a new one that ends with its
+    last user.
 
     Raises:
+        ConfigError: the program is a Ray client outside of the cluster.
         MissingExtraError: Ray is not installed.
+        WorkerError: there is no cluster at the address.
     """
     global _joined
     ray = require("ray", "ray")
     address = os.environ.get(ADDRESS, "")
     if address.startswith("ray://") or ray.util.client.ray.is_connected():
         raise ConfigError(
-            "hosts send their frames to this program, so it has to run on a node of the cluster: "
-            "start it there (ray job submit, or ray exec), without ray:// in its address"
+            "Ray client (ray://): nodes connect to this program, so it has to run on a machine of "
+            "the cluster; start it there (ray job submit, or ray exec)"
         )
     if ray.is_initialized() and not _joined:
         return False
@@ -55,7 +57,7 @@ def join() -> bool:  # whether `leave` has to be called
             ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR")
         except (OSError, RuntimeError, ValueError) as error:
             raise WorkerError(
-                f"no Ray cluster at {address or 'the address that ray start has left'}: {error}. "
+                f"no Ray cluster at {address or 'the address of the last ray start'}: {error}. "
                 f"Start one (ray start --head), or unset {ADDRESS} for one on this machine"
             ) from error
     _joined += 1
@@ -63,14 +65,14 @@ def join() -> bool:  # whether `leave` has to be called
 
 
 def _call(address: str) -> None:
-    """Check that a process listens there: Ray would try for minutes."""
+    """Check that a process listens at the address; Ray would try for minutes."""
     host, colon, port = address.rpartition(":")
     if colon and port.isdigit():
         socket.create_connection((host, int(port)), CALL_S).close()
 
 
 def leave() -> None:
-    """Leave the cluster, if no other part of this program needs it; a new one ends."""
+    """Leave the cluster if no other part of this program uses it; one started here ends."""
     global _joined
     _joined -= 1
     ray = require("ray", "ray")
@@ -79,7 +81,7 @@ def leave() -> None:
 
 
 def nodes() -> list[Node]:
-    """The nodes that are alive, this one first."""
+    """Return the living nodes of the cluster, this one first."""
     ray = require("ray", "ray")
     from ray._private.state import available_resources_per_node  # Ray has no public name for it
 
@@ -91,7 +93,7 @@ def nodes() -> list[Node]:
 
 
 def nodes_with(cpus: int) -> list[Node]:
-    """The nodes, after a short wait for CPUs that have just been given back."""
+    """Return the nodes, after a short wait for CPUs that were just released."""
     until_s = time.monotonic() + RELEASE_S
     while True:
         known = nodes()
@@ -101,10 +103,11 @@ def nodes_with(cpus: int) -> list[Node]:
 
 
 def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:  # names of nodes
-    """A node for each host: admissible, of the lowest LoadScore, with the fewest hosts so far.
+    """Choose an admissible node for each actor: the lowest LoadScore, then the fewest actors.
 
     Raises:
-        NoAdmissibleWorkerError: the rest of the CPUs is on nodes that are too busy.
+        ConfigError: there are too few free CPUs.
+        NoAdmissibleWorkerError: the other free CPUs are on nodes that are too busy.
     """
     free = sum(node.cpus for node in known)
     if workers > free:

@@ -16,7 +16,7 @@ from cavmarl.parallel.network.transport import (
     TransportPoll,
 )
 
-# A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
+# A machine that vanishes sends nothing, so the system probes a silent connection.
 _ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
     (socket.IPPROTO_TCP, getattr(socket, name), value)
     for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
@@ -64,12 +64,12 @@ class TcpConnection:
 
 
 class TcpListener:
-    """A `TransportListener`; only callers that know the secret get in."""
+    """A `TransportListener` for callers that know the secret."""
 
     def __init__(
         self,
         address: str,
-        secret: bytes | None = None,  # None: one is drawn
+        secret: bytes | None = None,  # None: a random one
         port: int = 0,  # 0: the system chooses
     ) -> None:
         self._listener = Listener(address, secret, port)

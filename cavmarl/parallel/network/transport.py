@@ -1,8 +1,8 @@
-"""`Transport`: what carries bytes between the processes of a run.
+"""`Transport`: carries bytes between the processes of a run.
 
-Nothing above this interface knows what a connection is made of. There are three implementations:
-`TcpTransport`, `MpiTransport`, and the network of `cavmarl.verify`'s simulated machine, which is in
-memory.
+Code above this interface does not depend on the kind of a connection. There are three
+implementations: `TcpTransport`, `MpiTransport`, and the network in memory of the simulated machine
+of `cavmarl.verify`.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ Place: TypeAlias = tuple[str, int]
 
 READS = select.POLLIN
 READS_AND_WRITES = select.POLLIN | select.POLLOUT
-MOST_PIECES = 512  # that are given to `Connection.send` at once
+MOST_PIECES = 512  # in one call of `Connection.send`
 
 
 class Connection(Protocol):
-    """One end of a stream of bytes between two processes. No call waits."""
+    """One end of a stream of bytes between two processes. Calls do not block."""
 
     @property
     def address(self) -> str:
-        """The address of this end, as the other one reaches it."""
+        """The address of this end, as the other end can reach it."""
         ...
 
     @property
     def keeps_bytes(self) -> bool:
-        """Whether it may keep bytes that have come and that no poll tells of."""
+        """Whether received bytes may wait here although a poll does not report them."""
         ...
 
     @property
     def closed(self) -> bool:
-        """Whether the other end has ended, and all that came before that has been received."""
+        """Whether the other end has closed, and all bytes before that have been received."""
         ...
 
     def send(self, pieces: Sequence[Bytes]) -> int:
-        """Send pieces as one; how many of their first bytes are taken, maybe none.
+        """Send the pieces as one; return how many of the first bytes were accepted.
 
         Raises:
             OSError: the other end has gone.
@@ -48,7 +48,7 @@ class Connection(Protocol):
         ...
 
     def receive(self, room: memoryview) -> int:
-        """Write what has come into `room`; how many bytes: 0, if none have come or will come.
+        """Read into `room`; return how many bytes, 0 if none are there or the end has closed.
 
         Raises:
             OSError: the other end has gone.
@@ -56,14 +56,14 @@ class Connection(Protocol):
         ...
 
     def fileno(self) -> int:
-        """The number by which a poll tells of it."""
+        """Return the number by which a poll reports this connection."""
         ...
 
     def close(self) -> None: ...
 
 
 class TransportListener(Protocol):
-    """A place where other processes open connections."""
+    """A place to which other processes open connections."""
 
     @property
     def place(self) -> Place: ...
@@ -71,7 +71,7 @@ class TransportListener(Protocol):
     def fileno(self) -> int: ...
 
     def admit(self) -> list[tuple[int, Connection]]:
-        """Connections that have been opened, and the number that each opener says."""
+        """Return new connections, each with the number that its opener gives."""
         ...
 
     def close(self) -> None: ...
@@ -87,26 +87,26 @@ class TransportPoll(Protocol):
     def unregister(self, one: Any) -> None: ...
 
     def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
-        """Numbers of those that can receive or send, within that time."""
+        """Return the numbers of those that can receive or send, within that time."""
         ...
 
 
 class Transport(Protocol):
-    """Opens connections of a kind."""
+    """Opens connections, and listens for them."""
 
     def open(
         self,
         place: Place,
         secret: bytes,  # that both ends have to know
-        number: int,  # that is said to the listener
-        answer_s: float | None,  # for the listener to answer; None: as long as it takes
+        number: int,  # that the listener receives
+        answer_s: float | None,  # time for the listener to answer; None: unlimited
     ) -> Connection:
         """Open a connection to a listener.
 
         Raises:
-            OSError: nothing listens there.
-            EOFError: the listener wants no more.
-            MessageError: it does not know the secret, or speaks another version.
+            OSError: nothing listens at the place.
+            EOFError: the listener has ended the connection.
+            MessageError: the listener does not know the secret, or has another version.
         """
         ...
 

@@ -1,1 +1,1 @@
-"""Zone nodes: processes that share nothing, each with some zones of the same worlds."""
+"""Worlds over nodes: processes without shared memory, each with some zones of the worlds."""

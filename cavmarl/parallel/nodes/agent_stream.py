@@ -1,4 +1,4 @@
-"""What goes between processes about agents, as kernels write and read it."""
+"""Frames about agents, which kernels write and read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError
 from cavmarl.parallel.network.transport import Bytes
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import (
     Outcome,
     note_own,
@@ -31,17 +31,17 @@ COMMON = (
 
 
 class _Room:
-    """Where a frame is written."""
+    """A buffer for a frame."""
 
-    def __init__(self, size: int) -> None:  # bytes, at most
+    def __init__(self, size: int) -> None:  # maximum in bytes
         self.words = np.empty(-(-size // 8), dtype=np.int64)
         self.data = self.words.view(np.uint8)
 
 
 def _tables(arrays: Sequence[Array]) -> tuple[NDArray[np.uint8], ...]:
-    """(W, A, …) as bytes of each agent, (W · A, b), views."""
+    """Return arrays (W, A, …) as the bytes of each agent, (W · A, b), as views."""
     num = arrays[0].shape[0] * arrays[0].shape[1]
-    assert all(array.flags.c_contiguous for array in arrays), "these are views of them"
+    assert all(array.flags.c_contiguous for array in arrays), "tables have to be views"
     return tuple(_flat(array).reshape(num, array.nbytes // max(num, 1)) for array in arrays)
 
 
@@ -50,19 +50,19 @@ def _flat(array: Array) -> NDArray[np.uint8]:
 
 
 def _size(tables: Sequence[Array]) -> int:
-    """Bytes of a frame of all agents."""
+    """Return the size of a frame of all agents."""
     return 8 + sum(8 * len(tables[0]) + table.size for table in tables)
 
 
 def _read(data: memoryview) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Whole words of a frame, and its bytes. Raises MessageError: it has not got any."""
+    """Return the whole words of a frame, and its bytes. Raises MessageError: it is too short."""
     if len(data) < 8:
-        raise MessageError(f"{len(data)} bytes are not what a node tells of its agents")
+        raise MessageError(f"{len(data)} bytes are no frame about agents")
     return np.frombuffer(data, np.int64, len(data) // 8), np.frombuffer(data, np.uint8)
 
 
 class AgentStream:
-    """Rows of some tables, between nodes."""
+    """Rows of tables of agents, from each node to the others."""
 
     def __init__(self, tables: Sequence[Array]) -> None:  # (W, A, …)
         self._tables = _tables(tables)
@@ -70,33 +70,33 @@ class AgentStream:
         self._mine = np.zeros(len(self._tables[0]), dtype=np.bool_)
         self._note = specialized(note_own, checks=False)
         self._pack = specialized(pack_agents, checks=False)
-        self._take = specialized(take_agents, checks=False)
+        self._unpack = specialized(take_agents, checks=False)
 
     def packed(
         self,
         present: Flags,  # (W, A) agents that have sensed in this node
         chosen: Flags,  # (W,) in these worlds
         number: int,  # of this node
-        own: Flags,  # (W, A) written: those that have sensed here last
-        owner: NDArray[np.int32],  # (W · A,) written: the node of each agent
+        own: Flags,  # (W, A) output: agents that sensed here last
+        owner: NDArray[np.int32],  # (W · A,) output: node of each agent
     ) -> Bytes:
-        """What is told of the agents of this node, until the next is packed."""
+        """Return a frame about the agents of this node, valid until the next call."""
         room = self._room
         self._note(present, chosen, number, own, self._mine, owner)
         return room.data[: self._pack(self._mine, self._tables, room.words, room.data)].data
 
-    def take(self, data: memoryview, number: int, owner: NDArray[np.int32]) -> None:
-        """Write what node `number` tells to the tables, and that it owns these agents.
+    def read(self, data: memoryview, number: int, owner: NDArray[np.int32]) -> None:
+        """Write the frame of node `number` to the tables, and note that it owns these agents.
 
         Raises:
-            MessageError: it is none, or is about agents that there are not.
+            MessageError: the bytes are no such frame, or name unknown agents.
         """
-        if self._take(self._tables, *_read(data), number, owner) != len(data):
-            raise MessageError(f"{len(data)} bytes are not what a node tells of its agents")
+        if self._unpack(self._tables, *_read(data), number, owner) != len(data):
+            raise MessageError(f"{len(data)} bytes are no frame about agents")
 
 
 class ResultStream:
-    """What a step or a reset gave, from nodes to the caller."""
+    """Results of a step or a reset, from nodes to the caller."""
 
     def __init__(self, arrays: StepArrays) -> None:
         sensed, final = (
@@ -107,41 +107,41 @@ class ResultStream:
             )
         )
         common = tuple(_flat(getattr(arrays, name)) for name in COMMON)
-        self._told = Outcome(common, sensed, final, arrays.episode_over, arrays.terminations)
+        self._outcome = Outcome(common, sensed, final, arrays.episode_over, arrays.terminations)
         size = sum(part.size for part in common) + _size(sensed) + _size(final)
         self._room = _Room(size + 16)
         self._mine = np.zeros(arrays.mask.size, dtype=np.bool_)
         self._unread = np.zeros(arrays.mask.size, dtype=np.int32)
         self._pack = specialized(pack_results, checks=False)
-        self._take = specialized(take_results, checks=False)
+        self._unpack = specialized(take_results, checks=False)
 
     def packed(
         self,
         own: Flags,  # (W, A) agents that have sensed in this node
-        chosen: Flags,  # (W,) the worlds that have been reset, or stepped
-        before: Flags,  # (W, A) those of before worlds began anew
+        chosen: Flags,  # (W,) worlds that were reset or stepped
+        before: Flags,  # (W, A) agents that had sensed here before the autoreset
         of_step: bool,
-        with_common: bool,  # what all nodes know alike goes along
+        with_common: bool,  # include the results that all nodes share
     ) -> Bytes:
-        """The results of one node, until the next are packed."""
+        """Return the results of this node, valid until the next call."""
         room = self._room
-        told = self._told, own, chosen, before, of_step, with_common, self._mine
-        return room.data[: self._pack(*told, room.words, room.data)].data
+        arguments = self._outcome, own, chosen, before, of_step, with_common, self._mine
+        return room.data[: self._pack(*arguments, room.words, room.data)].data
 
-    def take(
+    def read(
         self,
         data: memoryview,
-        chosen: Flags,  # (W,) the worlds that have been reset, or stepped
+        chosen: Flags,  # (W,) worlds that were reset or stepped
         of_step: bool,
-        with_common: bool,  # it is the first one: it tells what all know alike
+        with_common: bool,  # the node is the reporter, and is read first
         number: int,  # of the node
-        owner: NDArray[np.int32],  # (W · A,) written: the node of each agent
+        owner: NDArray[np.int32],  # (W · A,) output: node of each agent
     ) -> None:
-        """Write what a node has sent to the arrays.
+        """Write the results of a node to the arrays.
 
         Raises:
-            MessageError: it is none, or is about agents that there are not.
+            MessageError: the bytes are no results, or name unknown agents.
         """
-        told = self._told, chosen, of_step, with_common, number, owner, self._unread
-        if not self._take(*told, *_read(data)):
+        arguments = self._outcome, chosen, of_step, with_common, number, owner, self._unread
+        if not self._unpack(*arguments, *_read(data)):
             raise MessageError(f"{len(data)} bytes are not the results of a node")

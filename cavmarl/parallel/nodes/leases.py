@@ -1,26 +1,26 @@
-"""How long a lease of nodes is: the ticks of a step, for what agents do in them is known.
+"""Length of the leases of nodes: the ticks of a step, whose commands are known in advance.
 
-A vehicle that crosses a border meanwhile stays with its owner until the next lease. Where it cannot
-be offered before that, since it is on no record yet, a lease of no ticks comes first.
+A vehicle that crosses a border during a lease stays with its owner until the next lease. A vehicle
+without a record cannot be offered. For such a vehicle, a lease of no ticks comes first.
 """
 
 from __future__ import annotations
 
 from cavmarl.config.env import EnvConfig
 
-MOST = 4  # ticks: the longer, the further zones have to see over their borders
+MOST = 4  # ticks; a longer lease makes zones see further over their borders
 
 
 def lease_ticks(config: EnvConfig) -> int:
-    """The ticks of a lease; the last one of a step may have fewer."""
+    """Return the ticks of a lease; the last lease of a step may have fewer."""
     return min(config.clock.ticks_per_step, MOST)
 
 
 def leases_of(ticks: int, lease: int) -> int:
-    """How many leases of so many ticks, `lease`, they take."""
+    """Return how many leases of `lease` ticks cover `ticks`."""
     return -(-ticks // lease)
 
 
 def late_ticks(config: EnvConfig) -> int:
-    """For how many ticks more than one a vehicle that has crossed may stay with its zone."""
+    """Return for how many ticks more than one a vehicle may stay with the zone it has left."""
     return lease_ticks(config) - 1

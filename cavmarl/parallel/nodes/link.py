@@ -1,14 +1,14 @@
-"""`Link`: a connection over which whole frames go.
+"""`Link`: a connection that carries whole frames.
 
-A frame is a head of fixed size and bytes. Frames of a connection arrive in their order, or the
-connection has ended. Nothing in a frame is ever run.
+A frame is a head of fixed size, and data. Frames arrive in the order in which they were sent, or
+the connection has ended. Nothing in a frame is ever executed.
 
-    head    magic, version, kind, number, bytes of what follows, checksum of what follows,
+    head    magic, version, kind, number, bytes of the data, checksum of the data,
             checksum of the head
 
-Checksums are XXH3 of 64 bits; they guard against accidents alone. The seed of the head's is how
-many frames went before on that connection, so that one that comes twice or out of turn is no frame.
-It is compared before anything else of the frame is awaited.
+Checksums are XXH3 of 64 bits, and guard against accidents only. The checksum of the head has the
+number of the frame on its connection as seed, so a repeated or reordered frame is rejected. It is
+checked before the data are awaited.
 """
 
 from __future__ import annotations
@@ -33,49 +33,49 @@ MAX_FRAME = 1 << 32
 _ALL = (1 << 64) - 1
 BEGIN = MAGIC + VERSION.to_bytes(2, "little")
 _HEAD = struct.Struct("<6sHQQQ")
-SUMMED = _HEAD.size  # bytes of a head that its checksum is of
+SUMMED = _HEAD.size  # bytes of a head that its checksum covers
 _SUM = struct.Struct("<Q")
 _WHOLE_HEAD = struct.Struct("<6sHQQQQ")
 HEAD_BYTES = _WHOLE_HEAD.size
-ROOM = 1 << 14  # bytes that are read at once where it is not known what comes
+ROOM = 1 << 14  # bytes of the buffer for heads and small frames
 
 
 class FrameKind(IntEnum):
-    """What a frame carries."""
+    """What a frame carries; C is the caller, N a node."""
 
-    JOB = 0  # C → N: what to be
+    JOB = 0  # C → N: the worlds to load
     READY = 1  # N → C: where other nodes can call
-    JOIN = 2  # N → C: what it runs
-    COMMAND = 3  # C → N: a task, and what it needs
+    JOIN = 2  # N → C: the code that the node runs
+    COMMAND = 3  # C → N: a task and its arguments
     LEASE = 4  # C → N: STEP messages
     REPORT = 5  # N → C: DONE messages, and what the next decision needs
-    MESSAGES = 6  # N → N, N → C: the protocol's other messages
-    RESULT = 7  # N → C: what a task gave
+    MESSAGES = 6  # N → N, N → C: other messages of the protocol
+    RESULT = 7  # N → C: the result of a task
     FAILED = 8  # N → C: an error
     SHARE = 9  # N → N: a part of a tick
-    KEEP = 10  # N → N: the state of a node's zones, for when it is lost
-    RECOVER = 11  # C → N: nodes are lost or new; begin, or go back to a state that was kept
-    SYNC = 12  # N → N: all before this is of no use any more
+    KEEP = 10  # N → N, N → C: a replica of the state of a node
+    RECOVER = 11  # C → N: nodes are lost or new; start, or go back to a kept state
+    SYNC = 12  # N → N: all earlier frames are void
     PING = 13  # C → N: answer at once
     PONG = 14  # N → C: the answer
-    AGENT = 15  # N → N: what is kept of an agent whose vehicle changes its node
-    WANTED = 16  # N → C: files that it does not have
-    FILES = 17  # C → N: those
+    AGENT = 15  # N → N: state of an agent whose vehicle changes its node
+    WANTED = 16  # N → C: files that the node does not have
+    FILES = 17  # C → N: these files
     MISSED = 18  # N → C: the connection to another node has ended
-    REFUSED = 19  # C → N: why it is of no use
-    END = 20  # C → N: it is needed no more
-    GIVE = 21  # N → N: the state of zones that another node hosts from now on
-    NOT_MINE = 22  # N → C: agents whose actions have come to the wrong node, and their owners
-    ACTIONS = 23  # C → N: those
-    EXCHANGE = 24  # N → C: messages that are sent, for a network simulator
-    RECEPTIONS = 25  # C → N: which of them are received where
+    REFUSED = 19  # C → N: why the node is rejected
+    END = 20  # C → N: the node is not needed any more
+    GIVE = 21  # N → N: the state of zones that move to another node
+    NOT_MINE = 22  # N → C: agents whose actions came to the wrong node, and their owners
+    ACTIONS = 23  # C → N: forwarded actions
+    EXCHANGE = 24  # N → C: sent messages, for a network simulator
+    RECEPTIONS = 25  # C → N: received messages, from the network simulator
 
 
 class NodeFrame(NamedTuple):
-    """A frame that has come."""
+    """A received frame."""
 
     kind: FrameKind
-    number: int  # which of its kind, as both ends count
+    number: int  # its meaning depends on the kind
     data: memoryview
 
 
@@ -96,31 +96,31 @@ URGENT = frozenset(
         FrameKind.RECEPTIONS,
     }
 )
-_AT_ONCE = URGENT | {FrameKind.END, FrameKind.REFUSED}  # not kept until they are taken
+_AT_ONCE = URGENT | {FrameKind.END, FrameKind.REFUSED}  # do not wait in `Link.frames`
 
 
 class NeededNoMoreError(Exception):
-    """The coordinator says that this node may end."""
+    """The coordinator does not need this node any more."""
 
 
 class Link:
-    """One connection: what is to be sent, and what has come of the next frame."""
+    """One connection, with bytes still to be sent, and the part of a frame that has come."""
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
         self.waiting: deque[memoryview] = deque()
         self.frames: deque[NodeFrame] = deque()
-        self._room = memoryview(bytearray(ROOM))  # what has come, until it is known what it is
-        self._filled = 0  # bytes of it
-        self._into = self._room  # where the next bytes go: there, or into a frame that has begun
-        self._opened: tuple[NodeFrame, int] | None = None  # that frame, and its checksum
-        self._num_sent = self._num_heard = 0  # frames
+        self._room = memoryview(bytearray(ROOM))  # received bytes that are not split yet
+        self._filled = 0  # bytes in the room
+        self._into = self._room  # target of the next bytes: the room, or an open frame
+        self._opened: tuple[NodeFrame, int] | None = None  # the open frame, and its checksum
+        self._num_sent = self._num_received = 0  # frames
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> int:
-        """Send what the connection takes at once; the rest is kept, as a copy.
+        """Send as much as the connection accepts at once; keep a copy of the rest.
 
         Returns:
-            bytes of the frame.
+            size of the frame in bytes.
         """
         data = _joined(pieces)
         self._num_sent = num_sent = self._num_sent + 1 & _ALL
@@ -134,6 +134,7 @@ class Link:
         return size
 
     def go_on_sending(self) -> None:
+        """Send as much of the rest as the connection accepts."""
         waiting = self.waiting
         while waiting:
             sent = self.connection.send(list(islice(waiting, MOST_PIECES)))
@@ -145,12 +146,12 @@ class Link:
                 waiting[0] = waiting[0][sent:]
 
     def receive(self, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
-        """Take what has come; urgent frames are added to those of others, with a number each.
+        """Receive what has come; append urgent frames, with the number of this link.
 
         Raises:
             EOFError, OSError: the other end has gone.
-            MessageError: what came is no frame.
-            NeededNoMoreError, NodeRefusedError: the coordinator has said its last word.
+            MessageError: the bytes are no frame.
+            NeededNoMoreError, NodeRefusedError: the coordinator has dismissed this node.
         """
         while True:
             into = self._into
@@ -170,12 +171,12 @@ class Link:
                 return
 
     def _split(self, filled: int, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
-        """Take the frames that begin in what has come."""
+        """Split the room into frames, the last of which may be incomplete."""
         room, at = self._room, 0
         while filled - at >= HEAD_BYTES:
             begin, code, which, size, summed, own = _WHOLE_HEAD.unpack_from(room, at)
-            self._num_heard = heard = self._num_heard + 1 & _ALL
-            is_next = xxh3_64_intdigest(room[at : at + SUMMED], heard) == own
+            self._num_received = received = self._num_received + 1 & _ALL
+            is_next = xxh3_64_intdigest(room[at : at + SUMMED], received) == own
             if begin != BEGIN or not is_next or code not in _KINDS or size > MAX_FRAME:
                 raise _stranger(begin, is_next, code, size)
             at += HEAD_BYTES
@@ -199,13 +200,13 @@ class Link:
     def _close(
         self,
         frame: NodeFrame,
-        summed: int,  # its checksum, as the head has it
+        summed: int,  # checksum in the head
         urgent: deque[tuple[int, NodeFrame]],
         number: int,
     ) -> None:
-        """Take a frame that has come whole."""
+        """Check a complete frame, and queue it."""
         if xxh3_64_intdigest(frame.data) != summed:
-            raise MessageError("a frame is not what was sent")
+            raise MessageError("the data of a frame are damaged")
         kind = frame.kind
         if kind not in _AT_ONCE:
             self.frames.append(frame)
@@ -218,7 +219,7 @@ class Link:
 
 
 def _joined(pieces: Sequence[Bytes]) -> Bytes:
-    """Pieces as one; a single one is not copied."""
+    """Return the pieces as one, without a copy of a single piece."""
     if len(pieces) != 1:
         return b"".join(pieces)
     (data,) = pieces
@@ -228,21 +229,24 @@ def _joined(pieces: Sequence[Bytes]) -> Bytes:
 
 
 def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError:
-    """Why a head is none."""
+    """Return the error for a bad head."""
     version = int.from_bytes(begin[len(MAGIC) :], "little")
     if not begin.startswith(MAGIC):
-        return MessageError(f"{begin[: len(MAGIC)]!r} begins no frame of a node")
+        return MessageError(f"{begin[: len(MAGIC)]!r} does not start a frame of a node")
     if version != VERSION:
         return MessageError(
-            f"a frame of version {version}, this is {VERSION}: install the same cavmarl everywhere"
+            f"a frame has version {version}, this process has {VERSION}: install the same cavmarl "
+            "on all machines"
         )
     if not is_next:
-        return MessageError("a frame's head is not what was sent, or not the next one")
-    return MessageError(f"a frame of kind {code} with {size} bytes is none")
+        return MessageError("the head of a frame is damaged, or not the next one")
+    if code not in _KINDS:
+        return MessageError(f"a frame has the unknown kind {code}")
+    return MessageError(f"a frame has {size} bytes, more than {MAX_FRAME}")
 
 
-def said_by(frame: NodeFrame) -> list[Any]:
-    """A list as JSON. Raises MessageError: it is none."""
+def read_list(frame: NodeFrame) -> list[Any]:
+    """Read a JSON list. Raises MessageError: the frame has something else."""
     try:
         found: list[Any] = read_json(frame.data, list)
     except MessageError as error:

@@ -1,4 +1,4 @@
-"""`Links`: the connections of a process to others, over which whole frames go."""
+"""`Links`: the connections of a process to other processes, which carry whole frames."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from cavmarl.parallel.nodes.peer_faults import LinkLostError, reading
 LOST = (EOFError, OSError, MessageError)  # what ends a connection
 
 Urgent: TypeAlias = Callable[[int, NodeFrame], Exception | None]
-"""What is called with an urgent frame as soon as it has come, and the number of its sender.
+"""Handles an urgent frame as soon as it has come; the first argument is its sender.
 
-What fails in it is the sender's fault; what it returns is not, and is raised."""
+An error in the handler is the fault of the sender. `pump` raises an error that it returns."""
 
 
 class SilenceError(Exception):
-    """Nothing has come for long.
+    """An awaited frame has not come in time.
 
     Attributes:
-        awaited: nodes of which an answer to another node is awaited.
+        awaited: nodes that owe another node an answer.
     """
 
     def __init__(self, text: str, awaited: Collection[int] = ()) -> None:
@@ -35,7 +35,7 @@ class SilenceError(Exception):
 
 
 class RecoveryOrderedError(Exception):
-    """A node is to go back to a state that was kept; the order itself, if it has come."""
+    """A node has to go back to a kept state; `frame` is the order, if it has been received."""
 
     def __init__(self, frame: NodeFrame | None) -> None:
         super().__init__("other nodes are lost")
@@ -43,7 +43,7 @@ class RecoveryOrderedError(Exception):
 
 
 class Links:
-    """Connections by the number of the process at the other end."""
+    """Connections, by the number of the process at the other end."""
 
     def __init__(self, urgent: Urgent, system: NodeSystem = MACHINE) -> None:
         self.urgent = urgent
@@ -51,9 +51,11 @@ class Links:
         self._looks = system.looks
         self._links: dict[int, Link] = {}
         self._poll = system.poll()
-        self._by_place: dict[int, tuple[int, Link]] = {}  # as the poll tells of them
-        self._heard: deque[tuple[int, NodeFrame]] = deque()  # urgent frames, and their senders
-        self.wanted: Collection[int] = ()  # whose frames this process waits for
+        self._by_place: dict[int, tuple[int, Link]] = {}  # by the numbers of the poll
+        self._urgent_frames: deque[tuple[int, NodeFrame]] = (
+            deque()
+        )  # urgent frames, and their senders
+        self.wanted: Collection[int] = ()  # senders whose frames this process awaits
         self.waited_s = 0.0
         self.sent_bytes = 0
         self.sent_frames = 0
@@ -70,7 +72,7 @@ class Links:
 
     @property
     def awaited(self) -> list[int]:
-        """Nodes whose frames this process waits for."""
+        """Nodes whose frames this process awaits and has not received."""
         links = self._links
         return sorted(n for n in self.wanted if n not in links or not links[n].frames)
 
@@ -91,27 +93,26 @@ class Links:
         if link.waiting:
             self._poll.modify(link.connection, READS_AND_WRITES)
 
-    def take(
+    def receive(
         self,
-        wanted: Collection[int],  # numbers of the nodes whose frames are awaited
-        timeout_s: float | None = None,  # None: as long as it takes
+        wanted: Collection[int],  # senders
+        timeout_s: float | None = None,  # None: no limit
     ) -> dict[int, NodeFrame]:
-        """The next frame of each.
+        """Receive the next frame of each sender.
 
         Raises:
-            LinkLostError: one of them has gone.
-            MessageError: what came is no frame.
-            SilenceError: nothing has come in time.
-            RecoveryOrderedError: the coordinator has one that is not awaited.
+            LinkLostError: a sender has gone.
+            SilenceError: a frame has not come in time.
+            RecoveryOrderedError: the coordinator has ordered a recovery.
         """
-        links, heeds = self._links, COORDINATOR not in wanted
+        links, is_member = self._links, COORDINATOR not in wanted
         self.wanted = wanted
         until_s = None if timeout_s is None else self.now_s() + timeout_s
         left_ms = None
         for number in wanted:
             while number not in links or not links[number].frames:
-                if heeds:
-                    self.heed()
+                if is_member:
+                    self.check_recovery()
                 if number not in links:
                     raise LinkLostError(number)
                 if until_s is not None:
@@ -120,35 +121,35 @@ class Links:
                         silent = self.awaited
                         raise SilenceError(f"nodes {silent} do not answer within {timeout_s:g} s")
                 self.pump(left_ms)
-        if heeds:
-            self.heed()
+        if is_member:
+            self.check_recovery()
         found = {}
         for number in wanted:
             found[number] = links[number].frames.popleft()
         self.wanted = ()
         return found
 
-    def next(self, number: int) -> NodeFrame:
-        """The next frame of one, however long that takes; errors as of `take`."""
+    def receive_next(self, number: int) -> NodeFrame:
+        """Receive the next frame of a sender, without a limit; errors as of `receive`."""
         try:
             frames = self._links[number].frames
         except KeyError:
             raise LinkLostError(number) from None
         if not frames:
             self.wanted = (number,)
-            # another node is at the same place of its tick: to be woken would take longer
+            # Another node is at the same point of its tick, so polling is faster than to sleep.
             looks = 0 if number == COORDINATOR else self._looks
             while not frames:
                 if number != COORDINATOR:
-                    self.heed()
+                    self.check_recovery()
                 self.pump(None, looks)
             self.wanted = ()
         return frames.popleft()
 
-    def heed(self) -> None:
-        """Raises RecoveryOrderedError: the coordinator's order to go back has come.
+    def check_recovery(self) -> None:
+        """Raise RecoveryOrderedError if the coordinator has ordered a recovery.
 
-        What is awaited then may never come: its sender may be lost without anyone noticing here.
+        Then an awaited frame may never come, since its sender may be lost unnoticed.
         """
         link = self._links.get(COORDINATOR)
         if link is None or not link.frames:
@@ -156,30 +157,30 @@ class Links:
         if any(frame.kind is FrameKind.RECOVER for frame in link.frames):
             raise RecoveryOrderedError(None)
 
-    def arrived(self, number: int) -> NodeFrame | None:
-        """The next frame of one, if it has come."""
+    def receive_if_there(self, number: int) -> NodeFrame | None:
+        """Return the next frame of a sender, if it has come."""
         frames = self._links[number].frames
         return frames.popleft() if frames else None
 
     def has(self, number: int) -> bool:
-        """Whether a frame of one has come that has not been taken."""
+        """Return whether a frame of a sender waits here."""
         return number in self._links and bool(self._links[number].frames)
 
     def release(self, number: int) -> Link:
-        """Give a connection away."""
+        """Remove a connection and return it."""
         return self._forget(number)
 
-    def put_back(self, number: int, frame: NodeFrame) -> None:
-        """Let a frame be the next one of its sender once more."""
+    def unread(self, number: int, frame: NodeFrame) -> None:
+        """Put a frame back, as the next one of its sender."""
         self._links[number].frames.appendleft(frame)
 
     def pump(self, timeout_ms: float | None, looks: int = 0) -> None:
-        """Send and receive what can be; wait so long for the first that can.
+        """Send and receive on all connections that are ready; wait up to `timeout_ms` for one.
 
-        Before it sleeps it looks so many times.
+        Poll `looks` times before the process sleeps.
         """
-        if self._heard:  # an error was raised of the one before them
-            self._tell()
+        if self._urgent_frames:  # the frame before them has raised an error
+            self._deliver()
             return
         began_s = self.now_s()
         poll = self._poll.poll
@@ -196,38 +197,38 @@ class Links:
                     link.go_on_sending()
                     if not link.waiting:
                         self._poll.modify(link.connection, READS)
-                link.receive(self._heard, number)
+                link.receive(self._urgent_frames, number)
             except LOST as error:
-                self._tell()
+                self._deliver()
                 raise self._lost(number, error) from error
-            if self._heard:
-                self._tell()
+            if self._urgent_frames:
+                self._deliver()
 
-    def _tell(self) -> None:
-        """Let urgent frames be heard."""
-        while self._heard:
-            number, frame = self._heard.popleft()
+    def _deliver(self) -> None:
+        """Pass urgent frames to the handler."""
+        while self._urgent_frames:
+            number, frame = self._urgent_frames.popleft()
             try:
                 with reading(number):
-                    passed_on = self.urgent(number, frame)
+                    error = self.urgent(number, frame)
             except LinkLostError as lost:
                 if lost.peer == number:
                     self.drop(number)
                 raise
-            if passed_on is not None:
-                raise passed_on
+            if error is not None:
+                raise error
 
     def _lost(self, number: int, error: Exception) -> LinkLostError:
         self.drop(number)
         return LinkLostError(number, error)
 
     def flush(self) -> None:
-        """Wait until all that is to be sent is sent."""
+        """Wait until all frames are sent."""
         while any(link.waiting for link in self._links.values()):
             self.pump(None)
 
     def drop(self, number: int) -> None:
-        """End a connection, if there is one."""
+        """Close a connection, if there is one."""
         if number in self._links:
             self._forget(number).connection.close()
 
@@ -238,11 +239,11 @@ class Links:
         return link
 
     def end(self, timeout_s: float) -> None:
-        """Tell all that they are needed no more, and wait a while for them to end."""
+        """Send END to all, and wait up to a limit for them to close."""
         for number in self.numbers:
             with suppress(LinkLostError):
                 self.send(number, FrameKind.END, 0)
-        self.urgent = _unheard
+        self.urgent = _ignore
         until_s = self.now_s() + timeout_s
         while self._links and self.now_s() < until_s:
             with suppress(LinkLostError):
@@ -254,6 +255,6 @@ class Links:
             self.drop(number)
 
 
-def _unheard(number: int, frame: NodeFrame) -> Exception | None:
-    """What is of no use any more."""
+def _ignore(number: int, frame: NodeFrame) -> Exception | None:
+    """Ignore a late frame."""
     return None

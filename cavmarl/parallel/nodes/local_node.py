@@ -13,5 +13,5 @@ if __name__ == "__main__":
     host, port, number = sys.argv[1:]
     try:
         run_node((host, int(port)), bytes.fromhex(sys.stdin.readline().strip()), int(number))
-    except (EOFError, OSError):  # the caller has ended meanwhile
+    except (EOFError, OSError):  # the caller has ended
         sys.exit(1)

@@ -1,8 +1,9 @@
-"""`Actions`: what agents do in a step, which goes to the nodes that own their vehicles.
+"""`Actions`: actions of agents in a step, which go to the nodes that own their vehicles.
 
-The caller knows which node sensed for an agent last. After nodes were lost, or zones moved, that
-may be another one: a node that is told what an agent of another one does refuses it, with the
-owner's number, and the caller sends it there. A node waits until it knows what all its agents do.
+The caller knows which node sensed for an agent last. After nodes were lost, or zones have moved,
+the owner may be another node. A node that receives an action of an agent that it does not own
+refuses it with the number of the owner, and the caller forwards the action. A node waits until it
+has the actions of all its agents.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized, unchecked
 from cavmarl.core.errors import MessageError
 from cavmarl.parallel.network.transport import Bytes
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import UNOWNED, pack_actions, take_actions
 
 Agents = NDArray[np.int64]
-"""Some, counted over all worlds."""
+"""Agents, numbered through all worlds."""
 
 ZoneRects = list[list[float]]
-"""Zones as `node_cuts.told_zones` gives them."""
+"""Zones as a JSON value, see `node_cuts.zones_as_json`."""
 
 _pack = unchecked(pack_actions)
 
 
 class Actions(NamedTuple):
-    """Those of all agents of W worlds in one step."""
+    """The actions of all agents of W worlds in one step."""
 
     controls: NDArray[np.float64]  # (W · A, 2)
     meta_actions: NDArray[np.int64]  # (W · A,)
@@ -36,48 +37,49 @@ class Actions(NamedTuple):
 
     @classmethod
     def of(cls, arrays: StepArrays) -> Actions:
+        """Copy the actions from step arrays."""
         arrays_of = (arrays.controls.reshape(-1, 2), arrays.meta_actions, arrays.mask)
         return cls(arrays_of[0].copy(), arrays_of[1].flatten(), arrays_of[2].flatten())
 
     def of_node(self, number: int, owner: NDArray[np.int32]) -> Bytes:
-        """What a node is told: of its agents, and of those that may get a vehicle anywhere.
+        """Return the actions for a node: of its agents, and of agents without an owner.
 
         Args:
             number: of the node.
-            owner: (W · A,) the node of each agent, as far as is known.
+            owner: (W · A,) node of each agent, as far as it is known.
         """
         words = np.empty(2 + 4 * len(owner), dtype=np.int64)
         return words[: _pack(*self, owner, number, words, words.view(np.float64))].data
 
     def some(self, agents: Agents) -> Bytes:
-        """What the owner of some agents is told of them."""
+        """Return the actions of some agents, for their owner."""
         owner = np.full(len(self.mask), UNOWNED - 1, dtype=np.int32)
         owner[agents] = 0
         return self._replace(mask=np.ones_like(self.mask)).of_node(0, owner)
 
 
 class NodeCommand(NamedTuple):
-    """What all nodes are to do."""
+    """A command to all nodes."""
 
-    pieces: list[bytes]  # of its frame, the same for all
-    changes: bool  # what the worlds are
+    pieces: list[bytes]  # of its frame, the same for all nodes
+    changes: bool  # whether it changes the worlds
     ticks: int  # of the worlds
     actions: Actions | None = None  # of a step
-    cut: ZoneRects | None = None  # zones that the worlds have from then on
-    receptions: list[bytes] | None = None  # what a network simulator has said so far, in a step
+    cut: ZoneRects | None = None  # new zones of the worlds
+    receptions: list[bytes] | None = None  # answers of a network simulator so far, in a step
 
     def of_node(self, number: int, owner: NDArray[np.int32], lease: bytes) -> list[Bytes]:
-        """The pieces of the frame that a node gets; arguments as of `Actions.of_node`.
+        """Return the pieces of the frame for a node; arguments as of `Actions.of_node`.
 
-        The actions begin at a whole word of 8 bytes, for kernels read them.
+        The actions start at a whole word of 8 bytes, since kernels read them.
         """
         first, *rest = self.pieces
-        told = [] if self.actions is None else [self.actions.of_node(number, owner)]
-        return [first, *told, *rest, lease]
+        actions = [] if self.actions is None else [self.actions.of_node(number, owner)]
+        return [first, *actions, *rest, lease]
 
 
-class ActionsTaken:
-    """What agents do, as one node is told it step by step."""
+class ReceivedActions:
+    """The actions that a node receives for a step."""
 
     def __init__(self, arrays: StepArrays, number: int) -> None:  # `number`: of the node
         num = arrays.mask.size
@@ -85,45 +87,48 @@ class ActionsTaken:
         self._arrays = arrays.controls.reshape(num, 2), arrays.meta_actions.reshape(num)
         self._missing = np.zeros(num, dtype=np.bool_)
         self._wrong = np.empty(num, dtype=np.int64)
-        self._take = specialized(take_actions, checks=False)
-        self.are_due = False  # some of the node's own agents have not been told of yet
+        self._unpack = specialized(take_actions, checks=False)
+        self.are_due = False  # actions of agents of this node are missing
 
     def begin(self, owner: NDArray[np.int32]) -> None:
-        """A step begins; `owner`: (W · A,) the node of each agent."""
+        """Start a step; `owner`: (W · A,) node of each agent."""
         np.equal(owner, self._number, out=self._missing)
 
-    def take(self, data: memoryview, at: int, owner: NDArray[np.int32]) -> tuple[Agents, int]:
-        """Write what agents do to the arrays; those that other nodes own, and where it ends.
+    def read(self, data: memoryview, at: int, owner: NDArray[np.int32]) -> tuple[Agents, int]:
+        """Write received actions to the arrays.
+
+        Returns:
+            agents of other nodes, and where the actions end.
 
         Raises:
-            MessageError: the bytes tell of no actions.
+            MessageError: the bytes are no actions.
         """
         words = np.frombuffer(data, np.int64, (len(data) - at) // 8, at)
-        size, wrong, missing = self._take(
+        size, wrong, missing = self._unpack(
             words, words.view(np.float64), *self._arrays,
             self._missing, owner, self._number, self._wrong,
         )  # fmt: skip
         if size < 0:
-            raise MessageError(f"{len(data)} bytes do not tell what agents do")
+            raise MessageError(f"{len(data)} bytes are no actions of agents")
         self.are_due = missing > 0
         return self._wrong[:wrong], at + 8 * size
 
 
 def refusal(agents: Agents, owner: NDArray[np.int32]) -> list[Bytes]:
-    """What a node says of agents that are not its own: the number of the owner of each."""
+    """Return a refusal of agents of other nodes, with the owner of each."""
     return [np.stack([agents, owner[agents]]).reshape(-1).data]
 
 
 def read_refusal(data: memoryview, num_agents: int, nodes: set[int]) -> NDArray[np.int64]:
-    """(2, n) agents, and the node that owns each.
+    """Read a refusal: (2, n) agents, and the owner of each.
 
     Raises:
-        MessageError: it is none, or names agents or nodes that there are not.
+        MessageError: the bytes are no refusal, or name unknown agents or nodes.
     """
     if len(data) % 16:
-        raise MessageError(f"a refusal of {len(data)} bytes is none")
+        raise MessageError(f"{len(data)} bytes are no refusal")
     found = np.frombuffer(data, np.int64).reshape(2, -1)
     agents, owners = found
     if ((agents < 0) | (agents >= num_agents)).any() or not set(owners.tolist()) <= nodes:
-        raise MessageError("a refusal names agents or nodes that there are not")
+        raise MessageError("a refusal names unknown agents or nodes")
     return found

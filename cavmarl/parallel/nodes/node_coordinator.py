@@ -1,4 +1,4 @@
-"""`NodeCoordinator`: decides which zone owns which vehicle, and knows no row of any."""
+"""`NodeCoordinator`: decides which zone owns which vehicle, without the rows of vehicles."""
 
 from __future__ import annotations
 
@@ -19,29 +19,28 @@ from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, SilenceError
 from cavmarl.parallel.nodes.peer_faults import check_indices, reading
-from cavmarl.parallel.nodes.zone_hosts import NOTHING, Report, packed, unpacked
-
-MOST_IDS = 1 << 62  # of vehicles in a run
+from cavmarl.parallel.nodes.zone_endpoints import NOTHING, Report, packed, unpacked
+from cavmarl.shards.row_check import MOST_IDS
 
 
 class CrossingDigests:
-    """Digests of the states of vehicles that have crossed a border, as their owners said."""
+    """Digests of the states of vehicles that have crossed a border, from their owners."""
 
     def __init__(self) -> None:
-        self.told: dict[int, bytes] = {}
+        self.digests: dict[int, bytes] = {}
 
     def digest_of(self, vehicle: int) -> bytes:
-        return self.told[vehicle]
+        return self.digests[vehicle]
 
     def state(self, vehicle: int) -> bytes:
-        """No state is known here: a node that needs one has lost what it was sent."""
+        """Raise ProtocolError: a node that needs a state has lost one that it acknowledged."""
         raise ProtocolError(
-            f"vehicle {vehicle}: its new zone does not have the state that it has acknowledged"
+            f"vehicle {vehicle}: its new zone does not have the state that it acknowledged"
         )
 
 
 class _World:
-    """The decisions of one world."""
+    """Ownership in one world."""
 
     def __init__(
         self,
@@ -58,15 +57,15 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
-        self.has_told = False  # of the present episode, by a STEP to each zone
-        self.has_begun = False  # before the first reset nodes have rows of no episode
+        self.has_stepped = False  # each zone has got a STEP in the present episode
+        self.has_begun = False  # before the first reset, rows belong to no episode
         self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
 
     def check_owned(self, w: int, reports: Sequence[Report]) -> None:
         """Compare the vehicles that zones own by their rows with the records.
 
         Raises:
-            ProtocolError: they are others, or of another epoch.
+            ProtocolError: the vehicles, or their epochs, differ.
         """
         self.has_begun |= any(report.began for report in reports)
         if self.on_record is None or not self.has_begun:
@@ -79,17 +78,16 @@ class _World:
             if (num, total) != (due[zone], sums[zone]):
                 raise ProtocolError(
                     f"world {w}, tick {self.directory.table.tick}: zone {zone} has {num} vehicles, "
-                    f"on record are {due[zone]}, or others or of another epoch; "
-                    "zones.journal shows the records"
+                    f"the records have {due[zone]} or other epochs; zones.journal shows the records"
                 )
 
-    def says_nothing(self, births: Sequence[Birth]) -> bool:
-        """Whether there is nothing to say of the next tick, nor to write down."""
+    def is_silent(self, births: Sequence[Birth]) -> bool:
+        """Return whether the next tick needs no message and no record."""
         is_watched = self.journal is not None or self.on_record is not None
-        return self.has_told and not (births or self.movers or is_watched)
+        return self.has_stepped and not (births or self.movers or is_watched)
 
     def write(self, output: Output) -> int:
-        """Write records down; how many vehicles change their owner by them."""
+        """Write records; return how many vehicles change their owner by them."""
         if not output.records:
             return 0
         if self.journal is not None:
@@ -101,23 +99,24 @@ class _World:
 
 
 class NodeCoordinator:
-    """Those of W worlds.
+    """Decides about ownership in W worlds.
 
     Attributes:
-        switched: vehicles that have changed their owner.
-        is_late: a vehicle has crossed a border that was on no record: a lease of no ticks is due.
+        worlds: what it knows of each world.
+        switched: number of changes of owner.
+        is_late: a vehicle without a record has crossed a border, so a lease of no ticks is due.
     """
 
     def __init__(
         self,
         runs: Sequence[bytes],  # of each world
-        node_of: Sequence[int],  # zone → the node that hosts it
+        node_of: Sequence[int],  # zone → node
         limits: Limits,
         links: Links,  # to all nodes
         journals: Sequence[Journal | None],  # of each world
-        is_checked: bool = False,  # whether it is checked what zones own
+        is_checked: bool = False,  # check the vehicles that zones own
     ) -> None:
-        self._worlds = [
+        self.worlds = [
             _World(run, len(node_of), limits, journal, is_checked)
             for run, journal in zip(runs, journals, strict=True)
         ]
@@ -126,27 +125,30 @@ class NodeCoordinator:
         self.switched, self.is_late = 0, False
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
-        """Begin; what the hosts of all zones have to know, by worlds."""
+        """Start; return the hostings of all zones, by worlds."""
         self.know(neighbours)
-        for world in self._worlds:
+        for world in self.worlds:
             world.write(world.directory.reset())
             for zone, node in enumerate(self._node_of):
                 world.write(world.directory.host(zone, worker=node))
         return self._hostings()
 
     def know(self, neighbours: Neighbours) -> None:
-        """From now on let vehicles change between these zones only."""
-        for world in self._worlds:
+        """Let vehicles change between these zones only, from now on."""
+        for world in self.worlds:
             world.directory.know(neighbours)
 
     def recover(self, node_of: Sequence[int], switched: int) -> list[list[Hosting]]:
-        """Nodes are lost, and others host their zones; what is under way is void.
+        """Go back to a kept state, with zones on other nodes; open transfers are void.
 
         Args:
-            node_of: zone → the node that hosts it from now on.
-            switched: vehicles that had changed their owner when what is gone back to was kept.
+            node_of: zone → node, from now on.
+            switched: number of changes of owner in the kept state.
+
+        Returns:
+            the hostings of all zones, by worlds.
         """
-        for world in self._worlds:
+        for world in self.worlds:
             moved = [z for z, node in enumerate(node_of) if node != self._node_of[z]]
             for zone in moved:
                 world.write(world.directory.fence(zone))
@@ -155,24 +157,24 @@ class NodeCoordinator:
                 world.write(world.directory.host(zone, worker=node_of[zone]))
             world.births, world.movers = [], []
             world.answered.clear()
-            world.has_told = False
+            world.has_stepped = False
         self._node_of, self.switched = node_of, switched
         return self._hostings()
 
     def _hostings(self) -> list[list[Hosting]]:
         zones = range(len(self._node_of))
-        return [[world.directory.hosting(zone) for zone in zones] for world in self._worlds]
+        return [[world.directory.hosting(zone) for zone in zones] for world in self.worlds]
 
-    def hear(self, number: int, frame: NodeFrame) -> None:
-        """Acknowledgements, as soon as they come.
+    def receive(self, number: int, frame: NodeFrame) -> None:
+        """Apply acknowledgements as soon as they come.
 
         Raises:
-            MessageError: it is none, or of a zone of another node.
+            MessageError: the frame has something else, or is about a zone of another node.
         """
         messages = unpacked(frame.data)
         self.check(number, messages)
         for w, message in messages:
-            self._take(w, message)
+            self._apply(w, message)
 
     def check(
         self,
@@ -180,40 +182,40 @@ class NodeCoordinator:
         messages: Sequence[tuple[int, Message]],
         reports: Sequence[Report] = (),  # of all worlds, or none
     ) -> None:
-        """Refuse what a node cannot say.
+        """Check messages of a node.
 
         Raises:
-            MessageError: it speaks for a zone that it does not host, or of what there is not.
+            MessageError: they are about a zone of another node, or name something unknown.
         """
-        check_indices("world", (w for w, _ in messages), len(self._worlds))
+        check_indices("world", (w for w, _ in messages), len(self.worlds))
         for report in reports:
             self._check_report(number, report)
         for w, message in messages:
-            zone, table = getattr(message, "zone", None), self._worlds[w].directory.table
+            zone, table = getattr(message, "zone", None), self.worlds[w].directory.table
             if zone is None or message.episode != table.episode or message.tick < table.tick:
                 continue
             if not 0 <= zone < len(self._node_of) or self._node_of[zone] != number:
-                raise MessageError(f"node {number} speaks for zone {zone}, which it does not host")
+                raise MessageError(f"node {number} sends for zone {zone}, which it does not host")
 
     def _check_report(self, number: int, report: Report) -> None:
         zones = [zone for _, zone in report.births] + [zone for zone, *_ in report.owned]
         check_indices("zone", zones, len(self._node_of))
         check_indices("zone", (zone for _, zone, _ in report.movers), len(self._node_of))
         if any(self._node_of[zone] != number for zone in zones):
-            raise MessageError(f"node {number} tells of vehicles of a zone that it does not host")
+            raise MessageError(f"node {number} reports vehicles of a zone that it does not host")
         check_indices("vehicle", (vehicle for vehicle, _ in report.births), MOST_IDS)
         for vehicle, _, digest in report.movers:
             if len(bytes.fromhex(digest)) != DIGEST_BYTES:
-                raise MessageError(f"{digest!r} is no digest of vehicle {vehicle}")
+                raise MessageError(f"{digest!r} is not a digest of vehicle {vehicle}")
 
     def _check_movers(self, number: int, w: int, report: Report) -> None:
-        owners = self._worlds[w].directory.table.owners
+        owners = self.worlds[w].directory.table.owners
         for vehicle, *_ in report.movers:
             if vehicle not in owners or self._node_of[owners[vehicle][0]] != number:
                 raise MessageError(f"node {number} offers vehicle {vehicle}, which it does not own")
 
-    def _take(self, w: int, message: Message) -> None:
-        world = self._worlds[w]
+    def _apply(self, w: int, message: Message) -> None:
+        world = self.worlds[w]
         table = world.directory.table
         is_present = message.episode == table.episode and message.tick >= table.tick
         if isinstance(message, Ack | Nack) and is_present:
@@ -224,56 +226,58 @@ class NodeCoordinator:
             self.lease(self._by_node([(w, answer) for answer in output.messages]), 1)
 
     def commit(self, reports: Mapping[int, tuple[list[tuple[int, Message]], list[Report]]]) -> None:
-        """All nodes are through with the tick, as they report."""
+        """Commit a tick that all nodes have reported."""
         if any(messages for messages, _ in reports.values()):
-            self._take_all({number: messages for number, (messages, _) in reports.items()})
+            self._apply_all({number: messages for number, (messages, _) in reports.items()})
         every = [report for _, report in reports.values() if report]
         self.is_late = any(one.is_late for report in every for one in report)
-        for w, world in enumerate(self._worlds):
-            said = [report[w] for report in every]
+        for w, world in enumerate(self.worlds):
+            reported = [report[w] for report in every]
             if world.directory.is_quiet:
                 world.directory.commit_quiet()
-                if not said:
+                if not reported:
                     continue
             elif world.directory.table.plan is not None:
                 world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
-            if any(report.began for report in said):
+            if any(report.began for report in reported):
                 world.write(world.directory.reset())
-                world.births, world.has_told = [], False
+                world.births, world.has_stepped = [], False
             for number, (_, report) in reports.items():
                 with reading(number):
                     self._check_movers(number, w, report[w] if report else NOTHING)
-            movers = [mover for report in said for mover in report.movers]
+            movers = [mover for report in reported for mover in report.movers]
             world.movers = [(vehicle, target) for vehicle, target, _ in movers]
-            world.states.told = {v: bytes.fromhex(digest) for v, _, digest in movers}
-            world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
-            world.check_owned(w, said)
+            digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
+            world.states.digests = digests
+            world.births += [
+                Birth(v, zone, b"") for report in reported for v, zone in report.births
+            ]
+            world.check_owned(w, reported)
 
-    def _take_all(self, told: Mapping[int, Sequence[tuple[int, Message]]]) -> None:
-        """Take what nodes say of a tick; those of which nothing is said have changed nothing."""
-        worlds = {w for messages in told.values() for w, _ in messages}
-        disturbed = [w for w in worlds if self._worlds[w].directory.is_quiet]
+    def _apply_all(self, messages_of: Mapping[int, Sequence[tuple[int, Message]]]) -> None:
+        """Apply messages about a tick; zones without a message have changed nothing."""
+        worlds = {w for messages in messages_of.values() for w, _ in messages}
+        disturbed = [w for w in worlds if self.worlds[w].directory.is_quiet]
         for w in disturbed:
-            self._worlds[w].write(self._worlds[w].directory.break_quiet())
-        for number, messages in told.items():
+            self.worlds[w].write(self.worlds[w].directory.break_quiet())
+        for number, messages in messages_of.items():
             with reading(number):
                 for w, message in messages:
-                    self._take(w, message)
+                    self._apply(w, message)
         for w in disturbed:
-            self._worlds[w].directory.answer_for_silent()
+            self.worlds[w].directory.answer_for_silent()
 
     def begin(self, timeout_s: float) -> dict[int, bytes]:
-        """Decide the way to the next ticks, once all offers are answered.
+        """Decide the ownership in the next ticks, once all offers are answered.
 
         Returns:
-            node → its lease, STEP messages of its zones; of worlds of which there is nothing to say
-            there are none.
+            node → its lease: the STEP messages of its zones, for worlds with changes.
 
         Raises:
             SilenceError: an offer is not answered in time.
         """
         until_s = self._links.now_s() + timeout_s
-        for world in self._worlds:
+        for world in self.worlds:
             while missing := set(world.movers) - world.answered:
                 if self._links.now_s() > until_s:
                     targets = {self._node_of[zone] for _, zone in missing}
@@ -284,25 +288,25 @@ class NodeCoordinator:
 
     def _decide(self) -> list[tuple[int, Message]]:
         messages = []
-        for w, world in enumerate(self._worlds):
+        for w, world in enumerate(self.worlds):
             births, world.births = world.births, []
             world.answered.clear()
-            if world.says_nothing(births) and world.directory.begin_quiet():
+            if world.is_silent(births) and world.directory.begin_quiet():
                 continue
             output = world.directory.begin(world.movers, births)
-            world.has_told = True
+            world.has_stepped = True
             self.switched += world.write(output)
             messages += [(w, message) for message in output.messages]
         return messages
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
-        """What became of each change of owner, by worlds."""
-        return tuple(world.log for world in self._worlds)
+        """Changes of owner of each world."""
+        return tuple(world.log for world in self.worlds)
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
-        """Vehicles whose next zone has said that it holds their state, in one world."""
-        world = self._worlds[w]
+        """Return the vehicles of a world whose next zone has acknowledged their state."""
+        world = self.worlds[w]
         owners = world.directory.table.owners
         return [
             TransferInFlight(vehicle, owners[vehicle][0], zone, "prepared")
@@ -311,7 +315,7 @@ class NodeCoordinator:
         ]
 
     def lease(self, messages: Mapping[int, bytes], ticks: int) -> None:
-        """Send each node what `begin` has decided; 0 ticks, or as many as a lease has."""
+        """Send the leases that `begin` returned; 0 ticks, or the ticks of a lease."""
         for node, data in messages.items():
             self._links.send(node, FrameKind.LEASE, ticks, [data])
 
@@ -323,6 +327,6 @@ class NodeCoordinator:
         return {node: packed(some) for node, some in by_node.items()}
 
     def close(self) -> None:
-        for world in self._worlds:
+        for world in self.worlds:
             if world.journal is not None:
                 world.journal.close()

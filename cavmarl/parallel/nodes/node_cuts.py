@@ -1,9 +1,8 @@
-"""Zones that are cut anew while nodes host them: what goes between the caller and the nodes.
+"""Repartitioning of zones that nodes host: the messages between the caller and the nodes.
 
-The first node sees the places of all vehicles for a moment and proposes other zones. Then all nodes
-cut: each vehicle goes to the node of the zone that it is in, and ownership begins anew, as when
-worlds are loaded. Which zones there are is part of what the caller goes back to when nodes are
-lost.
+The first node reads the positions of all vehicles for a moment, and proposes new zones. Then all
+nodes repartition: each vehicle goes to the node of its zone, and ownership starts anew, as when
+worlds are loaded. The zones belong to the state to which the caller returns when nodes are lost.
 """
 
 from __future__ import annotations
@@ -26,63 +25,66 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class ZoneCut(NamedTuple):
-    """The zones of all worlds, as the caller knows them."""
+    """The zones of all worlds, as the caller has them."""
 
     partition: ZoneRects
     neighbours: Neighbours
 
 
 class PoolState(NamedTuple):
-    """What nodes have kept before a command, as the caller knows it."""
+    """A state that nodes have kept, as the caller describes it."""
 
     number: int
-    zones: list[list[int]]  # that each node hosted
-    switched: int  # vehicles that had changed their owner
+    zones: list[list[int]]  # of each node
+    switched: int  # changes of owner up to then
     cut: ZoneCut
 
 
-def told_zones(partition: ZonePartition) -> ZoneRects:
-    """Zones as JSON has them: the bounds, and the rectangle of each."""
+def zones_as_json(partition: ZonePartition) -> ZoneRects:
+    """Return zones as a JSON value: the bounds, and the rectangle of each zone."""
     return [list(map(float, partition.bounds)), *partition.rects.tolist()]
 
 
-def read_zones(told: Sequence[Sequence[float]]) -> ZonePartition:
-    bounds, *rects = told
+def read_zones(content: Sequence[Sequence[float]]) -> ZonePartition:
+    """Read zones from a JSON value."""
+    bounds, *rects = content
     min_x, min_y, max_x, max_y = bounds
     return ZonePartition((min_x, min_y, max_x, max_y), np.array(rects))
 
 
-def told_neighbours(simulation: Simulation) -> list[Any]:
-    """Between which zones vehicles change, likewise."""
+def neighbours_as_json(simulation: Simulation) -> list[Any]:
+    """Return the pairs of zones between which vehicles can change, as a JSON value."""
     near, may_teleport = neighbours_of(simulation.division)
     return [list(map(sorted, near)), may_teleport]
 
 
-def read_neighbours(told: Sequence[Any], zones: int) -> Neighbours:
-    """The same, read. Raises MessageError: it tells of other zones than there are."""
-    near, may_teleport = told
+def read_neighbours(content: Sequence[Any], zones: int) -> Neighbours:
+    """Read the neighbours of zones. Raises MessageError: they are of other zones."""
+    near, may_teleport = content
     if len(near) != zones:
-        raise MessageError(f"it tells of {len(near)} zones: there are {zones}")
+        raise MessageError(f"it has neighbours of {len(near)} zones: there are {zones}")
     for some in near:
         check_indices("zone", some, zones)
     return Neighbours(tuple(map(frozenset, near)), bool(may_teleport))
 
 
 def proposal_of(simulation: Simulation) -> list[Any] | None:
-    """Other zones, and what `Repartition` says of them; where all vehicles are in this process."""
+    """Propose zones, with the figures of `Repartition`; this process has to have all vehicles."""
     began = time.perf_counter()
     tolerance = simulation.config.zones.repartition_tolerance
     found = propose_cut(simulation.network, simulation.division, simulation.partition, tolerance)
     if found is None:
         return None
-    said = (found.before, found.after, found.moved, 1e3 * (time.perf_counter() - began))
-    return [told_zones(found.partition), *said]
+    figures = (found.before, found.after, found.moved, 1e3 * (time.perf_counter() - began))
+    return [zones_as_json(found.partition), *figures]
 
 
-def cut_worlds(simulation: Simulation, peers: NodePeers, told: Sequence[Sequence[float]]) -> None:
-    """Divide the plane otherwise; all nodes have to call it."""
+def cut_worlds(
+    simulation: Simulation, peers: NodePeers, content: Sequence[Sequence[float]]
+) -> None:
+    """Repartition the zones; all nodes have to call it."""
     division = simulation.division
     with peers.whole(simulation):
         vehicles = [division.vehicles(w).copy() for w in range(division.num_worlds)]
         contacts = division.contacts()
-    simulation.zones.repartition(read_zones(told), vehicles, contacts)
+    simulation.zones.repartition(read_zones(content), vehicles, contacts)

@@ -13,7 +13,7 @@ from cavmarl.shards.shard_group import ShardGroup
 
 
 class NodeExecutor(ShardGroup):
-    """Runs phases on the shards of this node; the other shards' rows stay on the same side."""
+    """Runs phases on the shards of this node, and keeps the other shards on the same side."""
 
     def __init__(self, own: Sequence[Shard], foreign: Sequence[Shard]) -> None:
         super().__init__(own)
@@ -21,14 +21,14 @@ class NodeExecutor(ShardGroup):
 
     def turn(self) -> None:
         super().turn()
-        self.follow()
+        self.align_foreign()
 
     def commit(self) -> None:
         super().commit()
-        self.follow()
+        self.align_foreign()
 
-    def follow(self) -> None:
-        """Let the other shards' rows be on the side of those of this node."""
+    def align_foreign(self) -> None:
+        """Turn the shards of other nodes to the side of the shards of this node."""
         side, next_side = self.sides
         for shard in self._foreign:
             if shard.side != side or shard.next_side != next_side:
@@ -36,13 +36,13 @@ class NodeExecutor(ShardGroup):
 
 
 class TimedNodeExecutor(PhaseExecutor):
-    """A `NodeExecutor` with a clock on each zone."""
+    """A `NodeExecutor` that measures the time of each zone."""
 
     def __init__(self, plain: NodeExecutor, clock: ShardClock) -> None:
         self._plain, self._clock = plain, clock
 
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
-        """Run a phase and measure it."""
+        """Run a phase, and measure its time."""
         self._clock.run(phase, arguments)
         if phase in (Phase.ADVANCE, Phase.COMMIT):
-            self._plain.follow()
+            self._plain.align_foreign()

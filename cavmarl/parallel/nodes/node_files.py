@@ -1,4 +1,4 @@
-"""The files of a world, as nodes on other machines get them: once, by their content."""
+"""The files of a world, which nodes on other machines receive once, identified by content."""
 
 from __future__ import annotations
 
@@ -24,38 +24,38 @@ _DIGEST = re.compile("[0-9a-f]{64}")
 
 
 class WorldFile(NamedTuple):
-    """One file, and the key of the configuration that names it."""
+    """A file, and the key of the configuration that names it."""
 
     key: str
-    nth: int  # which one of that key; -1: the only one
-    path: str  # where the caller has it
-    digest: str  # SHA-256 of its content
+    nth: int  # index among the files of the key; -1: the key names a single file
+    path: str  # on the machine of the caller
+    digest: str  # SHA-256 of the content
 
     @property
     def kept(self) -> Path:
-        """Where a node keeps it that has no such file at the path."""
+        """Where a node stores the file if it has none at the path."""
         if not _DIGEST.fullmatch(self.digest):
-            raise MessageError(f"{self.digest!r} is no SHA-256")
+            raise MessageError(f"{self.digest!r} is not an SHA-256 digest")
         return cache_dir() / "files" / self.digest / Path(self.path).name
 
     def found(self) -> Path | None:
-        """Where it is on this machine."""
+        """Return where the file is on this machine; None: it is missing."""
         for path in (Path(self.path), self.kept):
             if path.is_file() and _digest(path) == self.digest:
                 return path
         return None
 
     def keep(self, content: bytes) -> None:
-        """Put it where `found` looks, whole or not at all.
+        """Store the content where `found` looks, completely or not at all.
 
         Raises:
-            MessageError: it is another file's content.
-            WorkerError: it cannot be written.
+            MessageError: the content has another digest.
+            WorkerError: the file cannot be written.
         """
         if hashlib.sha256(content).hexdigest() != self.digest:
-            raise MessageError(f"what has come for {self.path} is something else")
+            raise MessageError(f"the received content of {self.path} has another SHA-256 digest")
         try:
-            self.kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)  # a caller's: private
+            self.kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)  # private to this user
             write_whole(self.kept, content)
         except OSError as error:
             raise WorkerError(
@@ -64,7 +64,7 @@ class WorldFile(NamedTuple):
 
 
 def files_of(config: EnvConfig, base_dir: Path) -> list[WorldFile]:
-    """Those that a configuration names."""
+    """Return the files that a configuration names."""
     buildings = resolve_buildings(config, base_dir) if config.map.buildings != "osm" else None
     paths = [
         *(("map.source", n, path) for n, path in enumerate(resolve_maps(config, base_dir))),
@@ -80,9 +80,9 @@ def files_of(config: EnvConfig, base_dir: Path) -> list[WorldFile]:
     ]
 
 
-def recipe_with(recipe: Mapping[str, Any], files: Sequence[WorldFile]) -> dict[str, Any]:
-    """A recipe whose configuration names the files as they are on this machine."""
-    config = dict(recipe["config"])
+def with_local_files(message: Mapping[str, Any], files: Sequence[WorldFile]) -> dict[str, Any]:
+    """Return a message whose configuration has the paths of the files on this machine."""
+    config = dict(message["config"])
     maps = [str(file.found()) for file in files if file.key == "map.source"]
     config["map"] = {**config["map"], "source": maps[0] if len(maps) == 1 else maps}
     for file in files:
@@ -97,7 +97,7 @@ def recipe_with(recipe: Mapping[str, Any], files: Sequence[WorldFile]) -> dict[s
             values[field] = [*values[field]]
             values[field][file.nth] = path
         config[section] = values
-    return {**recipe, "config": config}
+    return {**message, "config": config}
 
 
 def _digest(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Commands and results as bytes, between the caller and its nodes."""
+"""Commands to nodes as bytes."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.step_arrays import StepArrays
-from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.worlds.step_arrays import StepArrays
+from cavmarl.parallel.worlds.tasks import Task
 
 _HEAD = struct.Struct("<II")
 _INPUTS: Mapping[Task, tuple[str, ...]] = {
@@ -22,28 +22,28 @@ _INPUTS: Mapping[Task, tuple[str, ...]] = {
 
 
 def pieces_of(task: Task, payload: Any, arrays: StepArrays) -> list[bytes]:
-    """A command: the task with what it is told, and the arrays that all nodes read."""
-    said = b"" if payload is None else json.dumps(payload).encode()
+    """Return a command as pieces of a frame: task, payload, and the arrays for all nodes."""
+    text = b"" if payload is None else json.dumps(payload).encode()
     read = [getattr(arrays, name) for name in _INPUTS.get(task, ())]
-    return [_HEAD.pack(task, len(said)) + said, *(each.tobytes() for each in read if each.size)]
+    return [_HEAD.pack(task, len(text)) + text, *(each.tobytes() for each in read if each.size)]
 
 
 def command_of(data: memoryview) -> tuple[Task, Any, int]:
-    """The same at the other end, and where the arrays begin."""
+    """Read a command; return the task, the payload, and the place of the arrays."""
     task, size = _HEAD.unpack_from(data)
     at = _HEAD.size + size
     return Task(task), json.loads(bytes(data[_HEAD.size : at])) if size else None, at
 
 
 class Inputs:
-    """The arrays that all nodes read with a command."""
+    """The arrays that all nodes read from a command."""
 
     def __init__(self, arrays: StepArrays) -> None:
         every = {task: [_flat(getattr(arrays, name)) for name in _INPUTS[task]] for task in _INPUTS}
         self._parts = {task: [part for part in parts if part.size] for task, parts in every.items()}
 
-    def take(self, task: Task, data: memoryview, at: int) -> int:
-        """Read them; where they end."""
+    def read(self, task: Task, data: memoryview, at: int) -> int:
+        """Read the arrays of a task; return where they end."""
         for part in self._parts[task]:
             part[:] = np.frombuffer(data, np.uint8, part.size, at)
             at += part.size
@@ -51,7 +51,7 @@ class Inputs:
 
 
 def worlds_payload(saved: Sequence[bytes]) -> list[str]:
-    """Return worlds that were saved as bytes as a payload; see `LocalWorlds.save_worlds`."""
+    """Return the payload of saved worlds; see `LocalWorlds.save_worlds`."""
     return [b64encode(one).decode() for one in saved]
 
 

@@ -1,4 +1,4 @@
-"""`NodeGroups`: worlds that nodes share out, whole worlds each."""
+"""`NodeGroups`: worlds over nodes, each of which hosts whole worlds."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
-from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.commanded_worlds import CommandedWorlds
-from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds, WorldShare, check_nodes, empty_arrays
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task, commands_of
-from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.placement.commanded_worlds import CommandedWorlds
+from cavmarl.parallel.placement.mover import Mover
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.placement.work_shares import Part, parts_of
+from cavmarl.parallel.worlds.tasks import Task, commands_of
 from cavmarl.v2x.v2x_messages import Exchange, NetworkSimulator, check_external
 
 Found = TypeVar("Found")
@@ -40,16 +40,16 @@ CHANGES = (Task.STEP, Task.RESET, Task.LOAD)  # tasks that change worlds
 class NodeGroups(CommandedWorlds):
     """W worlds over n nodes, each of which hosts all zones of its worlds.
 
-    Each node has a coordinator and a thread of its own, and all do a command at the same time. The
-    state of the worlds of each node is kept in this process: if a node is lost, another one goes on
-    from there. With `workers.balance_steps` worlds change their node between steps.
+    Each node has a coordinator and a thread of its own, so all nodes carry out a command at once.
+    This process keeps the state of the worlds of each node: if a node is lost, another one resumes
+    from it. With `workers.balance_steps`, worlds move to other nodes between steps.
 
     Attributes:
-        pool: where the nodes come from.
+        pool: the supply of nodes.
         groups: the worlds of each node.
 
     Raises:
-        ConfigError: a setting that such worlds cannot have, or more nodes than worlds.
+        ConfigError: a setting that such worlds do not support, or more nodes than worlds.
         MissingExtraError: Ray is not installed.
         WorkerError: a node cannot be started.
     """
@@ -58,15 +58,15 @@ class NodeGroups(CommandedWorlds):
 
     def __init__(
         self,
-        world: World,  # what each is made of
-        base_dir: Path,  # the folder that its relative files start from
+        world: World,
+        base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
-        backend: BackendName,  # what starts n nodes, from 1 to W
-        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        backend: BackendName,  # n nodes, from 1 to W
+        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
         *,
-        route: Route = straight,  # where nodes of this machine call in order to reach a place
-        system: NodeSystem = MACHINE,  # that the nodes are on
-        start: Start = start_nodes,  # starts them
+        route: Route = straight,  # maps a place to the place that nodes of this machine call
+        system: NodeSystem = MACHINE,
+        start: Start = start_nodes,  # starts the nodes
     ) -> None:
         check_groups(world)
         self.world, self.in_next_step = world, in_next_step
@@ -104,10 +104,10 @@ class NodeGroups(CommandedWorlds):
         self._threads.shutdown()
 
     def connect_network(self, network: NetworkSimulator) -> None:
-        """From now on let a network simulator of this process decide receptions.
+        """Let a network simulator of this process decide receptions.
 
         Raises:
-            ConfigError: the channel is one of our own.
+            ConfigError: the channel is not external.
         """
         check_external(self.world.config.v2x)
         lock = Lock()
@@ -116,86 +116,88 @@ class NodeGroups(CommandedWorlds):
 
     def save_worlds(self) -> list[bytes]:
         return list(
-            chain.from_iterable(self._side_by_side(NodeWorlds.save_worlds, self.groups, _ignore))
+            chain.from_iterable(self._run_jobs(NodeWorlds.save_worlds, self.groups, _ignore))
         )
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
-        """Go on from what `save_worlds` gave; `arrays` stay as they are.
+        """Resume from what `save_worlds` returned; `arrays` do not change.
 
         Raises:
-            ConfigError: it is of other worlds.
+            ConfigError: the state is one of other worlds.
         """
         parts = [saved[first:last] for first, last in pairwise(self._bounds)]
         for group, part in zip(self.groups, parts, strict=True):
             group.check_worlds(part)
-        self._order(Task.LOAD, parts)
+        self._command(Task.LOAD, parts)
 
     @property
     def simulation(self) -> Simulation:
-        """Refused: the worlds live elsewhere."""
-        raise ConfigError("the worlds live in nodes: use backend='local' to look into them")
+        """Not available: the worlds are in nodes."""
+        raise ConfigError(
+            "the worlds are in nodes: use backend='local' for access to the simulation"
+        )
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
-        """What became of each change of owner, by worlds."""
+        """Changes of owner of each world."""
         return tuple(chain.from_iterable(group.transfers for group in self.groups))
 
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
-        """Vehicles of one world whose next zone holds their state already."""
+        """Return the vehicles of a world whose next zone has their state already."""
         k = self._group_of(world)
         return self.groups[k].in_flight(world - self._bounds[k])
 
     def _pids(self) -> dict[int, int]:
-        """Those of nodes of this machine."""
+        """Return node → process, for nodes of this machine."""
         if not self.pool.is_here:
             return {}
         return {k: pid for k, group in enumerate(self.groups) for pid in group.pool.pids}
 
     def _seen(self) -> LoadSnapshot:
-        """Ask what worlds have cost, before they are balanced by it."""
-        costs = self._side_by_side(NodeWorlds.world_costs_s, self.groups, _ignore)
+        """Add the costs of worlds before a round of balancing; nodes count as idle."""
+        costs = self._run_jobs(NodeWorlds.world_costs_s, self.groups, _ignore)
         self._spent_s[:, 0] += np.concatenate(costs)
         return idle_snapshot(len(self.groups))
 
     def _settle(self, parts: list[Part]) -> None:
-        """They have noted it when worlds moved."""
+        """Do nothing: `_move` has noted the new parts."""
 
     def _move(self, bounds: Sequence[int]) -> None:
-        """Let worlds change their node; on an error all are where they were.
+        """Move worlds to other nodes; if that fails, move them back.
 
         Args:
-            bounds: the first world of each node, and the end of the last one's.
+            bounds: first world of each node, and the number of worlds.
         """
         before = self._bounds
         changed = [k for k in range(len(self.groups)) if before[k : k + 2] != bounds[k : k + 2]]
         saved: list[bytes] = [b""] * bounds[-1]
         groups = [self.groups[k] for k in changed]
         for k, worlds in zip(
-            changed, self._side_by_side(NodeWorlds.save_worlds, groups, _ignore), strict=True
+            changed, self._run_jobs(NodeWorlds.save_worlds, groups, _ignore), strict=True
         ):
             saved[slice(*before[k : k + 2])] = worlds
 
-        def have(bounds: Sequence[int]) -> None:
-            def become(k: int) -> None:
+        def set_bounds(bounds: Sequence[int]) -> None:
+            def set_worlds(k: int) -> None:
                 part = slice(*bounds[k : k + 2])
                 arrays = self.arrays.part(part.start, part.stop)
-                self.groups[k].become(arrays, self._runs[part], saved[part])
+                self.groups[k].set_worlds(arrays, self._runs[part], saved[part])
 
-            self._side_by_side(become, changed, _ignore)
+            self._run_jobs(set_worlds, changed, _ignore)
             self._bounds = list(bounds)
 
         try:
-            have(bounds)
+            set_bounds(bounds)
         except BaseException:
-            have(before)
+            set_bounds(before)
             raise
 
     def _group_of(self, world: int) -> int:
         return bisect_right(self._bounds, world) - 1
 
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
-        """Let all nodes do a task; if it fails anywhere, no worlds have changed."""
-        if task == Task.PACK:  # worlds move in one go
+        """Let all nodes do a task; if it fails for a node, no worlds change."""
+        if task == Task.PACK:  # UNPACK does the whole move
             return
         if task == Task.UNPACK:
             self._move(payload)
@@ -210,29 +212,26 @@ class NodeGroups(CommandedWorlds):
             payloads = payload
 
         def perform(job: tuple[NodeWorlds, Any]) -> None:
-            group, told = job
+            group, own_payload = job
             if task == Task.STEP:
                 group.step(commands_of(group.arrays))
             else:
-                group.perform(task, told)
+                group.perform(task, own_payload)
 
         jobs = list(zip(self.groups, payloads, strict=True))
         # Threads must not load the same kernels at once.
         is_known = task in self._known
-        self._side_by_side(perform, jobs, _undo if task in CHANGES else _ignore, not is_known)
+        self._run_jobs(perform, jobs, _undo if task in CHANGES else _ignore, not is_known)
         self._known.add(task)
 
-    def _side_by_side(
+    def _run_jobs(
         self,
         perform: Callable[[Any], Found],
         jobs: Sequence[Any],
         undo: Callable[[Any], None],
         in_turn: bool = False,
     ) -> list[Found]:
-        """Do something for all groups at the same time, or one after the other.
-
-        If it fails for one, what was done for others is taken back.
-        """
+        """Do jobs in parallel, or one after the other; if one fails, undo the others."""
         running: list[Future[Found]] = []
         try:
             for job in jobs:
@@ -253,18 +252,18 @@ class NodeGroups(CommandedWorlds):
 
 
 def check_groups(world: World) -> None:
-    """Refuse what worlds that nodes share out cannot have."""
+    """Raise ConfigError for settings that whole worlds over nodes do not support."""
     config = world.config
     if config.workers.monitor_cpu:
         raise ConfigError(
-            "workers.monitor_cpu = True: whole worlds on nodes are balanced by what they cost; "
+            "workers.monitor_cpu = True: whole worlds on nodes are balanced by their costs only; "
             "leave it out, or use backend='processes:N' or more nodes than worlds"
         )
     check_nodes(world, 1)
     if config.workers.balance_steps and config.zones.journal:
         raise ConfigError(
-            f"zones.journal = {config.zones.journal!r} with workers.balance_steps: a journal is "
-            "begun anew when its world moves to another node; leave one out"
+            f"zones.journal = {config.zones.journal!r} with workers.balance_steps: a journal "
+            "restarts when its world moves to another node; leave one of the two out"
         )
 
 
@@ -273,16 +272,16 @@ def _undo(job: tuple[NodeWorlds, Any]) -> None:
 
 
 def _ignore(job: Any) -> None:
-    """Nothing has changed."""
+    """Undo nothing: the job has changed nothing."""
 
 
 class _SharedNetwork:
-    """The network simulator of all worlds as some of them see it; a `NetworkSimulator`."""
+    """The network simulator of all worlds, as a `NetworkSimulator` for some of them."""
 
     def __init__(self, network: NetworkSimulator, first: int, lock: Lock) -> None:
         self._network, self._first, self._lock = network, first, lock
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
-        """See `NetworkSimulator.exchange`; one group asks at a time."""
+        """See `NetworkSimulator.exchange`; only one group asks at a time."""
         with self._lock:
             return self._network.exchange(sent._replace(world=sent.world + self._first))

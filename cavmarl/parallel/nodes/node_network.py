@@ -1,8 +1,9 @@
-"""A network simulator of the caller that decides what messages stations of nodes receive.
+"""A network simulator of the caller, which decides what the stations of nodes receive.
 
-All nodes work out alike which packets are sent. In each tick the one that tells what all know alike
-asks the caller, which asks the simulator and sends the answer to all. It is kept with the command:
-nodes that go back and do a step again get it once more, and the simulator is not asked again.
+All nodes compute the same packets. In each tick, the reporter (the node that reports common
+results) sends a request to the caller, which asks the simulator and sends the answer to all nodes.
+The caller keeps the answers of a command: if nodes go back and repeat a step, it sends them again
+and does not ask the simulator.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ _HEAD = struct.Struct("<QQQQ")
 
 
 class NetworkFailedError(Exception):
-    """The simulator has failed, or answers what cannot be; no node is at fault.
+    """The simulator has failed, or has given a bad answer; no node is at fault.
 
     Attributes:
-        error: what the caller of a step gets.
+        error: the error for the caller of the step.
     """
 
     def __init__(self, error: Exception) -> None:
@@ -39,36 +40,36 @@ class NetworkFailedError(Exception):
         self.error = error
 
 
-class AskedNetwork:
-    """The simulator as the bus of a node sees it; a `NetworkSimulator`."""
+class RemoteNetwork:
+    """The network simulator of the caller, as a `NetworkSimulator` for the bus of a node."""
 
     def __init__(self, links: Links, bus: Bus) -> None:
         self._links, self._bus = links, bus
         self._generation = 0
-        self._tells = False
-        self._heard: deque[NodeFrame] = deque()
+        self._is_reporter = False
+        self._answers: deque[NodeFrame] = deque()
         bus.connect(self)
 
-    def begin(self, generation: int, tells: bool) -> None:
-        """Go on after nodes have come or gone; one of them asks for all."""
-        self._generation, self._tells = generation, tells
+    def begin(self, generation: int, is_reporter: bool) -> None:
+        """Start a new generation of nodes, one of which is the reporter."""
+        self._generation, self._is_reporter = generation, is_reporter
 
-    def hear(self, frame: NodeFrame) -> None:
-        self._heard.append(frame)
+    def receive(self, frame: NodeFrame) -> None:
+        self._answers.append(frame)
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         """See `NetworkSimulator.exchange`.
 
         Raises:
-            RecoveryOrderedError: the coordinator wants something else by now.
+            RecoveryOrderedError: the coordinator has ordered a recovery.
         """
         links = self._links
-        if self._tells:
-            asked = asked_of(sent, self._bus.mail.num_packets[sent.world])
+        if self._is_reporter:
+            asked = request_of(sent, self._bus.mail.num_packets[sent.world])
             links.send(COORDINATOR, FrameKind.EXCHANGE, self._generation, asked)
         while True:
-            while self._heard:
-                frame = self._heard.popleft()
+            while self._answers:
+                frame = self._answers.popleft()
                 if frame.number == self._generation:
                     with reading(COORDINATOR):
                         found = np.frombuffer(frame.data, RECEPTION)
@@ -76,47 +77,47 @@ class AskedNetwork:
                         return check_receptions(
                             found, sent, latency, self._bus.mail.num_packets[sent.world]
                         )
-            links.heed()
+            links.check_recovery()
             links.pump(None)
 
 
-class Asked(NamedTuple):
-    """What a simulator is asked, and what its answer is checked by."""
+class ExchangeRequest(NamedTuple):
+    """A request to the simulator, and what is needed to check the answer."""
 
     exchange: Exchange
-    num_packets: NDArray[np.int64]  # in flight, as `check_receptions` has it
+    num_packets: NDArray[np.int64]  # in flight, see `check_receptions`
 
 
-def asked_of(sent: Exchange, num_packets: NDArray[np.int64]) -> list[Bytes]:
-    """The same as the pieces of a frame."""
+def request_of(sent: Exchange, num_packets: NDArray[np.int64]) -> list[Bytes]:
+    """Return a request as pieces of a frame."""
     arrays = (num_packets, sent.packets, sent.receivers)
     head = _HEAD.pack(sent.world, sent.tick, len(sent.packets), len(sent.receivers))
     return [head, *(np.ascontiguousarray(array).tobytes() for array in arrays)]
 
 
-def read_asked(data: memoryview, num_worlds: int, latency_ticks: int) -> Asked:
-    """The same, read. Raises MessageError: it is none."""
+def read_request(data: memoryview, num_worlds: int, latency_ticks: int) -> ExchangeRequest:
+    """Read a request. Raises MessageError: the bytes are no request."""
     slots, at = latency_ticks + 1, _HEAD.size + 8 * (latency_ticks + 1)
     if len(data) < at:
-        raise MessageError(f"an exchange of {len(data)} bytes is none")
+        raise MessageError(f"{len(data)} bytes are too short for an exchange")
     world, tick, packets, receivers = _HEAD.unpack_from(data)
     size = at + packets * PACKET.itemsize + receivers * RECEIVER.itemsize
     if world >= num_worlds or len(data) != size:
-        raise MessageError(f"an exchange of {len(data)} bytes about world {world} is none")
+        raise MessageError(f"{len(data)} bytes are not an exchange of world {world}")
     sent = Exchange(
         world,
         tick,
         np.frombuffer(data, PACKET, packets, at),
         np.frombuffer(data, RECEIVER, receivers, at + packets * PACKET.itemsize),
     )
-    return Asked(sent, np.frombuffer(data, np.int64, slots, _HEAD.size))
+    return ExchangeRequest(sent, np.frombuffer(data, np.int64, slots, _HEAD.size))
 
 
-def answer_of(network: NetworkSimulator | None, asked: Asked) -> bytes:
-    """What the simulator says.
+def answer_of(network: NetworkSimulator | None, asked: ExchangeRequest) -> bytes:
+    """Return the answer of the simulator.
 
     Raises:
-        NetworkFailedError: there is none, or it fails, or answers what cannot be.
+        NetworkFailedError: there is no simulator, or it fails, or gives a bad answer.
     """
     sent = asked.exchange
     try:

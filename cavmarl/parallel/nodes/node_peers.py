@@ -1,4 +1,4 @@
-"""`NodePeers`: the other nodes of the same worlds; see `engine.peers.Peers`."""
+"""`NodePeers`: the exchange with the other nodes of the same worlds; see `engine.peers.Peers`."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from cavmarl.core.records.codes import (
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.agent_stream import AgentStream
+from cavmarl.parallel.nodes.index_check import IndexCheck
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, reading
-from cavmarl.parallel.nodes.row_checks import RowChecks
 from cavmarl.parallel.nodes.row_stream import RowStream, forecast_of, passing_of
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 from cavmarl.zones.kernels.row_frames import Passing, count_own
@@ -37,13 +37,13 @@ PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "p
 
 
 class NodePeers:
-    """Each share is one frame to every other node, and one from it.
+    """Exchanges shares: each share is one frame to every other node, and one frame from it.
 
     Attributes:
-        own: (W, A) agents that this node has sensed for last.
-        stepped: the same at the end of the last step, before worlds began anew.
-        checks: what rows of other nodes have to be like.
-        owner: (W · A,) the node that has sensed for each agent last; `UNOWNED`: none.
+        own: (W, A) agents for which this node sensed last.
+        stepped: (W, A) the same at the end of the last step, before the autoreset.
+        checks: checks rows of other nodes.
+        owner: (W · A,) node that sensed last for each agent; `UNOWNED`: none.
     """
 
     are_none = False
@@ -54,7 +54,7 @@ class NodePeers:
         links: Links,  # to all other nodes
         zones: Sequence[Sequence[int]],  # of each node
         number: int,  # of this one
-        first_share: int = 0,  # what shares are counted from, the same at all nodes
+        first_share: int = 0,  # number of the first share, the same at all nodes
     ) -> None:
         shard = simulation.shards[0]
         self._zoned = shard.zoned
@@ -75,7 +75,7 @@ class NodePeers:
         self._rerouted = np.zeros(self._num_worlds, dtype=np.int64)
         mine = (self._zoned, self._mine)
         clock = simulation.config.clock
-        self.checks = checks = RowChecks(simulation)
+        self.checks = checks = IndexCheck(simulation)
         bounds = checks.of_rows, checks.of_ghosts
         law = forecast_of(shard.roads, clock.sim_dt_s, clock.ticks_per_step, *bounds)
         self._rows = {
@@ -87,13 +87,13 @@ class NodePeers:
         self._sent = first_share
         self._is_stepping = False
         self._gate: DepartureQueue | None = None
-        self._leaving: Passing  # of that
+        self._leaving: Passing  # of the gate
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
         self.owner: NDArray[np.int32] = np.full(self.own.size, UNOWNED, dtype=np.int32)
 
     def begin_step(self) -> None:
-        """What is sensed next is what a step gave."""
+        """Note that the next outputs are those of a step."""
         self._is_stepping = True
 
     def keep_own(self, chosen: NDArray[np.bool_]) -> None:
@@ -105,7 +105,7 @@ class NodePeers:
             zoned.num_outer[zone, chosen] = -1
         for zone in range(len(zoned.num_rows)):
             for w in np.flatnonzero(chosen).tolist():
-                num = zoned.num_rows.item(zone, w)  # the first zone had the vehicles of all
+                num = zoned.num_rows.item(zone, w)  # the first zone had all vehicles
                 for array in (*zoned.rows[:, zone, w], *(each[zone, w] for each in self._of_rows)):
                     forget(array[num:])
         self._rerouted[chosen] = 0
@@ -137,7 +137,7 @@ class NodePeers:
         for number, rows in self._rows.items():
             data = self._share_of(number)
             with reading(number):
-                rows.take(data, side, passing)
+                rows.read(data, side, passing)
 
     def running(self) -> NDArray[np.int64]:
         if not self._others:
@@ -188,7 +188,7 @@ class NodePeers:
                 self._add_passing(departures, data, 0)
 
     def _passing(self, departures: DepartureQueue) -> list[Bytes]:
-        """How many vehicles pass the departure queue of each world, and their rows."""
+        """Return the number of vehicles that pass the queue of each world, and their rows."""
         counts = departures.num_passing.copy()
         rows = [departures.passing[w, :num] for w, num in enumerate(counts.tolist()) if num]
         return [counts.data, *map(_bytes, rows)]
@@ -213,8 +213,8 @@ class NodePeers:
         seen = worlds.detected_s
         changed = np.flatnonzero(seen.reshape(-1) != self._seen_s.reshape(-1))
         times = seen.reshape(-1)[changed]
-        told: list[Bytes] = [np.int64(changed.size).tobytes(), changed.data, times.data]
-        for number, data in self._swap(told):
+        pieces: list[Bytes] = [np.int64(changed.size).tobytes(), changed.data, times.data]
+        for number, data in self._swap(pieces):
             with reading(number):
                 (num,), at = _read(data, 0, np.int64, 1)
                 where, at = _read(data, at, np.int64, int(num))
@@ -224,17 +224,17 @@ class NodePeers:
         self._seen_s[...] = seen
 
     def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
-        told = self._agents.packed(outputs.present, chosen, self._number, self.own, self.owner)
+        frame = self._agents.packed(outputs.present, chosen, self._number, self.own, self.owner)
         if self._is_stepping:
             self._is_stepping = False
             self.stepped[...] = self.own
-        for number, data in self._swap([told]):
+        for number, data in self._swap([frame]):
             with reading(number):
-                self._agents.take(data, number, self.owner)
+                self._agents.read(data, number, self.owner)
 
     @contextmanager
     def everybody(self, departures: DepartureQueue, side: int) -> Iterator[None]:
-        """Vehicles of another node are those of the first of its zones meanwhile."""
+        """Have the vehicles of each other node in its first zone, for a while."""
         before = departures.counts[:, COUNT_REROUTED].copy()
         with self._rows_of_all(side):
             yield
@@ -242,7 +242,7 @@ class NodePeers:
 
     @contextmanager
     def whole(self, simulation: Simulation) -> Iterator[None]:
-        """The time in which each node has whole worlds; all have to call it."""
+        """Have whole worlds at each node, for a while; all nodes have to call it."""
         arrays = simulation.agent_arrays()
         mine = self._agents_of(simulation.division.side)
         with self._rows_of_all(simulation.division.side):
@@ -259,7 +259,7 @@ class NodePeers:
             yield
 
     def _agents_of(self, side: int) -> Array:
-        """(n,) agents whose vehicles are here, counted over all worlds."""
+        """Return (n,) agents whose vehicles are here, numbered through all worlds."""
         zoned, num_agents = self._zoned, self.own.shape[1]
         found = [
             agents[agents >= 0].astype(np.int64) + w * num_agents
@@ -297,7 +297,7 @@ class NodePeers:
                 array[self._foreign] = 0
 
     def _swap(self, pieces: Sequence[Bytes]) -> Iterator[tuple[int, memoryview]]:
-        """Send pieces to all others, and take theirs, by rising numbers."""
+        """Send pieces to all other nodes, and yield theirs, in rising order."""
         self._sent += 1
         for to in self._others:
             self._links.send(to, _SHARE, self._sent, pieces)
@@ -305,23 +305,23 @@ class NodePeers:
             yield number, self._share_of(number)
 
     def _share_of(self, number: int) -> memoryview:
-        """What another node has sent in the present share.
+        """Receive the present share of another node.
 
         Raises:
-            RecoveryOrderedError: it has been told to go back already.
+            RecoveryOrderedError: the other node has already got an order to recover.
         """
-        kind, which, data = self._links.next(number)
+        kind, which, data = self._links.receive_next(number)
         if kind is _SHARE and which == self._sent:
             return data
         if kind is FrameKind.SYNC:
-            self._links.put_back(number, NodeFrame(kind, which, data))
+            self._links.unread(number, NodeFrame(kind, which, data))
             raise RecoveryOrderedError(None)
         error = MessageError(f"it is at {kind.name} {which}, not at share {self._sent}")
         raise LinkLostError(number, error)
 
 
 def _by_agent(array: Array) -> Array:
-    """(W, A, …) as (W · A, …), a view."""
+    """Return (W, A, …) as (W · A, …), a view."""
     return array.reshape(-1, *array.shape[2:])
 
 
@@ -331,14 +331,16 @@ def _bytes(array: Array) -> Bytes:
 
 
 def _read(data: memoryview, at: int, kind: DTypeLike, num: int) -> tuple[Array, int]:
-    """An array (num,) of a frame, as a view, and where it ends.
+    """Return an array (num,) of a frame, as a view, and where it ends.
 
     Raises:
-        MessageError: the frame ends before that.
+        MessageError: the frame is too short.
     """
     dtype = np.dtype(kind)
     if not 0 <= num <= (len(data) - at) // dtype.itemsize:
-        raise MessageError(f"{len(data)} bytes do not have {num} more of {dtype.itemsize}")
+        raise MessageError(
+            f"{len(data)} bytes have no {num} items of {dtype.itemsize} bytes at {at}"
+        )
     return np.frombuffer(data, dtype, num, at) if num else np.zeros(0, dtype), at + (
         num * dtype.itemsize
     )

@@ -1,4 +1,4 @@
-"""`NodePool`: the processes of nodes, what they are told, and what is done when some are lost."""
+"""`NodePool`: commands for the nodes of worlds, and recovery when nodes are lost."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.network.transport import Bytes
-from cavmarl.parallel.nodes.kept_states import KEPT
+from cavmarl.parallel.nodes.joining_nodes import JoiningNode
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
-from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.newcomers import Newcomer
 from cavmarl.parallel.nodes.node_actions import NodeCommand, ZoneRects, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
-from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, told_zones
+from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, zones_as_json
 from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
-from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
+from cavmarl.parallel.nodes.state_replicas import KEPT
+from cavmarl.parallel.nodes.zone_endpoints import hostings_as_json, read_report
 from cavmarl.parallel.nodes.zone_moves import (
     ZoneMoves,
     Zones,
@@ -44,60 +44,60 @@ from cavmarl.parallel.nodes.zone_moves import (
     name_of,
     nodes_of,
 )
-from cavmarl.parallel.world_errors import own_error
+from cavmarl.parallel.worlds.world_errors import original_error
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 
 log = logging.getLogger("cavmarl.nodes")
 
-KEEP_S = 0.2  # so much of work may have to be done again
-END_S = 1.0  # for nodes to hear that they are needed no more
+KEEP_S = 0.2  # time between kept states: a recovery repeats about this much work
+END_S = 1.0  # time for nodes to end
 
 Found = TypeVar("Found")
 
 Read: TypeAlias = Callable[[int, memoryview], Found]
-"""Reads what the node of a number has found."""
+"""Reads the result of a node, whose number is the first argument."""
 
 
 class NodePool:
-    """The nodes of W worlds, the same zones of each at each node, and what they are to do.
+    """The nodes of W worlds. A node hosts the same zones in each world.
 
     Attributes:
-        zones: that each node hosts.
-        pids: of the nodes' processes, each on its machine.
-        teller: number of the node that tells what all know alike.
-        owner: (W · A,) the node that owns each agent, as far as is known.
-        partition: the zones' rectangles, as `node_cuts.told_zones` gives them.
-        coordinator: of the ownership of vehicles.
-        newcomers: nodes that have joined and host nothing yet.
-        generation: how often nodes have come and gone.
-        losses: how many nodes were lost.
-        recoveries: how often the worlds have gone back because of that.
-        replacements: how many nodes host zones in the place of others.
-        redirected: how many actions a node has refused that was not the owner of the agent.
+        zones: of each node.
+        pids: process of each node, on its machine.
+        reporter: number of the node that reports the results that all nodes share.
+        owner: (W · A,) node that owns each agent, as far as it is known.
+        partition: rectangles of the zones, see `node_cuts.zones_as_json`.
+        coordinator: decides about the ownership of vehicles.
+        joining_nodes: nodes that have joined and host no zones yet.
+        generation: number of changes of nodes.
+        losses: number of lost nodes.
+        recoveries: number of returns to a kept state because of lost nodes.
+        replacements: number of nodes that have replaced lost ones.
+        redirected: number of actions that were refused by a node and forwarded to the owner.
 
     Raises:
-        ConfigError: a setting that such worlds cannot have, or more nodes than zones.
+        ConfigError: a setting that such worlds do not support, or more nodes than zones.
         WorkerError: a node cannot be started.
     """
 
     owner: NDArray[np.int32]
-    _performed: NodeCommand | None = None  # what they do now
-    _exchanged = 0  # answers of a network simulator that nodes have got in the present command
+    _performed: NodeCommand | None = None  # the present command
+    _exchanged = 0  # answers of a network simulator that nodes have got for it
 
     def __init__(
         self,
-        world: World,  # what each is made of
-        runs: Sequence[WorldRun],  # (W,) of the worlds
-        zones: Zones,  # that each node hosts to begin with
-        supply: NodeSupply,  # where the nodes come from
+        world: World,
+        runs: Sequence[WorldRun],  # (W,)
+        zones: Zones,  # initial zones of each node
+        supply: NodeSupply,
         *,
-        answer: Callable[[memoryview], bytes],  # what a network simulator says to an EXCHANGE
-        system: NodeSystem = MACHINE,  # that the nodes are on
-        route: Route = straight,  # where to call in order to reach a place
+        answer: Callable[[memoryview], bytes],  # answers an EXCHANGE by a network simulator
+        system: NodeSystem = MACHINE,
+        route: Route = straight,  # maps a place to the place that other nodes call
     ) -> None:
         self._is_native = world.config.traffic.source == "native"
         self._supply, self._route, self._answer = supply, route, answer
-        self.newcomers = supply.newcomers
+        self.joining_nodes = supply.joining_nodes
         config = world.config
         self.zones = self._homes = zones
         self.generation = 0
@@ -109,14 +109,14 @@ class NodePool:
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
         self._num_ids, self._num_zones = config.population.num_ids, world.partition.count
-        self._partition = told_zones(world.partition)
+        self._partition = zones_as_json(world.partition)
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
         self._watch = NodeWatch(self._links, self._stopped)
-        self._nodes: dict[int, Newcomer] = {}  # what is known of each that lives
-        self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
+        self._nodes: dict[int, JoiningNode] = {}  # living nodes
+        self._new: dict[int, tuple[str, int]] = {}  # new nodes → where other nodes can call
         self._lease_ticks, self._settings = lease_ticks(config), config.zones
-        self._links.urgent = self._hear
+        self._links.urgent = self._receive
         self._prepare(runs)
         try:
             self._begin()
@@ -125,18 +125,18 @@ class NodePool:
             raise
 
     def _prepare(self, runs: Sequence[WorldRun]) -> None:
-        """Have worlds that have not begun."""
+        """Prepare for worlds before their first reset."""
         self.zones = self._homes
         self._living = living_of(self.zones)
-        self.teller = 0
+        self.reporter = 0
         self._cut = ZoneCut(self._partition, Neighbours(()))
-        # What all nodes can go back to, and what they keep before the next command.
+        # The state to which all nodes can go back, and the one that they keep next.
         self._state = PoolState(self._next_state, self.zones, 0, self._cut)
         self._opened: PoolState | None = None
         self._next_state += 1
-        self._kept: dict[int, Bytes] = {}  # states of the only node that there was, by numbers
+        self._kept: dict[int, Bytes] = {}  # replicas of the states of a single node, by numbers
         self._keep_again_s = -math.inf  # by the clock of `_links`
-        self._log: list[NodeCommand] = []  # since the state
+        self._log: list[NodeCommand] = []  # commands since the state
         self.owner = np.full(len(runs) * self._num_ids, UNOWNED, dtype=np.int32)
         self.coordinator = NodeCoordinator(
             [run.run for run in runs],
@@ -149,7 +149,7 @@ class NodePool:
         self._runs = [run.run.hex() for run in runs]
 
     def begin_anew(self, runs: Sequence[WorldRun]) -> None:
-        """Let the nodes have other worlds, or another number of them, which have not begun.
+        """Replace the worlds by others before their first reset, maybe another number of them.
 
         Raises:
             WorkerError: too many nodes were lost.
@@ -160,7 +160,7 @@ class NodePool:
         self._begin()
 
     def _begin(self) -> None:
-        """Wait until all nodes have joined, and give them their zones, again if one is lost."""
+        """Wait until all nodes have joined, and assign zones; repeat it if a node is lost."""
         hostings: list[list[Hosting]] = []
         while True:
             try:
@@ -171,18 +171,18 @@ class NodePool:
                 self._cut = self._cut._replace(neighbours=neighbours)
                 self._state = self._state._replace(cut=self._cut)
                 hostings = hostings or self.coordinator.host(neighbours)
-                self._tell_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
-                self._commit()
+                self.send_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
+                self.commit()
             except LinkLostError as lost:
                 self._lose(lost, has_begun=False)
-                self.generation += 1  # what nodes say of this attempt counts no more
+                self.generation += 1  # frames of this attempt are void
             else:
                 self._new.clear()
                 self._is_torn = False
                 return
 
     def _pump(self) -> None:
-        """Hear the nodes that are there. Raises LinkLostError: one of them is lost."""
+        """Serve the connected nodes. Raises LinkLostError: a node is lost."""
         self._links.pump(0.0)
 
     def _stopped(self) -> set[int]:
@@ -195,17 +195,17 @@ class NodePool:
 
     @property
     def first(self) -> int:
-        """The number of the node that answers what only one of them has to."""
+        """Number of the node that does the tasks of a single node."""
         return self._living[0]
 
     @property
     def num_nodes(self) -> int:
-        """How many nodes host zones if none is lost."""
+        """Number of nodes if none is lost."""
         return len(self._homes)
 
     @property
     def machines(self) -> list[tuple[str, int]]:
-        """The machine and the process of each living node."""
+        """Machine and process of each living node."""
         return [(node.machine, node.pid) for node in self._nodes.values()]
 
     @property
@@ -213,26 +213,26 @@ class NodePool:
         return self._cut.partition
 
     def _seat(self, num: int, waits: bool = True) -> None:
-        """Let nodes that are ready host the zones that lost nodes had at the beginning."""
+        """Give ready nodes the numbers of missing ones, and so their home zones."""
         empty = [n for n in range(len(self._homes)) if n not in self._nodes]
-        for newcomer, connection in self._supply.take(num, self._pump, waits):
-            number = newcomer.asked if newcomer.asked in empty else empty[0]
+        for joining_node, connection in self._supply.take(num, self._pump, waits):
+            number = joining_node.asked if joining_node.asked in empty else empty[0]
             empty.remove(number)
-            assert newcomer.place is not None
+            assert joining_node.place is not None
             self._links.add(number, connection)
-            self._nodes[number], self._new[number] = newcomer, self._route(newcomer.place)
+            self._nodes[number], self._new[number] = joining_node, self._route(joining_node.place)
             if number in self._lost:
                 self._lost.remove(number)
 
-    def _take(self, kind: FrameKind) -> dict[int, NodeFrame]:
-        """The next frame of all living nodes, by rising numbers.
+    def _receive_all(self, kind: FrameKind) -> dict[int, NodeFrame]:
+        """Receive a frame of a kind from each living node, in rising order.
 
         Raises:
-            LinkLostError: a node is lost.
+            LinkLostError: a node is lost, or has sent another kind.
         """
         found: dict[int, NodeFrame] = {}
         while missing := [n for n in self._living if n not in found] if found else self._living:
-            wait = partial(self._links.take, missing)
+            wait = partial(self._links.receive, missing)
             for number, frame in self._watch.wait(self._living, self._timeout_s, wait).items():
                 if frame.number == self.generation:
                     found[number] = frame
@@ -241,20 +241,20 @@ class NodePool:
                 raise LinkLostError(number, MessageError(f"{frame.kind.name}, not {kind.name}"))
         return dict(sorted(found.items()))
 
-    # Commands, and what becomes of them when nodes are lost
+    # Commands, and their repetition when nodes are lost
 
     def run(self, command: NodeCommand, read: Read[Found]) -> list[Found]:
-        """Let all nodes do a command.
+        """Let all nodes carry out a command.
 
         Args:
-            command: what they are to do.
-            read: reads what a node has found, of a number; what fails in it is that node's fault.
+            command: for all nodes.
+            read: reads the result of a node; an error in it is the fault of the node.
 
         Returns:
-            what was read, first of all of the node that tells what all know alike.
+            what `read` returns for each node, first of all for the reporter.
 
         Raises:
-            WorkerDeathError: no node has kept the zones of lost ones, or too many were lost.
+            WorkerDeathError: no node has a replica of a lost one, or too many were lost.
         """
         refuse_fork(self._pid, "the nodes")
         self._successions = 0
@@ -265,7 +265,7 @@ class NodePool:
             self._log.append(command)
         try:
             results = self._insist(command, read)
-        except BaseException:  # it is as if the command had never been given
+        except BaseException:  # the worlds return to the state before the command
             self._is_torn, self._opened = True, None
             if command.changes:
                 self._log.pop()
@@ -277,12 +277,12 @@ class NodePool:
         return results
 
     def undo(self) -> None:
-        """Let the last command, which has changed the worlds, never have been given."""
+        """Undo the last command, which has changed the worlds."""
         self._is_torn, self._opened = True, None
         self._log.pop()
 
     def move(self, zones: Zones) -> None:
-        """Let the zones have other homes from now on; errors as of `run`."""
+        """Move zones to other nodes; errors as of `run`."""
         before, self._homes = self._homes, zones
         self._is_torn, self._opened = True, None
         try:
@@ -292,7 +292,7 @@ class NodePool:
             raise
 
     def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
-        """Do a command, or none, again and again, until no node is lost meanwhile."""
+        """Carry out a command, or none, and repeat it until no node is lost meanwhile."""
         while True:
             try:
                 if self._is_torn:
@@ -305,7 +305,7 @@ class NodePool:
                 self._lose(lost)
 
     def _read(self, results: Mapping[int, memoryview], read: Read[Found]) -> list[Found]:
-        """Read what nodes have found. Raises LinkLostError: one has found what cannot be."""
+        """Read the results of nodes. Raises LinkLostError: a result is bad."""
         found = []
         for number, data in results.items():
             with reading(number):
@@ -313,10 +313,10 @@ class NodePool:
         return found
 
     def _replace_lost(self) -> bool:  # whether the worlds go back for that
-        """Let nodes that have joined meanwhile host what lost ones had.
+        """Let nodes that have joined in the meantime replace lost ones.
 
-        They get it from those that have it now, out of the newest state. With SUMO none can: what
-        SUMO was told up to now is in no state.
+        They get the zones of the newest state from the nodes that host them now. With SUMO this is
+        impossible, since no state has the commands to SUMO up to now.
         """
         if not self._is_native:
             return False
@@ -331,13 +331,13 @@ class NodePool:
         return True
 
     def _begin_state(self) -> None:
-        """Let all nodes keep what they have before the next command."""
+        """Let all nodes keep their state before the next command."""
         switched = self.coordinator.switched
         self._opened = PoolState(self._next_state, self.zones, switched, self._cut)
         self._next_state += 1
 
     def _perform(self, command: NodeCommand) -> dict[int, memoryview]:
-        """Do a command once; what each node has found. Raises LinkLostError: one is lost."""
+        """Carry out a command once; return the results. Raises LinkLostError: a node is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         self._performed, self._exchanged = command, 0
         leases = leases_of(command.ticks, self._lease_ticks)
@@ -346,30 +346,30 @@ class NodePool:
             pieces = command.of_node(number, self.owner, lease.get(number, b""))
             self._links.send(number, FrameKind.COMMAND, kept, pieces)
         if not command.changes:
-            return {n: frame.data for n, frame in self._take(FrameKind.RESULT).items()}
-        results = self._commit()
+            return {n: frame.data for n, frame in self._receive_all(FrameKind.RESULT).items()}
+        results = self.commit()
         for _ in range(1, leases):
             self.coordinator.lease(self._begin_lease(), self._ticks_per_step)
-            results = self._commit()
+            results = self.commit()
         if command.cut is not None:
-            with reading(self.teller):
-                near = read_neighbours(read_json(results[self.teller], list), self._num_zones)
+            with reading(self.reporter):
+                near = read_neighbours(read_json(results[self.reporter], list), self._num_zones)
             self._cut = ZoneCut(command.cut, near)
             self.coordinator.know(near)
         return results
 
     def _begin_lease(self) -> dict[int, bytes]:
-        """What nodes are to be told before the next ticks."""
+        """Return the lease of each node for the next ticks."""
         decide = partial(self._watch.wait, self._living, self._timeout_s, self.coordinator.begin)
         lease = decide()
         while self.coordinator.is_late:
             self.coordinator.lease(lease, 0)
-            self._commit()
+            self.commit()
             lease = decide()
         return lease
 
-    def _hear(self, number: int, frame: NodeFrame) -> Exception | None:
-        """Take an urgent frame.
+    def _receive(self, number: int, frame: NodeFrame) -> Exception | None:
+        """Apply an urgent frame.
 
         Returns:
             an error of a node, for the caller.
@@ -379,16 +379,16 @@ class NodePool:
             case FrameKind.MISSED:
                 peer = int.from_bytes(frame.data, "little")
                 if is_present and peer in self._nodes:
-                    self._watch.hear_missed(number, peer)
+                    self._watch.report_missed(number, peer)
             case FrameKind.FAILED:
-                name, text, trace = map(str, said_by(frame))
+                name, text, trace = map(str, read_list(frame))
                 part = name_of(self._homes[number])
                 failure = WorkerFailureError(number, part, name, text, trace)
-                found = own_error(failure)
+                found = original_error(failure)
                 found.__cause__ = None if found is failure else failure
                 return found
             case FrameKind.PONG:
-                self._watch.hear_pong(number, frame)
+                self._watch.receive_pong(number, frame)
             case FrameKind.KEEP:
                 self._kept[frame.number] = frame.data
                 for old in sorted(self._kept)[:-KEPT]:
@@ -398,22 +398,22 @@ class NodePool:
                     self._exchange(frame)
             case FrameKind.NOT_MINE:
                 if is_present:
-                    self._send_on(frame)
+                    self._forward(frame)
             case FrameKind.MESSAGES:
-                self.coordinator.hear(number, frame)
+                self.coordinator.receive(number, frame)
             case _:
-                raise MessageError(f"a node sends no frame of kind {frame.kind.name}")
+                raise MessageError(f"a node must not send frames of kind {frame.kind.name}")
         return None
 
     def _exchange(self, frame: NodeFrame) -> None:
-        """Tell all nodes what stations receive; of a step that is done again, what they did.
+        """Send the receptions to all nodes; if a step is repeated, the same as before.
 
         Raises:
-            MessageError: no step is taken.
+            MessageError: there is no step.
         """
         known = None if self._performed is None else self._performed.receptions
         if known is None:
-            raise MessageError("messages are sent where no step is taken")
+            raise MessageError("it sends an EXCHANGE without a step")
         if self._exchanged == len(known):
             known.append(self._answer(frame.data))
         for node in self._living:
@@ -421,15 +421,15 @@ class NodePool:
             self._links.send(node, FrameKind.RECEPTIONS, self.generation, [answer])
         self._exchanged += 1
 
-    def _send_on(self, frame: NodeFrame) -> None:
-        """Send actions that a node refuses to the owners that it names.
+    def _forward(self, frame: NodeFrame) -> None:
+        """Forward actions that a node has refused to their owners.
 
         Raises:
-            MessageError: there are no such agents, or owners.
+            MessageError: the agents or owners are unknown.
         """
         found = read_refusal(frame.data, self.owner.size, set(self._living))
         if self._performed is None or (actions := self._performed.actions) is None:
-            raise MessageError("actions are refused where there are none")
+            raise MessageError("it refuses actions without a step")
         for owner in np.unique(found[1]).tolist():
             agents = found[0, found[1] == owner]
             self.owner[agents] = owner
@@ -437,10 +437,10 @@ class NodePool:
             self._links.send(owner, FrameKind.ACTIONS, self.generation, [actions.some(agents)])
 
     def _lose(self, lost: LinkLostError, has_begun: bool = True) -> None:
-        """A node is gone: nothing of it counts any more.
+        """Remove a lost node, and start another one in its place.
 
         Raises:
-            WorkerError: it had not begun, and too many were lost like that.
+            WorkerError: the node had not begun, and too many were lost like that.
         """
         is_silent = isinstance(lost, SilentNodeError)
         lost = lost if is_silent else self._watch.most_missed(lost)
@@ -462,37 +462,37 @@ class NodePool:
             raise WorkerError(why) from lost
 
     def _recover(self) -> None:
-        """Let the living nodes host the zones of the lost ones, as of the newest state they have.
+        """Go back to the newest state of all nodes; living nodes take over zones of lost ones.
 
-        Zones whose home is another node that lives go there.
+        Zones whose home is another living node go there.
 
         Raises:
-            LinkLostError: another one is lost.
-            WorkerDeathError: what a lost one had is kept nowhere.
+            LinkLostError: another node is lost.
+            WorkerDeathError: there is no replica of a lost node.
         """
         state = self._state
         self._opened = None
         moves, kept = self._moves()
         self.zones, self._living = moves.zones, living_of(moves.zones)
-        self.owner[~np.isin(self.owner, self._living)] = UNOWNED  # of lost ones any may be
+        self.owner[~np.isin(self.owner, self._living)] = UNOWNED  # the owner may be any node
         self.generation += 1
         self._cut = state.cut
         self.coordinator.know(state.cut.neighbours)
         hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)
-        self._tell_zones(hostings, moves, begins=False, kept=kept)
-        self._commit()
+        self.send_zones(hostings, moves, begins=False, kept=kept)
+        self.commit()
         self._new.clear()
         self._is_torn = False
         self._keep_again_s = -math.inf
         self.recoveries += bool(moves.heirs or kept)
 
     def _moves(self) -> tuple[ZoneMoves, Bytes]:
-        """Return which node hosts which zones from now on, and the state if it is kept here.
+        """Return the new zones of the nodes, and the replica of the state if it is only here.
 
         If the only node is lost, another one takes its place.
 
         Raises:
-            WorkerDeathError: what a lost node had is kept nowhere, or too many were lost.
+            WorkerDeathError: there is no replica of a lost node, or too many were lost.
         """
         state = self._state
         hosts, kept = living_of(state.zones), self._kept.get(state.number)
@@ -511,15 +511,15 @@ class NodePool:
         zones[successor] = state.zones[hosts[0]]
         return ZoneMoves(zones, {}, []), kept
 
-    def _tell_zones(
+    def send_zones(
         self,
         hostings: Sequence[Sequence[Hosting]],
         moves: ZoneMoves,
         begins: bool,
-        kept: Bytes = b"",  # the state, if only this process has it
+        kept: Bytes = b"",  # replica of the state, if only this process has it
     ) -> None:
-        """Let the nodes host their zones from now on."""
-        told = {
+        """Send the order to recover, with the zones of all nodes."""
+        order = {
             "num_worlds": len(self._runs),
             "begins": begins,
             "lost": self._lost,
@@ -528,44 +528,44 @@ class NodePool:
             "places": list(self._new.items()),
             "zones": moves.zones,
             "partition": self._cut.partition,
-            "first": self._first_teller(),
+            "first": self._choose_reporter(),
             "state": self._state.number,
             "runs": self._runs,
-            "hostings": told_hostings(hostings),
+            "hostings": hostings_as_json(hostings),
         }
         for number in self._living:
-            data = json.dumps({**told, "number": number}).encode()
+            data = json.dumps({**order, "number": number}).encode()
             size = len(data).to_bytes(8, "little")
             self._links.send(number, FrameKind.RECOVER, self.generation, [size, data, kept])
 
-    def _first_teller(self) -> int:
-        """The node that tells what all know alike: one that has been there in the last step."""
+    def _choose_reporter(self) -> int:
+        """Return the reporter: a node that was there in the last step, if possible."""
         old = [number for number in self._living if number not in self._new]
-        self.teller = self.teller if self.teller in old else (old or self._living)[0]
-        return self.teller
+        self.reporter = self.reporter if self.reporter in old else (old or self._living)[0]
+        return self.reporter
 
-    def _commit(self) -> dict[int, memoryview]:
-        """Wait for the nodes to be through with a tick.
+    def commit(self) -> dict[int, memoryview]:
+        """Wait for the reports of all nodes on a tick, and commit it.
 
         Returns:
-            what else they have sent with it, first of all the one that tells what all know alike.
+            the results that came with the reports, that of the reporter first.
 
         Raises:
-            LinkLostError: one is lost, or has sent what cannot be.
+            LinkLostError: a node is lost, or has sent a bad report.
         """
-        told, results = {}, {}
-        frames = self._take(FrameKind.REPORT)
-        for number in sorted(frames, key=self.teller.__ne__):  # else by rising numbers
+        reports, results = {}, {}
+        frames = self._receive_all(FrameKind.REPORT)
+        for number in sorted(frames, key=self.reporter.__ne__):  # the others in rising order
             with reading(number):
-                messages, said, more = read_report(frames[number].data, len(self._runs))
-                self.coordinator.check(number, messages, said)
-            told[number] = messages, said
+                messages, of_worlds, more = read_report(frames[number].data, len(self._runs))
+                self.coordinator.check(number, messages, of_worlds)
+            reports[number] = messages, of_worlds
             results[number] = more
-        self.coordinator.commit(told)
+        self.coordinator.commit(reports)
         return results
 
     def close(self) -> None:
-        """End the nodes; a fork of the pool's process has no right to."""
+        """End the nodes, unless this process is a fork of the one that started them."""
         if is_fork(self._pid):
             return
         self._links.end(END_S)
@@ -573,9 +573,9 @@ class NodePool:
 
 
 def unread(number: int, data: memoryview) -> None:
-    """What a node has found is of no use."""
+    """Ignore the result of a node."""
 
 
 def _nothing(number: int, frame: NodeFrame) -> Exception | None:
-    """Before a tick there are no messages."""
+    """Ignore messages before the first tick."""
     return None

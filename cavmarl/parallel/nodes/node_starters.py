@@ -1,4 +1,4 @@
-"""What starts nodes: this machine, Ray, MPI, or a command by hand on any machine."""
+"""Starters of nodes: on this machine, by Ray, by MPI, or by hand on any machine."""
 
 from __future__ import annotations
 
@@ -12,69 +12,69 @@ from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
-from cavmarl.parallel.backend_name import RAY, BackendName
 from cavmarl.parallel.network.mpi_transport import MPI, mpi_transport
 from cavmarl.parallel.network.ray_actors import RayActors
 from cavmarl.parallel.network.tcp_transport import TcpListener
 from cavmarl.parallel.network.transport import Place, TransportListener
 from cavmarl.parallel.nodes.node_process import run_on_ray
 from cavmarl.parallel.nodes.node_system import MACHINE, Machine, NodeSystem
+from cavmarl.parallel.placement.backend_name import RAY, BackendName
 from cavmarl.parallel.processes.watchdog import is_stopped
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
-LOOPBACK = "127.0.0.1"  # where nodes of this machine meet
+LOOPBACK = "127.0.0.1"  # address for nodes of this machine
 MIN_KEY = 32  # characters of a key file
-END_S = 5.0  # for nodes to end by themselves
+END_S = 5.0  # time for nodes to end
 
 
 Route: TypeAlias = Callable[[Place], Place]
 
 
 def straight(place: Place) -> Place:
-    """Where to call in order to reach a place: there."""
+    """Return the place itself: the route without a detour."""
     return place
 
 
 class NodeStarter(Protocol):
-    """Starts nodes, and starts others in the place of those that are lost."""
+    """Starts nodes, and replaces lost ones."""
 
     @property
     def count(self) -> int:
-        """How many nodes there are to be."""
+        """The number of nodes."""
         ...
 
     def trouble(self, begun: Collection[int]) -> str | None:
-        """Why a node does not come, in words; one that was killed before it began begins again.
+        """Return why a node will not come; restart nodes that were killed before they began.
 
         Args:
-            begun: processes of the nodes that have begun, which are not looked at.
+            begun: processes of nodes that have begun, which are not checked.
         """
         ...
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
-        """Start one again that was lost before it had begun; else why not, in words."""
+        """Restart a node that was lost before it had begun; return why that is impossible."""
         ...
 
     def replace(self, number: int, is_silent: bool) -> None:
-        """One is lost, or silent, and may still run."""
+        """Replace a node that is lost, or silent and may still run."""
         ...
 
     def stopped(self) -> set[int]:
-        """Nodes whose processes are stopped (SIGSTOP), as far as that can be seen."""
+        """Return the nodes whose processes are known to be stopped (SIGSTOP)."""
         ...
 
     def close(self) -> None: ...
 
 
 class LocalNodes:
-    """Processes of this machine, which end with this one."""
+    """Nodes as processes of this machine, which end with this process."""
 
     def __init__(
         self,
         nodes: int,
         listener: TcpListener,
         place: Place,
-        max_retries: int,  # of nodes that are killed or stopped before they have begun
+        max_retries: int,  # for nodes that are killed or stopped before they have begun
     ) -> None:
         self.count = nodes
         self._listener, self._place = listener, place
@@ -82,15 +82,18 @@ class LocalNodes:
         self._seen_stopped: set[int] = set()
         self._processes: list[subprocess.Popen[Any]] = []
         try:
-            self._processes = [self._start(number) for number in range(nodes)]
+            self._processes = [self.start(number) for number in range(nodes)]
         except BaseException:
             self.close()
             raise
 
-    def _start(self, number: int) -> subprocess.Popen[Any]:
-        told = map(str, (*self._place, number))
-        # States that are kept, and large frames, are new memory each time.
-        process = start_python(["-m", NODE, *told], huge_heap(), stdin=subprocess.PIPE, text=True)
+    def start(self, number: int) -> subprocess.Popen[Any]:
+        """Start the process of a node."""
+        arguments = map(str, (*self._place, number))
+        # Kept states and large frames are allocated anew each time.
+        process = start_python(
+            ["-m", NODE, *arguments], huge_heap(), stdin=subprocess.PIPE, text=True
+        )
         assert process.stdin is not None
         with suppress(BrokenPipeError), process.stdin as pipe:
             pipe.write(f"{self._listener.secret.hex()}\n")
@@ -98,7 +101,7 @@ class LocalNodes:
 
     def trouble(self, begun: Collection[int]) -> str | None:
         stopped = {n for n in self.stopped() if self._processes[n].pid not in begun}
-        for number in stopped & self._seen_stopped:  # at two looks
+        for number in stopped & self._seen_stopped:  # at two checks in a row
             self._processes[number].kill()
             self._processes[number].wait()
         self._seen_stopped = stopped
@@ -111,7 +114,7 @@ class LocalNodes:
         return None
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
-        if self._processes[number].pid != pid:  # another one has been started already
+        if self._processes[number].pid != pid:  # it was replaced already
             return None
         if self._retries == 0:
             return self._ended(number)
@@ -123,14 +126,14 @@ class LocalNodes:
         process = self._processes[number]
         process.kill()
         return (
-            f"node {number} ended with {process.wait()} before it had begun; what it printed "
-            "stands on standard error"
+            f"node {number} ended with exit status {process.wait()} before it had begun; see its "
+            "standard error"
         )
 
     def replace(self, number: int, is_silent: bool) -> None:
         self._processes[number].kill()
         self._processes[number].wait()
-        self._processes[number] = self._start(number)
+        self._processes[number] = self.start(number)
 
     def stopped(self) -> set[int]:
         return {n for n, process in enumerate(self._processes) if is_stopped(process.pid)}
@@ -145,13 +148,13 @@ class LocalNodes:
 
 
 class RayNodes:
-    """Actors of a Ray cluster."""
+    """Nodes as actors of a Ray cluster."""
 
     def __init__(
         self,
         actors: RayActors,
         listener: TcpListener,
-        max_retries: int,  # of nodes that are lost while they are given their zones
+        max_retries: int,  # for nodes that are lost before they have begun
     ) -> None:
         self._actors = actors
         self.count = actors.workers
@@ -171,21 +174,21 @@ class RayNodes:
     def replace(self, number: int, is_silent: bool) -> None:
         if is_silent:
             self._actors.restart(number)
-        else:  # Ray starts it again
+        else:  # Ray restarts it
             self._actors.trouble()
 
     def stopped(self) -> set[int]:
-        return set()  # Ray does not say
+        return set()  # Ray does not tell
 
     def close(self) -> None:
         self._actors.close()
 
 
 class MpiNodes:
-    """The other ranks of an MPI run, which has no failover.
+    """Nodes as the other ranks of an MPI run, which has no failover.
 
     Raises:
-        ConfigError: this process is not rank 0, or there are too few others.
+        ConfigError: this process is not rank 0, or there are too few other ranks.
     """
 
     def __init__(self, nodes: int) -> None:
@@ -200,9 +203,9 @@ class MpiNodes:
         return f"rank {number + 1} was lost before it had begun: MPI has no failover"
 
     def replace(self, number: int, is_silent: bool) -> None:
-        """Raises WorkerDeathError: none takes the place of a lost rank."""
+        """Raise WorkerDeathError: a lost rank cannot be replaced."""
         mpi_transport().is_broken = True
-        cause = "it says nothing" if is_silent else "its connection has ended"
+        cause = "it does not answer" if is_silent else "its connection has ended"
         raise WorkerDeathError(
             number, f"rank {number + 1} of MPI, which has no failover", 0, "step", [cause]
         )
@@ -215,7 +218,7 @@ class MpiNodes:
 
 
 class JoinedNodes:
-    """Nodes that are started by hand: `cavmarl node --join`."""
+    """Nodes started by hand with `cavmarl node --join`."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -224,11 +227,11 @@ class JoinedNodes:
         return None
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
-        """Another one is awaited."""
+        """Return None: the pool waits for another node."""
         return None
 
     def replace(self, number: int, is_silent: bool) -> None:
-        """Another one may be started by hand."""
+        """Do nothing: another node may be started by hand."""
 
     def stopped(self) -> set[int]:
         return set()  # they are on other machines
@@ -240,27 +243,27 @@ class JoinedNodes:
 Start: TypeAlias = Callable[
     [BackendName, int, WorkersConfig, Path, Route], tuple[NodeStarter, TransportListener]
 ]
-"""Begins to start nodes; arguments as of `start_nodes`."""
+"""Starts nodes like `start_nodes`, with the same arguments."""
 
 
 def start_nodes(
-    backend: BackendName,  # nodes of this machine, Ray or MPI, or that are started by hand
-    num_worlds: int,  # so many actors of Ray are of use where the backend does not say how many
+    backend: BackendName,
+    num_worlds: int,  # limit on the number of Ray actors if the backend has no number
     settings: WorkersConfig,
-    base_dir: Path,  # the folder that a relative key file starts from
+    base_dir: Path,  # folder of a relative key file
     route: Route,  # for nodes of this machine
 ) -> tuple[NodeStarter, TransportListener]:
-    """Begin to start nodes; they call the listener.
+    """Start nodes, which will call the listener.
 
     Raises:
-        ConfigError: a key file that cannot be, or MPI without as many other ranks.
+        ConfigError: the key file is unusable, or MPI has too few ranks.
         MissingExtraError: Ray, or mpi4py, is not installed.
-        WorkerError: the port cannot be listened on, or nodes cannot be started.
+        WorkerError: the process cannot listen on the port, or cannot start nodes.
     """
     nodes = backend.count or 1
     if backend.kind == RAY:
         at_most = backend.count or num_worlds
-        actors = RayActors(run_on_ray, lambda workers: "", backend.count, at_most)
+        actors = RayActors(run_on_ray, backend.count, at_most)
         listener = TcpListener(actors.address)
         return RayNodes(actors, listener, settings.max_retries), listener
     if backend.address is None:
@@ -271,22 +274,22 @@ def start_nodes(
     host, port = backend.address
     if not settings.key_file:
         raise ConfigError(
-            f"backend = '{backend}' without workers.key_file: name the file with the key that "
+            f"backend = '{backend}' without workers.key_file: set it to the file with the key that "
             "nodes have to know"
         )
     return JoinedNodes(nodes), TcpListener(host, read_key(base_dir / settings.key_file), port)
 
 
 def system_of(backend: BackendName) -> NodeSystem:
-    """Return the system that such nodes are on."""
+    """Return the system of the nodes of a backend."""
     return Machine(mpi_transport()) if backend.is_mpi else MACHINE
 
 
 def read_key(path: Path) -> bytes:
-    """The key of a file, which this user alone can read.
+    """Read a key from a file that only this user can read.
 
     Raises:
-        ConfigError: it cannot be read, is too short, or others can read it.
+        ConfigError: the file cannot be read, is too short, or others can read it.
     """
     make = "make one: (umask 077; openssl rand -hex 32 > FILE), the same file on all machines"
     try:
@@ -295,7 +298,7 @@ def read_key(path: Path) -> bytes:
     except OSError as error:
         raise ConfigError(f"key file {path}: {error.strerror or error}; {make}") from error
     if mode & 0o077:
-        raise ConfigError(f"key file {path}: others can read it; chmod 600 {path}")
+        raise ConfigError(f"key file {path}: other users can read it; run chmod 600 {path}")
     if len(key) < MIN_KEY:
         raise ConfigError(f"key file {path}: has {len(key)} of {MIN_KEY} characters; {make}")
     return key

@@ -1,4 +1,4 @@
-"""`NodeSupply`: the nodes that pools can have, from their start until they have joined."""
+"""`NodeSupply`: starts nodes, lets them join, and gives them to pools."""
 
 from __future__ import annotations
 
@@ -10,91 +10,93 @@ from threading import RLock
 from cavmarl.core.processes import is_fork
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.joining_nodes import ANYONE, JoiningNode, JoiningNodes
 from cavmarl.parallel.nodes.leases import lease_ticks
 from cavmarl.parallel.nodes.link import Link
-from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.recipe import recipe_of
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.worlds.journaled_worlds import without_journals
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.world_message import make_world_message
 
-SPARES = 1  # nodes more than are wanted that may wait for another one's end
+SPARES = 1  # additional nodes that may wait to replace a lost one
 
 
 class NodeSupply:
-    """Starts nodes, lets them join, and gives them to pools, which may run in several threads.
+    """The nodes for one or more pools, which may run in several threads.
 
     Attributes:
-        count: how many nodes the pools have together if none is lost.
-        newcomers: nodes that have joined and belong to no pool.
+        count: number of nodes of all pools if none is lost.
+        joining_nodes: nodes that have joined and belong to no pool.
 
     Raises:
-        ConfigError: a setting that nodes cannot have.
+        ConfigError: a setting that nodes do not support.
         MissingExtraError: Ray, or mpi4py, is not installed.
         WorkerError: a node cannot be started.
     """
 
     def __init__(
         self,
-        world: World,  # what each is made of
-        base_dir: Path,  # the folder that its relative files start from
-        num_worlds: int,  # W of all pools; a node is ready for its share of them
-        backend: BackendName,  # what starts the nodes
-        in_next_step: bool,  # when worlds begin anew; see `SteppedWorlds`
+        world: World,
+        base_dir: Path,  # folder of relative paths
+        num_worlds: int,  # W of all pools
+        backend: BackendName,
+        in_next_step: bool,  # when new episodes start; see `SteppedWorlds`
         *,
         by_worlds: bool = False,  # each node hosts worlds of its own
-        route: Route = straight,  # where to call in order to reach a place
-        system: NodeSystem = MACHINE,  # that the nodes are on
-        start: Start = start_nodes,  # starts them
+        route: Route = straight,  # maps a place to the place to call instead
+        system: NodeSystem = MACHINE,
+        start: Start = start_nodes,  # starts the nodes
     ) -> None:
         config = world.config
         if not compiled_before():
-            LocalWorlds(unwatched(world), 1, warm=True)
+            LocalWorlds(without_journals(world), 1, warm=True)
         self._join_timeout_s = config.workers.join_timeout_s
         self._lock, self._pid = RLock(), os.getpid()
-        self._are_there = False  # all nodes that the pools want have been there
+        self._are_complete = False  # the pools have once had all their nodes
         self._begun: list[int] = []  # processes of the nodes of pools
         files = files_of(config, base_dir)
         self._starter, listener = start(backend, num_worlds, config.workers, base_dir, route)
         self.count = self._starter.count
         job = {
-            "recipe": recipe_of(world, base_dir),
+            "message": make_world_message(world, base_dir),
             "num_worlds": -(-num_worlds // self.count) if by_worlds else num_worlds,
             "in_next_step": in_next_step,
             "lease_ticks": lease_ticks(config),
         }
-        self.newcomers = Newcomers(listener, job, files, self._room, world.partition.count, system)
+        self.joining_nodes = JoiningNodes(
+            listener, job, files, self._room, world.partition.count, system
+        )
 
     @property
     def is_here(self) -> bool:
-        """Whether the nodes are processes of this machine that this one has started."""
+        """Whether this process has started the nodes on this machine."""
         return isinstance(self._starter, LocalNodes)
 
     def _room(self) -> int:
         return self.count - len(self._begun) + SPARES
 
     def look(self) -> bool:
-        """Hear nodes that want to join; return whether one is ready."""
+        """Serve joining nodes; return whether one is ready."""
         with self._lock:
-            self.newcomers.look(0.0)
-            return bool(self.newcomers.ready)
+            self.joining_nodes.look(0.0)
+            return bool(self.joining_nodes.ready)
 
     def take(
         self, num: int, trouble: Callable[[], None], waits: bool = True
-    ) -> list[tuple[Newcomer, Link]]:
-        """Return nodes that are ready, and their connections.
+    ) -> list[tuple[JoiningNode, Link]]:
+        """Return ready nodes with their connections.
 
         Args:
-            num: how many at most; as many, if they are awaited.
-            trouble: called while they are awaited.
-            waits: whether they are awaited.
+            num: the number of nodes; without waiting, the maximum.
+            trouble: called while nodes are awaited.
+            waits: whether to wait for the nodes.
 
         Raises:
-            CavmarlError: what one of them has raised.
-            WorkerError: they do not come in time.
+            CavmarlError: a node has raised this error.
+            WorkerError: the nodes do not come in time.
         """
 
         def why() -> str | None:
@@ -102,40 +104,40 @@ class NodeSupply:
             return self._starter.trouble(self._begun)
 
         with self._lock:
-            newcomers, wanted = self.newcomers, num
+            joining_nodes, wanted = self.joining_nodes, num
             while waits and len(self._usable()) < num:
-                newcomers.await_ready(wanted, self._join_timeout_s, why)
-                wanted = len(newcomers.ready) + 1
-            found = [newcomers.take(number) for number in self._usable()[:num]]
-            self._begun += [newcomer.pid for newcomer, _ in found]
-            self._are_there |= len(self._begun) == self.count
+                joining_nodes.await_ready(wanted, self._join_timeout_s, why)
+                wanted = len(joining_nodes.ready) + 1
+            found = [joining_nodes.take(number) for number in self._usable()[:num]]
+            self._begun += [joining_node.pid for joining_node, _ in found]
+            self._are_complete |= len(self._begun) == self.count
             return found
 
     def _usable(self) -> list[int]:
-        """Return which are ready; none that was started to spare before all others were there."""
-        newcomers, spares = self.newcomers, range(self.count, ANYONE)
-        ready = newcomers.ready
-        return [n for n in ready if self._are_there or newcomers.asked(n) not in spares]
+        """Return the ready nodes; spare ones count only once the pools were complete."""
+        joining_nodes, spares = self.joining_nodes, range(self.count, ANYONE)
+        ready = joining_nodes.ready
+        return [n for n in ready if self._are_complete or joining_nodes.asked(n) not in spares]
 
-    def replace(self, node: Newcomer, is_silent: bool) -> None:
-        """A node of a pool is lost: start another one in its place."""
+    def replace(self, node: JoiningNode, is_silent: bool) -> None:
+        """Start another node in the place of a lost one."""
         with self._lock:
             self._begun.remove(node.pid)
             self._starter.replace(node.asked, is_silent)
 
-    def retry(self, node: Newcomer, is_silent: bool) -> str | None:
-        """Start a node again that was lost before it had begun; else why not, in words."""
+    def retry(self, node: JoiningNode, is_silent: bool) -> str | None:
+        """Restart a node that was lost before it had begun; return why that is impossible."""
         with self._lock:
             self._begun.remove(node.pid)
             return self._starter.retry(node.asked, node.pid, is_silent)
 
     def stopped(self) -> set[int]:
-        """Return the numbers of nodes, as they were started, whose processes are stopped."""
+        """Return the start numbers of nodes whose processes are stopped."""
         return self._starter.stopped()
 
     def close(self) -> None:
-        """Send away the nodes that wait, and end the processes; a fork has no right to."""
+        """Dismiss waiting nodes and end the processes, unless this process is a fork."""
         if is_fork(self._pid):
             return
-        self.newcomers.close()
+        self.joining_nodes.close()
         self._starter.close()

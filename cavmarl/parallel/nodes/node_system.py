@@ -1,4 +1,4 @@
-"""What a caller or a node needs of the system: a clock, connections, and the worlds of a recipe."""
+"""What the caller and the nodes need of their system: a clock, connections and worlds."""
 
 from __future__ import annotations
 
@@ -7,36 +7,38 @@ import time
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.network.tcp_transport import TcpTransport
 from cavmarl.parallel.network.transport import Transport
 from cavmarl.parallel.nodes.leases import late_ticks
-from cavmarl.parallel.recipe import world_of
+from cavmarl.parallel.worlds.journaled_worlds import without_journals
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.world_message import world_of
 
-LOOKS = 25  # of about a microsecond each
+LOOKS = 25  # polls of about a microsecond each
 
 
 class NodeSystem(Transport, Protocol):
-    """`cavmarl.verify` has one beside this machine's, in which all processes are threads of one."""
+    """The system of a node: a real machine, or the simulated machine of `cavmarl.verify`."""
 
-    looks: int  # that a node takes for what another one sends before it sleeps
+    looks: int  # polls of a node for a frame of another node before it sleeps
 
     def now_s(self) -> float:
-        """A clock that never goes back; of this process alone."""
+        """Return the time of a monotonic clock of this process."""
         ...
 
     def worlds_of(
         self,
-        recipe: Mapping[str, Any],
-        trouble: str,  # what it means if its files differ
+        message: Mapping[str, Any],
+        trouble: str,  # text for the error if files differ
         num_worlds: int,
-        in_next_step: bool,  # when worlds begin anew
-    ) -> LocalWorlds: ...
+        in_next_step: bool,  # when new episodes start
+    ) -> LocalWorlds:
+        """Make the worlds of a message."""
+        ...
 
 
 class Machine:
-    """This machine's."""
+    """The system of this machine."""
 
     looks = LOOKS if (os.cpu_count() or 1) > 1 else 0
     now_s = staticmethod(time.monotonic)
@@ -45,11 +47,11 @@ class Machine:
         self.open, self.listen, self.poll = transport.open, transport.listen, transport.poll
 
     def worlds_of(
-        self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
+        self, message: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
     ) -> LocalWorlds:
-        world = world_of(recipe, trouble)
+        world = world_of(message, trouble)
         late = late_ticks(world.config)
-        world = unwatched(world)
+        world = without_journals(world)
         return LocalWorlds(world, num_worlds, warm=True, in_next_step=in_next_step, late_ticks=late)
 
 

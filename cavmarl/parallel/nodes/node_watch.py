@@ -1,4 +1,4 @@
-"""`NodeWatch`: finds out which node is lost, when one is silent or others cannot reach it."""
+"""`NodeWatch`: finds out which node is lost if a node is silent or others cannot reach it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import TypeVar
 
 from cavmarl.core.errors import MessageError, WorkerError
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import Links, SilenceError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices
 
-LOOK_S = 0.5  # between looks; a process that is stopped at two of them is given up
-PONG_S = 1.0  # for a living node to answer
-MISSED_S = 0.1  # to hear which others miss a node
-VAIN = 5  # times that all nodes answer and yet nothing comes of a command
+LOOK_S = 0.5  # between checks; a process that is stopped at two checks is given up
+PONG_S = 1.0  # time for a living node to answer a PING
+MISSED_S = 0.1  # time to collect reports of lost connections
+VAIN = 5  # rounds in which all nodes answer a PING, but the command does not end
 
 MOST_NODES = 1 << 32
 
@@ -23,31 +23,32 @@ Found = TypeVar("Found")
 
 
 class SilentNodeError(LinkLostError):
-    """A node says nothing, or another one waits for it in vain; its process may still run."""
+    """A node is silent, or another node waits for it in vain; its process may still run."""
 
 
 class NodeWatch:
-    """Of the nodes at the other ends of some connections."""
+    """Watches the nodes at the other ends of `links`."""
 
     def __init__(
         self,
         links: Links,
-        stopped: Callable[[], set[int]],  # nodes whose processes are known to be stopped
+        stopped: Callable[[], set[int]],  # returns the nodes whose processes are stopped
     ) -> None:
         self._links, self._stopped = links, stopped
-        self._missed: list[int] = []  # the two ends of connections that nodes have lost
-        # nodes that answered the last PING, and whose frames each waits for
+        self._missed: list[int] = []  # both ends of each connection that nodes have lost
+        # node that answered the last PING → nodes whose frames it awaits
         self._answered: dict[int, list[int]] = {}
         self._pings = 0
 
-    def hear_missed(self, number: int, peer: int) -> None:
-        """A node says that its connection to another one has ended. Raises LinkLostError."""
+    def report_missed(self, number: int, peer: int) -> None:
+        """Note that a node has lost its connection to another one. Raises LinkLostError."""
         self._missed += (number, peer)
         raise LinkLostError(peer)
 
-    def hear_pong(self, number: int, frame: NodeFrame) -> None:
+    def receive_pong(self, number: int, frame: NodeFrame) -> None:
+        """Apply the answer of a node to a PING."""
         if frame.number == self._pings:
-            awaited = said_by(frame)
+            awaited = read_list(frame)
             check_indices("node", (peer for peer in awaited if peer != COORDINATOR), MOST_NODES)
             self._answered[number] = awaited
 
@@ -55,14 +56,14 @@ class NodeWatch:
         self,
         living: Sequence[int],
         timeout_s: float,
-        wait: Callable[[float], Found],  # for so many seconds; may be called again after silence
+        wait: Callable[[float], Found],  # waits up to a number of seconds; may be called again
     ) -> Found:
-        """What comes of waiting, again and again as long as all nodes answer meanwhile.
+        """Call `wait` until it succeeds, as long as all nodes answer meanwhile.
 
         Raises:
-            SilentNodeError: one does not, its process is stopped, another one waits for it in
-                vain, or it has not answered another one in two silences.
-            WorkerError: all answer, and nothing comes of it.
+            SilentNodeError: a node does not answer, or its process is stopped, or another node
+                waits for it in vain, or it owes another node an answer after two timeouts.
+            WorkerError: all nodes answer, but `wait` does not succeed.
         """
         silence: SilenceError | None = None
         for _ in range(VAIN):
@@ -72,11 +73,13 @@ class NodeWatch:
                 before, silence = silence, error
                 self._ask(living)
                 for number in sorted(set(before.awaited if before else ()) & set(error.awaited)):
-                    raise SilentNodeError(number, MessageError("it answers no offers")) from error
+                    raise SilentNodeError(
+                        number, MessageError("it does not answer offers")
+                    ) from error
         raise WorkerError(f"{silence}, {VAIN} times, though all nodes live") from silence
 
     def _wait(self, timeout_s: float, wait: Callable[[float], Found]) -> Found:
-        """Wait, and look now and then whether a process is stopped."""
+        """Wait, and check now and then whether a process is stopped."""
         stopped: set[int] = set()
         left_s = timeout_s
         while left_s > LOOK_S:
@@ -90,11 +93,15 @@ class NodeWatch:
         try:
             return wait(left_s)
         except SilenceError as silence:
-            text = f"nothing has come for {timeout_s:g} s"
+            text = f"no frame has come for {timeout_s:g} s"
             raise SilenceError(text, silence.awaited) from silence
 
     def _ask(self, living: Sequence[int]) -> None:
-        """Ask all nodes whether they live, and which nodes they wait for."""
+        """Send a PING to all nodes, and evaluate the answers.
+
+        Raises:
+            SilentNodeError: a node does not answer, or others wait for it.
+        """
         links = self._links
         self._pings += 1
         self._answered.clear()
@@ -105,16 +112,16 @@ class NodeWatch:
             links.pump(1e3 * left_s)
         for number in living:
             if number not in self._answered:
-                raise SilentNodeError(number, MessageError("it says nothing"))
+                raise SilentNodeError(number, MessageError("it does not answer"))
         awaited = Counter(peer for peers in self._answered.values() for peer in peers)
         for number, _ in awaited.most_common():
             if number in living:
                 raise SilentNodeError(number, MessageError("others wait for it"))
 
     def most_missed(self, lost: LinkLostError) -> LinkLostError:
-        """The node that has ended, or else the one that cannot be reached by most others."""
+        """Return the node that has ended, or else the one that most others cannot reach."""
         links = self._links
-        if not self._missed:  # what it sent cannot be
+        if not self._missed:  # the node has sent a bad frame
             return lost
         until_s = links.now_s() + MISSED_S
         while lost.peer in links.numbers and (left_s := until_s - links.now_s()) > 0:
@@ -128,5 +135,5 @@ class NodeWatch:
         return LinkLostError(worst, MessageError("other nodes do not reach it"))
 
     def forget_missed(self) -> None:
-        """A node is given up: what was missed because of it does not count any more."""
+        """Drop reports of lost connections after a node was given up."""
         self._missed.clear()

@@ -1,4 +1,4 @@
-"""`NodeWorlds`: worlds whose zones are hosted by nodes, processes that share nothing."""
+"""`NodeWorlds`: worlds whose zones are distributed over nodes."""
 
 from __future__ import annotations
 
@@ -23,9 +23,6 @@ from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
 from cavmarl.handoff.repartitioning import Repartition, is_due
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
-from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.commanded_worlds import CommandedWorlds
-from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand, ZoneRects
 from cavmarl.parallel.nodes.node_cuts import read_zones
@@ -42,38 +39,41 @@ from cavmarl.parallel.nodes.node_loads import (
     NodeLoad,
     since,
 )
-from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_asked
+from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_request
 from cavmarl.parallel.nodes.node_pool import Found, NodePool, Read, unread
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.peer_faults import check_indices, read_json
-from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.tasks import Task
-from cavmarl.parallel.work_shares import Part, parts_of
+from cavmarl.parallel.placement.backend_name import BackendName
+from cavmarl.parallel.placement.commanded_worlds import CommandedWorlds
+from cavmarl.parallel.placement.mover import Mover
+from cavmarl.parallel.placement.step_placement import StepPlacement
+from cavmarl.parallel.placement.work_shares import Part, parts_of
+from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays, layout_of
+from cavmarl.parallel.worlds.tasks import Task
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator, check_external
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class WorldShare(NamedTuple):
-    """The part of more worlds that one node hosts."""
+    """The worlds that one node of `NodeGroups` hosts."""
 
     arrays: StepArrays  # of these worlds
-    runs: Sequence[WorldRun]  # the same
+    runs: Sequence[WorldRun]  # of these worlds
     supply: NodeSupply  # of all nodes
 
 
 class NodeWorlds(CommandedWorlds):
-    """W worlds over n nodes, which share out the zones of each world.
+    """W worlds over n nodes, which share the zones of each world.
 
     Attributes:
         pool: the nodes.
-        repartitions: when worlds have been cut anew.
+        repartitions: changes of the zones.
 
     Raises:
-        ConfigError: a setting that such worlds cannot have, or more nodes than zones.
+        ConfigError: a setting that such worlds do not support, or more nodes than zones.
         WorkerError: a node cannot be started.
     """
 
@@ -81,22 +81,22 @@ class NodeWorlds(CommandedWorlds):
 
     def __init__(
         self,
-        world: World,  # what each is made of
-        base_dir: Path,  # the folder that its relative files start from
+        world: World,
+        base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
-        backend: BackendName,  # what starts n nodes, from 1 to the zones of a world
-        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        backend: BackendName,  # n nodes, from 1 to the zones of a world
+        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
         *,
-        route: Route = straight,  # where nodes of this machine call in order to reach a place
-        system: NodeSystem = MACHINE,  # that the nodes are on
-        start: Start = start_nodes,  # starts them
-        share: WorldShare | None = None,  # of more worlds; None: these are all
+        route: Route = straight,  # maps a place to the place that nodes of this machine call
+        system: NodeSystem = MACHINE,
+        start: Start = start_nodes,  # starts the nodes
+        share: WorldShare | None = None,  # part of more worlds; None: these are all worlds
     ) -> None:
         config, count = world.config, world.partition.count
         nodes = 1 if share else backend.count or 1
         check_nodes(world, nodes)
         self.world, self.in_next_step = world, in_next_step
-        self._have(share.arrays if share else empty_arrays(world, num_worlds))
+        self._set_arrays(share.arrays if share else empty_arrays(world, num_worlds))
         self.placement = StepPlacement(world, 1, nodes, is_here=False)
         zones = parts_of(self.plans, count)[0].zones
         self._network: NetworkSimulator | None = None
@@ -121,15 +121,15 @@ class NodeWorlds(CommandedWorlds):
             raise
         self._spent_s = np.zeros((1, count))
         self._ticks_per_step = config.clock.ticks_per_step
-        self._ticks_done = self._ticks_told = 0
+        self._ticks_done = self._ticks_reported = 0
         self._steps_begun = 0  # since the worlds were made
         self.repartitions: list[Repartition] = []
-        self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
+        self._last_loads: dict[int, list[Any]] = {}  # last report of each node
         every = config.workers.balance_steps
         if every and share is None:
             self.mover = Mover(self.placement, count, every, self._spent_s)
         if config.workers.monitor_cpu:
-            self.node_snapshot(TO_BALANCE)  # from now on they watch
+            self.node_snapshot(TO_BALANCE)  # nodes watch their machines from now on
 
     def close(self) -> None:
         super().close()
@@ -140,46 +140,46 @@ class NodeWorlds(CommandedWorlds):
             self._supply.close()
 
     def step(self, commands: Commands) -> None:
-        """See `CommandedWorlds.step`; before that zones are cut anew, if it is time."""
-        self._cut_anew()
+        """See `CommandedWorlds.step`; before that, repartition the zones if that is due."""
+        self._repartition()
         super().step(commands)
 
-    def _cut_anew(self) -> None:
-        """Every so many steps cut the zones by their vehicles; see `zones.repartition_steps`."""
+    def _repartition(self) -> None:
+        """Repartition the zones by their vehicles, every `zones.repartition_steps` steps."""
         self._steps_begun += 1
         if not is_due(self._steps_begun, self.world.config.zones.repartition_steps):
             return
         if proposal := self.ask(Task.PROPOSE):
             zones, figures = proposal
-            self._order(Task.CUT, zones)
+            self._command(Task.CUT, zones)
             self.repartitions.append(Repartition(self._steps_begun - 1, *figures))
 
-    def _read_proposal(self, said: Any) -> tuple[ZoneRects, list[Any]] | None:
-        if said is None:
+    def _read_proposal(self, proposal: Any) -> tuple[ZoneRects, list[Any]] | None:
+        if proposal is None:
             return None
-        zones, *figures = said
+        zones, *figures = proposal
         if read_zones(zones).count != self.world.partition.count or len(figures) != 4:
-            raise MessageError(f"it proposes {said!r}")
+            raise MessageError(f"it proposes {proposal!r}")
         return zones, figures
 
     def connect_network(self, network: NetworkSimulator) -> None:
-        """From now on let a network simulator of this process decide receptions.
+        """Let a network simulator of this process decide receptions.
 
         Raises:
-            ConfigError: the channel is one of our own.
+            ConfigError: the channel is not external.
         """
         check_external(self.world.config.v2x)
         self._network = network
 
     def _answer(self, data: memoryview) -> bytes:
-        """Return what the network simulator says; errors as of `answer_of`."""
+        """Return the answer of the network simulator; errors as of `answer_of`."""
         latency = self.world.config.v2x.channel.latency_ticks
-        return answer_of(self._network, read_asked(data, len(self.arrays.mask), latency))
+        return answer_of(self._network, read_request(data, len(self.arrays.mask), latency))
 
     def _seen(self) -> LoadSnapshot:
-        """Ask what zones have cost, before they are balanced by it; how busy all nodes are.
+        """Add the costs of zones before a round of balancing; return how busy nodes are.
 
-        Those that are not watched, or lost, are taken to be idle.
+        Nodes that are not watched, or are lost, count as idle.
         """
         for of_zones, _ in self._costs():
             for zone, spent_s in of_zones:
@@ -192,9 +192,9 @@ class NodeWorlds(CommandedWorlds):
         return replace(seen, workers=tuple(states[node] for node in sorted(states)))
 
     def _costs(self) -> list[tuple[list[tuple[int, float]], list[int]]]:
-        """Return what each node has spent on its zones since it was asked last.
+        """Return the costs of each node since the previous request.
 
-        Of each node: pairs of a zone and s of processor time, and the vehicles of each world.
+        For each node: pairs of a zone and its processor time in s, and the vehicles of each world.
         """
         return self._run(Task.COSTS, None, self._read_costs)
 
@@ -205,24 +205,26 @@ class NodeWorlds(CommandedWorlds):
         found = [(zone, float(spent_s)) for zone, spent_s in of_zones]
         check_indices("zone", (zone for zone, _ in found), self._spent_s.shape[1])
         if len(running) != len(self.arrays.mask):
-            raise MessageError(f"it tells of {len(running)} worlds")
+            raise MessageError(f"it has the vehicles of {len(running)} worlds")
         return found, list(map(int, running))
 
     def world_costs_s(self) -> NDArray[np.float64]:
-        """Return the processor time (W,) of each world; worlds share it by their vehicles."""
+        """Return the processor time (W,) of each world, in proportion to its vehicles."""
         found = np.zeros(len(self.arrays.mask))
         for of_zones, running in self._costs():
             vehicles = np.array(running, dtype=np.float64) + 1.0
             found += vehicles * (sum(spent_s for _, spent_s in of_zones) / vehicles.sum())
         return found
 
-    def become(self, arrays: StepArrays, runs: Sequence[WorldRun], saved: Sequence[bytes]) -> None:
-        """Have other worlds from now on, as they were saved; errors as of `NodePool.begin_anew`."""
-        self._have(arrays)
+    def set_worlds(
+        self, arrays: StepArrays, runs: Sequence[WorldRun], saved: Sequence[bytes]
+    ) -> None:
+        """Replace the worlds by saved ones; errors as of `NodePool.begin_anew`."""
+        self._set_arrays(arrays)
         self.pool.begin_anew(runs)
         self.perform(Task.LOAD, saved)
 
-    def _have(self, arrays: StepArrays) -> None:
+    def _set_arrays(self, arrays: StepArrays) -> None:
         self.arrays = arrays
         self._results = ResultStream(arrays)
         self._everywhere = np.ones(len(arrays.mask), dtype=np.bool_)
@@ -234,9 +236,9 @@ class NodeWorlds(CommandedWorlds):
             self.perform(task, payload)
 
     def perform(self, task: Task, payload: Any = None) -> None:
-        """Let all nodes do a task, and write what comes out to `arrays`."""
-        told = worlds_payload(payload) if task == Task.LOAD else payload
-        results = self._run(task, told, self._readers.get(task, unread))
+        """Let all nodes do a task, and write its outputs to `arrays`."""
+        content = worlds_payload(payload) if task == Task.LOAD else payload
+        results = self._run(task, content, self._readers.get(task, unread))
         arrays = self.arrays
         if task == Task.STEP:
             self._ticks_done += self._ticks_per_step
@@ -248,16 +250,16 @@ class NodeWorlds(CommandedWorlds):
                 arrays.suggested.reshape(-1, 2)[where] = found
 
     def _settle(self, parts: list[Part]) -> None:
-        """The pool has noted it when zones have moved."""
+        """Do nothing: the pool has noted the new zones."""
 
     def _run(self, task: Task, payload: Any, read: Read[Found]) -> list[Found]:
-        """Let all nodes do a task; return what is read of what each has found."""
+        """Let all nodes do a task; return what `read` makes of each result."""
         try:
-            return self.pool.run(self._command(task, payload), read)
+            return self.pool.run(self._make_command(task, payload), read)
         except NetworkFailedError as failed:
             raise failed.error from None
 
-    def _command(self, task: Task, payload: Any) -> NodeCommand:
+    def _make_command(self, task: Task, payload: Any) -> NodeCommand:
         changes = task in (Task.STEP, Task.RESET, Task.LOAD, Task.CUT)
         pieces = pieces_of(task, payload, self.arrays)
         if task != Task.STEP:
@@ -269,13 +271,13 @@ class NodeWorlds(CommandedWorlds):
         return self.ask(task, payload)
 
     def ask(self, task: Task, payload: Any = None) -> Any:
-        """Return what the first node answers, which has the whole worlds meanwhile."""
+        """Return the answer of the first node, which has the whole worlds for that."""
         read = self._read_proposal if task == Task.PROPOSE else _ANSWERS[task]
         first = self._of_first(lambda data: read(json.loads(bytes(data))))
         return self._run(task, payload, first)[0]
 
     def _of_first(self, read: Callable[[memoryview], Any]) -> Read[Any]:
-        """Return what reads the answer of the first node; the others have nothing to say."""
+        """Return a reader of the answer of the first node; other nodes send no answer."""
         return lambda number, data: read(data) if number == self.pool.first else None
 
     def _read_begun(self, number: int, data: memoryview) -> None:
@@ -288,7 +290,7 @@ class NodeWorlds(CommandedWorlds):
         self, chosen: NDArray[np.bool_], of_step: bool, number: int, data: memoryview
     ) -> None:
         pool = self.pool
-        self._results.take(data, chosen, of_step, number == pool.teller, number, pool.owner)
+        self._results.read(data, chosen, of_step, number == pool.reporter, number, pool.owner)
 
     def _read_suggested(self, number: int, data: memoryview) -> tuple[NDArray[Any], NDArray[Any]]:
         suggested = self.arrays.suggested
@@ -296,7 +298,7 @@ class NodeWorlds(CommandedWorlds):
         where = np.frombuffer(data, np.int64, num)
         check_indices("agent", where, suggested.size // 2)
         if rest:
-            raise MessageError(f"{len(data)} bytes tell of no suggestions")
+            raise MessageError(f"{len(data)} bytes are no suggestions")
         return where, np.frombuffer(data, suggested.dtype, 2 * num, 8 * num).reshape(-1, 2)
 
     def _read_states(self, data: memoryview) -> None:
@@ -304,23 +306,24 @@ class NodeWorlds(CommandedWorlds):
         states[...] = np.frombuffer(data, states.dtype).reshape(states.shape)
 
     def node_loads(self) -> list[NodeLoad]:
-        """What each node has done since this was asked last, by rising numbers.
+        """Return the load of each node since the previous call, in rising order.
 
-        After a node was lost its successor's time is that since it began.
+        The load of a node that has replaced a lost one counts from its start.
         """
         found = []
-        ticks, self._ticks_told = self._ticks_done - self._ticks_told, self._ticks_done
+        ticks, self._ticks_reported = self._ticks_done - self._ticks_reported, self._ticks_done
         for node, now in self._run(Task.LOADS, None, _read_totals):
-            before = self._told.get(node)
+            before = self._last_loads.get(node)
             is_same = before is not None and before[0] <= now[0]
             found.append(since(node, ticks, now, before if is_same else None))
-            self._told[node] = now
+            self._last_loads[node] = now
         return sorted(found)
 
     def node_snapshot(self, purpose: str = TO_SHOW) -> LoadSnapshot:
-        """How busy others keep the machine of each node, as it says, since it was asked last.
+        """Return how busy other programs keep the machine of each node.
 
-        Other purposes have times of their own. What this run itself computes there does not count.
+        The time starts with the previous call for the same purpose. The load of this run does not
+        count.
         """
         here: dict[str, list[int]] = {socket.gethostname(): [os.getpid()]}
         for machine, pid in self.pool.machines:
@@ -335,45 +338,47 @@ class NodeWorlds(CommandedWorlds):
         return saved
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
-        """Go on from what `save_worlds` gave; `arrays` stay as they are.
+        """Resume from what `save_worlds` returned; `arrays` do not change.
 
         Raises:
-            ConfigError: it is of other worlds.
+            ConfigError: the state is one of other worlds.
         """
         self.check_worlds(saved)
-        self._order(Task.LOAD, saved)
+        self._command(Task.LOAD, saved)
 
     def check_worlds(self, saved: Sequence[bytes]) -> None:
-        """Raises ConfigError: worlds were saved that these cannot go on from."""
+        """Raise ConfigError if the worlds cannot resume from saved ones."""
         if refusal := self.ask(Task.CHECK, worlds_payload(saved)):
             raise ConfigError(refusal)
 
     @property
     def partition(self) -> ZonePartition:
-        """The zones as they are now; a cut gives the worlds others."""
+        """The present zones, which repartitioning changes."""
         return read_zones(self.pool.partition)
 
     @property
     def simulation(self) -> Simulation:
-        """Refused: the worlds live elsewhere."""
-        raise ConfigError("the worlds live in nodes: use backend='local' to look into them")
+        """Not available: the worlds are in nodes."""
+        raise ConfigError(
+            "the worlds are in nodes: use backend='local' for access to the simulation"
+        )
 
     def _pids(self) -> dict[int, int]:
-        """Those of nodes of this machine; others measure their machines, see `node_snapshot`."""
+        """Return node → process on this machine; `node_snapshot` covers other machines."""
         return dict(enumerate(self.pool.pids)) if self._supply.is_here else {}
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
-        """What became of each change of owner, by worlds."""
+        """Changes of owner of each world."""
         return self.pool.coordinator.transfers
 
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
-        """Vehicles of one world whose next zone holds their state already."""
+        """Return the vehicles of a world whose next zone has their state already."""
         return self.pool.coordinator.in_flight(world)
 
     @property
     def migrations(self) -> int:
-        """How many vehicles have changed their owner since the worlds were made."""
+        """Number of changes of owner since the worlds were made."""
         return self.pool.coordinator.switched
 
 
@@ -386,47 +391,47 @@ def empty_arrays(world: World, num_worlds: int) -> StepArrays:
 _ANSWERS: Mapping[Task, Callable[[Any], Any]] = {
     Task.STATE_HASH: str,
     Task.TRAFFIC_STATS: dict,
-    Task.DRIVEN: lambda said: [Driven(*row) for row in said],
-    Task.SIGNAL_PHASES: lambda said: np.array(said, dtype=np.int32),
+    Task.DRIVEN: lambda rows: [Driven(*row) for row in rows],
+    Task.SIGNAL_PHASES: lambda rows: np.array(rows, dtype=np.int32),
     Task.SAVE: saved_of,
     Task.CHECK: str,
 }
-"""Reads what the first node answers."""
+"""Reads the answer of the first node to a task."""
 
 
 def _read_totals(number: int, data: memoryview) -> tuple[int, list[Any]]:
-    """What a node has done; see `node_loads.totals`."""
-    said = read_json(data, list)
-    if len(said) != 1 + TOTALS or said[0] != number:
-        raise MessageError(f"it tells {said!r} of its load")
-    return number, list(map(float, said[1:5])) + list(map(int, said[5:]))
+    """Read the report of a node about itself; see `node_loads.totals`."""
+    report = read_json(data, list)
+    if len(report) != 1 + TOTALS or report[0] != number:
+        raise MessageError(f"it reports the load {report!r}")
+    return number, list(map(float, report[1:5])) + list(map(int, report[5:]))
 
 
 def _read_watched(number: int, data: memoryview) -> tuple[Candidate, str]:
-    """How busy the machine of a node is, and the source of that."""
+    """Read how busy the machine of a node is, and the source of the figure."""
     _, shares, source = read_json(data, list)
     return Candidate(number, Utilisation(*shares)), str(source)
 
 
 def check_nodes(world: World, nodes: int) -> None:
-    """Refuse what worlds over nodes cannot have."""
+    """Raise ConfigError for settings that worlds over nodes do not support."""
     config, count = world.config, world.partition.count
     if not 1 <= nodes <= count:
         raise ConfigError(
-            f"nodes = {nodes}: a world of {count} zone(s) is hosted by 1 to {count} nodes; use "
-            "more zones or fewer nodes"
+            f"nodes = {nodes}: a world of {count} zone(s) needs 1 to {count} nodes; use more zones "
+            "or fewer nodes"
         )
     refused = {
         "workers.sensors": (
             config.workers.sensors,
-            "each node senses for its own vehicles; use more nodes in place of sensor workers",
+            "each node senses for its own vehicles; use more nodes instead of sensor workers",
         ),
     }
     for key, (value, why) in refused.items():
         if value:
-            raise ConfigError(f"{key} = {value!r}: worlds over nodes do not have it: {why}")
+            raise ConfigError(f"{key} = {value!r}: not supported over nodes: {why}")
     if config.workers.monitor_cpu and not config.workers.balance_steps:
         raise ConfigError(
-            "workers.monitor_cpu = True: nodes watch their machines for rounds of balance; set "
+            "workers.monitor_cpu = True: nodes watch their machines for balancing only; set "
             "workers.balance_steps, or leave it out"
         )

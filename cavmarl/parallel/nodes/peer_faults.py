@@ -1,4 +1,4 @@
-"""What is wrong with a frame is its sender's fault: the sender is lost, and the run goes on."""
+"""A bad frame is the fault of its sender: that node counts as lost, and the run goes on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FAULTS = (
 
 
 class LinkLostError(Exception):
-    """A connection has ended, or what came over it cannot be."""
+    """A connection has ended, or has carried a bad frame."""
 
     def __init__(self, peer: int, cause: Exception | None = None) -> None:
         why = f": {cause}" if isinstance(cause, MessageError) else ""
@@ -28,10 +28,10 @@ class LinkLostError(Exception):
 
 
 class reading:
-    """The time in which a frame of a peer is read and checked.
+    """Context in which a frame of a peer is read and checked.
 
     Raises:
-        LinkLostError: anything has failed meanwhile, but the journal.
+        LinkLostError: the code inside has failed, except for the journal.
     """
 
     __slots__ = ("_peer",)
@@ -45,19 +45,19 @@ class reading:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, FAULTS) and not isinstance(error, JournalError):
             if not isinstance(error, MessageError):
-                error = MessageError(f"what it sent cannot be read: {error!r}")
+                error = MessageError(f"a frame of it cannot be read: {error!r}")
             raise LinkLostError(self._peer, error) from error
 
 
 def check_indices(what: str, found: Iterable[int] | NDArray[Any], count: int) -> None:
-    """Refuse what is no index of a table with so many rows, before anything is looked up by it.
+    """Check indices of a table with `count` rows before anything is looked up by them.
 
     Raises:
-        MessageError: one of them is no whole number, or out of range.
+        MessageError: an index is no whole number, or out of range.
     """
     if isinstance(found, np.ndarray):
         if found.size and not 0 <= int(found.min()) <= int(found.max()) < count:
-            raise MessageError(f"it names a {what} that there is not: there are {count}")
+            raise MessageError(f"it names a {what} out of range: there are {count}")
         return
     for index in found:
         if type(index) is not int or not 0 <= index < count:
@@ -65,11 +65,11 @@ def check_indices(what: str, found: Iterable[int] | NDArray[Any], count: int) ->
 
 
 def read_json(data: memoryview | bytes, kind: type[Any]) -> Any:
-    """What a part of a frame says. Raises MessageError: it is no JSON, or says something else."""
+    """Read a JSON value of a type from a frame. Raises MessageError: it is something else."""
     try:
-        said = json.loads(bytes(data))
+        value = json.loads(bytes(data))
     except (ValueError, RecursionError) as error:
-        raise MessageError(f"it is no JSON: {error}") from error
-    if not isinstance(said, kind):
-        raise MessageError(f"it says {said!r}")
-    return said
+        raise MessageError(f"it is not JSON: {error}") from error
+    if not isinstance(value, kind):
+        raise MessageError(f"it has {value!r} in place of a {kind.__name__}")
+    return value

@@ -1,7 +1,7 @@
-"""`RowStream`: what two nodes tell each other about the rows of each tick.
+"""`RowStream`: the ghosts that two nodes send each other in each tick.
 
-Both ends keep the ghosts of the frame before, and foresee those of the next; a frame has the words
-that are different.
+Both ends keep the ghosts of the previous frame, and forecast those of the next one. A frame has
+only the words that differ from the forecast.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ Array = NDArray[Any]
 
 
 class _Room:
-    """Ghosts of two frames: the one before, and room for the present one."""
+    """Ghosts of the previous frame, and room for those of the present frame."""
 
     def __init__(self, words: int) -> None:  # of a ghost
         self._before, self.now = (_ghosts(np.empty((0, words), dtype=np.int64)) for _ in range(2))
         self.before = self._before
 
     def make(self, num: int) -> None:
-        """Make room for so many, at least."""
+        """Make room for at least `num` ghosts."""
         if len(self.now.words) < num:
             size = self.now.words.shape[1]
             self.now = _ghosts(huge_zeros((num + num // 2, size), dtype=np.int64))
 
     def turn(self, num: int) -> None:
-        """So many that have been written are those before from now on."""
+        """Let the `num` present ghosts be the previous ones from now on."""
         self._before, self.now = self.now, self._before
         self.before = _ghosts(self._before.words[:num])
 
@@ -62,10 +62,10 @@ def forecast_of(
     roads: RoadArrays,
     dt: float,  # s of a tick
     ticks_per_step: int,
-    of_rows: Bounds,  # see `RowChecks`
-    of_ghosts: Bounds,  # likewise
+    of_rows: Bounds,  # see `IndexCheck`
+    of_ghosts: Bounds,  # see `IndexCheck`
 ) -> Forecast:
-    """What is foreseen on some roads, and what is not taken."""
+    """Return what kernels need to forecast ghosts, and to check them."""
     lanes, links = roads.lanes, roads.links
     beyond = np.zeros(len(lanes))
     inside = lanes["internal"]
@@ -82,13 +82,13 @@ def forecast_of(
 
 
 def _word(dtype: np.dtype[Any], name: str) -> int:
-    """Which word of a record a field is in."""
+    """Return the word of a record that has a field."""
     assert dtype.fields is not None
     return int(dtype.fields[name][1]) // 8
 
 
 class RowStream:
-    """Between this node and another one."""
+    """The stream of ghosts between this node and another one."""
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class RowStream:
         zones: NDArray[np.int64],  # of this node
         others: NDArray[np.int64],  # of the other one
         running: NDArray[np.int64],  # (W,) see `Both`
-        rerouted: NDArray[np.int64],  # (W,) likewise
+        rerouted: NDArray[np.int64],  # (W,) see `Both`
         law: Forecast,
     ) -> None:
         rows, steps = words_of(zoned.rows), words_of(zoned.step)
@@ -107,18 +107,18 @@ class RowStream:
         assert size < MOST
         self._law = law
         assert zoned.rows["id"].ctypes.data - zoned.rows.ctypes.data == 8 * ID
-        self._sent, self._taken = _Room(size), _Room(size)
+        self._sent, self._received = _Room(size), _Room(size)
         self._slots = np.empty(1, dtype=np.int32)
         self._make_frame(1 + (3 + 2 * len(others)) * running.size)
         self._pack = specialized(pack_frame, checks=False)
-        self._take = specialized(take_frame, checks=False)
+        self._unpack = specialized(take_frame, checks=False)
 
     def packed(self, side: int, passing: Passing) -> Bytes:
-        """The frame that the other one gets, until the next is packed.
+        """Return the next frame for the other node, valid until the next call.
 
         Args:
             side: of the rows whose ghosts are sent.
-            passing: what leaves.
+            passing: vehicles that leave.
         """
         sent = self._sent
         before = len(sent.before.words)
@@ -141,31 +141,31 @@ class RowStream:
         self._frame = huge_zeros(words, dtype=np.int64)
         self._bytes = self._frame.view(np.uint8).data
 
-    def take(self, data: memoryview, side: int, passing: Passing) -> None:
-        """Take a frame of the other one.
+    def read(self, data: memoryview, side: int, passing: Passing) -> None:
+        """Read a frame of the other node.
 
         Raises:
-            MessageError: it is none, or there is no room for what it has.
+            MessageError: the bytes are no frame, or there is no room for its content.
         """
-        taken, num = self._taken, NO_FRAME
+        received, num = self._received, NO_FRAME
         if data and not len(data) % 8:
             frame = np.frombuffer(data, np.int64)
-            args = self._both, side, passing, self._law, taken.before
-            num = self._take(*args, taken.now, frame)
+            args = self._both, side, passing, self._law, received.before
+            num = self._unpack(*args, received.now, frame)
             if NO_FRAME < num < 0:
-                taken.make(-1 - num)
-                num = self._take(*args, taken.now, frame)
+                received.make(-1 - num)
+                num = self._unpack(*args, received.now, frame)
         if num < 0:
-            raise MessageError(f"{len(data)} bytes are not what a node tells of the rows of a tick")
-        if num or len(taken.before.words):
-            taken.turn(num)
+            raise MessageError(f"{len(data)} bytes are no frame of ghosts")
+        if num or len(received.before.words):
+            received.turn(num)
 
 
 def passing_of(departures: DepartureQueue) -> Passing:
-    """What leaves by a departure queue; views."""
+    """Return the vehicles that leave by a departure queue, as views."""
     return Passing(words_of(departures.passing), departures.num_passing, departures.counts)
 
 
 def words_of(rows: Array) -> Array:
-    """(…, words) records as whole numbers of 8 bytes, a view."""
+    """Return records as words of 8 bytes, (…, words), a view."""
     return rows.view(np.int64).reshape(*rows.shape, -1)

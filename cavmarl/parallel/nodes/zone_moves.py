@@ -1,4 +1,4 @@
-"""Which node hosts which zones after nodes were lost, or others have come."""
+"""Which node hosts which zones after nodes were lost or have joined."""
 
 from __future__ import annotations
 
@@ -12,45 +12,45 @@ Zones = list[list[int]]  # of each node
 
 
 class ZoneMoves(NamedTuple):
-    """What changes, from a state that nodes have kept."""
+    """The changes with which nodes resume from a state that they have kept."""
 
     zones: Zones  # from now on
-    heirs: dict[int, int]  # lost node → the one that hosts its zones now
-    donors: list[tuple[int, int]]  # nodes that give zones away, and those that get them
+    heirs: dict[int, int]  # lost node → node that takes over its zones
+    donors: list[tuple[int, int]]  # node that gives zones away, and node that gets them
 
 
 def living_of(zones: Sequence[Sequence[int]]) -> list[int]:
-    """The nodes that host some, by rising numbers."""
+    """Return the nodes that host zones, in rising order."""
     return [number for number, some in enumerate(zones) if some]
 
 
 def read_order(data: memoryview, zones: int) -> dict[str, Any]:
-    """What the caller says of nodes that are lost or new, checked against the zones there are.
+    """Read the order of the caller to recover, and check it.
 
     Raises:
-        MessageError: it tells of zones, nodes or worlds that there are not.
+        MessageError: the order names unknown zones, nodes or worlds.
     """
-    told: dict[str, Any] = read_json(data, dict)
-    nodes = len(told["zones"])
-    hosted = [zone for some in told["zones"] for zone in some]
+    order: dict[str, Any] = read_json(data, dict)
+    nodes = len(order["zones"])
+    hosted = [zone for some in order["zones"] for zone in some]
     check_indices("zone", hosted, zones)
     if sorted(hosted) != list(range(zones)):
-        raise MessageError(f"it gives nodes the zones {hosted}: there are {zones}")
-    pairs = [*told["heirs"], *told["donors"]]
-    named = [told["number"], told["first"], *told["lost"], *(n for pair in pairs for n in pair)]
-    check_indices("node", [*named, *(node for node, _ in told["places"])], nodes)
-    told["places"] = {node: (str(host), int(port)) for node, (host, port) in told["places"]}
-    num_worlds = told["num_worlds"]
+        raise MessageError(f"it gives nodes the zones {hosted}: there are {zones} zones")
+    pairs = [*order["heirs"], *order["donors"]]
+    named = [order["number"], order["first"], *order["lost"], *(n for pair in pairs for n in pair)]
+    check_indices("node", [*named, *(node for node, _ in order["places"])], nodes)
+    order["places"] = {node: (str(host), int(port)) for node, (host, port) in order["places"]}
+    num_worlds = order["num_worlds"]
     check_indices("number", [num_worlds - 1], 1 << 62)
-    counts = {len(told["runs"]), len(told["hostings"])}
+    counts = {len(order["runs"]), len(order["hostings"])}
     if any(len(pair) != 2 for pair in pairs) or counts != {num_worlds}:
-        raise MessageError("it tells of other worlds or nodes than there are")
-    for some in told["hostings"]:
+        raise MessageError("it names other worlds or nodes than there are")
+    for some in order["hostings"]:
         check_indices("number", (n for numbers in some for n in numbers), 1 << 62)
         if [len(numbers) for numbers in some] != [4] * zones:
-            raise MessageError(f"it tells of {len(some)} zones: there are {zones}")
-    told["state"], told["begins"] = int(told["state"]), bool(told["begins"])
-    return told
+            raise MessageError(f"it has hostings of {len(some)} zones: there are {zones}")
+    order["state"], order["begins"] = int(order["state"]), bool(order["begins"])
+    return order
 
 
 def moves_of(
@@ -58,12 +58,12 @@ def moves_of(
     homes: Sequence[Sequence[int]],  # zones of each node if none is lost
     lost: Sequence[int],
     living: Collection[int],
-    state: int,  # its number
+    state: int,  # number of the state
 ) -> ZoneMoves:
-    """The next node of the ring has what a lost one had; zones go home where they can.
+    """Give the zones of a lost node to the next node of the ring, and zones to their homes.
 
     Raises:
-        WorkerDeathError: the next one is lost, too.
+        WorkerDeathError: the next node is lost, too.
     """
     ring = living_of(kept)
     zones = [list(some) for some in kept]
@@ -94,11 +94,11 @@ def moves_of(
 
 
 def nodes_of(zones: Sequence[Sequence[int]]) -> list[int]:
-    """Zone → the node that hosts it."""
+    """Return the node of each zone."""
     pairs = ((zone, node) for node, some in enumerate(zones) for zone in some)
     return [node for _, node in sorted(pairs)]
 
 
 def name_of(zones: Sequence[int]) -> str:
-    """A node's part, in words."""
+    """Return a description of the part of a node."""
     return f"zones {', '.join(map(str, zones))}"

@@ -1,1 +1,1 @@
-"""Worker processes of this machine: forked, watched, replaced, with memory that they share."""
+"""Worker processes of this machine: how they are forked, commanded, watched and replaced."""

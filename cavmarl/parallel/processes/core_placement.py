@@ -1,8 +1,8 @@
-"""On which cores workers are: none shares one with another as long as there are enough of them.
+"""Placement of workers on cores: no two workers share a core while there are enough cores.
 
-Systems put processes that are woken together on one core, where one waits until the other is done,
-and take many steps to notice that another core is free. A worker found there is kept off the
-cores of the others; apart from that the system places it as it likes.
+Operating systems put processes that wake together on one core, where one waits for the other, and
+take many steps to move one to a free core. A worker found on a shared core is kept off the cores of
+the other workers. Apart from that the system is free to place it.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from contextlib import suppress
 
 from cavmarl.parallel.processes.process_barrier import usable_cores
 
-UNKNOWN = -1  # as `process_barrier.present_core` says it where nothing is compiled
+UNKNOWN = -1  # what `process_barrier.present_core` returns without the compiler
 
 
 def homes(
-    cores: Sequence[int],  # where each has been found
-    usable: set[int],  # all that there are
-) -> list[int]:  # as many different cores, or none if there are not so many
-    """A core for each process, where it has been unless one before it has been there, too."""
+    cores: Sequence[int],  # where each process was seen
+    usable: set[int],
+) -> list[int]:  # different cores; empty if there are too few
+    """Choose a core for each process: where it was seen, unless an earlier process was there."""
     free = sorted(usable - set(cores))
     found: list[int] = []
     for core in cores:
@@ -35,14 +35,14 @@ def homes(
 
 def keep_apart(
     pids: Sequence[int],  # of processes that work at the same time
-    cores: Sequence[int],  # where each has been found; -1: unknown
+    cores: Sequence[int],  # where each was seen; -1: unknown
 ) -> None:
-    """Keep each of some processes off the cores of the others, if two have been on one."""
+    """Keep each process off the cores of the others, if two of them shared a core."""
     if len(set(cores)) == len(cores) or UNKNOWN in cores:
         return
     usable = usable_cores()
     found = homes(cores, usable)
     for pid, home in zip(pids, found, strict=False):
-        # Others notice that it is dead; where this is forbidden it goes where the system puts it.
+        # Its pool notices a death. Where this is forbidden, the system places the process.
         with suppress(ProcessLookupError, PermissionError):
             os.sched_setaffinity(pid, usable - set(found) | {home})

@@ -1,4 +1,4 @@
-"""`ForkServer`: the pool's handle of the process that forks its workers."""
+"""`ForkServer`: the process that forks the workers of a pool, as the pool sees it."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.watchdog import CHECK_S, STOPPED_CHECKS, is_stopped
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
-ANSWER_MS = 2_000  # to fork or to reap; a server that takes longer is stopped or broken
-END_S = 1.0  # for all to end by themselves
+ANSWER_MS = 2_000  # time to fork or reap; a server that takes longer is stopped or broken
+END_S = 1.0  # time for the server and its workers to end
 
-# One thread a worker: the processes share the cores out among themselves.
+# One thread per worker: the processes themselves share the cores.
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 
 
 def has_ended(pidfds: Iterable[int], limit_s: float | None) -> bool:
-    """Whether one of some processes has ended, after a while at most; None: as long as it takes.
+    """Wait until one of the processes has ended; return False after the limit (None: no limit).
 
-    By `poll`: `select` takes no descriptor above 1,023.
+    It uses `poll`, since `select` accepts no descriptor above 1,023.
     """
     waiting = select.poll()
     for pidfd in pidfds:
@@ -41,30 +41,30 @@ def has_ended(pidfds: Iterable[int], limit_s: float | None) -> bool:
 
 
 class ServerGoneError(Exception):
-    """The forking process does not answer any more."""
+    """The fork server does not answer."""
 
 
 @dataclass
 class Process:
-    """One worker's process."""
+    """The process of a worker."""
 
-    pid: int  # its number, not given again until it is reaped
-    pidfd: int  # readable when it has ended
-    wire: socket.socket  # socket to it
-    mail: list[bytes] = field(default_factory=list)  # what it has sent, unread
+    pid: int  # not reused until the process is reaped
+    pidfd: int  # readable when the process has ended
+    wire: socket.socket  # connection to the process
+    mail: list[bytes] = field(default_factory=list)  # received messages that are not read yet
 
     def collect(self) -> None:
-        """Take what has come through the wire; calls to wake up are forgotten."""
+        """Receive all messages that have come, and drop those that only wake."""
         with suppress(BlockingIOError, ConnectionResetError):
-            while self.take():
+            while self.receive():
                 pass
 
-    def take(self) -> bool:
-        """Take one message; False: the other end is closed.
+    def receive(self) -> bool:
+        """Receive one message; return False if the other end is closed.
 
         Raises:
-            BlockingIOError: none has come.
-            ConnectionResetError: the other end was closed before it had read all.
+            BlockingIOError: no message has come.
+            ConnectionResetError: the other end was closed with unread messages.
         """
         message = self.wire.recv(MAX_MESSAGE, socket.MSG_DONTWAIT)
         if message and message != WAKE:
@@ -72,7 +72,7 @@ class Process:
         return bool(message)
 
     def kill(self) -> None:
-        """See to it that it is dead, whatever it was doing."""
+        """Kill the process, and wait for its end."""
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
         has_ended([self.pidfd], None)
@@ -83,21 +83,22 @@ class Process:
 
 
 class ForkServer:
-    """Starts the process and asks it for workers.
+    """Starts the server process, and lets it fork workers.
 
     Raises:
-        ServerGoneError: it was killed or stopped before it was ready.
-        WorkerFailureError: an exception in it.
+        ServerGoneError: the server was killed or stopped before it was ready.
+        WorkerError: the server cannot be started, or has ended before it was ready.
+        WorkerFailureError: the server has raised an exception.
     """
 
     def __init__(
         self,
-        program: str,  # module that is run, and calls `worker_loop.serve`
-        start: Mapping[str, Any],  # what it is told, as JSON knows it; descriptors by number
-        descriptors: tuple[int, ...],  # that it and its workers get
+        program: str,  # module that the server runs, which calls `worker_loop.serve`
+        start: Mapping[str, Any],  # JSON message for the server, with numbers of descriptors
+        descriptors: tuple[int, ...],  # that the server and its workers inherit
     ) -> None:
         ours, theirs = _wires()
-        told = {
+        start_message = {
             **start,
             "pool": theirs.fileno(),
             "parent": os.getpid(),
@@ -105,7 +106,7 @@ class ForkServer:
         self._wire = ours
         try:
             self._process = start_python(
-                ["-m", program, json.dumps(told)],
+                ["-m", program, json.dumps(start_message)],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(), *descriptors),
                 env=_ONE_THREAD,
@@ -116,7 +117,7 @@ class ForkServer:
         finally:
             theirs.close()
         try:
-            self._greet()
+            self._await_ready()
         except BaseException:
             self.close()
             raise
@@ -126,7 +127,12 @@ class ForkServer:
         return self._process.pid
 
     def fork(self, number: int) -> Process:
-        """A new process for a worker. Raises WorkerError: this process has no descriptors left."""
+        """Fork a worker.
+
+        Raises:
+            ServerGoneError: the server does not answer.
+            WorkerError: this process has no descriptors left.
+        """
         ours, theirs = _wires()
         try:
             pid = int(self._ask({"fork": number}, theirs.fileno())["pid"])
@@ -136,15 +142,15 @@ class ForkServer:
             raise ServerGoneError from error
         except OSError as error:
             ours.close()
-            raise WorkerError(f"no descriptor of a worker's process: {error}") from error
+            raise WorkerError(f"no descriptor for the process of a worker: {error}") from error
         finally:
             theirs.close()
 
     def reap(self, process: Process) -> int:
-        """Let a process that is dead be forgotten.
+        """Reap a dead process.
 
         Returns:
-            its exit status; of one that was killed, minus the signal.
+            its exit status, or minus the signal that killed it.
 
         Raises:
             ServerGoneError: the server does not answer.
@@ -159,8 +165,8 @@ class ForkServer:
             self._process.kill()  # the system kills the workers
             self._process.wait()
 
-    def _greet(self) -> None:
-        """Wait until it is ready; that takes as long as its work, unless it is stopped."""
+    def _await_ready(self) -> None:
+        """Wait until the server is ready, without a limit, unless it is stopped."""
         poll = select.poll()
         poll.register(self._wire, select.POLLIN)
         stopped = 0
@@ -174,8 +180,8 @@ class ForkServer:
             if status < 0:
                 raise ServerGoneError(signal.Signals(-status).name)
             raise WorkerError(
-                f"the process that starts workers ended with {status} before it was ready; what it "
-                "printed stands on standard error"
+                f"the process that starts workers ended with exit status {status} before it was "
+                "ready; see its standard error"
             )
         answer = json.loads(message)
         if "ready" not in answer:
@@ -200,7 +206,7 @@ class ForkServer:
 
 
 def _wires() -> tuple[socket.socket, socket.socket]:
-    """The two ends of a wire that carries messages."""
+    """Return the two ends of a connection that carries messages."""
     try:
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     except OSError as error:

@@ -1,14 +1,14 @@
-"""How a process waits for another: it polls for a moment, then it sleeps.
+"""How a process waits for another process: it polls for a moment, then it sleeps.
 
-Each side has a line of 64-bit words that only itself writes. Word `NUMBER` counts what it has done;
-word `ASLEEP` says whether it has to be woken. To wait is to look at the other's number for a while
-in a compiled loop, which costs a fraction of a microsecond, and then to sleep on a socket, which
-costs no processor at all.
+Each of the two sides has a line of 64-bit words that only this side writes. Word `NUMBER` counts
+what the side has done; word `ASLEEP` says whether it has to be woken. A side that waits first polls
+the number of the other side in a compiled loop, which reacts within a fraction of a microsecond.
+Then it sleeps on a socket, which takes no processor time.
 
-All words are read and written sequentially consistent, so of two that write one word and read the
-other's, at least one sees what the other wrote: the side about to sleep sees the number, or the
-side that has written the number sees that the other sleeps. And a side that sees a number sees all
-written before it.
+All accesses are sequentially consistent. If each of two sides writes one word and reads the word of
+the other, at least one of them sees what the other wrote: the side about to sleep sees the number,
+or the side that has written the number sees that the other one sleeps. A side that sees a number
+also sees all memory written before it.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from cavmarl.core.compiled.intrinsic import intrinsic
 
 Words = NDArray[np.int64]
 
-WORDS = 8  # of a line; of a cache line, too
-NUMBER, ASLEEP = 0, 1  # words of either side; the others are the pool's
+WORDS = 8  # of a line, which is one cache line
+NUMBER, ASLEEP = 0, 1  # words of this module; callers define the others
 
-SHORT_S = 20e-6  # that a side polls before it sleeps
-LONG_S = 200e-6  # that it polls where the last time has not been longer
-LONG_WORK_S = 500e-6  # after which no side polls for so long
-PAUSES = 4  # polls before it lets others run
-ROUNDS = 16  # of those before it reads the clock
-ALONE_S = 300e-6  # of polling without a break by a side with a core for itself
-AWAKE_S = 10e-3  # of polling for a part of a command that lets others run in between
-NAP_S = 100e-6  # that it sleeps between them from then on
+SHORT_S = 20e-6  # a side polls for this time before it sleeps
+LONG_S = 200e-6  # it polls for this time, if the previous wait was not longer
+LONG_WORK_S = 500e-6  # after a longer wait, or more work, it does not poll for `LONG_S`
+PAUSES = 4  # polls before it yields the core
+ROUNDS = 16  # yields before it reads the clock
+ALONE_S = 300e-6  # a side with a core of its own polls without yielding for this time
+AWAKE_S = 10e-3  # within a command, a side polls and yields for this time
+NAP_S = 100e-6  # after that, it sleeps for this time between polls
 WAKE = b"!"
 
 _PAUSE = {"x86_64": "llvm.x86.sse2.pause", "AMD64": "llvm.x86.sse2.pause"}.get(platform.machine())
 
 
 def usable_cores() -> set[int]:
-    """The cores that this process may run on."""
+    """Return the cores on which this process may run."""
     if hasattr(os, "sched_getaffinity"):
         return os.sched_getaffinity(0)
     return set(range(os.cpu_count() or 1))
@@ -109,19 +109,19 @@ def _generate_system_call(name: str) -> Any:
 
 @intrinsic(_generate_load)
 def _load(words: Words, at: int) -> int:
-    """Read `words[at]` anew, after all that this thread has written."""
+    """Read `words[at]` from memory, after all writes of this thread."""
     return int(words[at])
 
 
 @intrinsic(_generate_store)
 def _store(words: Words, at: int, value: int) -> None:
-    """Set `words[at] = value`, seen by others after all that was written before."""
+    """Set `words[at] = value`, which other threads see after all earlier writes."""
     words[at] = value
 
 
 @intrinsic(_generate_pause)
 def _pause() -> None:
-    """Tell the processor that this is a loop of waiting."""
+    """Hint to the processor that this is a spin loop."""
 
 
 @intrinsic(_generate_system_call("sched_yield"))
@@ -141,14 +141,14 @@ def _compiled_has(theirs: Words, number: int) -> bool:
 
 @kernel
 def _compiled_set(mine: Words, at: int, value: int, theirs: Words) -> int:
-    """Write a word, then read whether the other side sleeps."""
+    """Write a word, then return whether the other side sleeps."""
     _store(mine, at, value)
     return _load(theirs, ASLEEP)
 
 
 @kernel
 def _compiled_look(theirs: Words, number: int, yields: bool) -> bool:
-    """Whether the other side comes to a number within some rounds."""
+    """Return whether the other side reaches a number within some rounds."""
     for _ in range(ROUNDS):
         for _ in range(PAUSES):
             if _load(theirs, NUMBER) >= number:
@@ -190,7 +190,7 @@ def _plain_look(theirs: Words, number: int, yields: bool) -> bool:
     return bool(theirs[NUMBER] >= number)
 
 
-_has, _set, _look, _pass, present_core = (
+_has, _set, look, _pass, present_core = (
     (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
     if IS_PLAIN
     else (
@@ -204,48 +204,47 @@ _has, _set, _look, _pass, present_core = (
 
 
 def load_kernels() -> None:
-    """Have the loops ready, for this process and those that it forks."""
+    """Load the compiled loops, for this process and those that it forks."""
     words = np.zeros(WORDS, dtype=np.int64)
     _set(words, NUMBER, 1, words)
     _has(words, 1)
-    _look(words, 1, True)
+    look(words, 1, True)
     _pass()
     present_core()
 
 
 def post(mine: Words, number: int) -> None:
-    """Come to a number, for sides that never sleep until it is there."""
+    """Set the number of this side; the other side must not sleep while it waits for it."""
     _set(mine, NUMBER, number, mine)
 
 
 def wait_for(
-    theirs: Words,  # (WORDS,) that the other side writes
+    theirs: Words,  # (WORDS,) line of the other side
     number: int,  # to wait for
-    # the other side was on another core when it was seen last. Then the core is not yielded for a
-    # while: of other programs that have the same core, one that is may keep it for milliseconds
+    # whether the other side was last seen on another core. Then this side does not yield at first,
+    # since another program could keep the core for milliseconds
     is_apart: bool = False,
 ) -> None:
-    """Return when the other side comes to a number, which it does soon unless it is dead."""
-    if _look(theirs, number, False):
+    """Wait until the other side reaches a number, which it does soon unless it is dead."""
+    if look(theirs, number, False):
         return
     now = time.perf_counter()
     alone, end = now + is_apart * ALONE_S, now + AWAKE_S
-    while not _look(theirs, number, now >= alone):
+    while not look(theirs, number, now >= alone):
         now = time.perf_counter()
         if now > end:
             time.sleep(NAP_S)
 
 
-class Meeting:
-    """One side of a place where two processes wait for each other."""
+class WakeSignal:
+    """One side of a pair of processes that wait for, and wake, each other."""
 
     def __init__(
         self,
-        mine: Words,  # (WORDS,) that this side writes
-        theirs: Words,  # (WORDS,) that the other one writes
-        wire: socket.socket,  # socket to the other side; a sleeping side is woken through it
-        # more processes take part than there are cores, so a polling side lets others run
-        crowded: bool,
+        mine: Words,  # (WORDS,) line of this side
+        theirs: Words,  # (WORDS,) line of the other side
+        wire: socket.socket,  # connection to the other side, over which a sleeping side is woken
+        crowded: bool,  # there are more processes than cores, so a polling side yields
     ) -> None:
         self.mine = mine
         self.theirs = theirs
@@ -253,17 +252,18 @@ class Meeting:
         self._crowded = crowded
 
     def post(self, number: int) -> None:
+        """Set the number of this side, and wake the other side if it sleeps."""
         if self.announce(number):
-            self.wake()
+            self.wake_peer()
         if self._crowded:
-            _pass()  # the other side may look from this core, or wake up on it
+            _pass()  # the other side may poll or wake up on this core
 
     def announce(self, number: int) -> int:
-        """Come to a number; not 0: the other side sleeps, and has to be woken."""
+        """Set the number of this side; return not 0 if the other side has to be woken."""
         return _set(self.mine, NUMBER, number, self.theirs)
 
-    def wake(self) -> None:
-        with suppress(BrokenPipeError, ConnectionResetError):  # its process has ended
+    def wake_peer(self) -> None:
+        with suppress(BrokenPipeError, ConnectionResetError):  # the other process has ended
             self.wire.send(WAKE)
 
     def has(self, number: int) -> bool:
@@ -272,38 +272,37 @@ class Meeting:
     def watch(
         self,
         number: int,  # to wait for
-        last_s: float,  # how long it has had to wait the last time
-        work_s: float = 0.0,  # since this side waited last
-        is_soon: bool = False,  # it is known that it does not take long
+        last_s: float,  # duration of the previous wait
+        work_s: float = 0.0,  # duration of the work since then
+        is_soon: bool = False,  # the caller knows that it does not take long
     ) -> bool:
-        """Look for a moment whether the other side comes to a number.
+        """Poll for a moment whether the other side reaches a number.
 
-        A side that waited for long the last time does not poll for long, nor one that worked for
-        long: the system puts waking processes on free cores, and leaves polling ones where they
-        are, two on one core if it comes to that.
+        After a long wait or long work, a side polls only briefly. The operating system puts waking
+        processes on free cores, but leaves polling processes where they are, even two on one core.
         """
-        if _look(self.theirs, number, self._crowded):
+        if look(self.theirs, number, self._crowded):
             return True
         if last_s > LONG_WORK_S and not is_soon:
             return False
         is_soon |= last_s < LONG_S and work_s < LONG_WORK_S
         end = time.perf_counter() + (LONG_S if is_soon else SHORT_S)
         while time.perf_counter() < end:
-            if _look(self.theirs, number, self._crowded):
+            if look(self.theirs, number, self._crowded):
                 return True
         return False
 
-    def lie_down_first(self) -> None:
-        """Say that this side sleeps when it comes to its next number: it will have to wait long."""
-        self.mine[ASLEEP] = 1  # seen with that number, or before
+    def announce_sleep(self) -> None:
+        """Mark this side as asleep before its next number: its wait will be long."""
+        self.mine[ASLEEP] = 1  # the other side sees it before or with that number
 
-    def lie_down(self, number: int) -> bool:
-        """Say that this side sleeps from here on; False: there is no need any more."""
+    def sleep(self, number: int) -> bool:
+        """Mark this side as asleep; return False if the number is already there."""
         _set(self.mine, ASLEEP, 1, self.theirs)
         if self.has(number):
-            self.get_up()
+            self.wake()
             return False
         return True
 
-    def get_up(self) -> None:
+    def wake(self) -> None:
         _set(self.mine, ASLEEP, 0, self.theirs)

@@ -1,26 +1,26 @@
-"""`Watchdog` tells whether a process works, hangs or is slow."""
+"""`Watchdog` tells whether a process works, hangs or takes too long."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-CHECK_S = 0.1
-STILL_CHECKS = 8  # for so long a process may sleep without the processor
-AT_WORK = ("R", "D")  # states: runs or could, waits for a disk
-STOPPED_CHECKS = 2  # for so long it may be stopped
+CHECK_S = 0.1  # time between checks
+STILL_CHECKS = 8  # checks in a row at which a process may sleep without processor time
+AT_WORK = ("R", "D")  # states: runnable, waits for a disk
+STOPPED_CHECKS = 2  # checks in a row at which it is stopped
 
 
 class Watchdog:
-    """Looks at one process again and again while something is expected of it.
+    """Checks a process from time to time while it has work to do.
 
-    A process that has work to do uses the processor, or waits for it or for a disk. If it is
-    stopped, or sleeps, it does not go on by itself, unless processes that it has started do.
+    A process that works uses the processor, or waits for it or for a disk. A process that is
+    stopped or sleeps does not continue by itself, unless its descendants work for it.
     """
 
     def __init__(
         self,
-        pid: int,  # of the process
-        timeout_s: float,  # for so long it may work; unwatched times do not count
+        pid: int,
+        timeout_s: float,  # limit on the work, without times in which nothing checks
     ) -> None:
         self._pid = pid
         self._timeout_s = timeout_s
@@ -30,16 +30,16 @@ class Watchdog:
         self._stopped = 0
 
     def verdict(self) -> str | None:
-        """What is wrong with it, in words; to be asked every `CHECK_S`."""
+        """Return what is wrong with the process, None: nothing. Call it every `CHECK_S`."""
         try:
-            state, spent = _look(self._pid)
+            state, spent = read_state(self._pid)
         except OSError:
-            return None  # it has ended, which others notice
+            return None  # it has ended, which its pool notices
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
         is_still = state == "S"
-        if is_still:  # those that it has started may work for it, or wait for the processor
-            for child, ticks in map(_look_if_there, _started_by(self._pid)):
+        if is_still:  # processes that it has started may work for it
+            for child, ticks in map(_read_state_if_there, descendants(self._pid)):
                 is_still &= child not in AT_WORK
                 spent += ticks
         self._still = self._still + 1 if is_still and spent == self._spent else 0
@@ -54,34 +54,34 @@ class Watchdog:
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether a process is stopped (SIGSTOP), where the system tells."""
-    return _look_if_there(pid)[0] in "Tt"
+    """Return whether a process is stopped (SIGSTOP), if the system can tell."""
+    return _read_state_if_there(pid)[0] in "Tt"
 
 
 def processor_s(pid: int) -> float:
-    """Processor time that a process has taken, s."""
+    """Return the processor time of a process in s."""
     return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
 
 
-def _started_by(pid: int) -> list[int]:
-    """The processes that one has started, and those that they have."""
+def descendants(pid: int) -> list[int]:
+    """Return the descendants of a process."""
     try:
         text = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
-    except OSError:  # it has ended, or the system does not tell
+    except OSError:  # it has ended, or the system cannot tell
         return []
     children = [int(word) for word in text.split()]
-    return children + [one for child in children for one in _started_by(child)]
+    return children + [one for child in children for one in descendants(child)]
 
 
-def _look_if_there(pid: int) -> tuple[str, int]:
+def _read_state_if_there(pid: int) -> tuple[str, int]:
     try:
-        return _look(pid)
+        return read_state(pid)
     except OSError:
         return "X", 0
 
 
-def _look(pid: int) -> tuple[str, int]:
-    """State of a process, a letter, and its processor time in ticks of the system."""
+def read_state(pid: int) -> tuple[str, int]:
+    """Return the state of a process, a letter, and its processor time in system ticks."""
     text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     fields = text.rpartition(")")[2].split()
     return fields[0], int(fields[11]) + int(fields[12])

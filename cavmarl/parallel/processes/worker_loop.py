@@ -1,11 +1,11 @@
-"""The programs of a pool's processes: the fork server, and the workers that it forks.
+"""The programs of the processes of a pool: the fork server, and the workers that it forks.
 
-The pool starts one process as a program. That one makes every worker's job ready, with all kernels
-loaded, and has no threads; then it forks a worker whenever the pool asks for one. So a worker that
-has died is replaced in milliseconds, and its successor begins with what is ready.
+The pool starts the fork server as a program. The server has no threads; it makes the jobs of all
+workers, with all kernels loaded, and forks a worker when the pool requests one. So a dead worker is
+replaced in milliseconds by a successor that shares the prepared memory.
 
-No process outlives the pool: the forking process ends when the pool's process does, or when it
-hears no more of it, and the system kills the workers with the process that forked them.
+No process outlives the pool: the server ends with the process of the pool, or when its connection
+to the pool is closed, and the system kills the workers with the server.
 """
 
 from __future__ import annotations
@@ -28,54 +28,58 @@ import numpy as np
 
 from cavmarl.core.processes import die_with_parent
 from cavmarl.core.tracebacks import traceback_text
+from cavmarl.parallel.memory.shared_huge_pages import collapse_heap
+from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.processes import process_barrier as barrier
-from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, Meeting, present_core
-from cavmarl.parallel.processes.shared_huge_pages import collapse_heap
-from cavmarl.parallel.processes.shared_memory import Segment
-from cavmarl.parallel.processes.state_image import Arrays, Image
+from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, WakeSignal, present_core
+from cavmarl.parallel.state.state_image import Arrays, Image
 
-# Words of the pool's line, behind those of `barrier`.
+# Words of the line of the pool, after those of `process_barrier`.
 TASK, PAYLOAD, SLOT, COMMITTED, LOADS = 2, 3, 4, 5, 6
-# Words of the worker's line: how its command ended, and on which core it began it.
+# Words of the line of a worker: how its command ended, and the core on which it began.
 ANSWER, CORE = 2, 3
 SILENT, ANSWERED, FAILED = 0, 1, 2
 
-NOTHING = -1  # a task: to be there
+NOTHING = -1  # the task that does nothing
 OUT_OF_MEMORY = 77  # exit status
 MAX_MESSAGE = 1 << 17
-MAIL = b"="  # begins a message with something in it
-MAX_TRACEBACK = 16_000  # characters, six bytes each at most; the end of a longer one is sent
+MAIL = b"="  # starts a message with content
+MAX_TRACEBACK = 16_000  # characters of at most six bytes; a longer traceback loses its start
+
+
+class TeamFailedError(Exception):
+    """A worker cannot go on because another one of its team failed; that one reports why."""
 
 
 class Job:
-    """What one worker does."""
+    """The work of one worker."""
 
     def perform(
         self,
-        task: int,  # which one; numbers from 0 on are the job's own
-        payload: Any,  # what the pool has to say to it, as JSON knows it; mostly nothing
+        task: int,  # its number, from 0 on; each kind of job has tasks of its own
+        payload: Any,  # JSON value from the pool, often None
     ) -> Any:
-        """Do a task; the answer, as JSON knows it, of those that have one."""
+        """Do a task, and return its answer, a JSON value, or None if it has none."""
         raise NotImplementedError
 
     def save(self) -> Arrays:
-        """All that a successor needs to go on from here; nothing if there is no such thing."""
+        """Return what a successor needs to resume from here; empty if it needs nothing."""
         return []
 
     def load(self, saved: Sequence[Any]) -> None:
-        """Go on from what `save` gave."""
+        """Resume from what `save` returned."""
 
-    def afterwards(self) -> None:
-        """Called after a command's answer is sent: for work that is not waited for.
+    def on_idle(self) -> None:
+        """Do work that the pool does not wait for, after the answer to a command was sent.
 
-        What it makes must not be needed before another command is carried out: that one may be
-        carried out by a successor, which finds what was committed.
+        The next command must not depend on this work: a successor may carry it out, which finds
+        only what was committed.
         """
 
-    def prepare(self) -> None:
-        """Called where workers are forked, before each fork that is to do this job.
+    def before_fork(self) -> None:
+        """Prepare, in the fork server, for the fork of a worker with this job.
 
-        The worker that did it is dead; so are those it shares memory with, if it is their first.
+        The previous worker with this job is dead. If it led a team, the whole team is dead.
         """
 
 
@@ -83,8 +87,8 @@ MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]
 
 
 def serve(make_jobs: MakeJobs) -> NoReturn:
-    """The whole life of the forking process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pool, which sees to the rest
+    """Run the fork server until the pool is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pool, which ends all
     faulthandler.enable()
     start = json.loads(sys.argv[1])
     pool = socket.socket(fileno=start["pool"])
@@ -92,26 +96,26 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
     if os.getppid() != start["parent"]:
         os._exit(0)
     try:
-        recipe = _read(start["recipe"], start["recipe_bytes"])
-        jobs = make_jobs(recipe)
+        message = _read(start["message"], start["message_bytes"])
+        jobs = make_jobs(message)
         barrier.load_kernels()
         _refuse_threads()
     except Exception as error:
-        _say(pool, describe(error))
+        send_to_pool(pool, describe(error))
         os._exit(1)
     gc.collect()
-    gc.freeze()  # what is ready is not moved around by workers
+    gc.freeze()  # so that workers do not write to shared pages
     collapse_heap()
-    _say(pool, {"ready": len(jobs)})
+    send_to_pool(pool, {"ready": len(jobs)})
     _fork_on_demand(pool, parent, jobs, start)
 
 
 def _refuse_threads() -> None:
-    """A process with threads must not fork."""
+    """Raise RuntimeError if this process has threads, which a fork would lose."""
     threads = len(os.listdir("/proc/self/task"))
     if threads > 1:
         names = [thread.name for thread in threading.enumerate()]
-        raise RuntimeError(f"a process that forks has {threads} threads, of Python's: {names}")
+        raise RuntimeError(f"the fork server has {threads} threads, those of Python are {names}")
 
 
 def _read(fd: int, size: int) -> Any:
@@ -119,14 +123,14 @@ def _read(fd: int, size: int) -> Any:
 
 
 def describe(error: BaseException) -> dict[str, str]:
-    """An exception in words, not too many: its class, its message, its traceback."""
+    """Return the class, the message and the traceback of an exception, cut to size."""
     text = traceback_text(error)[-MAX_TRACEBACK:]
     message = str(error)[: MAX_TRACEBACK // 4]
     return {"kind": type(error).__name__, "text": message, "traceback": text}
 
 
-def _say(pool: socket.socket, what: Mapping[str, Any]) -> None:
-    """Tell the pool; that it is gone (Ctrl-C) is seen when its socket is read."""
+def send_to_pool(pool: socket.socket, what: Mapping[str, Any]) -> None:
+    """Send to the pool. If it is gone (Ctrl-C), the next read from its socket notices."""
     with suppress(BrokenPipeError, ConnectionResetError):
         pool.send(json.dumps(what).encode())
 
@@ -149,26 +153,26 @@ def _fork_on_demand(
             pid = order["reap"]
             _, status = os.waitpid(pid, 0)
             alive.discard(pid)
-            _say(pool, {"status": os.waitstatus_to_exitcode(status)})
+            send_to_pool(pool, {"status": os.waitstatus_to_exitcode(status)})
             continue
         number, (wire,) = order["fork"], descriptors
-        jobs[number].prepare()
-        mother = os.getpid()
+        jobs[number].before_fork()
+        server_pid = os.getpid()
         pid = os.fork()
         if pid == 0:
             die_with_parent()
-            if os.getppid() != mother:
+            if os.getppid() != server_pid:
                 os._exit(0)
             pool.close()
             os.close(parent)
             _work(number, jobs[number], socket.socket(fileno=wire), start)
         os.close(wire)
         alive.add(pid)
-        _say(pool, {"pid": pid})
+        send_to_pool(pool, {"pid": pid})
 
 
 def _end(alive: set[int]) -> NoReturn:
-    """The pool is closed: nothing is left behind, not even a zombie."""
+    """End with all workers, and reap them, after the pool was closed."""
     for pid in alive:
         os.kill(pid, signal.SIGKILL)
     for pid in alive:
@@ -184,25 +188,25 @@ def _work(number: int, job: Job, wire: socket.socket, start: Mapping[str, Any]) 
     theirs = orders[number * WORDS : (number + 1) * WORDS]
     mine = np.frombuffer(Segment(start["statuses"][number], 0).map(), dtype=np.int64)[:WORDS]
     slots = [Image(Segment(fd, 0)) for fd in start["images"][number]]
-    meeting = Meeting(mine, theirs, wire, start["crowded"])
-    meeting.get_up()  # a predecessor may have died asleep
+    wake_signal = WakeSignal(mine, theirs, wire, start["crowded"])
+    wake_signal.wake()  # a predecessor may have died asleep
     with suppress(BrokenPipeError, ConnectionResetError):  # the pool is gone
-        _obey(job, meeting, slots)
+        _run_commands(job, wake_signal, slots)
     os._exit(0)
 
 
-def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
-    mine, theirs = meeting.mine, meeting.theirs
+def _run_commands(job: Job, wake_signal: WakeSignal, slots: Sequence[Image]) -> NoReturn:
+    mine, theirs = wake_signal.mine, wake_signal.theirs
     is_new = True
     wait_s = 0.0
     began = time.perf_counter()
     while True:
         order = int(mine[NUMBER]) + 1
-        wait_s = _await(meeting, order, wait_s, time.perf_counter() - began)
+        wait_s = _await(wake_signal, order, wait_s, time.perf_counter() - began)
         began = time.perf_counter()
         core = present_core()
         number, _, task, has_payload, slot, committed, loads, _ = theirs.tolist()
-        payload = _receive(meeting.wire) if has_payload else None
+        payload = _receive(wake_signal.wire) if has_payload else None
         try:
             if (is_new or loads) and committed >= 0:
                 dtypes = [array.dtype for array in job.save()]
@@ -218,39 +222,39 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
             os._exit(OUT_OF_MEMORY)
         except Exception as error:
             mine[ANSWER] = FAILED
-            meeting.wire.send(MAIL + json.dumps(describe(error)).encode())
+            wake_signal.wire.send(MAIL + json.dumps(describe(error)).encode())
         else:
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
-                meeting.wire.send(MAIL + json.dumps(answer).encode())
-        mine[CORE] = core  # now, and not before: the pool polls this line all the time
-        meeting.post(number)
+                wake_signal.wire.send(MAIL + json.dumps(answer).encode())
+        mine[CORE] = core  # only now, since the pool polls this line all the time
+        wake_signal.post(number)
         if mine[ANSWER] != FAILED:
             try:
-                job.afterwards()
+                job.on_idle()
             except MemoryError:
                 os._exit(OUT_OF_MEMORY)
 
 
 def _await(
-    meeting: Meeting,  # with the pool
-    order: int,
-    last_s: float,  # how long the last wait was that was one
-    work_s: float,  # how long was worked since
-) -> float:  # how long the last wait was, which may be this one
-    """Return when there is a command; end with the pool."""
-    if meeting.has(order):
+    wake_signal: WakeSignal,  # shared with the pool
+    order: int,  # number of the command
+    last_s: float,  # duration of the last real wait
+    work_s: float,  # duration of the work since then
+) -> float:  # duration of the last real wait, maybe this one
+    """Wait for a command; exit if the pool is closed."""
+    if wake_signal.has(order):
         return last_s
     began = time.perf_counter()
-    if not meeting.watch(order, last_s, work_s):
-        while meeting.lie_down(order):
-            # A payload may come before its command: it is left where it is.
-            message = meeting.wire.recv(len(WAKE), socket.MSG_PEEK)
-            meeting.get_up()
+    if not wake_signal.watch(order, last_s, work_s):
+        while wake_signal.sleep(order):
+            # A payload may come before its command, so it stays unread.
+            message = wake_signal.wire.recv(len(WAKE), socket.MSG_PEEK)
+            wake_signal.wake()
             if not message:
                 os._exit(0)
             if message == WAKE:
-                meeting.wire.recv(len(WAKE))
+                wake_signal.wire.recv(len(WAKE))
     return time.perf_counter() - began
 
 

@@ -1,10 +1,10 @@
-"""`Pool`: worker processes that do one job together, command by command, and survive their deaths.
+"""`Pool`: worker processes that carry out commands together, and survive deaths of workers.
 
-Every worker keeps its state in its own memory, and leaves an image of it behind with every command
-that changes it. There are two images of each: the one that is committed, and the one that is being
-written. When all workers have carried out a command, the pool commits it. A worker that dies before
-that is replaced: its successor reads the committed image and carries the command out again. It
-reads the same, so it does the same.
+Each worker has its state in its own memory, and writes an image of it after each command that
+changes it. A worker has two images: the committed one, and the one that it writes. When all workers
+have carried out a command, the pool commits it. If a worker dies before that, its successor resumes
+from the committed image and repeats the command. Commands are deterministic, so the result is the
+same.
 """
 
 from __future__ import annotations
@@ -21,24 +21,30 @@ from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureErro
 from cavmarl.core.processes import refuse_fork
 from cavmarl.parallel.processes.process_barrier import LONG_WORK_S
 from cavmarl.parallel.processes.watchdog import CHECK_S, Watchdog, processor_s
-from cavmarl.parallel.processes.worker_loop import FAILED, MAIL, MAX_MESSAGE, NOTHING, TASK
+from cavmarl.parallel.processes.worker_loop import (
+    FAILED,
+    MAIL,
+    MAX_MESSAGE,
+    NOTHING,
+    TASK,
+    TeamFailedError,
+)
 from cavmarl.parallel.processes.worker_processes import Program, WorkerProcesses
-from cavmarl.parallel.team.team import LeftAloneError
 
 __all__ = ["Death", "Pool", "Program"]
 
 
 @dataclass
 class Death:
-    """What became of one process and of what it did; times are those of `time.monotonic`."""
+    """The death of a worker process and its replacement; times are of `time.monotonic`."""
 
-    worker: int  # whose process it was
-    order: int  # that was to be carried out
-    cause: str  # signal or exit status, or why it was taken for dead
-    ordered_s: float  # when the command was given
-    noticed_s: float  # when that was noticed
-    replaced_s: float  # when its successor had its order
-    done_s: float = nan  # when that was carried out; nan: not yet
+    worker: int  # number of the worker
+    order: int  # number of the command at that time
+    cause: str  # signal, exit status, or why the process was given up
+    ordered_s: float  # when the command was sent
+    noticed_s: float  # when the death was noticed
+    replaced_s: float  # when the successor had the command
+    done_s: float = nan  # when the successor had carried it out; nan: not yet
 
 
 class Pool:
@@ -52,19 +58,19 @@ class Pool:
     def __init__(
         self,
         program: Program,
-        timeout_s: float,  # for so long a worker may be busy with one order
-        repeats: int,  # how often a start, or a command, is begun again because a process has died
+        timeout_s: float,  # limit on the duration of a command
+        repeats: int,  # how often a start or a command is repeated after deaths
     ) -> None:
-        self.deaths: list[Death] = []  # all that there were
+        self.deaths: list[Death] = []  # since the start
         self._program = program
         self._timeout_s = timeout_s
         self._repeats = repeats
         self._all = tuple(range(len(program.parts)))
         self._committed = -1  # the slot of the committed images
-        self._open: tuple[int, ...] = ()  # workers with an order that is not committed
-        self._stale = [False] * len(program.parts)  # whose memory is not what is committed
+        self._open: tuple[int, ...] = ()  # workers with a command that is not committed
+        self._stale = [False] * len(program.parts)  # memory differs from what is committed
         self._ordered_s = 0.0
-        self._lasted: dict[int, float] = {}  # how long each task has taken the last time, s
+        self._lasted: dict[int, float] = {}  # last duration of each task in s
         self._pid = os.getpid()
         self._processes = WorkerProcesses(program, repeats)
         self._finalizer = weakref.finalize(self, self._processes.release)
@@ -78,7 +84,7 @@ class Pool:
         return self._processes.server_pid
 
     def team_of(self, worker: int) -> tuple[int, ...]:
-        """The workers replaced with a worker, itself among them."""
+        """Return the workers that are replaced together with a worker, including itself."""
         return self._program.team_of(worker)
 
     def processor_s(self) -> list[float]:
@@ -88,34 +94,34 @@ class Pool:
         """Let all workers do a task.
 
         Returns:
-            what each has answered.
+            the answer of each worker.
 
         Raises:
-            WorkerDeathError: too many processes died of it; the pool is closed.
-            WorkerFailureError: an exception in a worker; all are as they were before.
+            WorkerDeathError: too many processes died of the task; the pool is closed.
+            WorkerFailureError: a worker raised an exception; the state is that before the task.
         """
         return self._command(self._all, task, payload, commits)
 
     def ask(self, worker: int, task: int, payload: Any = None) -> Any:
-        """Let one worker do a task that changes nothing; raises as `run`."""
+        """Let one worker do a task that changes nothing; errors as of `run`."""
         return self._command((worker,), task, payload, False)[0]
 
     def ping(self) -> None:
-        """Let all workers do nothing: an empty barrier."""
+        """Let all workers do nothing, and wait for them."""
         self.run(NOTHING, commits=False)
 
     def rename(self, parts: tuple[str, ...]) -> None:
         self._program = self._program._replace(parts=parts)
 
     def close(self) -> None:
-        """End all processes and give the memory back; what is mapped stays readable."""
+        """End all processes and release the memory; mapped arrays stay readable."""
         self._finalizer()
 
     def _command(
         self, workers: tuple[int, ...], task: int, payload: Any, commits: bool
     ) -> list[Any]:
         if not self._finalizer.alive:
-            raise WorkerError("the workers are closed: make the environment anew")
+            raise WorkerError("the workers are closed: make a new environment")
         refuse_fork(self._pid, "the workers")
         if self._open:
             self._settle()
@@ -129,7 +135,7 @@ class Pool:
         expected_s = self._lasted.get(task, 0.0)
         sleeps = expected_s > LONG_WORK_S
         if workers == self._all:
-            self._processes.keep_apart()  # where they were with the last command
+            self._processes.keep_apart()  # by the cores of the last command
         self._processes.order(workers, head, self._stale, mail, sleeps)
         self._await(workers, mail, expected_s, sleeps)
         self._lasted[task] = time.monotonic() - self._ordered_s
@@ -142,7 +148,7 @@ class Pool:
         return answers
 
     def _settle(self) -> None:
-        """Let a command end that was interrupted, or failed; it is not committed."""
+        """Wait for the end of a command that was interrupted or failed; it is not committed."""
         for k in self._open:
             watchdog = Watchdog(self._processes.processes[k].pid, self._timeout_s)
             while not self._processes.settle(k, CHECK_S):
@@ -160,16 +166,16 @@ class Pool:
         if pending:
             self._await_asleep(pending, mail, sleeps)
 
-    def _await_asleep(self, pending: list[int], mail: bytes | None, is_lying: bool) -> None:
-        dead = self._processes.sleep(pending, CHECK_S, is_lying)
+    def _await_asleep(self, pending: list[int], mail: bytes | None, is_asleep: bool) -> None:
+        dead = self._processes.sleep(pending, CHECK_S, is_asleep)
         first = len(self.deaths)
         guard = _Guard(self._processes, self._timeout_s, self._ordered_s)
         while pending or dead:
             asked = pending
             pending = self._pending()
             if pending and len(pending) < len(asked):
-                # Orders are shared out so that all end together.
-                self._processes.forget_calls()
+                # Work is shared so that all workers end at about the same time.
+                self._processes.drain_wakeups()
                 pending = [k for k in pending if not self._processes.watch(k, is_soon=True)]
             self._note_done(first, pending)
             if not (pending or dead):
@@ -177,7 +183,7 @@ class Pool:
             suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
             suspected = {k: self._processes.processes[k] for k in suspects} | dead
             for k, cause in suspects.items():
-                if self._processes.processes[k] is suspected[k]:  # not replaced with another one's
+                if self._processes.processes[k] is suspected[k]:  # not replaced with its team
                     self._replace(k, cause, mail)
             pending = self._pending()
             for k in pending:
@@ -189,7 +195,7 @@ class Pool:
         self._note_done(first, pending)
 
     def _note_done(self, first: int, pending: list[int]) -> None:
-        """Of deaths from a number on: when the successors are through."""
+        """Note for deaths from a number on when the successors have finished."""
         for death in self.deaths[first:]:
             if death.worker not in pending and isnan(death.done_s):
                 death.done_s = time.monotonic()
@@ -198,7 +204,7 @@ class Pool:
         return [k for k in self._open if not self._processes.has(k)]
 
     def _replace(self, k: int, cause: str, mail: bytes | None) -> None:
-        """A worker's process is dead, or taken for it: another one goes on in its place."""
+        """Replace the process of a worker, which is dead or given up."""
         noticed_s = time.monotonic()
         try:
             found = self._processes.replace(k, mail, self._open)
@@ -221,7 +227,7 @@ class Pool:
         failure: WorkerFailureError | None = None
         for k in workers:
             kind, answer = self._processes.answer(k)
-            if kind == FAILED and (failure is None or failure.kind == LeftAloneError.__name__):
+            if kind == FAILED and (failure is None or failure.kind == TeamFailedError.__name__):
                 failure = WorkerFailureError(k, self._program.parts[k], **answer)
             answers.append(answer)
         if failure is not None:
@@ -230,7 +236,7 @@ class Pool:
 
 
 class _Guard:
-    """Checks the workers that are waited for, from time to time."""
+    """Checks from time to time the workers for which the pool waits."""
 
     def __init__(self, processes: WorkerProcesses, timeout_s: float, since_s: float) -> None:
         self._processes = processes
@@ -239,6 +245,7 @@ class _Guard:
         self._next_s = since_s + CHECK_S
 
     def hanging(self, pending: list[int]) -> dict[int, str]:
+        """Return the workers that hang, and what is wrong with each."""
         now = time.monotonic()
         if now < self._next_s:
             return {}

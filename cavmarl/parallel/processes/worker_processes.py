@@ -1,4 +1,4 @@
-"""`WorkerProcesses` starts and replaces a pool's processes, and sends them commands."""
+"""`WorkerProcesses` starts and replaces the processes of a pool, and sends commands to them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cavmarl.core.errors import WorkerError
+from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.processes.core_placement import keep_apart
 from cavmarl.parallel.processes.fork_server import (
     ForkServer,
@@ -23,11 +24,10 @@ from cavmarl.parallel.processes.fork_server import (
 from cavmarl.parallel.processes.process_barrier import (
     NUMBER,
     WORDS,
-    Meeting,
+    WakeSignal,
     present_core,
     usable_cores,
 )
-from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.worker_loop import ANSWER, CORE, LOADS, OUT_OF_MEMORY, SILENT, TASK
 
 _LINE_BYTES = WORDS * 8
@@ -37,179 +37,180 @@ _FIRST_IMAGE_BYTES = 1 << 12
 class Program(NamedTuple):
     """What the workers of a pool run."""
 
-    module: str  # that is run as a program and calls `worker_loop.serve`
-    recipe: Mapping[str, Any]  # from which it makes the jobs, as JSON knows it
-    parts: tuple[str, ...]  # what each worker hosts, in words
-    # that the jobs share with the pool, and the pool gives back; the recipe names their descriptors
+    module: str  # run as a program, which calls `worker_loop.serve`
+    message: Mapping[str, Any]  # JSON value from which the program makes the jobs
+    parts: tuple[str, ...]  # description of the part of each worker
+    # memory shared by the jobs and the pool, which closes it; the message names the descriptors
     segments: tuple[Segment, ...]
-    tasks: tuple[str, ...]  # what each task is called, by its number
-    pins: bool = False  # each worker stays on a core of its own, as far as there are so many
-    # workers that share their state, by rising numbers: none of them can go on without the others.
-    # A worker in no team is alone
+    tasks: tuple[str, ...]  # name of each task, by its number
+    pins: bool = False  # pin each worker to a core of its own, as far as there are enough cores
+    # groups of workers that share their state, so that none can go on without the others; a worker
+    # in no team is alone
     teams: tuple[tuple[int, ...], ...] = ()
 
     def team_of(self, worker: int) -> tuple[int, ...]:
-        """The workers that share their state with a worker, itself among them."""
+        """Return the workers that share their state with a worker, including itself."""
         return next((team for team in self.teams if worker in team), (worker,))
 
 
 class WorkerProcesses:
-    """m worker processes and the one that forks them.
+    """m worker processes and the server that forks them.
 
     Attributes:
-        orders: (m, WORDS) the lines that this side writes.
+        orders: (m, WORDS) the lines of the pool, one for each worker.
 
     Raises:
-        WorkerError: no process, or those that start were killed too often.
-        WorkerFailureError: an exception while the jobs were made.
+        WorkerError: the server cannot be started, or was killed too often.
+        WorkerFailureError: an exception was raised while the jobs were made.
     """
 
     def __init__(
         self,
         program: Program,
-        repeats: int,  # how often a start that is killed is begun again
+        repeats: int,  # how often the start is repeated after the server was killed
     ) -> None:
         self._program = program
         self._repeats = repeats
         self._count = len(program.parts)
         self._crowded = self._count + 1 > len(usable_cores())
         self._poll = select.poll()
-        self._held = _Held(list(program.segments))
-        self._meetings: dict[int, Meeting] = {}
-        self._owners: dict[int, tuple[int, bool]] = {}  # descriptor → worker, whether of its death
-        self._heard: set[int] = set()  # workers whose messages have woken this side, and lie there
+        self._resources = _OwnedResources(list(program.segments))
+        self._signals: dict[int, WakeSignal] = {}
+        # descriptor → worker, and whether it reports the death of the worker
+        self._owners: dict[int, tuple[int, bool]] = {}
+        self._woken_by: set[int] = set()  # workers whose unread messages have woken this side
         try:
             if not hasattr(os, "pidfd_open"):
                 raise WorkerError("workers need Linux 5.3 or later: use backend='local'")
             self._make_memory()
             self._start()
         except BaseException:
-            self._held.release()
+            self._resources.release()
             raise
 
     @property
     def release(self) -> Callable[[], None]:
-        """Ends the processes and gives all back, also when this object is collected."""
-        return self._held.release
+        """A function that ends the processes and frees all resources."""
+        return self._resources.release
 
     @property
     def processes(self) -> dict[int, Process]:
-        """By number of the worker; none when all have been given back."""
-        return self._held.processes
+        """The process of each worker; empty after `release`."""
+        return self._resources.processes
 
     @property
     def server_pid(self) -> int:
-        server = self._held.server
+        server = self._resources.server
         return 0 if server is None else server.pid
 
     def order(
         self,
         workers: Sequence[int],
         head: tuple[int, ...],  # words of the command, from TASK to COMMITTED
-        stale: Sequence[bool],  # of all workers, whose memory is not what is committed
-        mail: bytes | None,  # what goes with it
-        # this side goes to sleep at once: what it does from here on it does on a core on which a
-        # worker waits to begin
+        stale: Sequence[bool],  # of all workers: whether the memory differs from what is committed
+        mail: bytes | None,  # payload
+        # this side sleeps at once, since a worker may wait for its core
         sleeps: bool = False,
     ) -> None:
-        """Send the next command; dead workers are detected in `wait`.
+        """Send the next command; `sleep` detects dead workers.
 
-        Polling workers have it before any is woken, and the worker that may take the core that
-        this process is on is woken last.
+        Polling workers get the command before any other is woken. A worker that may need the core
+        of this process is woken last.
         """
         if sleeps:
             for k in workers:
-                self._meetings[k].lie_down_first()
+                self._signals[k].announce_sleep()
         asleep = []
         for k in workers:
             words = self.orders[k]
             words[TASK : LOADS + 1] = (*head, stale[k])
             if mail is not None:
                 self._send(k, mail)
-            if self._meetings[k].announce(words.item(NUMBER) + 1):
+            if self._signals[k].announce(words.item(NUMBER) + 1):
                 asleep.append(k)
         if len(asleep) > 1:
             here = present_core()
             asleep.sort(key=lambda k: self._statuses[k].item(CORE) == here)
         for k in asleep:
-            self._meetings[k].wake()
+            self._signals[k].wake_peer()
 
     def number(self, k: int) -> int:
         return self.orders.item(k, NUMBER)
 
     def has(self, k: int) -> bool:
-        return self._meetings[k].has(self.number(k))
+        """Return whether a worker has finished its command."""
+        return self._signals[k].has(self.number(k))
 
     def watch(self, k: int, last_s: float = 0.0, is_soon: bool = False) -> bool:
-        """The same, but look for a moment; a longer one if it cannot take long."""
-        return self._meetings[k].watch(self.number(k), last_s, is_soon=is_soon)
+        """Poll for a moment whether a worker finishes its command; longer if it is due soon."""
+        return self._signals[k].watch(self.number(k), last_s, is_soon=is_soon)
 
     def sleep(
-        self, pending: Sequence[int], limit_s: float, is_lying: bool = False
-    ) -> dict[int, Process]:  # the dead, by worker
-        """Sleep until one of those is done, or one is dead, but not for ever."""
+        self, pending: Sequence[int], limit_s: float, is_asleep: bool = False
+    ) -> dict[int, Process]:  # dead processes by worker
+        """Sleep until a worker has finished or died, or until the limit."""
         ready: list[tuple[int, int]] = []
-        if self._hears_no_worker(pending) if is_lying else self._lie_down(pending):
+        if self._none_has_finished(pending) if is_asleep else self._fall_asleep(pending):
             ready = self._poll.poll(1000.0 * limit_s)
         for k in pending:
-            self._meetings[k].get_up()
+            self._signals[k].wake()
         if not ready:
             return {}
         found = [self._owners[fd] for fd, _ in ready]
-        self._heard.update(k for k, is_dead in found if not is_dead)
+        self._woken_by.update(k for k, is_dead in found if not is_dead)
         return {k: self.processes[k] for k, is_dead in found if is_dead}
 
-    def _lie_down(self, pending: Sequence[int]) -> bool:
-        """Say that this side sleeps; False: a worker is through by now, or has called already."""
-        self.forget_calls()
-        # Of several it is enough that one of them is through: an awake process is not woken.
-        return all(self._meetings[k].lie_down(self.number(k)) for k in pending)
+    def _fall_asleep(self, pending: Sequence[int]) -> bool:
+        """Mark this side as asleep; return False if a worker has finished in the meantime."""
+        self.drain_wakeups()
+        # One finished worker is enough: it has not woken this side, which was awake.
+        return all(self._signals[k].sleep(self.number(k)) for k in pending)
 
-    def forget_calls(self) -> None:
+    def drain_wakeups(self) -> None:
         """Drain the sockets, so that old messages do not wake this side again.
 
-        Mostly it is one message; another one is read the next time.
+        Usually there is one message; the next call reads another one.
         """
-        for k in self._heard:
+        for k in self._woken_by:
             with suppress(BlockingIOError, ConnectionResetError):
-                self.processes[k].take()
-        self._heard.clear()
+                self.processes[k].receive()
+        self._woken_by.clear()
 
-    def _hears_no_worker(self, pending: Sequence[int]) -> bool:
-        """Forget also calls that came while this side was about to get up; False: one is through.
+    def _none_has_finished(self, pending: Sequence[int]) -> bool:
+        """Drain late wake-ups; return False if a worker has finished.
 
-        Only once they have their command, so that none waits for it: of a call that is forgotten
-        too much, the number is there before it.
+        It is called after the workers got their command. If it drains a wake-up that belongs to
+        this command, the number of that worker is already set.
         """
         for fd, _ in self._poll.poll(0):
             k, is_dead = self._owners[fd]
             if not is_dead:
-                self._heard.add(k)
-        self.forget_calls()
+                self._woken_by.add(k)
+        self.drain_wakeups()
         return not any(map(self.has, pending))
 
     def settle(self, k: int, limit_s: float) -> bool:
-        """Whether a worker has carried out its command or has died of it, after a while at most."""
+        """Wait up to a limit for a worker to finish or to die; return whether it did."""
         process = self.processes[k]
         if has_ended([process.pidfd], 0.0 if self.has(k) else limit_s):
-            self._statuses[k][NUMBER] = self.number(k)  # its writer is dead
+            self._statuses[k][NUMBER] = self.number(k)  # the worker, which writes it, is dead
         process.collect()
         process.mail.clear()
         return self.has(k)
 
     def is_left_alone(self, k: int) -> bool:
-        """Whether a process is dead without which a worker cannot go on."""
+        """Return whether another worker of the same team is dead."""
         others = [self.processes[j].pidfd for j in self._program.team_of(k) if j != k]
         return has_ended(others, 0.0)
 
     def keep_apart(self) -> None:
-        """Give workers that shared a core different ones, unless each has its own for good."""
+        """Separate workers that shared a core, unless workers are pinned."""
         cores = [status.item(CORE) for status in self._statuses]
         if len(set(cores)) < len(cores) and not self._program.pins:
             keep_apart([process.pid for process in self.processes.values()], cores)
 
     def answer(self, k: int) -> tuple[int, Any]:
-        """How a worker's command ended, as its line says, and what it has answered."""
+        """Return how the command of a worker ended, as its line says, and its answer."""
         kind = self._statuses[k].item(ANSWER)
         if kind == SILENT:
             return kind, None
@@ -218,23 +219,23 @@ class WorkerProcesses:
         return kind, json.loads(process.mail.pop(0))
 
     def replace(self, k: int, mail: bytes | None, ordered: Collection[int]) -> str:
-        """Give a worker's team new processes, and those the command, if it is not carried out yet.
+        """Replace the processes of the team of a worker, and repeat an unfinished command.
 
         Returns:
-            what the old process of the worker died of, if nothing else is known.
+            the cause of death of the old process.
         """
         team = self._program.team_of(k)
         old = {j: self.processes[j] for j in team}
         for process in old.values():
             self._dismiss(process)
-        self._take_back(team, ordered)
-        server = self._held.server
+        self._reopen_command(team, ordered)
+        server = self._resources.server
         assert server is not None
         try:
             statuses = {j: server.reap(process) for j, process in old.items()}
-            cause = _say(statuses[k])
+            cause = _describe_status(statuses[k])
             for j in team:
-                self._fork(j)
+                self.fork(j)
         except ServerGoneError:
             cause = "the process that starts workers ended"
             old = self._start_anew(old, ordered)
@@ -249,15 +250,15 @@ class WorkerProcesses:
             del self._owners[fd]
         process.collect()
 
-    def _take_back(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
-        """Let a team, all of it dead, do a command again together that not all have carried out."""
+    def _reopen_command(self, team: tuple[int, ...], ordered: Collection[int]) -> None:
+        """Let a dead team repeat a command that not all of its workers have carried out."""
         asked = [j for j in team if j in ordered]
         if not all(self.has(j) for j in asked):
             for j in asked:
-                self._statuses[j][NUMBER] = self.number(j) - 1  # no other process writes there
+                self._statuses[j][NUMBER] = self.number(j) - 1  # its writer is dead
 
     def _hand_over(self, k: int, old: Process, mail: bytes | None) -> None:
-        """To a new process, what has come from the old one, or what that one was sent."""
+        """Give a new process the mail from the old one, or else the payload again."""
         if self.has(k):
             self.processes[k].mail = old.mail
         else:
@@ -265,22 +266,22 @@ class WorkerProcesses:
         old.release()
 
     def _start_anew(self, dead: dict[int, Process], ordered: Collection[int]) -> dict[int, Process]:
-        """The process that forks is gone, or hangs: another one, and new workers for all.
+        """Restart the fork server, which is gone or hangs, and all workers.
 
         Returns:
             the old processes of all workers.
         """
-        assert self._held.server is not None
-        self._held.server.close()
+        assert self._resources.server is not None
+        self._resources.server.close()
         for k, process in self.processes.items():
             if process is dead.get(k):
                 continue
             self._dismiss(process)
-            if k in dead:  # its successor is of no use, either
+            if k in dead:  # the successor of a dead process is of no use, either
                 process.release()
         old = {**self.processes, **dead}
         for team in {self._program.team_of(k) for k in old}:
-            self._take_back(team, ordered)
+            self._reopen_command(team, ordered)
         try:
             self._start()
         except BaseException:
@@ -296,21 +297,21 @@ class WorkerProcesses:
                 self.processes[k].wire.send(mail)
 
     def _make_memory(self) -> None:
-        held = self._held
-        orders = held.hold(Segment.make(self._count * _LINE_BYTES))
-        statuses = [held.hold(Segment.make(_LINE_BYTES)) for _ in range(self._count)]
+        resources = self._resources
+        orders = resources.own(Segment.make(self._count * _LINE_BYTES))
+        statuses = [resources.own(Segment.make(_LINE_BYTES)) for _ in range(self._count)]
         images = [
-            [held.hold(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2)]
+            [resources.own(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2)]
             for _ in range(self._count)
         ]
-        text = json.dumps(self._program.recipe).encode()
-        recipe = held.hold(Segment.make(len(text)))
-        os.pwrite(recipe.fd, text, 0)
+        text = json.dumps(self._program.message).encode()
+        message = resources.own(Segment.make(len(text)))
+        os.pwrite(message.fd, text, 0)
         self.orders = np.frombuffer(orders.map(), dtype=np.int64).reshape(-1, WORDS)
         self._statuses = [np.frombuffer(s.map(), dtype=np.int64)[:WORDS] for s in statuses]
-        self._told = {
-            "recipe": recipe.fd,
-            "recipe_bytes": len(text),
+        self._start_message = {
+            "message": message.fd,
+            "message_bytes": len(text),
             "orders": orders.fd,
             "statuses": [segment.fd for segment in statuses],
             "images": [[image.fd for image in pair] for pair in images],
@@ -319,45 +320,48 @@ class WorkerProcesses:
         }
 
     def _start(self) -> None:
-        """Start the process that forks, and a process for every worker."""
-        fds = tuple(segment.fd for segment in self._held.segments)
+        """Start the fork server and a process for each worker."""
+        fds = tuple(segment.fd for segment in self._resources.segments)
         causes: list[str] = []
         while len(causes) <= self._repeats:
             try:
-                self._held.server = ForkServer(self._program.module, self._told, fds)
+                self._resources.server = ForkServer(self._program.module, self._start_message, fds)
                 for k in range(self._count):
-                    self._fork(k)
+                    self.fork(k)
                 return
             except ServerGoneError as error:
                 causes.append(str(error) or "no answer")
                 self._clear()
         raise WorkerError(
-            f"the process that starts workers ended {len(causes)} times before all were there: "
+            f"the process that starts workers ended {len(causes)} times before all had started: "
             f"{', '.join(causes)}"
         )
 
     def _clear(self) -> None:
-        """Give back what a start that came to nothing has left."""
+        """Free what a failed start has left."""
         for process in self.processes.values():
             if process.wire.fileno() in self._owners:
                 self._dismiss(process)
                 process.release()
         self.processes.clear()
-        if self._held.server is not None:
-            self._held.server.close()
-            self._held.server = None
+        if self._resources.server is not None:
+            self._resources.server.close()
+            self._resources.server = None
 
-    def _fork(self, k: int) -> None:
-        assert self._held.server is not None
-        process = self._held.server.fork(k)
+    def fork(self, k: int) -> None:
+        """Let the server fork the process of worker `k`."""
+        assert self._resources.server is not None
+        process = self._resources.server.fork(k)
         self.processes[k] = process
         for fd, is_dead in ((process.pidfd, True), (process.wire.fileno(), False)):
             self._poll.register(fd, select.POLLIN)
             self._owners[fd] = k, is_dead
-        self._meetings[k] = Meeting(self.orders[k], self._statuses[k], process.wire, self._crowded)
+        self._signals[k] = WakeSignal(
+            self.orders[k], self._statuses[k], process.wire, self._crowded
+        )
 
 
-def _say(status: int) -> str:
+def _describe_status(status: int) -> str:
     if status == OUT_OF_MEMORY:
         return "out of memory"
     if status >= 0:
@@ -365,8 +369,8 @@ def _say(status: int) -> str:
     return signal.Signals(-status).name
 
 
-class _Held:
-    """What has to be given back, in any case."""
+class _OwnedResources:
+    """Processes and memory of a pool, which are released in any case."""
 
     def __init__(self, segments: list[Segment]) -> None:
         self.segments = segments
@@ -374,12 +378,12 @@ class _Held:
         self.processes: dict[int, Process] = {}
         self._pid = os.getpid()
 
-    def hold(self, segment: Segment) -> Segment:
+    def own(self, segment: Segment) -> Segment:
         self.segments.append(segment)
         return segment
 
     def release(self) -> None:
-        """End the processes; a fork of the pool's process has no right to."""
+        """End the processes, unless this process is a fork of the one that started them."""
         if os.getpid() != self._pid:
             return
         for process in self.processes.values():

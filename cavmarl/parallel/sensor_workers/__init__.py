@@ -1,1 +1,1 @@
-"""The sensing of one world in processes of its own."""
+"""Processes that compute the mounted sensors of the worlds of another process."""

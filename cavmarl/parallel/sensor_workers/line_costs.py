@@ -1,4 +1,4 @@
-"""`LineCosts`: where in each sensor's frames the time goes, as its workers measure it."""
+"""`LineCosts`: the costs of the lines of sensor frames, as workers measure them."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-PARTS = 32  # of a frame, in each of which lines are taken to cost the same
+PARTS = 32  # of a frame; lines of one part count as equally expensive
 
 
 class LineCosts:
-    """At first every line of a frame costs the same."""
+    """Relative costs of the lines of each frame; initially all are equal."""
 
     def __init__(self, num_lines: Sequence[int]) -> None:
         self._num_lines = tuple(num_lines)
         self._parts = np.full((len(num_lines), PARTS), 1.0 / PARTS)
 
     def part(self, sensor: int, begin: int, end: int) -> float:
-        """What the lines [begin, end) cost, as a part of the frame."""
+        """Return the cost of the lines [begin, end) as a share of the frame."""
         return float(self._parts[sensor] @ self._covered(sensor, begin, end))
 
     def line_at(self, sensor: int, part: float) -> int:
-        """The line before which about that part of the frame's cost lies."""
+        """Return the line before which about this share of the cost of the frame lies."""
         before = np.concatenate([[0.0], np.cumsum(self._parts[sensor])])
         place = np.interp(part, before, np.arange(PARTS + 1.0))
         return round(float(place) / PARTS * self._num_lines[sensor])
@@ -30,11 +30,10 @@ class LineCosts:
     def learn(
         self,
         sensor: int,
-        # [begin, end) of each part; together all lines, each once
-        lines: Sequence[tuple[int, int]],
-        spent_s: Sequence[float],  # of each; where all are 0 nothing is learnt
+        lines: Sequence[tuple[int, int]],  # [begin, end) of ranges that cover each line once
+        spent_s: Sequence[float],  # time of each range; if all are 0, nothing changes
     ) -> None:
-        """Correct it by the time that each part of a frame has taken."""
+        """Correct the costs by the measured time of ranges of lines."""
         total_s = sum(spent_s)
         if not total_s > 0.0:
             return
@@ -42,11 +41,11 @@ class LineCosts:
         for (begin, end), part_s in zip(lines, spent_s, strict=True):
             expected = before * self._covered(sensor, begin, end)
             now += expected * (part_s / total_s / expected.sum())
-        # None is left without any: what costs nothing now may cost something when it moves.
+        # Each part keeps a minimal cost, since its cost may grow when vehicles move.
         self._parts[sensor] = np.maximum(now, 1e-3 / PARTS) / np.maximum(now, 1e-3 / PARTS).sum()
 
     def _covered(self, sensor: int, begin: int, end: int) -> NDArray[np.float64]:
-        """(PARTS,) how much of each part lies in some lines."""
+        """Return (PARTS,) the share of each part that lies in [begin, end)."""
         scale = PARTS / self._num_lines[sensor]
         edges = np.arange(PARTS, dtype=np.float64)
         low, high = np.clip([[begin * scale], [end * scale]], edges, edges + 1.0)

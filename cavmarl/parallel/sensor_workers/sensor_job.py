@@ -1,4 +1,4 @@
-"""`SensorJob`: what a sensor worker does. It keeps nothing from one command to the next."""
+"""`SensorJob`: the job of a sensor worker, which keeps no state between commands."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from cavmarl.sensors.mounted.frames import Frames
 
 
 class SensorTask(IntEnum):
-    """What a sensor worker can be asked for."""
+    """Tasks of a sensor worker."""
 
     SENSE = 0
 
 
 class SensorJob(Job):
-    """Senses for the agents of its share, as a zone would that owned them and saw all others."""
+    """Senses for its share of the agents, like a zone that owns them and sees all others."""
 
     def __init__(
         self,
-        # undivided worlds of the same environment, without vehicles: the roads, and room for rows
+        # undivided worlds of the same environment without vehicles: roads, and room for rows
         simulation: Simulation,
-        shared: SceneArrays,  # what there is to see
-        frames: Frames,  # where the samples go
+        shared: SceneArrays,  # the scene
+        frames: Frames,  # samples are written here
         number: int,
     ) -> None:
         mounted = simulation.mounted
@@ -52,30 +52,30 @@ class SensorJob(Job):
         self._put_first = specialized(put_first)
 
     def warm(self) -> None:
-        """Have the kernels of all sensors ready; no vehicle is there to be sensed."""
-        self._look()
+        """Load the kernels of all sensors by sensing an empty scene."""
+        self._read_scene()
         for _, sensor, due, frames, lines in self._sensors:
-            self._own(lines)
+            self._select_agents(lines)
             sensor.lines = lines
             sensor.sense(self._scenes, due, frames)
 
     def perform(self, task: int, payload: Any) -> None:
         began = perf_counter()
-        self._look()
+        self._read_scene()
         shared, number = self._shared, self._number
         for place, sensor, due, frames, lines in self._sensors:
             if not due.num.any():
                 continue
             spent = thread_time()
-            if self._own(lines):
+            if self._select_agents(lines):
                 sensor.lines = lines
                 sensor.sense(self._scenes, due, frames)
             shared.spent_s[number, place] = thread_time() - spent
             shared.delivered[number, place] = shared.ticks
         shared.busy_s[number] = perf_counter() - began
 
-    def _look(self) -> None:
-        """Take the tick that is to be sensed."""
+    def _read_scene(self) -> None:
+        """Copy the scene of the tick to be sensed."""
         shared, worlds = self._shared, self._worlds
         self._take_rows(shared.rows, shared.num_rows, worlds.rows)
         worlds.num_rows[:] = shared.num_rows
@@ -83,7 +83,7 @@ class SensorJob(Job):
         worlds.keys[:] = shared.keys
         worlds.signal_phase[:] = shared.signal_phase
 
-    def _own(self, lines: NDArray[np.int32]) -> int:
-        """For how many agents it writes lines (W, A, 2) of a sensor; their rows come first."""
+    def _select_agents(self, lines: NDArray[np.int32]) -> int:
+        """Put the rows of agents with lines (W, A, 2) first; return the number of these agents."""
         shared, worlds = self._shared, self._worlds
         return self._put_first(worlds.rows, shared.num_agents, lines, self._spare, worlds.num_owned)

@@ -1,4 +1,4 @@
-"""`SensorWorkers` runs sensor workers for the worlds of this process, which keeps their state."""
+"""`SensorWorkers`: a pool of processes that sense for the worlds of this process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.processes.shared_memory import Segment, size_of
+from cavmarl.parallel.memory.shared_memory import Segment, size_of
 from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_job import SensorTask
@@ -30,53 +30,53 @@ from cavmarl.sensors.kernels.sensor_share import gather_rows
 from cavmarl.sensors.mounted.mounted_sensor import SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 
-SHARED_ANEW = 32  # ticks from one sharing out to the next; at first 1, 2, 4, … until there are more
-NEW_COST = 0.5  # weight of the latest costs from then on; what is first measured is of cold caches
+SHARED_ANEW = 32  # ticks between two distributions; initially 1, 2, 4, …
+NEW_COST = 0.5  # weight of new costs after that; the first measurements suffer from cold caches
 
 
 class SensorWorkerPlan(NamedTuple):
-    """What processes are made of."""
+    """What is needed to start sensor workers."""
 
-    module: str  # that they run
-    recipe: Mapping[str, Any]  # from which it makes its jobs; `shape` and `scene` are added
-    frames: Segment  # memory that samples are written to; it is released with the sensor workers
-    shape: SceneShape  # of what is shared
-    num_lines: tuple[int, ...]  # (S,) into how many lines a frame of each sensor can be divided
-    workers: WorkersConfig  # how they are watched, and how sensing is shared out
+    module: str  # their program
+    message: Mapping[str, Any]  # for the program; the descriptors of shared memory are added
+    frames: Segment  # memory of the samples, closed together with the workers
+    shape: SceneShape
+    num_lines: tuple[int, ...]  # (S,) lines into which a frame of each sensor can be divided
+    workers: WorkersConfig
 
 
 @dataclass
 class SensorWorkerTimes:
     """Sums over all ticks in which sensors were due."""
 
-    publish_s: float = 0.0  # writing down what there is to see, and which worker senses what
-    own_s: float = 0.0  # sensing what stays here
+    publish_s: float = 0.0  # writing the scene and the shares
+    own_s: float = 0.0  # sensing in this process
     wait_s: float = 0.0  # from the command until all frames were there
-    busy_s: float = 0.0  # of that, while the busiest worker sensed
+    busy_s: float = 0.0  # part of `wait_s` in which the busiest worker sensed
     ticks: int = 0
-    sent_bytes: int = 0  # that the workers were given to read
-    got_bytes: int = 0  # of frames that they have written
+    sent_bytes: int = 0  # written for the workers
+    got_bytes: int = 0  # of frames written by the workers
     messages: int = 0  # commands and answers
 
     def since(self, before: SensorWorkerTimes) -> SensorWorkerTimes:
-        """What has come to it since it was a copy of `before`."""
+        """Return the differences to an earlier copy."""
         return SensorWorkerTimes(
             *(getattr(self, field.name) - getattr(before, field.name) for field in fields(self))
         )
 
 
 class _Sharing:
-    """Which worker senses what of the same sensors, and the time it has taken since then.
+    """The shares of a set of sensors, and the measurements since they were made.
 
     Attributes:
-        spent_s: (n, S) processor time since then, of each worker for each sensor.
+        spent_s: (n, S) processor time of each worker for each sensor since then.
     """
 
     def __init__(self, shares: Shares, sensors: int) -> None:
-        self.shares = shares  # which worker senses what
-        self.uses = 0  # ticks, in all
+        self.shares = shares
+        self.uses = 0  # ticks in total
         self.spent_s = np.zeros((shares.workers, sensors))
-        self.agents = 0  # that have been sensed for, summed over these ticks
+        self.agents = 0  # agents, summed over the ticks since then
 
     def note(self, spent_s: NDArray[np.float64], agents: int) -> None:
         self.uses += 1
@@ -85,12 +85,12 @@ class _Sharing:
 
     @property
     def is_settled(self) -> bool:
-        """Whether it has been measured often enough to be kept for long."""
+        """Whether there are enough measurements to keep the shares for long."""
         return self.uses >= SHARED_ANEW
 
     @property
     def is_over(self) -> bool:
-        """Whether it is time to look at what has been measured."""
+        """Whether it is time to evaluate the measurements."""
         often = self.uses % SHARED_ANEW == 0 if self.is_settled else self.uses.bit_count() == 1
         return often and self.agents > 0
 
@@ -100,20 +100,20 @@ class _Sharing:
 
 
 class SensorWorkers:
-    """n sensor workers; it lets them sense as `rig.Sense` describes.
+    """n sensor workers, called as `sensor_rig.Sense`.
 
-    It starts them when it is called for the first time, so it may be made before a fork. A call
-    returns when each sensor that is due has delivered the frame of this tick. A late one is waited
-    for; a dead one is replaced, and its successor senses the same again.
+    The first call starts the workers, so the object may be made before a fork. A call returns when
+    each sensor that is due has delivered the frame of this tick. A dead worker is replaced, and its
+    successor senses the same frames.
 
     Attributes:
-        shared: with the processes, once they have been started.
+        shared: memory shared with the workers, once they have started.
     """
 
     shared: SceneArrays
 
     def __init__(self, plan: SensorWorkerPlan) -> None:
-        self.times = SensorWorkerTimes()  # where the time has gone
+        self.times = SensorWorkerTimes()
         self._plan = plan
         self._pool: Pool | None = None
         self._unused = weakref.finalize(self, plan.frames.close)
@@ -125,7 +125,7 @@ class SensorWorkers:
 
     @property
     def pool(self) -> Pool | None:
-        """The processes, if they have been started."""
+        """The worker processes, if they have started."""
         return self._pool
 
     @property
@@ -134,7 +134,7 @@ class SensorWorkers:
 
     @property
     def costs_s(self) -> NDArray[np.float64]:
-        """(S,) processor time of one agent's frame of each sensor, as it is of late."""
+        """(S,) recent processor time of a frame of one agent, for each sensor."""
         return self._costs_s.copy()
 
     def __call__(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
@@ -164,22 +164,24 @@ class SensorWorkers:
     def _started(self) -> Pool:
         if self._pool is None:
             self._pool = self._start()
-            self._unused.detach()  # the pool gives the memory back
+            self._unused.detach()  # the pool closes the memory
         return self._pool
 
     def _start(self) -> Pool:
         plan = self._plan
         scene = Segment.make(size_of(plan.shape.layout))
         self.shared = SceneArrays.of(scene, plan.shape)
-        told = {"shape": plan.shape, "scene": scene.fd, "frames": plan.frames.fd}
-        recipe = {**plan.recipe, **told}
+        shared = {"shape": plan.shape, "scene": scene.fd, "frames": plan.frames.fd}
+        message = {**plan.message, **shared}
         names = tuple(f"sensor worker {k}" for k in range(plan.shape.workers))
         tasks = tuple(task.name.lower() for task in SensorTask)
-        program = Program(plan.module, recipe, names, (scene, plan.frames), tasks, plan.workers.pin)
+        program = Program(
+            plan.module, message, names, (scene, plan.frames), tasks, plan.workers.pin
+        )
         return Pool(program, plan.workers.timeout_s, plan.workers.max_retries)
 
     def _publish(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write down what there is to see; the rows of all zones, each once."""
+        """Write the scene: the rows of all zones, each row once."""
         shared, worlds = self.shared, scenes[0].worlds
         shared.num_rows[:] = 0
         for scene in scenes:
@@ -198,7 +200,11 @@ class SensorWorkers:
         shared.spent_s[:] = 0.0
 
     def check(self, turns: Sequence[Turn]) -> None:
-        """See that every worker has delivered every frame that is due, of this tick."""
+        """Check that each worker has delivered all frames of this tick.
+
+        Raises:
+            WorkerError: a frame is of another tick.
+        """
         shared = self.shared
         wrong = (shared.delivered != shared.ticks) & (shared.due[:, 0] > 0)  # (n, S, W)
         if not wrong.any():
@@ -207,12 +213,12 @@ class SensorWorkers:
             for worker, world in np.argwhere(wrong[:, turn.place]).tolist():
                 found = shared.delivered[worker, turn.place, world]
                 raise WorkerError(
-                    f"rig.{turn.sensor.name}: the frame of tick {shared.ticks[world]} is not "
-                    f"there, but one of tick {found}; sensor_workers=0 senses in this process"
+                    f"rig.{turn.sensor.name}: the frame of tick {shared.ticks[world]} is missing, "
+                    f"there is one of tick {found}; use sensor_workers=0"
                 )
 
     def _share(self, sensors: tuple[int, ...]) -> _Sharing:
-        """Which worker senses what of some sensors, written for the workers."""
+        """Return the shares of a set of sensors, written for the workers."""
         sharing = self._sharings.get(sensors)
         if sharing is None:
             sharing = _Sharing(self._share_anew(sensors), self._plan.shape.sensors)
@@ -246,7 +252,7 @@ class SensorWorkers:
         return shares if unknown else divide(shares, self._line_costs)
 
     def _learn(self, sharing: _Sharing) -> None:
-        """Take over what has been measured: what a frame costs, and which of its lines."""
+        """Update the costs of frames and of their lines by the measurements."""
         costs_s = sharing.spent_s.sum(axis=0) / sharing.agents
         weight = NEW_COST if sharing.is_settled else 1.0
         known = np.where(self._costs_s > 0.0, self._costs_s, costs_s)
@@ -259,7 +265,7 @@ class SensorWorkers:
     def _note(
         self, began: float, published: float, sensed: float, ended: float, turns: Sequence[Turn]
     ) -> None:
-        """Add up what a tick has taken; times are those of `time.perf_counter`."""
+        """Add the times of a tick; the arguments are values of `time.perf_counter`."""
         times, shared = self.times, self.shared
         times.publish_s += published - began
         times.own_s += sensed - published
@@ -271,6 +277,6 @@ class SensorWorkers:
         )
         for turn in turns:
             frames = turn.frames.data
-            one = frames.nbytes // (frames.shape[0] * frames.shape[2])  # of all agents of a world
+            one = frames.nbytes // (frames.shape[0] * frames.shape[2])  # frames of a world
             times.got_bytes += int(turn.due.num.sum()) * one
         times.messages += 2 * self._plan.shape.workers

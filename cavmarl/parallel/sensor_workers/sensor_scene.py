@@ -1,7 +1,7 @@
-"""`SceneArrays`: the memory that a process of worlds and its sensor workers share.
+"""`SceneArrays`: the memory that a process with worlds shares with its sensor workers.
 
-The process writes what there is to see and which worker is to sense what, before it sends a
-command; the workers write frames, and say here of which tick they are.
+Before a command, the process writes the scene and the share of each worker. The workers write
+frames, and here the tick to which the frames belong.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.parallel.processes.shared_memory import Layout, Segment, arrays_in
+from cavmarl.parallel.memory.shared_memory import Layout, Segment, arrays_in
 from cavmarl.sensors.kernels.rig_frames import POSE, Due
 
-NEVER = -1  # a tick that there is not
+NEVER = -1  # no tick
 
 
 class SceneShape(NamedTuple):
-    """How large it is."""
+    """Sizes of the shared arrays."""
 
     worlds: int  # W
     capacity: int  # C, rows of a world
@@ -48,24 +48,24 @@ class SceneShape(NamedTuple):
 
 
 class SceneArrays(NamedTuple):
-    """What there is to see in one tick, the workers' shares, and what has been delivered."""
+    """The scene of one tick, the shares of the workers, and what they have delivered."""
 
-    rows: NDArray[np.void]  # VEHICLE (W, C) of all zones: agents' vehicles before the others
-    num_agents: NDArray[np.int64]  # (W,) rows of agents
-    num_rows: NDArray[np.int64]  # (W,) rows
+    rows: NDArray[np.void]  # VEHICLE (W, C) of all zones, vehicles of agents first
+    num_agents: NDArray[np.int64]  # (W,) number of rows of agents
+    num_rows: NDArray[np.int64]  # (W,) number of rows
     ticks: NDArray[np.int64]  # (W,) since the reset
     keys: NDArray[np.uint64]  # (W,) see `Worlds`
     signal_phase: NDArray[np.int32]  # (W, num_signals) see `Worlds`
     before: NDArray[np.void]  # POSE (W, A) of the tick before
     due: NDArray[np.int64]  # (S, 3, W) each sensor's `Due`
-    lines: NDArray[np.int32]  # (n, S, W, A, 2) [first, last) that a worker writes of each frame
-    delivered: NDArray[np.int64]  # (n, S, W) tick of the frames that a worker has written
-    spent_s: NDArray[np.float64]  # (n, S) processor time that it took for each that was due
-    busy_s: NDArray[np.float64]  # (n,) time that it took for all
+    lines: NDArray[np.int32]  # (n, S, W, A, 2) lines [first, last) of each frame for each worker
+    delivered: NDArray[np.int64]  # (n, S, W) tick of the last frames of each worker
+    spent_s: NDArray[np.float64]  # (n, S) processor time of each worker for each sensor
+    busy_s: NDArray[np.float64]  # (n,) time of each worker for all sensors
 
     @classmethod
     def of(cls, segment: Segment, shape: SceneShape) -> SceneArrays:
-        """Those in a segment of `size_of(shape.layout)` bytes."""
+        """Return the arrays in a segment of `size_of(shape.layout)` bytes."""
         arrays: dict[str, NDArray[Any]] = arrays_in(segment.map(), shape.layout)
         for name, record in (("rows", VEHICLE), ("before", POSE)):
             arrays[name] = arrays[name].view(record)[..., 0]

@@ -1,8 +1,8 @@
-"""Which sensor worker senses what: in turn, or by what it costs.
+"""Distribution of sensing over sensor workers: round robin, or by cost.
 
-What is shared out is a sensor of some agents. Agents of one sensor cost about the same, so where
-there are many of them they are shared out by the dozen. By cost, frames are divided as well where
-whole ones leave a worker with too much: each worker writes some lines of them.
+A unit is one sensor of some agents. Agents of one sensor cost about the same, so many agents form a
+unit. By cost, frames are divided as well if whole frames overload a worker: then several workers
+write lines of the same frames.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,42 +22,34 @@ from cavmarl.balance.load_snapshot import idle_snapshot
 from cavmarl.balance.local_search import refine
 from cavmarl.balance.problem import Problem, ShardCost
 from cavmarl.balance.shard_placement import Placement
+from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 
-PIECES_A_WORKER = 4  # of the agents of one sensor, where there are so many
-LEAST_S = 2e-4  # that has to be saved to divide frames: what stands around is looked up twice then
+PIECES_PER_WORKER = 4  # units of one sensor, if there are enough agents
+MIN_GAIN_S = 2e-4  # to divide frames, since two workers then look up the same surroundings
 
 
 class Unit(NamedTuple):
-    """One sensor of some agents; those of all worlds are counted one after the other."""
+    """One sensor of some agents, which are numbered through all worlds."""
 
-    sensor: int  # its number in the rig
-    first: int  # agent
-    last: int  # the one after the last
-    begin: int = 0  # line of their frames
-    end: int = 1  # the one after the last
-
-
-class LineWorth(Protocol):
-    """Where in the frames of each sensor the time goes."""
-
-    def part(self, sensor: int, begin: int, end: int) -> float:
-        """What the lines [begin, end) cost, as a part of the frame."""
-
-    def line_at(self, sensor: int, part: float) -> int:
-        """The line before which about that part of the frame's cost lies."""
+    sensor: int  # number in the rig
+    first: int  # first agent
+    last: int  # agent after the last one
+    begin: int = 0  # first line of their frames
+    end: int = 1  # line after the last one
 
 
 @dataclass(frozen=True)
 class Shares:
-    """Which worker senses what."""
+    """The units, and the worker of each."""
 
-    units: tuple[Unit, ...]  # what is shared out
-    homes: tuple[int, ...]  # the worker of each
-    costs_s: tuple[float, ...]  # what each costs; equal where nothing has been measured
-    workers: int  # how many there are
+    units: tuple[Unit, ...]
+    homes: tuple[int, ...]  # worker of each unit
+    costs_s: tuple[float, ...]  # cost of each unit; equal if nothing was measured
+    workers: int  # number of workers
 
     @property
     def loads_s(self) -> list[float]:
+        """Total cost of each worker."""
         loads: list[list[float]] = [[] for _ in range(self.workers)]
         for home, cost_s in zip(self.homes, self.costs_s, strict=True):
             loads[home].append(cost_s)
@@ -65,9 +57,9 @@ class Shares:
 
     @property
     def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
-        """Worker and lines of each part of the sensors that are divided alike for all agents.
+        """Worker and lines of each part of the sensors that are divided equally for all agents.
 
-        Of others it cannot be told what a worker has spent on which lines.
+        For other sensors, the time of a worker cannot be attributed to lines.
         """
         parts: dict[int, list[tuple[int, tuple[int, int]]]] = {}
         agents: dict[int, set[tuple[int, int]]] = {}
@@ -81,7 +73,7 @@ class Shares:
         }
 
     def write(self, lines: NDArray[np.int32]) -> None:
-        """Write which lines each worker writes, (n, S, agents, 2), of the sensors shared out."""
+        """Write the lines of each worker, (n, S, agents, 2), for the sensors of the units."""
         for unit in self.units:
             lines[:, unit.sensor, unit.first : unit.last] = 0
         for unit, home in zip(self.units, self.homes, strict=True):
@@ -89,8 +81,8 @@ class Shares:
 
 
 def cut(sensors: Mapping[int, int], agents: int, workers: int) -> list[Unit]:
-    """What is to be shared out of all agents, of sensors with so many lines a frame."""
-    pieces = min(agents, PIECES_A_WORKER * workers)
+    """Return the units of all agents; `sensors` has the lines per frame of each sensor."""
+    pieces = min(agents, PIECES_PER_WORKER * workers)
     bounds = [agents * piece // pieces for piece in range(pieces + 1)]
     return [
         Unit(sensor, first, last, 0, lines)
@@ -100,13 +92,13 @@ def cut(sensors: Mapping[int, int], agents: int, workers: int) -> list[Unit]:
 
 
 def share_in_turn(units: Sequence[Unit], costs_s: Sequence[float], workers: int) -> Shares:
-    """One after the other to the workers in turn, whatever they cost."""
+    """Assign the units to the workers in turn, whatever they cost."""
     homes = tuple(number % workers for number in range(len(units)))
     return Shares(tuple(units), homes, tuple(costs_s), workers)
 
 
 def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int) -> Shares:
-    """The costliest first to the worker through first, then moves and swaps that help."""
+    """Assign the most expensive units first, then improve by moves and swaps."""
     shards = tuple(
         ShardCost(unit.sensor, number, cost_s)
         for number, (unit, cost_s) in enumerate(zip(units, costs_s, strict=True))
@@ -119,10 +111,10 @@ def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int)
     return Shares(tuple(units), tuple(placed.homes), tuple(costs_s), workers)
 
 
-def divide(shares: Shares, worth: LineWorth) -> Shares:
-    """Move lines from workers with too many to workers with too few, until all have about the same.
+def divide(shares: Shares, costs: LineCosts) -> Shares:
+    """Move lines from the busiest to the least busy worker, until loads are about equal.
 
-    Each step leaves one worker with the mean, so no more frames are divided than there are workers.
+    Each move brings one worker to the mean, so there are fewer moves than workers.
     """
     units, homes, costs_s = list(shares.units), list(shares.homes), list(shares.costs_s)
     for _ in range(shares.workers - 1):
@@ -131,24 +123,24 @@ def divide(shares: Shares, worth: LineWorth) -> Shares:
         giver = max(range(shares.workers), key=loads_s.__getitem__)
         taker = min(range(shares.workers), key=loads_s.__getitem__)
         wanted_s = min(loads_s[giver] - mean_s, mean_s - loads_s[taker])
-        if wanted_s < LEAST_S:
+        if wanted_s < MIN_GAIN_S:
             break
         owned = [number for number, home in enumerate(homes) if home == giver]
         number = max(owned, key=costs_s.__getitem__)
         unit, cost_s = units[number], costs_s[number]
         if cost_s <= wanted_s:
-            break  # nothing so large is left that a part of it would do
+            break  # the worker has no unit that is large enough to divide
         if any(
             home == taker and other[:3] == unit[:3]
             for other, home in zip(units, homes, strict=True)
         ):
-            break  # what one worker writes of a frame is in one piece
-        before = worth.part(unit.sensor, 0, unit.end)
-        within = worth.part(unit.sensor, unit.begin, unit.end)
-        line = worth.line_at(unit.sensor, before - within * wanted_s / cost_s)
+            break  # a worker writes a single range of lines of a frame
+        before = costs.part(unit.sensor, 0, unit.end)
+        within = costs.part(unit.sensor, unit.begin, unit.end)
+        line = costs.line_at(unit.sensor, before - within * wanted_s / cost_s)
         if not unit.begin < line < unit.end:
-            break  # it cannot be divided, or not so finely
-        given_s = cost_s * worth.part(unit.sensor, line, unit.end) / within
+            break  # the lines are too coarse for this division
+        given_s = cost_s * costs.part(unit.sensor, line, unit.end) / within
         units[number], costs_s[number] = unit._replace(end=line), cost_s - given_s
         units.append(unit._replace(begin=line))
         homes.append(taker)

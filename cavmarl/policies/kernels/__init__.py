@@ -1,1 +1,1 @@
-"""Compiled loops of driver networks: the same bytes on every processor."""
+"""Compiled loops of driver networks, with equal results on every processor."""

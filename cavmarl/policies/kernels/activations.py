@@ -70,7 +70,7 @@ def apply_tanh(values: Float32s) -> None:
 
 @kernel
 def apply_relu(values: Float32s) -> None:
-    """Replace each negative one of `values` (n,) by 0; NaN stays NaN."""
+    """Replace each negative element of `values` (n,) by 0; NaN stays NaN."""
     for i in range(values.shape[0]):
         if values[i] < ZERO:
             values[i] = ZERO

@@ -119,7 +119,7 @@ def _copy(source: Float32s, target: Float32s) -> None:
 
 @kernel
 def _linear(own: Float32s, inputs: Float32s, num_in: int, num_out: int, outputs: Float32s) -> None:
-    """Call `linear` with weights and biases that lie one behind the other."""
+    """Call `linear` with weights and biases that are stored one after the other."""
     num_weights = num_in * num_out
     linear(inputs, own[:num_weights], own[num_weights : num_weights + num_out], outputs)
 
@@ -139,7 +139,7 @@ def _add_observed(factors: Float32s, observations: Float32s, values: Float32s) -
 
 @kernel
 def choose_largest(outputs: Float32s, choices: NDArray[np.int64]) -> None:
-    """Set `choices` (rows,) to the place of each row's largest number, the first among equal ones.
+    """Set `choices` (rows,) to the index of each row's largest number, the first one on a tie.
 
     A NaN counts as the largest number, as in NumPy and torch.
     """

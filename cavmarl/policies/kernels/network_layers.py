@@ -12,7 +12,7 @@ import numpy as np
 from cavmarl.core.compiled import kernel
 from cavmarl.policies.kernels.activations import ONE, ZERO, Float32s, sigmoid, tanh
 
-PARTIAL_SUMS = 16  # of a LayerNorm sum, so that the processor adds several numbers at once
+PARTIAL_SUMS = 16  # number of partial sums, so that the processor adds several numbers at once
 NORM_EPSILON = np.float32(1e-5)  # added to a variance, as torch's LayerNorm does
 
 
@@ -61,9 +61,9 @@ def linear(
 @kernel
 def _add_eight(
     inputs: Float32s,  # (rows · width,)
-    first: int,  # of the eight inputs of each row
+    first: int,  # first of the eight inputs in each row
     width: int,
-    weights: Float32s,  # (8 · size,): those of the eight inputs
+    weights: Float32s,  # (8 · size,) weights of the eight inputs
     outputs: Float32s,  # (rows · size,)
     size: int,
 ) -> None:
@@ -147,8 +147,8 @@ def _total(partial: Float32s) -> np.float32:
 
 @kernel
 def gru_gates(
-    from_input: Float32s,  # (rows · 3 · size,): reset, update and candidate of the input
-    from_state: Float32s,  # (rows · 3 · size,): the same of the state
+    from_input: Float32s,  # (rows · 3 · size,): reset, update and candidate for the input
+    from_state: Float32s,  # (rows · 3 · size,): the same for the state
     states: Float32s,  # (rows · size,), overwritten by the next states
     size: int,  # units of a row
 ) -> None:

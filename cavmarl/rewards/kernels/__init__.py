@@ -1,1 +1,1 @@
-"""The terms, as compiled functions of a vehicle and its surroundings."""
+"""Compiled terms and sums of the reward."""

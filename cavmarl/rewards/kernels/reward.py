@@ -1,7 +1,7 @@
 """The reward of each agent: the weighted sum of its terms, the team's share, and the credit.
 
-Rewards of all agents of a world are computed at once, in agent order, so that a result does not
-depend on which shard wrote which terms.
+The rewards of all agents of a world are computed at once and in agent order, so that no result
+depends on which shard wrote which terms.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def _own_reward(outputs: Outputs, w: int, agent: int, weights: NDArray[np.float6
 
 @kernel
 def _share_all(outputs: Outputs, w: int, weights: NDArray[np.float64], team_share: float) -> None:
-    """Own rewards, mixed with the team's mean; summed in agent order."""
+    """Write own rewards mixed with the mean of all agents, summed in agent order."""
     team = 0.0
     acted = 0
     for agent in range(outputs.rewards.shape[1]):
@@ -47,7 +47,7 @@ def _share_all(outputs: Outputs, w: int, weights: NDArray[np.float64], team_shar
 def _share_near(
     outputs: Outputs, w: int, weights: NDArray[np.float64], team_share: float, range_m: float
 ) -> None:
-    """Own rewards, mixed with the mean of those near, itself too; summed in agent order."""
+    """Write own rewards mixed with the mean of agents within range, including the agent itself."""
     for agent in range(outputs.rewards.shape[1]):
         if not outputs.acted[w, agent]:
             continue
@@ -75,8 +75,8 @@ def write_rewards(
 ) -> None:
     """Write the rewards of the agents of world `w` that acted.
 
-    `weights`: (T,) a number for each term. `team_share`: the share of a reward that is the mean
-    reward of the team. `team_range_m`: only agents within this distance belong to the team; 0: all.
+    `weights`: (T,) weight of each term. `team_share`: share of the team's mean in a reward.
+    `team_range_m`: only agents within this distance belong to the team; 0: all agents.
     """
     if team_range_m > 0.0:
         _share_near(outputs, w, weights, team_share, team_range_m)
@@ -91,10 +91,10 @@ def credit(
     rewards: NDArray[np.float32],
     chosen: NDArray[np.bool_],
 ) -> None:
-    """Add the rewards of the step to the return of each owned agent in its episode.
+    """Add the rewards of the step to the episode return of each owned agent.
 
-    `rows`: VEHICLE (W, C); episode_return of agents' rows is written. `num_owned`: (W,) rows of the
-    shard's own. `rewards`: (W, A).
+    `rows`: VEHICLE (W, C); episode_return of agents' rows is written. `num_owned`: (W,) number of
+    the shard's owned rows. `rewards`: (W, A).
     """
     for w in range(chosen.size):
         if not chosen[w]:

@@ -1,7 +1,7 @@
-"""The named terms of one agent's step. Reward and evaluation read the same numbers.
+"""The named terms of one agent's step, which reward and evaluation read.
 
-One function a term, all with the same arguments' names; `write_terms` calls them in the order of
-`config.terms.TERMS`.
+There is one function per term, with common argument names; `write_terms` calls them in the order
+of `config.terms.TERMS`.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from cavmarl.core.records.codes import (
 )
 
 NUM_TERMS = 10
-TTC_HORIZON_S = 4.0  # times to collision above this do not count
+TTC_HORIZON_S = 4.0  # longer times to collision do not count
 TTC_REACH_M = 60.0
-CIRCLE_MARGIN_M = 0.01  # around two circles that would not touch: more than rounding
+CIRCLE_MARGIN_M = 0.01  # margin around two circles that do not touch; larger than rounding errors
 
 
 @kernel
 def _progress(row: np.void, step_s: float) -> float:
-    """Way towards the goal in m.
+    """Return the progress towards the goal in m.
 
-    A new plan after a wrong turn may be longer by far: that counts as no more than driving back.
+    After a wrong turn the new way may be much longer; the loss is limited to that of driving back.
     """
     if row["step_to_go"] == math.inf:
-        return 0.0  # it came from where no way led to its goal
+        return 0.0  # before the step, no way led to the goal
     most = max(row["speed"], 1.0) * step_s * 2.0
     return clamp(row["step_to_go"] - row["to_go"], -most, most)
 
@@ -51,22 +51,22 @@ def _of_limit(roads: RoadArrays, row: np.void) -> float:
 
 @kernel
 def _speed(roads: RoadArrays, row: np.void) -> float:
-    """Speed above the lane's limit, as a share of it; what is lost below it is `delay`."""
+    """Return the speed above the lane's limit as a share of it; `delay` covers lower speeds."""
     return max(_of_limit(roads, row) - 1.0, 0.0)
 
 
 @kernel
 def _comfort(row: np.void, step_s: float) -> float:
-    """Mean |jerk| over the step in 10 m/s³."""
+    """Return the mean |jerk| over the step in 10 m/s³."""
     discomfort: float = row["step_jerk"] / step_s / 10.0
     return discomfort
 
 
 @kernel
 def _ttc_risk(rows: NDArray[np.void], i: int, grid: Grid) -> float:
-    """1 - ttc / TTC_HORIZON_S for the vehicle that would be hit first at constant velocities, or 0.
+    """Return 1 - ttc / TTC_HORIZON_S for the first vehicle hit at constant velocities, or 0.
 
-    Asks only about those whose circumscribed circle could touch the own one before the horizon.
+    Only vehicles whose circumscribed circle could touch the agent's before the horizon are checked.
     """
     row = rows[i]
     cos, sin = cos_sin(row["heading"])
@@ -92,7 +92,7 @@ def _ttc_risk(rows: NDArray[np.void], i: int, grid: Grid) -> float:
             apart = radius + body["radius"] + CIRCLE_MARGIN_M
             room = squared - apart * apart
             if room > 0.0:
-                # The squared distance falls by less than 2 · closing a second.
+                # The squared distance decreases by less than 2 · closing per second.
                 closing = -(dx * vx + dy * vy)
                 across = dx * vy - dy * vx
                 if room > 2.0 * least * closing:
@@ -124,7 +124,7 @@ def _event(row: np.void, bit: int) -> float:
 
 @kernel
 def _delay(roads: RoadArrays, row: np.void, step_s: float) -> float:
-    """Time lost against driving at the limit, in s."""
+    """Return the time lost in s compared with driving at the limit."""
     return step_s * max(1.0 - _of_limit(roads, row), 0.0)
 
 
@@ -134,7 +134,7 @@ def write_terms(
     rows: NDArray[np.void],  # VEHICLE (C,) at the end of the step
     i: int,  # row of the agent's vehicle
     grid: Grid,  # filled from these rows
-    step_s: float,  # seconds a step
+    step_s: float,  # duration of a step in s
     out: NDArray[np.float32],  # (NUM_TERMS,) in the order of `config.terms.TERMS`
 ) -> None:
     row = rows[i]

@@ -1,7 +1,7 @@
-"""What a camera sees: the sky, the ground, roads, and the faces of bodies and walls.
+"""Camera pictures: sky, ground, roads, and the faces of bodies and walls.
 
-Depth, class and colour of pixels are delivered some rows at a time: of those that have been taken
-last, the first being row `first` of the whole picture.
+A picture is rendered some rows at a time. The functions that write depths, classes or colours read
+the rows that were rendered last; `first` is the row of the whole picture at which these begin.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from cavmarl.sensors.kernels.polygon_fill import (
     set_corner,
 )
 
-# Faces that every picture has; those of bodies and buildings follow.
+# Faces of every picture; the faces of bodies and buildings follow.
 SKY_FACE = 0
 GROUND_FACE = 1
 ROAD_FACE = 2
@@ -49,27 +49,27 @@ FIRST_FACE = 3
 _FACES_OF_PRISM = 6
 _SEEN_OF_PRISM = 3  # at most
 
-# With 12 bytes each they stay in a core's second-level cache, beside what is delivered of them.
+# With 12 bytes per pixel, a band and its output fit in the second-level cache of a core.
 BAND_PIXELS = 1 << 14
 
 
 def make_camera(
     mount: NDArray[np.float64], width: int, fov_rad: float, range_m: float
 ) -> CameraPose:
-    """A camera.
+    """Create a camera.
 
     Args:
-        mount: (3, 4) axes and place in the vehicle's frame.
-        width: pixels.
-        fov_rad: horizontal opening, less than pi.
-        range_m: deeper places are not seen.
+        mount: (3, 4) axes and position in the vehicle's frame.
+        width: width of the picture in pixels.
+        fov_rad: horizontal field of view, less than pi.
+        range_m: largest visible depth.
     """
     focal = 0.5 * width / tangent(0.5 * fov_rad)
     return CameraPose(mount, focal, range_m, np.zeros((5, 4)), np.zeros((4, 3)))
 
 
 def make_picture(width: int, height: int, panorama: Panorama) -> PixelRows:
-    """Room for a picture of such a panorama, some rows at a time."""
+    """Allocate the rows of a picture, for scenes of the size of `panorama`."""
     faces = FIRST_FACE + _FACES_OF_PRISM * len(panorama.prisms) + len(panorama.walls)
     semantic = np.zeros(faces, np.uint8)
     semantic[:FIRST_FACE] = NOTHING, GROUND, ROAD
@@ -93,7 +93,7 @@ def make_picture(width: int, height: int, panorama: Panorama) -> PixelRows:
 
 @kernel
 def _clear(camera: CameraPose, picture: PixelRows, first: int, last: int) -> None:
-    """Sky, and the ground as far as the camera sees it, in the rows [first, last)."""
+    """Fill the rows [first, last) with sky and, within the camera's range, with ground."""
     width = picture.face.shape[1]
     mount = camera.mount
     picture.closeness[: last - first] = 0.0
@@ -118,7 +118,7 @@ def _corner_of(prism: np.void, along: float, across: float) -> tuple[float, floa
 
 @kernel
 def _add_prism(camera: CameraPose, picture: PixelRows, num: int, prism: np.void, first: int) -> int:
-    """Add the faces of a body that turn to the camera: at most two sides and one end."""
+    """Add the faces of a body that face the camera: at most two sides and the top or bottom."""
     cos = prism["cos"]
     sin = prism["sin"]
     dx = camera.mount[0, 3] - prism["x"]
@@ -128,7 +128,7 @@ def _add_prism(camera: CameraPose, picture: PixelRows, num: int, prism: np.void,
     bottom = prism["bottom"]
     top = prism["top"]
     for side in range(4):
-        # Front, left, rear, right: outwards is (along, across).
+        # The sides are front, left, rear, right; (along, across) is the outward normal.
         along = 1.0 if side == 0 else (-1.0 if side == 2 else 0.0)
         across = 1.0 if side == 1 else (-1.0 if side == 3 else 0.0)
         out = ahead * along + left * across
@@ -160,13 +160,13 @@ def _add_prism(camera: CameraPose, picture: PixelRows, num: int, prism: np.void,
 
 @kernel
 def _light(x: float, y: float) -> float:
-    """How bright an upright face is that looks to (x, y); light comes from ahead on the left."""
+    """Return the brightness of an upright face with normal (x, y); light comes from ahead left."""
     return 0.7 + 0.15 * (x + y)
 
 
 @kernel
 def _add_wall(camera: CameraPose, picture: PixelRows, num: int, wall: np.void, number: int) -> int:
-    """Add a wall, which looks the same from both sides."""
+    """Add a wall; both of its sides look the same."""
     ax, ay, bx, by = wall["ax"], wall["ay"], wall["bx"], wall["by"]
     height = wall["height"]
     set_corner(camera, 0, ax, ay, 0.0)
@@ -177,7 +177,7 @@ def _add_wall(camera: CameraPose, picture: PixelRows, num: int, wall: np.void, n
     length = hypot(bx - ax, by - ay)
     if length > 0.0:
         x, y = (by - ay) / length, (ax - bx) / length
-        # The side that is seen.
+        # Shade the side that faces the camera.
         away = x * (camera.mount[0, 3] - ax) + y * (camera.mount[1, 3] - ay)
         picture.light[number] = _light(math.copysign(x, x * away), math.copysign(y, y * away))
     return add_face(camera, picture, num, number, False)
@@ -185,12 +185,10 @@ def _add_wall(camera: CameraPose, picture: PixelRows, num: int, wall: np.void, n
 
 @kernel
 def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: PixelRows) -> int:
-    """Find the faces that a picture shows.
+    """Find the faces that a picture shows, and return their number.
 
-    `panorama`: what stands around the vehicle, prisms ordered by id. `picture`: its faces are
+    `panorama`: the scene around the vehicle, prisms ordered by id. `picture`: its faces are
     overwritten.
-
-    Returns how many there are.
     """
     num = 0
     if camera.mount[2, 3] > 0.0:
@@ -210,24 +208,25 @@ def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: 
 
 @kernel
 def look(camera: CameraPose, picture: PixelRows, num: int, first: int, last: int) -> None:
-    """Take the rows [first, last) of a picture.
+    """Render the rows [first, last) of a picture.
 
-    `picture`: with faces; its rows are overwritten from the first on. `num`: how many faces there
-    are. `last`: the one after the last; as many as there is room for, at most.
+    `picture`: has its faces; its rows are overwritten from the first one on. `num`: number of
+    faces. `last`: at most `first` plus the number of rows of `picture`.
     """
     _clear(camera, picture, first, last)
     draw_faces(picture, num, first, last)
 
 
-# Nothing is nearer than this: a place inside of a body has no depth.
+# Smallest depth, for cameras inside a body.
 LEAST_DEPTH_M = 0.01
 
-# From float32 to float16: the difference of the exponents' biases, and half of what is dropped.
+# Conversion from float32 to float16: number of dropped bits, and difference of the exponents'
+# biases less half of the dropped range.
 _DROPPED = np.uint32(13)
 _ONE = np.uint32(1)
 _REBIAS = np.uint32((112 << 23) - 0xFFF)
 
-# How much of a colour is lost in the haze at the end of the range.
+# Share of a colour that is lost in haze at the end of the range.
 HAZE = 0.6
 
 _COLOURS = {
@@ -246,7 +245,7 @@ _COLOURS = {
 
 
 def colours() -> NDArray[np.float64]:
-    """(classes, 3) red, green and blue of each class in full light."""
+    """Return red, green and blue (classes, 3) of each class in full light."""
     found = np.zeros((NUM_SEMANTICS, 3))
     for semantic, colour in _COLOURS.items():
         found[semantic] = colour
@@ -254,8 +253,8 @@ def colours() -> NDArray[np.float64]:
 
 
 @kernel
-def _deepen(camera: CameraPose, picture: PixelRows, first: int, rows: int) -> None:
-    """Set the closeness also where there is only the ground or the sky."""
+def _complete_closeness(camera: CameraPose, picture: PixelRows, first: int, rows: int) -> None:
+    """Set the closeness also of pixels that show only ground or sky."""
     width = picture.face.shape[1]
     constant, by_column, by_row = ground_at(camera, width, picture.height)
     nothing = 1.0 / camera.range_m
@@ -272,12 +271,13 @@ def _deepen(camera: CameraPose, picture: PixelRows, first: int, rows: int) -> No
 def measure_depths(
     camera: CameraPose, picture: PixelRows, first: int, out: NDArray[np.float32]
 ) -> None:
-    """Depths (rows, W) in metres along the optical axis, the range where nothing is.
+    """Write depths (rows, W) in metres along the optical axis; the range where nothing is seen.
 
-    `camera`: that took the picture. `picture`: taken; its closeness is completed. `out`: (rows, W).
+    `camera`: the camera of the picture. `picture`: rendered rows; their closeness is completed.
+    `out`: (rows, W).
     """
     rows, width = out.shape
-    _deepen(camera, picture, first, rows)
+    _complete_closeness(camera, picture, first, rows)
     nearest = np.float32(LEAST_DEPTH_M)
     for j in range(rows):
         for i in range(width):
@@ -286,9 +286,9 @@ def measure_depths(
 
 @kernel
 def write_halves(bits: NDArray[np.uint32], out: NDArray[np.uint16]) -> None:
-    """The bits of float16 (rows, W) from those of float32, all between 2^-14 and 65504.
+    """Convert the bits of float32 numbers (rows, W) between 2^-14 and 65504 to bits of float16.
 
-    Rounded to the nearest, and of two equally near ones to the even one.
+    Numbers are rounded to the nearest float16, ties to even.
     """
     rows, width = out.shape
     for j in range(rows):
@@ -299,7 +299,7 @@ def write_halves(bits: NDArray[np.uint32], out: NDArray[np.uint16]) -> None:
 
 @kernel
 def write_classes(picture: PixelRows, out: NDArray[np.uint8]) -> None:
-    """The class of what each pixel shows, (rows, W)."""
+    """Write the class (rows, W) of each pixel."""
     rows, width = out.shape
     for j in range(rows):
         for i in range(width):
@@ -314,13 +314,13 @@ def write_colours(
     palette: NDArray[np.float64],
     out: NDArray[np.uint8],
 ) -> None:
-    """Red, green and blue: the class's colour in the face's light, paler with the distance.
+    """Write red, green and blue: the class's colour, shaded by its face, paler with distance.
 
-    `camera`: that took the picture. `picture`: taken; its closeness is completed. `palette`:
-    (classes, 3). `out`: (rows, W, 3).
+    `camera`: the camera of the picture. `picture`: rendered rows; their closeness is completed.
+    `palette`: (classes, 3). `out`: (rows, W, 3).
     """
     rows, width, _ = out.shape
-    _deepen(camera, picture, first, rows)
+    _complete_closeness(camera, picture, first, rows)
     for j in range(rows):
         for i in range(width):
             face = picture.face[j, i]

@@ -1,7 +1,7 @@
-"""Frames of an observation: the last few, one after the other, oldest first.
+"""Frame stacks: an observation holds the last few frames, oldest first.
 
-The observation of an agent stands in the output arrays at its index and nowhere else, so whatever
-carries the outputs of an agent carries its past frames.
+Past frames are stored only in an agent's observation, in the output arrays. So moving an agent's
+outputs also moves its past frames.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 
 @kernel
 def has_entered(row: np.void, ticks_per_step: int) -> bool:
-    """Whether a vehicle entered during the last step, at reset too."""
+    """Return whether a vehicle entered during the last step or at reset."""
     return bool(row["departed"] > row["tick"] - ticks_per_step)
 
 
@@ -27,7 +27,7 @@ def newest_frame(observation: NDArray[np.float32], stack: int) -> int:
 
 @kernel
 def shift_frames(observation: NDArray[np.float32], stack: int, kept_at: int, kept: int) -> None:
-    """Move the frames up and clear the newest, but for `kept` numbers from `kept_at` on."""
+    """Move all frames back by one and clear the newest, except `kept` numbers from `kept_at` on."""
     newest = newest_frame(observation, stack)
     size = observation.size - newest
     for k in range(newest):
@@ -38,7 +38,7 @@ def shift_frames(observation: NDArray[np.float32], stack: int, kept_at: int, kep
 
 @kernel
 def repeat_frame(observation: NDArray[np.float32], stack: int) -> None:
-    """Make all frames the newest one: what an agent sees that has just entered."""
+    """Copy the newest frame to all others, for an agent that has just entered."""
     newest = newest_frame(observation, stack)
     size = observation.size - newest
     for k in range(newest):

@@ -1,11 +1,11 @@
 """highway-env's `LidarObservation`: distance and radial speed in equal sectors around a vehicle.
 
-The sectors do not turn with the vehicle: the middle of cell k lies k steps clockwise from east (the
-frame of `vehicle_features`). It differs from our `lidar`, whose rays meet bodies exactly
-and turn with the vehicle, in ways that are kept here: a vehicle is seen if its centre is in range;
-it is also drawn into the cell of its centre, at its distance less half its width; within a body
-distances are negative; and speeds are divided by the range in metres, as distances are. Cells
-without a vehicle have the range as distance and as speed.
+The sectors do not turn with the vehicle: the centre of cell k lies k steps clockwise from east (the
+frame of `vehicle_features`). The sensor differs from `lidar`, whose rays intersect bodies exactly
+and turn with the vehicle, as highway-env does: a vehicle is seen if its centre is in range; it is
+also drawn into the cell of its centre, at its distance less half its width; inside a body,
+distances are negative; and speeds, like distances, are divided by the range in metres. Empty cells
+have the range as distance and as speed.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ TWO_PI = 2.0 * math.pi
 
 
 def cell_directions(cells: int) -> NDArray[np.float64]:
-    """Cosine and sine (cells, 2) of the middle of each cell, from east to south."""
+    """Return cosine and sine (cells, 2) of each cell's centre, clockwise from east."""
     angles = np.arange(cells) * (2.0 * np.pi / max(cells, 1))
     return np.stack([cos_all(angles), sin_all(angles)], axis=1)
 
 
 class LidarCells(NamedTuple):
-    """highway-env's `LidarObservation`."""
+    """Settings and scratch of highway-env's `LidarObservation`."""
 
     at: int
     cells: int  # 0: off
     range_m: float
-    scale: float  # what distances and speeds are divided by
-    directions: NDArray[np.float64]  # (cells, 2) cosine and sine of the middle of each cell
+    scale: float  # divisor of distances and speeds
+    directions: NDArray[np.float64]  # (cells, 2) cosine and sine of each cell's centre
     echoes: NDArray[np.void]  # ECHO (cells,) scratch
 
 
 @kernel
 def _cell_of(x: float, y: float, cells: int) -> tuple[int, float]:
-    """The cell of a direction, and the angle that highway-env finds it by."""
+    """Return the cell of a direction, and the angle from which highway-env computes it."""
     step = TWO_PI / cells
     angle = atan2(y, x) + 0.5 * step
     return math.floor(angle / step) % cells, angle
@@ -51,7 +51,7 @@ def _cell_of(x: float, y: float, cells: int) -> tuple[int, float]:
 
 @kernel
 def _axis_interval(start: float, size: float, slope: float) -> tuple[float, float]:
-    """Where a ray is between two parallel lines: from and to which share of its length."""
+    """Return where a ray enters and leaves the strip between two parallels, in ray lengths."""
     if slope == 0.0:
         return (-math.inf, math.inf) if start < 0.0 < start + size else (math.inf, math.inf)
     near = start / slope
@@ -61,7 +61,7 @@ def _axis_interval(start: float, size: float, slope: float) -> tuple[float, floa
 
 @kernel
 def _overlap(low_1: float, high_1: float, low_2: float, high_2: float) -> bool:
-    """Whether two intervals share a point."""
+    """Return whether two intervals share a point."""
     gap = low_2 - high_1 if low_1 < low_2 else low_1 - high_2
     return gap <= 0.0
 
@@ -70,14 +70,14 @@ def _overlap(low_1: float, high_1: float, low_2: float, high_2: float) -> bool:
 def _ray_to_body(
     x: float, y: float, cos: float, sin: float, body: np.void, ray_x: float, ray_y: float
 ) -> float:
-    """Distance along a ray, in units of its length, to a body; negative inside, inf if missed.
+    """Return the distance along a ray to a body in ray lengths; negative inside, inf if missed.
 
-    `x`: of the body's centre. `y`: of the body's centre. `cos`: of the body's heading. `sin`: of
-    the body's heading. `body`: for its size. `ray_x`: the ray, as long as it reaches.
+    `x`, `y`: the body's centre. `cos`, `sin`: the body's heading. `body`: its size. `ray_x`,
+    `ray_y`: the ray, whose length is the range.
     """
     length = 2.0 * body["half_length"]
     width = 2.0 * body["half_width"]
-    # From the origin to the rear corner of smaller lateral offset, along both axes of the body.
+    # Rear corner with the smaller lateral offset, along both axes of the body.
     along = x * cos + y * sin - body["half_length"]
     across = y * cos - x * sin - body["half_width"]
     enter_1, leave_1 = _axis_interval(across, width, ray_y * cos - ray_x * sin)
@@ -95,7 +95,7 @@ def _ray_to_body(
 def _cells_over(
     x: float, y: float, cos: float, sin: float, body: np.void, cells: int
 ) -> tuple[int, int]:
-    """The first and the last cell that highway-env tests for a body, clockwise."""
+    """Return the first and the last cell that highway-env tests for a body, clockwise."""
     smallest, largest = math.inf, -math.inf
     for side in range(4):
         along = body["half_length"] if side >= 2 else -body["half_length"]
@@ -111,7 +111,7 @@ def _cells_over(
 
 @kernel
 def _record(echo: np.void, distance: float, speed: float, vehicle_id: int) -> None:
-    """Keep the nearest; of equally near ones the larger id, which highway-env draws last."""
+    """Keep the nearest echo; on a tie keep the larger id, which highway-env draws last."""
     if distance < echo["distance"] or (distance == echo["distance"] and vehicle_id >= echo["id"]):
         echo["distance"] = distance
         echo["speed"] = speed
@@ -147,7 +147,7 @@ def observe_lidar_cells(
 ) -> None:
     """Write distance and speed of each cell.
 
-    `out`: an observation; 2 · cells numbers from `sensor.at` on are written.
+    `out`: an observation; 2 · cells numbers are written, from `sensor.at` on.
     """
     ego = rows[i]
     ego_cos = cosine(ego["heading"])

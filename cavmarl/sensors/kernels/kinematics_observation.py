@@ -1,13 +1,13 @@
-"""highway-env's `KinematicObservation`: a table of the vehicles near one, by features.
+"""highway-env's `KinematicObservation`: a table of nearby vehicles and their features.
 
-Vehicles within `PERCEPTION_M` and not more than two own lengths behind, in the order of their
-distance along the own lane, whose line goes on straight beyond its ends. The own vehicle is the
-first row and always in the world's frame.
+The table shows vehicles within `PERCEPTION_M` and at most two ego lengths behind, ordered by
+distance along the ego lane, which is extended straight beyond its ends. The first row is the ego
+vehicle, always in the world's frame.
 
-`vehicle_features` are highway-env's numbers of one vehicle, `Vehicle.to_dict`. Their frame is that
-of its pictures: x to the right, which is east, and y down, which is south; headings turn clockwise.
-So on a road to the east, y grows to the right of the driving direction. They are ours with y,
-headings and lateral offsets negated.
+`vehicle_features` returns the numbers of highway-env's `Vehicle.to_dict`. Their frame is that of
+highway-env's pictures: x points right (east), y points down (south), and headings turn clockwise.
+On a road to the east, y therefore grows to the right of the driving direction. Compared with this
+package, y, headings and lateral offsets are negated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cavmarl.core.math.rng import STREAM_SENSOR, below
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays
 
-# In the order of config_sensors.VEHICLE_FEATURES, then `on_road`, which is of a place and not of a
+# In the order of config_sensors.VEHICLE_FEATURES; last is `on_road`, a feature of a place, not of a
 # vehicle.
 FEATURE_PRESENCE = 0
 FEATURE_X = 1
@@ -46,18 +46,18 @@ FEATURE_ON_ROAD = 13
 
 
 class KinematicsSensor(NamedTuple):
-    """highway-env's `Kinematics`."""
+    """Settings and scratch of highway-env's `Kinematics`."""
 
     at: int
-    vehicles: int  # rows, the own one included; 0: off
+    vehicles: int  # rows, including the ego vehicle; 0: off
     features: NDArray[np.int64]  # (F,) FEATURE_* codes, the columns
-    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) what becomes [-1, 1]; nan: left as is
+    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) mapped to [-1, 1]; nan: not mapped
     absolute: bool
     shuffled: bool
     clip: bool
     see_behind: bool
     observe_intentions: bool
-    destinations: NDArray[np.float64]  # (M, G, 2) where each goal of each map is, m
+    destinations: NDArray[np.float64]  # (M, G, 2) position of each goal of each map, m
     near_body: NDArray[np.int64]  # (vehicles,) scratch
     near_key: NDArray[np.float64]
     values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) scratch
@@ -72,11 +72,11 @@ def vehicle_features(
     intentions: bool,
     out: NDArray[np.float64],
 ) -> None:
-    """All features of a vehicle in the world's frame.
+    """Write all features of a vehicle in the world's frame.
 
-    `destinations`: (M, G, 2) x and y of each map's goals in m, our frame. `intentions`: whether the
-    direction to the vehicle's goal is shown; else it is 0. `out`: (NUM_VEHICLE_FEATURES,),
-    overwritten.
+    `destinations`: (M, G, 2) x and y of each map's goals in m, in this package's frame.
+    `intentions`: whether to write the direction to the vehicle's goal; otherwise it is 0. `out`:
+    (NUM_VEHICLE_FEATURES,), overwritten.
     """
     cos, sin = cos_sin(row["heading"])
     out[FEATURE_PRESENCE] = 1.0
@@ -108,7 +108,7 @@ def vehicle_features(
 
 @kernel
 def make_relative(values: NDArray[np.float64], ego: np.void) -> None:
-    """Take the place and the velocity of `ego` from those in `values`, in the world's axes."""
+    """Subtract position and velocity of `ego` from `values`, in the world's axes."""
     values[FEATURE_X] -= ego["x"]
     values[FEATURE_Y] -= -ego["y"]
     values[FEATURE_VX] -= ego["speed"] * cosine(ego["heading"])
@@ -117,7 +117,7 @@ def make_relative(values: NDArray[np.float64], ego: np.void) -> None:
 
 @kernel
 def in_range(value: float, ranges: NDArray[np.float64], feature: int) -> float:
-    """The value with the feature's range mapped to [-1, 1]; as it is if it has no range."""
+    """Map a value from the feature's range to [-1, 1]; return it unchanged if there is no range."""
     low = ranges[feature, 0]
     if math.isnan(low):
         return value
@@ -132,7 +132,7 @@ PERCEPTION_M = 200.0  # AbstractEnv.PERCEPTION_DISTANCE
 def _find_near(
     roads: RoadArrays, rows: NDArray[np.void], i: int, grid: Grid, sensor: KinematicsSensor
 ) -> int:
-    """Fill `near_body` with the vehicles that are shown, sorted; returns how many there are."""
+    """Fill `near_body` with the vehicles to show, sorted, and return their number."""
     ego = rows[i]
     lane = roads.lanes[ego["lane"]]
     first_point, num_points = lane["first_point"], lane["num_points"]
@@ -160,7 +160,8 @@ def _find_near(
             along = s - own_s
             if not (sensor.see_behind or along > -2.0 * ego["length"]):
                 continue
-            # Unsorted, highway-env takes vehicles in the order of their creation: that of ids.
+            # Without sorting, highway-env takes vehicles in order of creation, which is that of
+            # ids.
             key = 0.0 if sensor.shuffled else abs(along)
             place = found
             while place > 0 and (
@@ -185,7 +186,7 @@ def _find_near(
 
 @kernel
 def _write(sensor: KinematicsSensor, table_row: int, out: NDArray[np.float32]) -> None:
-    """Put the chosen features of `sensor.values` into a row of the table."""
+    """Write the selected features of `sensor.values` to a row of the table."""
     num = sensor.features.size
     at = sensor.at + table_row * num
     for f in range(num):
@@ -198,7 +199,7 @@ def _write(sensor: KinematicsSensor, table_row: int, out: NDArray[np.float32]) -
 
 @kernel
 def _shuffle(sensor: KinematicsSensor, ego: np.void, out: NDArray[np.float32]) -> None:
-    """Put all rows but the first, empty ones too, in random order (Fisher and Yates)."""
+    """Shuffle all rows except the first, including empty ones (Fisher and Yates)."""
     num = sensor.features.size
     for last in range(sensor.vehicles - 1, 1, -1):
         other = 1 + below(ego["rng_key"], ego["id"], ego["tick"], STREAM_SENSOR + last, last)
@@ -217,9 +218,9 @@ def observe_kinematics(
     sensor: KinematicsSensor,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the table of one vehicle, row by row; rows without a vehicle are left as they are.
+    """Write the table of one vehicle, row by row; rows without a vehicle are left unchanged.
 
-    Where two vehicles are equally far along the lane, the one with the smaller id comes first.
+    Of two vehicles at equal distance along the lane, the one with the smaller id comes first.
 
     `sensor`: settings and scratch; ranges in the frame of `vehicle_features`. `out`: an
     observation, zeros from `sensor.at` on.

@@ -1,10 +1,10 @@
 """Lidar: distances along equally spaced rays to the bodies of other vehicles.
 
-As highway-env's `LidarObservation`, but rays and boxes meet exactly: there, a vehicle is also drawn
-into the cell of its centre, at its distance less half its width.
+Unlike in highway-env's `LidarObservation`, rays and boxes are intersected exactly.
 
-A vehicle covers few rays. For each one in range the kernel bounds the rays that can meet it, by an
-angle that is never too small, and tests only those. The bound needs no accuracy: the test is exact.
+A vehicle covers few rays. For each vehicle in range, the kernel bounds the rays that can hit it by
+an angle that is never too small, and tests only those. The bound may be loose, since the test is
+exact.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.records import record
 
-# What a ray met first.
+# The first hit of a ray.
 ECHO = record(
-    ("distance", np.float64),  # m; 0 from inside of a body, the range where nothing is
-    # its velocity less the own one, in m/s along the ray: positive where it goes away
-    # (highway-env's sign); 0 where nothing is
+    ("distance", np.float64),  # m; 0 inside a body, the range if nothing is hit
+    # speed of the vehicle relative to ego along the ray, in m/s, positive away (highway-env's
+    # sign); 0 if nothing is hit
     ("speed", np.float64),
-    ("id", np.int64),  # of the vehicle; -1 where nothing is
+    ("id", np.int64),  # id of the vehicle; -1 if nothing is hit
 )
 
 PI = math.pi
 TWO_PI = 2.0 * math.pi
 
-# A ray that closes in on a strip by less than this each metre does not reach it within any range.
+# A ray that approaches a strip by less than this per metre does not reach it within any range.
 _PARALLEL = 1e-200
 
 
 def ray_directions(num_rays: int) -> NDArray[np.float64]:
-    """Directions (num_rays, 2), cosine and sine: equally spaced, counter-clockwise from ahead."""
+    """Return cosine and sine (num_rays, 2) of equally spaced rays, counter-clockwise from ahead."""
     angles = 2.0 * np.pi * np.arange(num_rays) / num_rays
     return np.stack([cos_all(angles), sin_all(angles)], axis=1)
 
@@ -47,27 +47,27 @@ def ray_directions(num_rays: int) -> NDArray[np.float64]:
 def _ray_to_box(
     x: float, y: float, closing_x: float, closing_y: float, half_length: float, half_width: float
 ) -> float:
-    """Distance along a ray to a box around the origin, 0 inside of it and inf if missed.
+    """Return the distance along a ray to a box around the origin; 0 inside, inf if missed.
 
-    Slabs (Kay, Kajiya: "Ray tracing complex scenes", SIGGRAPH 1986): of the two strips that make
-    the box, the one that the ray enters last decides where it meets it.
+    The method is that of slabs (Kay, Kajiya: "Ray tracing complex scenes", SIGGRAPH 1986): the box
+    is the intersection of two strips, and the ray hits it where it enters the second strip.
 
     Args:
-        x: where the ray starts, mirrored into x >= 0.
-        y: where the ray starts, mirrored into y >= 0.
-        closing_x: the ray's direction, towards the origin: x falls by this much each metre.
-        closing_y: the same of y.
-        half_length: of the box along x.
-        half_width: of the box along y.
+        x: start of the ray, mirrored to x >= 0.
+        y: start of the ray, mirrored to y >= 0.
+        closing_x: decrease of x per metre along the ray.
+        closing_y: decrease of y per metre along the ray.
+        half_length: half the box's size along x.
+        half_width: half the box's size along y.
     """
-    # Negative for a strip that the ray starts in; beyond any range for one that it turns away from.
+    # Negative if the ray starts inside the strip; beyond any range if it points away from it.
     enter_x = (x - half_length) / max(closing_x, _PARALLEL)
     enter_y = (y - half_width) / max(closing_y, _PARALLEL)
     distance = max(max(enter_x, enter_y), 0.0)
     there_x = x - closing_x * distance
     there_y = y - closing_y * distance
-    # The near side of a strip that was entered is not tested again: by rounding, rays would slip in
-    # between two faces. `&` and not `and`: the tests are cheaper than branches on random geometry.
+    # The near side of an entered strip is not tested again: rounding would let rays pass between
+    # two faces. `&` instead of `and`: the tests are cheaper than branches on random geometry.
     inside_x = (there_x >= -half_length) & (there_x <= max(x, half_length))
     inside_y = (there_y >= -half_width) & (there_y <= max(y, half_width))
     return distance if inside_x & inside_y else np.inf
@@ -83,15 +83,15 @@ def _rays_over(
     half_width: float,
     rays: int,
 ) -> tuple[int, int]:
-    """The rays that can meet a box with its centre at (x, y): the first one and how many.
+    """Return the first ray that can hit a box with centre (x, y), and the number of such rays.
 
-    Seen from the origin, the box keeps within `across` of the line to its centre and begins no
+    Seen from the origin, the box stays within `across` of the line to its centre and begins no
     nearer than `ahead`: the angle to each side is at most atan(across / ahead) < across / ahead.
 
-    `along`: of the origin from the centre, in m along the box, at least 0. `beside`: the same
-    across the box.
+    `along`, `beside`: position of the origin from the centre along and across the box, in m, at
+    least 0.
     """
-    # Both times the distance to the centre, which cancels out.
+    # Both are multiplied by the distance to the centre, which cancels out.
     ahead = x * x + y * y - (half_length * along + half_width * beside)
     across = half_length * beside + half_width * along
     if across >= (PI - ANGLE_ERROR_RAD) * ahead:
@@ -113,8 +113,8 @@ def _scan_body(
     rays: NDArray[np.float64],
     out: NDArray[np.void],
 ) -> None:
-    """Let the rays of `lidar` meet one body."""
-    # All in the frame of the vehicle that looks, where the rays are given.
+    """Intersect the rays of `lidar` with one body."""
+    # All in the frame of the ego vehicle, in which the rays are given.
     dx = body["x"] - ego["x"]
     dy = body["y"] - ego["y"]
     x = dx * ego_cos + dy * ego_sin
@@ -125,7 +125,7 @@ def _scan_body(
     velocity_y = body["speed"] * sin
     half_length = body["half_length"]
     half_width = body["half_width"]
-    # The body's axes, each turned to point from the sensor towards the body.
+    # The body's axes, each flipped to point away from the sensor.
     along = x * cos + y * sin
     beside = y * cos - x * sin
     along_sign = math.copysign(1.0, along)
@@ -168,10 +168,10 @@ def lidar(
 ) -> None:
     """Scan around one vehicle, from its centre, for other vehicles on its level.
 
-    Where two vehicles are equally far along a ray, the one with the smaller id counts.
+    Of two vehicles at equal distance along a ray, the one with the smaller id is reported.
 
-    `rays`: (num_rays, 2) directions in the vehicle's frame, from `ray_directions`. `range_m`: how
-    far it sees, in the plane. `out`: ECHO (num_rays,), overwritten.
+    `rays`: (num_rays, 2) directions in the vehicle's frame, from `ray_directions`. `range_m`: range
+    in the plane. `out`: ECHO (num_rays,), overwritten.
     """
     ego = rows[row]
     ego_cos, ego_sin = cos_sin(ego["heading"])

@@ -1,4 +1,4 @@
-"""The sensors that most environments leave off: highway-env's, and those for any map."""
+"""Sensors that most environments leave off: highway-env's sensors, and the map-independent ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from cavmarl.sensors.kernels.occupancy import OccupancyGrid, observe_occupancy
 class OptionalSensors(NamedTuple):
     """The settings of each optional sensor, by its name in `sensors.observed.SENSORS`.
 
-    They are apart from `arrays.Sensors`, so that `sense` need not unpack what is off.
+    They are separate from `arrays.Sensors`, so that `sense` does not unpack sensors that are off.
     """
 
     kinematics: KinematicsSensor
@@ -53,11 +53,11 @@ def observe_optional(
     chosen: NDArray[np.bool_],
     observations: NDArray[np.float32],
 ) -> None:
-    """Write these sensors' parts of every agent's newest frame in the chosen worlds.
+    """Write the optional sensors' parts of every agent's newest frame in the chosen worlds.
 
     `optional`: settings and scratch; sensors that are off write nothing. `objects`: REPORT (W, A or
-    more, N), the inboxes of vehicles; N is 0 where there are no messages. `observations`:
-    (W, A, D), the parts 0 before.
+    more, N), the vehicles' inboxes; N is 0 without messages. `observations`: (W, A, D), whose
+    optional parts are 0 before the call.
     """
     kinematics = optional.kinematics
     occupancy_grid = optional.occupancy_grid
@@ -69,7 +69,7 @@ def observe_optional(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        is_filled = False  # many zones have no agents
+        is_filled = False  # fill the grid on first use: many zones have no agents
         for i in range(worlds.num_owned[w]):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:
@@ -92,9 +92,9 @@ def observe_optional(
                 controllers = worlds.controllers[w]
                 observe_way(roads, travel, controllers, row, phase, time, tick_s, way, out)
             if conflicts.most > 0:
-                told, tick = objects[w, row["agent"]], worlds.ticks[w]
+                reports, tick = objects[w, row["agent"]], worlds.ticks[w]
                 observe_conflicts(
-                    roads, travel, rows, i, grid, phase, told, tick, tick_s, conflicts, out
+                    roads, travel, rows, i, grid, phase, reports, tick, tick_s, conflicts, out
                 )
             if history.size > 0:
                 entered = has_entered(row, ticks_per_step)

@@ -1,15 +1,16 @@
-"""What the `conflicts` sensor writes: the vehicles that come nearest to the own way.
+"""The kernel of the `conflicts` sensor: the vehicles that come closest to the ego path.
 
-All are taken to go on as they go now: the others straight on along their headings, as their plans
-are not known, the own one along its way. At a few moments ahead the gap between the bodies is
-taken, as boxes along the own one; what comes nearest and soonest stands first. Right of way is that
-of the map: by the lane that the other is on, whichever way it takes from there.
+All vehicles are assumed to keep their speed: the ego vehicle along its path, the others straight
+along their headings, as their plans are unknown. At a few moments ahead, the kernel computes the
+gap between the two bodies, as boxes along the ego axes. The vehicle whose approach is closest and
+soonest comes first. Right of way follows from the lane that the other vehicle is on, whichever link
+it takes from there.
 
-With `indicators` the others are taken to follow their lanes, and over one junction the way that
-they indicate: the next one, or the one that they are on. From there on they go straight.
+With `indicators`, other vehicles are assumed to follow their lanes and, over the current or next
+junction, the link that they indicate. After that they go straight.
 
-With `heard` those count, too, that are not seen and that a message tells of: where they are if they
-have gone on as it says, and nothing else of them. Which lane they are on it does not say.
+With `heard`, vehicles that are not seen but known from a message are included, extrapolated from
+the position and speed in the message. Their lanes are unknown.
 """
 
 from __future__ import annotations
@@ -39,56 +40,56 @@ from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.sensors.kernels.observing_way import MOST_LANES
 
 CONFLICT_FEATURES = 9
-HEARD_FEATURES = 2  # more with `heard`
-INDICATED_FEATURES = 1  # more with `indicators`
-INDICATED_RAD = 0.4  # a way that turns by less is not indicated
+HEARD_FEATURES = 2  # additional features with `heard`
+INDICATED_FEATURES = 1  # additional features with `indicators`
+INDICATED_RAD = 0.4  # a link that turns by less is not indicated
 AGE_SCALE_S = 1.0
-NUM_LOOKS = 10  # moments that are looked at,
-LOOK_S = 0.5  # so far apart
-SLOWEST_MPS = 3.0  # the own vehicle is taken to go on with: one that stands wants to set off
-WAIT_MPS = 2.0  # so much nearer counts what comes a second sooner
-GAP_HALF_M = 2.0  # a gap of this length is a nearness of 0.5
-WHEN_HALF_S = 2.0  # a time of this length is a soonness of 0.5
-PLACE_HALF_M = 10.0  # a distance of this length is 0.5
-SPEED_HALF_MPS = 10.0  # a relative speed of this is 0.5
+NUM_LOOKS = 10  # number of predicted moments
+LOOK_S = 0.5  # time between predicted moments
+SLOWEST_MPS = 3.0  # the ego vehicle is assumed to drive at least this fast, even if it stands
+WAIT_MPS = 2.0  # an approach that is 1 s later ranks like one that is this many metres farther
+GAP_HALF_M = 2.0  # a gap of this length has a closeness of 0.5
+WHEN_HALF_S = 2.0  # a time of this length has a soonness of 0.5
+PLACE_HALF_M = 10.0  # a distance of this length is scaled to 0.5
+SPEED_HALF_MPS = 10.0  # a relative speed of this size is scaled to 0.5
 
 
 RANKED = record(
-    ("counts", np.float64),  # m, what it is ranked by
-    ("near", np.float64),  # m, the gap of its approach
-    ("when", np.float64),  # s until then
+    ("counts", np.float64),  # m, rank: smaller comes first
+    ("near", np.float64),  # m, the gap of the nearest approach
+    ("when", np.float64),  # s until the nearest approach
     ("id", np.int64),
-    ("body", np.int64),  # position in `Grid.bodies`; -1 - k: `ConflictsSensor.told[k]`
+    ("body", np.int64),  # index in `Grid.bodies`; -1 - k: `ConflictsSensor.told[k]`
 )
 
 
 class ConflictsSensor(NamedTuple):
-    """Vehicles that come near the own way."""
+    """Settings and scratch of the `conflicts` sensor."""
 
     at: int
-    most: int  # vehicles that are told; 0: off
+    most: int  # vehicles per observation; 0: off
     range_m: float
-    walls: Walls  # that hide others
-    heard: bool  # whether messages tell of those that are not seen
-    told: NDArray[np.void]  # BODY (inbox,) scratch: those that messages tell of, where they are now
-    indicators: bool  # whether others show their way over the next junction
-    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: where the own vehicle will be,
-    heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) one that a message tells of,
-    others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) and those in `Grid.bodies`
-    indicated: NDArray[np.float64]  # (capacity,) the turn that each indicates: 1 left, -1 right
-    foreseen: NDArray[np.int64]  # (capacity,) at which filling of the grid these were written
-    filling: NDArray[np.int64]  # (1,) which one it is now
+    walls: Walls  # walls that hide vehicles
+    heard: bool  # whether vehicles known only from messages are included
+    told: NDArray[np.void]  # BODY (inbox,) scratch: present positions of vehicles in messages
+    indicators: bool  # whether others indicate their link over the next junction
+    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: predicted poses of the ego vehicle
+    heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: of a vehicle in a message
+    others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) scratch: of `Grid.bodies`
+    indicated: NDArray[np.float64]  # (capacity,) indicated turn of each body: 1 left, -1 right
+    foreseen: NDArray[np.int64]  # (capacity,) grid filling at which these were written
+    filling: NDArray[np.int64]  # (1,) number of the present grid filling
     ranked: NDArray[np.void]  # RANKED (count,) scratch
 
 
 @kernel
-def _bent(value: float, half: float) -> float:
-    """0.5 at `half`, towards 1 far beyond it, likewise below 0."""
+def _saturate(value: float, half: float) -> float:
+    """Map a value to (-1, 1): 0.5 at `half`, -0.5 at `-half`."""
     return value / (half + abs(value))
 
 
 @kernel
-def _foresee(
+def _predict_on_path(
     roads: RoadArrays,
     travel: TripTables,
     row: np.void,
@@ -96,10 +97,10 @@ def _foresee(
     num_links: int,
     looks: NDArray[np.float64],
 ) -> tuple[int, bool]:
-    """Write where a vehicle will be with `speed`, `looks` (NUM_LOOKS, 4): x, y, cos and sin.
+    """Predict a vehicle's poses at `speed`; `looks` (NUM_LOOKS, 4) gets x, y, cos and sin.
 
-    Its way is followed over `num_links` links at most, and straight on from there. Returns the link
-    that it is on or comes to first within these, -1: none, and whether it is on it.
+    The vehicle follows its path over at most `num_links` links, then goes straight. Returns the
+    first of these links (-1: none), and whether the vehicle is on it.
     """
     looks[0, 0] = row["x"]
     looks[0, 1] = row["y"]
@@ -112,38 +113,38 @@ def _foresee(
     is_on = crossed >= 0
     left = num_links - int(is_on)
     start = -row["s"]
-    told = 1
+    written = 1
     for _ in range(MOST_LANES):
         end = start + here["length_m"]
         following, way_there, link = next_step_of_plan(roads, travel, lane, way)
         if link >= 0:
             following = following if left > 0 else -1
             left -= 1
-        while told < NUM_LOOKS and (told * stride <= end or following < 0):
+        while written < NUM_LOOKS and (written * stride <= end or following < 0):
             x, y, _, cos, sin, _ = lane_pose(
-                roads.points, here["first_point"], here["num_points"], told * stride - start
+                roads.points, here["first_point"], here["num_points"], written * stride - start
             )
-            looks[told, 0] = x
-            looks[told, 1] = y
-            looks[told, 2] = cos
-            looks[told, 3] = sin
-            told += 1
+            looks[written, 0] = x
+            looks[written, 1] = y
+            looks[written, 2] = cos
+            looks[written, 3] = sin
+            written += 1
         if crossed < 0 and link >= 0 and following >= 0:
             crossed = link
-        if told == NUM_LOOKS or following < 0:
+        if written == NUM_LOOKS or following < 0:
             break
         lane, way, start = following, way_there, end
         here = roads.lanes[lane]
-    # A way of very many short lanes: it is not looked at any further.
-    for k in range(told, NUM_LOOKS):
+    # If the path has too many short lanes, the prediction stops at the last one.
+    for k in range(written, NUM_LOOKS):
         for axis in range(4):
-            looks[k, axis] = looks[told - 1, axis]
+            looks[k, axis] = looks[written - 1, axis]
     return crossed, is_on
 
 
 @kernel
-def _go_straight(body: np.void, looks: NDArray[np.float64]) -> None:
-    """Write where a body will be that goes on as it goes, along its heading."""
+def _predict_straight(body: np.void, looks: NDArray[np.float64]) -> None:
+    """Predict the poses of a body that keeps its speed and heading."""
     for k in range(NUM_LOOKS):
         time = LOOK_S * k
         looks[k, 0] = body["x"] + time * body["speed"] * body["cos"]
@@ -153,8 +154,8 @@ def _go_straight(body: np.void, looks: NDArray[np.float64]) -> None:
 
 
 @kernel
-def _indicated(roads: RoadArrays, link: int) -> float:
-    """1: a link turns left, -1: right, 0: neither, or there is no link."""
+def _turn_of(roads: RoadArrays, link: int) -> float:
+    """Return 1 if a link turns left, -1 if it turns right, 0 otherwise or without a link."""
     if link < 0:
         return 0.0
     before = roads.lanes[roads.links[link]["from_lane"]]
@@ -171,12 +172,12 @@ def _indicated(roads: RoadArrays, link: int) -> float:
 
 @kernel
 def forget_others(sensor: ConflictsSensor) -> None:
-    """Begin anew with bodies that are sorted into the grid anew."""
+    """Mark the predictions as outdated, after the grid has been filled again."""
     sensor.filling[0] += 1
 
 
 @kernel
-def _foresee_other(
+def _predict_other(
     roads: RoadArrays,
     travel: TripTables,
     other: np.void,
@@ -184,26 +185,26 @@ def _foresee_other(
     at: int,
     sensor: ConflictsSensor,
 ) -> None:
-    """Write where the body `at` of the grid will be, once for all agents that see it."""
+    """Predict the poses of body `at` of the grid, once for all agents that see it."""
     if sensor.foreseen[at] == sensor.filling[0]:
         return
     sensor.foreseen[at] = sensor.filling[0]
     sensor.indicated[at] = 0.0
     if sensor.indicators and other["driver"] != DRIVER_SCRIPTED and not is_off_lanes(other):
-        link, _ = _foresee(roads, travel, other, other["speed"], 1, sensor.others[at])
-        sensor.indicated[at] = _indicated(roads, link)
+        link, _ = _predict_on_path(roads, travel, other, other["speed"], 1, sensor.others[at])
+        sensor.indicated[at] = _turn_of(roads, link)
     else:
-        _go_straight(body, sensor.others[at])
+        _predict_straight(body, sensor.others[at])
 
 
 @kernel
 def _nearest_approach(
     row: np.void, body: np.void, looks: NDArray[np.float64], others: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """The gap in m that counts most, between two boxes, and in how many seconds it is so.
+    """Return the gap in m and the time in s of the approach between two boxes that ranks first.
 
-    The gap is the sum of those along and across the own vehicle. `looks`, `others` (NUM_LOOKS, 4):
-    where the own one and the other will be.
+    The gap is the sum of the gaps along and across the ego vehicle. `looks`, `others` (NUM_LOOKS,
+    4): predicted poses of the ego vehicle and of the other one.
     """
     half_length = 0.5 * row["length"]
     half_width = 0.5 * row["width"]
@@ -239,7 +240,10 @@ def _is_held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
 def _right_of_way(
     roads: RoadArrays, link: int, is_on: bool, other: np.void, phase: NDArray[np.int32]
 ) -> float:
-    """1: the other is on, or may take, a link that goes before `link`; -1: it gives way; 0."""
+    """Return 1 if the other vehicle has priority over `link`, -1 if it must yield, else 0.
+
+    It has priority if it is on a link, or may take one, that goes before `link`.
+    """
     if link < 0 or is_off_lanes(other):
         return 0.0
     there = roads.lanes[other["lane"]]
@@ -268,7 +272,7 @@ def _right_of_way(
 def _take_reports(
     reports: NDArray[np.void], tick: int, tick_s: float, told: NDArray[np.void]
 ) -> int:
-    """Write those that reports (N,) tell of into BODY `told` (N,); returns how many there are."""
+    """Write the vehicles in `reports` (N,) to BODY `told` (N,) and return their number."""
     for k in range(reports.size):
         report = reports[k]
         if report["sender"] < 0:
@@ -298,7 +302,7 @@ def _is_near(row: np.void, body: np.void, range_m: float) -> bool:
 
 
 @kernel
-def _put(
+def _insert(
     row: np.void,
     body: np.void,
     others: NDArray[np.float64],
@@ -306,7 +310,7 @@ def _put(
     found: int,
     sensor: ConflictsSensor,
 ) -> int:
-    """Put a body in its place among the `found` that count most; returns how many there are now."""
+    """Insert a body into the ranking of `found` vehicles and return their new number."""
     near, when = _nearest_approach(row, body, sensor.looks, others)
     counts = near + WAIT_MPS * when
     place = found
@@ -340,7 +344,7 @@ def _rank(
     num_told: int,
     sensor: ConflictsSensor,
 ) -> int:
-    """Put those that count most into the sensor's scratch, first by their approach, then by id."""
+    """Rank the vehicles into the sensor's scratch by their approach, then by id."""
     row = rows[i]
     first_column, last_column = cell_columns(grid, row["x"], sensor.range_m)
     first_row, last_row = cell_rows(grid, row["y"], sensor.range_m)
@@ -354,17 +358,17 @@ def _rank(
                 continue
             if is_cut(sensor.walls, row["x"], row["y"], body["x"], body["y"]):
                 continue
-            _foresee_other(roads, travel, rows[body["row"]], body, b, sensor)
-            found = _put(row, body, sensor.others[b], b, found, sensor)
+            _predict_other(roads, travel, rows[body["row"]], body, b, sensor)
+            found = _insert(row, body, sensor.others[b], b, found, sensor)
             for k in range(num_told):
                 if sensor.told[k]["id"] == body["id"]:
-                    sensor.told[k]["id"] = -1  # it is seen
+                    sensor.told[k]["id"] = -1  # the vehicle is seen
     for k in range(num_told):
         body = sensor.told[k]
         if body["id"] < 0 or body["id"] == row["id"] or not _is_near(row, body, sensor.range_m):
             continue
-        _go_straight(body, sensor.heard_looks)
-        found = _put(row, body, sensor.heard_looks, -1 - k, found, sensor)
+        _predict_straight(body, sensor.heard_looks)
+        found = _insert(row, body, sensor.heard_looks, -1 - k, found, sensor)
     return found
 
 
@@ -382,14 +386,14 @@ def observe_conflicts(
     sensor: ConflictsSensor,
     observation: NDArray[np.float32],
 ) -> None:
-    """Nine to twelve numbers of each vehicle that counts most; zeros where there are fewer.
+    """Write nine to twelve numbers per vehicle, in order of rank; missing vehicles are zeros.
 
-    `i`: row of the agent's vehicle. `phase`: (num_signals,) PHASE rows that are on. `reports`:
-    REPORT (N,) of vehicles, the agent's inbox; not read without `heard`. `tick`: the world's.
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) present PHASE rows. `reports`: REPORT
+    (N,) of vehicles in the agent's inbox; not read without `heard`. `tick`: the world's tick.
     """
     row = rows[i]
     speed = max(row["speed"], SLOWEST_MPS)
-    link, is_on = _foresee(roads, travel, row, speed, MOST_LANES, sensor.looks)
+    link, is_on = _predict_on_path(roads, travel, row, speed, MOST_LANES, sensor.looks)
     num_told = _take_reports(reports, tick, tick_s, sensor.told) if sensor.heard else 0
     found = _rank(roads, travel, grid, rows, i, num_told, sensor)
     cos_heading = sensor.looks[0, 2]
@@ -408,10 +412,10 @@ def observe_conflicts(
         out = observation[at : at + size]
         out[0] = GAP_HALF_M / (GAP_HALF_M + ranked["near"])
         out[1] = WHEN_HALF_S / (WHEN_HALF_S + ranked["when"])
-        out[2] = _bent(dx * cos_heading + dy * sin_heading, PLACE_HALF_M)
-        out[3] = _bent(dy * cos_heading - dx * sin_heading, PLACE_HALF_M)
-        out[4] = _bent(dvx * cos_heading + dvy * sin_heading, SPEED_HALF_MPS)
-        out[5] = _bent(dvy * cos_heading - dvx * sin_heading, SPEED_HALF_MPS)
+        out[2] = _saturate(dx * cos_heading + dy * sin_heading, PLACE_HALF_M)
+        out[3] = _saturate(dy * cos_heading - dx * sin_heading, PLACE_HALF_M)
+        out[4] = _saturate(dvx * cos_heading + dvy * sin_heading, SPEED_HALF_MPS)
+        out[5] = _saturate(dvy * cos_heading - dvx * sin_heading, SPEED_HALF_MPS)
         out[6] = min(max(body["cos"] * cos_heading + body["sin"] * sin_heading, -1.0), 1.0)
         out[7] = min(max(body["sin"] * cos_heading - body["cos"] * sin_heading, -1.0), 1.0)
         if is_seen:

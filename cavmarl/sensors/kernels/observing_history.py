@@ -1,6 +1,6 @@
-"""What the `history` sensor writes: what the vehicle was told to do in the last steps.
+"""The kernel of the `history` sensor: the controls and speeds of the last steps.
 
-The numbers of the steps before stand in the frame before, which `shift_frames` has left them in.
+The numbers of earlier steps are those of the previous frame, which `shift_frames` keeps in place.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.sensors.kernels.sense import ACCEL_SCALE, SPEED_SCALE, STEERING_SCALE, unit
 
-HISTORY_FEATURES = 3  # of a step
+HISTORY_FEATURES = 3  # per step
 
 
 class HistorySensor(NamedTuple):
-    """What the vehicle did before."""
+    """Settings of the `history` sensor."""
 
     at: int
     size: int  # numbers; 0: off
@@ -27,9 +27,9 @@ class HistorySensor(NamedTuple):
 def observe_history(
     row: np.void, entered: bool, at: int, size: int, observation: NDArray[np.float32]
 ) -> None:
-    """Move the steps back by one and write the newest; all are the newest of one that entered.
+    """Move the steps back by one and write the newest; if `entered`, write it to all steps.
 
-    `size` numbers from `at` on, the last step first.
+    `size` numbers from `at` on are written, the last step first.
     """
     for k in range(at + size - 1, at + HISTORY_FEATURES - 1, -1):
         observation[k] = observation[k - HISTORY_FEATURES]

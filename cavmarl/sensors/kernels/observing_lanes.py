@@ -1,8 +1,8 @@
-"""What the `lanes` sensor writes: vehicles ahead and behind on the lanes around, and crossing ones.
+"""The kernel of the `lanes` sensor: gaps on the lanes around, and the next crossing vehicle.
 
-The nearest vehicles in the plane (`neighbors`) leave it to the policy to find out which of them are
-in its way; here places are told along lanes, as car-following models take them. Of two that are
-equally near, the slower one is told: the order of rows plays no part.
+The nearest vehicles in the plane (`neighbors`) do not show which of them are in the agent's way;
+here positions are given along lanes, as in car-following models. If two vehicles are equally near,
+the slower one is shown, so that the order of rows does not matter.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
 from cavmarl.driving.kernels.lanes.route_following import next_step
 
-OWN = 0  # slots of two features each: a gap and a speed
-LEFT = 1  # ahead; behind in the slot after it
+OWN = 0  # slots of two features each: gap and speed
+LEFT = 1  # ahead; the next slot is behind
 RIGHT = 3
-CROSSING = 10  # where the features of the crossing vehicle begin
+CROSSING = 10  # index of the first feature of the crossing vehicle
 LANES_FEATURES = 14
 SPEED_SCALE = 40.0  # m/s
-HALF_M = 10.0  # a way of this length is a closeness of 0.5
-LANES_AHEAD = 8  # that a way is followed over, at most
-SLOWEST_MPS = 1.0  # that a vehicle is taken to cross with
+HALF_M = 10.0  # a distance of this length has a closeness of 0.5
+LANES_AHEAD = 8  # largest number of lanes that a path is followed over
+SLOWEST_MPS = 1.0  # a crossing vehicle is assumed to drive at least this fast
 
 
 @kernel
 def _closeness(way: float) -> np.float32:
-    """1 where two touch, 0.5 at `HALF_M`, 0 far away: metres count where they are few."""
+    """Return the closeness of a distance: 1 at contact, 0.5 at `HALF_M`, towards 0 far away."""
     return np.float32(HALF_M / (HALF_M + max(way, 0.0)))
 
 
@@ -54,7 +54,7 @@ def _way_between(
     target: int,
     target_s: float,
 ) -> float:
-    """Metres along a way from `s` of `lane` to `target_s` of lane `target`; inf: not on it."""
+    """Return the distance in m along a path from `s` on `lane` to `target_s`; inf: not on it."""
     start = -s
     for _ in range(LANES_AHEAD):
         if lane == target:
@@ -68,7 +68,7 @@ def _way_between(
 
 @kernel
 def _note_gap(out: NDArray[np.float32], slot: int, gap: float, speed: float) -> None:
-    """Keep the nearest vehicle of a slot."""
+    """Write a gap to a slot if it is the smallest so far."""
     at = 2 * slot
     closeness = _closeness(gap)
     scaled = _scaled_speed(speed)
@@ -88,7 +88,7 @@ def _observe_gap(
     range_m: float,
     out: NDArray[np.float32],
 ) -> None:
-    """Note `other` in `slot` if it is ahead on the way from `lane`, in the next one if behind."""
+    """Write `other` to `slot` if ahead on the path from `lane`, to the next slot if behind."""
     s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
     half = 0.5 * (row["length"] + other["length"])
     faster = other["speed"] - row["speed"]
@@ -113,7 +113,7 @@ def _observe_gap(
 def _next_link(
     roads: RoadArrays, travel: TripTables, row: np.void, range_m: float
 ) -> tuple[int, float]:
-    """The link that a vehicle is on or comes to next, -1: none, and the way to its stop line."""
+    """Return the link that a vehicle is on or reaches next, or -1, and its stop line's distance."""
     lane = row["lane"]
     here = roads.lanes[lane]
     if here["internal"]:
@@ -143,10 +143,10 @@ def _observe_crossing(
     soonest: float,
     out: NDArray[np.float32],
 ) -> float:
-    """Note `other` if it comes to a place that both links share before all others so far.
+    """Write `other` if it reaches a place that both links share earlier than any other so far.
 
-    Those inside count, and those that have the right of way and are not held by a red signal.
-    Returns the time in s in which the soonest does, `soonest` or less.
+    Only vehicles inside the junction count, and those that have the right of way and no red signal.
+    Returns the earliest arrival in s, at most `soonest`.
     """
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
@@ -177,7 +177,7 @@ def _observe_crossing(
 
 
 @kernel
-def _held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
+def _is_held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
     signal = link_signal(roads, link, phase)
     return signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
 
@@ -193,10 +193,10 @@ def observe_lanes(
     sensors: Sensors,
     observation: NDArray[np.float32],
 ) -> None:
-    """Gaps and relative speeds on the lanes around, and the first vehicle where ways cross.
+    """Write gaps and relative speeds on the lanes around, and the first vehicle to cross the path.
 
-    `i`: row of the agent's vehicle. `phase`: (num_signals,) PHASE rows that are on. `sensors`:
-    range and place of the sensor; a range of 0 switches it off. `observation`: (D,), of which
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) present PHASE rows. `sensors`: range
+    and position of the sensor; a range of 0 switches it off. `observation`: (D,), of which
     `LANES_FEATURES` numbers are written; 0 before.
     """
     range_m = sensors.lanes_range_m
@@ -231,7 +231,7 @@ def observe_lanes(
             if link >= 0:
                 foe_link, foe_distance = _next_link(roads, travel, other, range_m)
                 if foe_link >= 0:
-                    held = _held(roads, foe_link, phase)
+                    held = _is_held(roads, foe_link, phase)
                     soonest = _observe_crossing(
                         roads,
                         row,

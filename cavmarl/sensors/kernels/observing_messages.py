@@ -1,4 +1,4 @@
-"""What an agent observes of its inboxes: vehicles, events, and the next signal on its route."""
+"""The kernel of the `messages` sensor: vehicles, events and the next signal from the inbox."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ ACCEL_SCALE = 10.0  # m/s²
 LENGTH_SCALE = 20.0  # m
 AGE_SCALE_S = 1.0
 EVENT_AGE_SCALE_S = 10.0
-SOON_S = 5.0  # a change after this time is a soonness of 0.5
-SIGNAL_RANGE_M = 300.0  # of the way on which the next signal is looked for
+SOON_S = 5.0  # a change after this time has a soonness of 0.5
+SIGNAL_RANGE_M = 300.0  # distance within which the next signal is searched for
 
 
 @kernel
@@ -79,7 +79,7 @@ def _observe_event(
     tick_s: float,
     out: NDArray[np.float32],
 ) -> None:
-    """Where something has happened, how long ago, and which of the causes it is."""
+    """Write position, age and cause of an event."""
     _observe_place(report, row, cos, sin, scale_m, out)
     out[3] = _unit((row["tick"] - report["tick"]) * tick_s / EVENT_AGE_SCALE_S)
     if report["code"] == CAUSE_COLLISION:
@@ -94,7 +94,7 @@ def _observe_event(
 
 @kernel
 def _next_signal(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> int:
-    """The first link with a signal on a vehicle's route, or -1."""
+    """Return the first link with a signal on a vehicle's route, or -1."""
     lane = row["lane"]
     distance = -row["s"]
     while True:
@@ -116,7 +116,7 @@ def _observe_signal(
     tick_s: float,
     out: NDArray[np.float32],
 ) -> None:
-    """What the roadside unit at a link has said of it, if it was heard."""
+    """Write the last message of the roadside unit at a link, if one was received."""
     for k in range(signals.size):
         report = signals[k]
         if report["sender"] < 0:
@@ -149,11 +149,11 @@ def observe_messages(
     chosen: NDArray[np.bool_],
     observations: NDArray[np.float32],
 ) -> None:
-    """Write what the owned agents of the chosen worlds have in their inboxes.
+    """Write the inboxes of the owned agents of the chosen worlds.
 
-    `mail`: the inboxes. `at`: where the sensor's part begins in a frame. `objects`: vehicles that
-    are shown. `signal`: whether the next signal is shown. `scale_m`: what a place of 1 stands for.
-    `observations`: (W, A, D), the part of the newest frame is 0 before.
+    `mail`: the inboxes. `at`: index of the sensor's part in a frame. `objects`, `events`: number of
+    vehicles and events. `signal`: whether to write the next signal. `scale_m`: distance that is
+    scaled to 1. `observations`: (W, A, D), whose part of the newest frame is 0 before.
     """
     for w in range(chosen.size):
         if not chosen[w]:

@@ -1,7 +1,7 @@
-"""What the `way` sensor writes: the shape of the way ahead and the stop lines on it.
+"""The kernel of the `way` sensor: the shape of the path ahead, and its stop lines.
 
-Where the plan asks for another lane the way goes on from that one, so that the next turn is seen
-from any lane of a road.
+If the plan needs another lane, the path continues from that lane, so that the next turn is visible
+from every lane of a road.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.sensors.kernels.sense import SPEED_SCALE, gives_way_on, soonness, unit
 
-PLACE_FEATURES = 4  # of a place of the way
-LINE_FEATURES = 5  # of a stop line, one more with the time of its signal
+PLACE_FEATURES = 4  # per point of the path
+LINE_FEATURES = 5  # per stop line; one more with the signal's timing
 CURVATURE_SCALE = 0.2  # 1/m
 WIDTH_SCALE = 8.0  # m
-LINE_HALF_M = 20.0  # a line at this distance is half as near as can be
-MOST_LANES = 48  # that a way is followed over
+LINE_HALF_M = 20.0  # a line at this distance has a closeness of 0.5
+MOST_LANES = 48  # largest number of lanes that a path is followed over
 
 
 class WaySensor(NamedTuple):
-    """The way ahead."""
+    """Settings of the `way` sensor."""
 
     at: int
-    distances_m: NDArray[np.float64]  # (P,) of the places that are told, rising
-    lines: int  # stop lines that are told
-    range_m: float  # up to where
+    distances_m: NDArray[np.float64]  # (P,) distances of the points, increasing
+    lines: int  # number of stop lines
+    range_m: float  # range of the stop lines
     timing: bool
 
 
@@ -59,7 +59,7 @@ def _observe_line(
     timing: bool,
     out: NDArray[np.float32],
 ) -> bool:
-    """Write the stop line before a link, if there is a reason to stop at it."""
+    """Write the stop line before a link; return False if there is no reason to stop at it."""
     signal = link_signal(roads, link, phase)
     gives_way = gives_way_on(roads, link, signal)
     stops = must_stop(roads, link, signal)
@@ -90,10 +90,10 @@ def observe_way(
     sensor: WaySensor,
     observation: NDArray[np.float32],
 ) -> None:
-    """Places of the way at given distances, then its next stop lines.
+    """Write points of the path at the given distances, then the next stop lines.
 
-    Beyond the end of the way its last place is told, without a curve. `time` is that of the tick,
-    in s since the world's reset. `observation`: (D,), 0 before.
+    Beyond the end of the path, its last point is repeated, without curvature. `time`: time of the
+    tick, in s since the world's reset. `observation`: (D,), 0 before.
     """
     cos_heading, sin_heading = cos_sin(row["heading"])
     distances = sensor.distances_m
@@ -101,27 +101,27 @@ def observe_way(
     size = LINE_FEATURES + 1 if sensor.timing else LINE_FEATURES
     lane, way = row["lane"], row["way"]
     here = roads.lanes[lane]
-    start = -row["s"]  # the way to the beginning of the lane
+    start = -row["s"]  # distance to the beginning of the lane
     _, _, _, cos, sin, _ = lane_pose(
         roads.points, here["first_point"], here["num_points"], row["s"]
     )
     before_m = 0.0
     direction = atan2(sin, cos)
-    told = 0
+    written = 0
     lines = 0
     for _ in range(MOST_LANES):
         end = start + here["length_m"]
         following, way_there, link = next_step_of_plan(roads, travel, lane, way)
-        while told < distances.size and (distances[told] <= end or following < 0):
-            at = sensor.at + PLACE_FEATURES * told
-            distance = min(distances[told], end)
+        while written < distances.size and (distances[written] <= end or following < 0):
+            at = sensor.at + PLACE_FEATURES * written
+            distance = min(distances[written], end)
             x, y, _, cos, sin, _ = lane_pose(
                 roads.points, here["first_point"], here["num_points"], distance - start
             )
             left = (y - row["y"]) * cos_heading - (x - row["x"]) * sin_heading
             turned = atan2(sin, cos)
             out = observation[at : at + PLACE_FEATURES]
-            out[0] = unit(left / distances[told])
+            out[0] = unit(left / distances[written])
             if distance > before_m:
                 curvature = wrap_angle(turned - direction) / (distance - before_m)
                 out[1] = unit(curvature / CURVATURE_SCALE)
@@ -129,7 +129,7 @@ def observe_way(
             out[3] = unit(here["speed_mps"] / SPEED_SCALE)
             direction = turned
             before_m = distance
-            told += 1
+            written += 1
         if link >= 0 and lines < sensor.lines and end <= sensor.range_m:
             out = observation[lines_at + size * lines : lines_at + size * (lines + 1)]
             if _observe_line(
@@ -137,7 +137,7 @@ def observe_way(
             ):
                 lines += 1
         is_beyond = lines == sensor.lines or end > sensor.range_m
-        if following < 0 or (told == distances.size and is_beyond):
+        if following < 0 or (written == distances.size and is_beyond):
             break
         lane, way, start = following, way_there, end
         here = roads.lanes[lane]

@@ -1,8 +1,8 @@
 """highway-env's `OccupancyGridObservation`: layers of cells around a vehicle.
 
-A cell shows the vehicle whose centre lies in it; of several the one with the smallest id. Places
-and velocities are relative to the own vehicle, which is in the grid too. `on_road` marks the cells
-that hold a waypoint of a lane's middle.
+A cell shows the vehicle whose centre lies in it; of several vehicles, the one with the smallest id.
+Positions and velocities are relative to the ego vehicle, which is also in the grid. `on_road` marks
+the cells that contain a waypoint of a lane's centre line.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ from cavmarl.sensors.kernels.kinematics_observation import (
     vehicle_features,
 )
 
-# How far along a lane highway-env sets waypoints, from the place beside the vehicle.
+# Distance along a lane, from the point beside the vehicle, in which highway-env sets waypoints.
 LANE_REACH_M = 100.0
 
 
 class OccupancyGrid(NamedTuple):
-    """highway-env's `OccupancyGrid`."""
+    """Settings and scratch of highway-env's `OccupancyGrid`."""
 
     at: int
     features: NDArray[np.int64]  # (F,) FEATURE_* codes, the layers; none: off
-    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) what becomes [-1, 1]; nan: left as is
+    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) mapped to [-1, 1]; nan: not mapped
     min_x: float
     min_y: float
     step_x: float
     step_y: float
     num_x: int
     num_y: int
-    radius_m: float  # of a circle around the vehicle that holds the grid
+    radius_m: float  # radius of a circle around the vehicle that contains the grid
     aligned: bool
     clip: bool
     as_image: bool
-    destinations: NDArray[np.float64]  # (M, G, 2) where each goal of each map is, m
+    destinations: NDArray[np.float64]  # (M, G, 2) position of each goal of each map, m
     cell_body: NDArray[np.int64]  # (num_x * num_y,) scratch
-    lane_seen: NDArray[np.int64]  # (L + 1,) scratch: when each lane was drawn last, and the time
+    lane_seen: NDArray[np.int64]  # (L + 1,) scratch: last drawing of each lane; count of drawings
     values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) scratch
 
 
 @kernel
 def _cell(sensor: OccupancyGrid, ego: np.void, x: float, y: float) -> int:
-    """The cell of a place in our frame, -1 outside: column (along x) · num_y + row (along y)."""
+    """Return the cell of a point, column (along x) · num_y + row (along y), or -1 outside."""
     right = x - ego["x"]
     down = ego["y"] - y
     if sensor.aligned:
@@ -70,7 +70,7 @@ def _cell(sensor: OccupancyGrid, ego: np.void, x: float, y: float) -> int:
 
 @kernel
 def _level(sensor: OccupancyGrid, value: float) -> float:
-    """What a value is shown as."""
+    """Return the clipped, and for images scaled, value of a cell."""
     if sensor.clip or sensor.as_image:
         value = clamp(value, -1.0, 1.0)
     if sensor.as_image:
@@ -80,7 +80,7 @@ def _level(sensor: OccupancyGrid, value: float) -> float:
 
 @kernel
 def _find_bodies(ego: np.void, grid: Grid, sensor: OccupancyGrid) -> None:
-    """Fill `cell_body` with the vehicle that each cell shows, -1 for none."""
+    """Fill `cell_body` with the vehicle that each cell shows; -1: none."""
     sensor.cell_body[:] = -1
     first_column, last_column = cell_columns(grid, ego["x"], sensor.radius_m)
     first_row, last_row = cell_rows(grid, ego["y"], sensor.radius_m)
@@ -106,7 +106,7 @@ def _draw_lane(
     at: int,
     out: NDArray[np.float32],
 ) -> None:
-    """Mark the cells with waypoints of one lane, as far apart as a cell is wide."""
+    """Mark the cells that contain waypoints of one lane; waypoints are one cell width apart."""
     row = roads.lanes[lane]
     reach = sensor.radius_m
     if (
@@ -179,7 +179,7 @@ def observe_occupancy(
     sensor: OccupancyGrid,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the layers of one vehicle, each by columns along x; empty cells are left as they are.
+    """Write the layers of one vehicle, each by columns along x; empty cells are left unchanged.
 
     `sensor`: settings and scratch; cells and ranges in the frame of `vehicle_features`. `out`: an
     observation, zeros from `sensor.at` on.

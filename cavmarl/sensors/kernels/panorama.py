@@ -1,12 +1,12 @@
-"""What stands around one vehicle, in its own frame: the world as its imaging sensors see it.
+"""The surroundings of one vehicle in its own frame, for imaging sensors.
 
-The frame has its origin at the vehicle's place on the road, x ahead, y to the left, z up and
-square to the road under the vehicle: it turns with the heading and the pitch. In it the ground is
-the plane z = 0, bodies are upright prisms over oriented rectangles, and buildings are walls that
-stand on the ground. So slopes are seen as far as they go on evenly; the ground never hides a body.
-As for every sensor here, bodies more than `LEVEL_HEIGHT_M` above or below are not seen.
+The frame has its origin at the vehicle's position on the road; x points ahead, y left, and z up,
+perpendicular to the road under the vehicle. It turns with heading and pitch. In it, the ground is
+the plane z = 0, bodies are upright prisms over oriented rectangles, and buildings are walls on the
+ground. Slopes are therefore seen as far as they are even; the ground never hides a body. As for
+every sensor, bodies more than `LEVEL_HEIGHT_M` above or below are not seen.
 
-The records do not say in which row a body lies or which zone owns it.
+The result does not depend on a body's row or on the zone that owns it.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from cavmarl.core.records import record
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop, gather_quads, gather_walls
 
 NOTHING = 0  # the sky, or nothing in range
-GROUND = 1  # beside the roads
+GROUND = 1  # off the roads
 ROAD = 2  # lanes and junctions
-LANE_LINE = 3  # the edges of lanes, in the bird's-eye grid
+LANE_LINE = 3  # edges of lanes, in the bird's-eye grid only
 BUILDING = 4
 CAR = 5
 TRUCK = 6
@@ -51,7 +51,7 @@ SEMANTIC_NAMES = (
 )
 NUM_SEMANTICS = len(SEMANTIC_NAMES)
 
-# By SUMO's abstract vehicle class; those of one shape look the same.
+# By SUMO's abstract vehicle class; vehicles of similar shape share a class.
 SEMANTIC_OF_CLASS = {
     "passenger": CAR,
     "taxi": CAR,
@@ -73,17 +73,17 @@ PRISM = record(
     ("y", np.float64),
     ("bottom", np.float64),  # z, m
     ("top", np.float64),
-    ("cos", np.float64),  # of its heading in the frame
+    ("cos", np.float64),  # cosine of its heading in the frame
     ("sin", np.float64),
     ("half_length", np.float64),  # m
     ("half_width", np.float64),
     ("radius", np.float64),  # half the diagonal, m
-    ("speed", np.float64),  # over the ground along its heading, m/s
+    ("speed", np.float64),  # m/s over the ground, along its heading
 )
 
 
 class Panorama(NamedTuple):
-    """Room for what stands around one vehicle; `gather` says how much of it is filled."""
+    """Memory for the surroundings of one vehicle; `gather` returns how much of it is filled."""
 
     prisms: NDArray[np.void]  # PRISM (C,)
     order: NDArray[np.int32]  # (C,) prisms by id
@@ -95,7 +95,7 @@ class Panorama(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """How many things of each kind a panorama holds."""
+    """The number of objects of each kind in a panorama."""
 
     prisms: int
     walls: int
@@ -104,7 +104,7 @@ class Counts(NamedTuple):
 
 
 def make_panorama(backdrop: Backdrop, capacity: int) -> Panorama:
-    """Room before such a backdrop, for so many bodies."""
+    """Allocate a panorama for a backdrop and `capacity` bodies."""
     return Panorama(
         np.zeros(capacity, PRISM),
         np.zeros(capacity, np.int32),
@@ -148,13 +148,11 @@ def _gather_prisms(
     reach_m: float,
     out: NDArray[np.void],
 ) -> int:
-    """The bodies around a vehicle, in no order that counts.
+    """Collect the bodies around a vehicle, in any order, and return their number.
 
-    `row`: the vehicle that looks; it does not see itself. `semantics`: (num_types,) class of each
-    type of vehicle. `reach_m`: bodies that are farther away in the plane are left out. `out`: PRISM
-    (C,), overwritten up to the returned number.
-
-    Returns how many there are.
+    `row`: the observing vehicle, which does not see itself. `semantics`: (num_types,) class of each
+    type of vehicle. `reach_m`: bodies farther away in the plane are left out. `out`: PRISM (C,),
+    overwritten up to the returned number.
     """
     ego = rows[row]
     axes = (
@@ -188,7 +186,7 @@ def _gather_prisms(
 
 @kernel
 def _sort_by_id(prisms: NDArray[np.void], num: int, order: NDArray[np.int32]) -> None:
-    """Write into `order` (C,) which of the first `num` prisms is the next by id."""
+    """Write the first `num` prisms' indices, sorted by id, to `order` (C,)."""
     for k in range(num):
         place = k
         while place > 0 and prisms[k]["id"] < prisms[order[place - 1]]["id"]:
@@ -207,10 +205,10 @@ def gather(
     with_faces: bool,
     out: Panorama,
 ) -> Counts:
-    """Gather what stands around a vehicle, in its frame.
+    """Collect the surroundings of a vehicle, in its frame.
 
-    `row`: the vehicle that looks; it does not see itself. `reach_m`: what is farther away in the
-    plane is left out. `with_faces`: also roofs and strips, and bodies in the order of their ids.
+    `row`: the observing vehicle, which does not see itself. `reach_m`: objects farther away in the
+    plane are left out. `with_faces`: also collect roofs and strips, and sort bodies by id.
     """
     ego = rows[row]
     prisms = _gather_prisms(rows, row, grid, backdrop.semantics, reach_m, out.prisms)

@@ -1,16 +1,15 @@
-"""Flat convex faces in the picture of a pinhole camera.
+"""Rasterization of flat convex faces in the picture of a pinhole camera.
 
-One over the depth of a face is linear over the picture, and so are the sides of its edges: a face
-is drawn row by row, from the first to the last column of the row inside it, with one addition a
-pixel, and the nearest face stays. That is exact for every direction of the camera, roll included,
-and no ray is cast.
+The reciprocal of a face's depth is linear in picture coordinates, and so are the half-planes of its
+edges. A face is drawn row by row, from its first to its last column, with one addition per pixel;
+the nearest face is kept. This is exact for every orientation of the camera, including roll, and
+casts no rays.
 
-A picture is drawn some rows at a time: so many as stay in the processor's own cache with all that
-is noted of a pixel. No row depends on which others are drawn with it, and memory that cores share
-gets only what is delivered.
+A picture is drawn in bands of rows that fit in the core's own cache with all data per pixel. Rows
+do not depend on each other, and only results are written to memory that cores share.
 
-Depth is along the optical axis. The camera's axes are those of its mount: ahead, left, up; pixel
-rows go down, columns to the right, and pixels are square.
+Depth is along the optical axis. The camera's axes are those of its mount: ahead, left, up. Pixel
+rows go down, columns go right, and pixels are square.
 """
 
 from __future__ import annotations
@@ -24,44 +23,44 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.scanlines import row_span
 
-# Of a face with a corner nearer than this, or behind the camera, all rows are tried.
+# If a face has a corner nearer than this, or behind the camera, all rows are tested.
 NEAR_M = 0.01
 
 
 class CameraPose(NamedTuple):
-    """Where a camera looks from and how."""
+    """The pose and the optics of a camera."""
 
-    mount: NDArray[np.float64]  # (3, 4) axes (ahead, left, up) and place in the vehicle's frame
-    focal: float  # pixels
-    range_m: float  # of depths
-    edges: NDArray[np.float64]  # (5, 4) scratch: those of one face
-    face: NDArray[np.float64]  # (4, 3) scratch: its corners in the camera's frame
+    mount: NDArray[np.float64]  # (3, 4) axes (ahead, left, up), position in the vehicle's frame
+    focal: float  # focal length in pixels
+    range_m: float  # largest depth
+    edges: NDArray[np.float64]  # (5, 4) scratch: edges of one face
+    face: NDArray[np.float64]  # (4, 3) scratch: corners of one face in the camera's frame
 
 
 class Faces(NamedTuple):
-    """The faces of one picture that can be seen, in the order in which they are drawn."""
+    """The visible faces of one picture, in drawing order."""
 
-    edges: NDArray[np.float64]  # (F, 5, 4) of each, the fifth being the range
-    plane: NDArray[np.float64]  # (F, 3) its closeness: constant, by column, by row
-    rows: NDArray[np.int32]  # (F, 2) [first, last) that it can be in
-    number: NDArray[np.int32]  # (F,) which face it is
-    flat: NDArray[np.bool_]  # (F,) it lies on the ground, and covers whatever was there
+    edges: NDArray[np.float64]  # (F, 5, 4) edges of each face; the fifth is the range
+    plane: NDArray[np.float64]  # (F, 3) closeness: constant, per column, per row
+    rows: NDArray[np.int32]  # (F, 2) rows [first, last) that the face can cover
+    number: NDArray[np.int32]  # (F,) index of the face
+    flat: NDArray[np.bool_]  # (F,) whether the face lies on the ground and covers earlier ones
 
 
 class PixelRows(NamedTuple):
-    """What some rows of pixels show, R at a time from top to bottom, and what is drawn."""
+    """Rendered rows of a picture, R at a time from top to bottom, and its faces."""
 
-    height: int  # of the whole picture, pixels
-    closeness: NDArray[np.float64]  # (R, W) one over the depth in m; 0: no body and no building
-    face: NDArray[np.int32]  # (R, W) a face
-    semantic: NDArray[np.uint8]  # (all faces,) of each face
-    light: NDArray[np.float64]  # (all faces,) how bright each face is, in [0, 1]
+    height: int  # height of the whole picture, pixels
+    closeness: NDArray[np.float64]  # (R, W) 1 / depth in 1/m; 0: no body and no building
+    face: NDArray[np.int32]  # (R, W) index of the visible face
+    semantic: NDArray[np.uint8]  # (all faces,) class of each face
+    light: NDArray[np.float64]  # (all faces,) brightness of each face, in [0, 1]
     faces: Faces
 
 
 @kernel
 def set_corner(camera: CameraPose, c: int, x: float, y: float, z: float) -> None:
-    """Bring a corner of the face from the vehicle's frame into the camera's."""
+    """Transform a corner of the face from the vehicle's frame to the camera's."""
     mount = camera.mount
     dx = x - mount[0, 3]
     dy = y - mount[1, 3]
@@ -74,7 +73,7 @@ def set_corner(camera: CameraPose, c: int, x: float, y: float, z: float) -> None
 def _set_edge(
     camera: CameraPose, k: int, x: float, y: float, z: float, width: int, height: int
 ) -> None:
-    """Edge k: the pixels whose direction (1, -u', -v') has no negative product with (x, y, z)."""
+    """Set edge k: the pixels whose direction (1, -u', -v') times (x, y, z) is not negative."""
     by_column = -y / camera.focal
     by_row = -z / camera.focal
     edges = camera.edges
@@ -86,7 +85,7 @@ def _set_edge(
 
 @kernel
 def _is_aside(camera: CameraPose, width: int, height: int) -> bool:
-    """Whether all corners of the face are behind the camera, or beside one edge of the picture."""
+    """Return whether all corners are behind the camera, or beyond one edge of the picture."""
     face = camera.face
     slope_x = 0.5 * width / camera.focal
     slope_z = 0.5 * height / camera.focal
@@ -102,10 +101,10 @@ def _is_aside(camera: CameraPose, width: int, height: int) -> bool:
 
 @kernel
 def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, float, float, float]:
-    """Set the edges of the face whose corners are set, the fifth being the range.
+    """Set the edges of the face with the current corners; the fifth is the range.
 
-    Returns the rows [first, last) that it can be in, and the closeness of the plane that it lies
-    in: constant, by column, by row. No rows for a face that cannot be seen.
+    Returns the rows [first, last) that it can cover, and the closeness of its plane: constant, per
+    column, per row. A face that cannot be seen has no rows.
     """
     if _is_aside(camera, width, height):
         return 0, 0, 0.0, 0.0, 0.0
@@ -144,7 +143,7 @@ def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, fl
     edges[4, 0] -= 1.0 / camera.range_m
     if not in_front:
         return 0, height, constant, by_column, by_row
-    # One row more than needed: the edges tell.
+    # One row more than needed; the edges exclude it.
     first = max(math.floor(max(low * camera.focal + 0.5 * height, 0.0) - 1.0), 0)
     last = min(math.ceil(min(high * camera.focal + 0.5 * height, float(height)) + 1.0), height)
     return first, last, constant, by_column, by_row
@@ -152,9 +151,9 @@ def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, fl
 
 @kernel
 def add_face(camera: CameraPose, picture: PixelRows, num: int, number: int, flat: bool) -> int:
-    """Put the face whose corners are set behind the `num` that are drawn before it.
+    """Append the face with the current corners to the `num` faces that are drawn before it.
 
-    Returns how many there are now: no more if it cannot be seen.
+    Returns the new number of faces, which is `num` if the face cannot be seen.
     """
     width = picture.face.shape[1]
     first, last, constant, by_column, by_row = _set_face(camera, width, picture.height)
@@ -176,7 +175,7 @@ def add_face(camera: CameraPose, picture: PixelRows, num: int, number: int, flat
 
 @kernel
 def draw_faces(picture: PixelRows, num: int, first: int, last: int) -> None:
-    """Draw the first `num` faces over what is farther away, in the rows [first, last)."""
+    """Draw the first `num` faces in the rows [first, last), hiding what is farther away."""
     faces = picture.faces
     for k in range(num):
         begin_row = max(first, faces.rows[k, 0])
@@ -189,7 +188,7 @@ def draw_faces(picture: PixelRows, num: int, first: int, last: int) -> None:
 
 @kernel
 def _draw(picture: PixelRows, k: int, first: int, begin_row: int, end_row: int) -> None:
-    """Draw a face over what is farther away; row `first` is the first that there is room for."""
+    """Draw a face, hiding what is farther away; `first` is the first row in memory."""
     width = picture.face.shape[1]
     edges = picture.faces.edges[k]
     plane = picture.faces.plane[k]
@@ -209,7 +208,7 @@ def _draw(picture: PixelRows, k: int, first: int, begin_row: int, end_row: int) 
 
 @kernel
 def _draw_flat(picture: PixelRows, k: int, first: int, begin_row: int, end_row: int) -> None:
-    """Draw a face over whatever was there."""
+    """Draw a face over everything drawn before it."""
     width = picture.face.shape[1]
     edges = picture.faces.edges[k]
     number = picture.faces.number[k]
@@ -220,9 +219,9 @@ def _draw_flat(picture: PixelRows, k: int, first: int, begin_row: int, end_row: 
 
 @kernel
 def ground_at(camera: CameraPose, width: int, height: int) -> tuple[float, float, float]:
-    """The closeness of the ground: constant, by column, by row. Overwrites edge 4.
+    """Return the ground's closeness (constant, per column, per row); overwrites edge 4.
 
-    A camera on the ground does not see it.
+    A camera at ground level does not see the ground.
     """
     mount = camera.mount
     z = -mount[2, 3]

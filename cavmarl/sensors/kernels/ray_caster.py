@@ -1,13 +1,12 @@
-"""Rays from one place of a vehicle that end at bodies, walls and the ground: lidar and radar.
+"""Ray casting from one point of a vehicle to bodies, walls and the ground, for lidar and radar.
 
-A fan has columns of equal azimuth in the sensor's frame and in each column one ray a channel. A
-body covers few columns: those are bounded by an angle that is never too small, and only their rays
-are tested, exactly. Ray and prism meet by slabs (Kay, Kajiya: "Ray tracing complex scenes",
-SIGGRAPH 1986).
+A fan has columns of equal azimuth in the sensor's frame; each column has one ray per channel. A
+body covers few columns: these are bounded by an angle that is never too small, and only their rays
+are tested, exactly. Rays and prisms are intersected by slabs (Kay, Kajiya: "Ray tracing complex
+scenes", SIGGRAPH 1986).
 
-The sensor's frame is that of `scene` moved and turned by `mount`: a matrix (3, 4) whose first three
-columns are the sensor's axes (ahead, left, up) and whose last one is its place, all in the
-vehicle's frame.
+`mount` transforms the sensor's frame to the vehicle's: a matrix (3, 4) of the sensor's axes (ahead,
+left, up) and its position, all as columns in the vehicle's frame.
 """
 
 from __future__ import annotations
@@ -25,33 +24,33 @@ from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.math.geometry import PI, TWO_PI
 from cavmarl.core.records import record
 
-# What a ray met first.
+# The first hit of a ray.
 HIT = record(
-    ("distance", np.float64),  # m along the ray; 0 from inside of a body, the range for nothing
-    ("id", np.int64),  # of the vehicle or pedestrian; -1: none
-    ("what", np.int64),  # PRISM row of the panorama; or see `WALL_HIT`
+    ("distance", np.float64),  # m along the ray; 0 inside a body, the range without a hit
+    ("id", np.int64),  # id of the vehicle or pedestrian; -1: none
+    ("what", np.int64),  # row in PRISM of the panorama, or a code below
 )
 NO_HIT = -1
 GROUND_HIT = -2
 WALL_HIT = -3  # WALL row k of the scene is WALL_HIT - k
 
-# A ray that closes in on a slab by less than this each metre does not reach it within any range.
+# A ray that approaches a slab by less than this per metre does not reach it within any range.
 _PARALLEL = 1e-200
-# One that falls by less than this each metre does not meet the ground within any range.
+# A ray that falls by less than this per metre does not meet the ground within any range.
 _LEVEL = 1e-9
 
 
 class Fan(NamedTuple):
-    """Which rays there are; A columns and E channels."""
+    """The rays of a sensor, in A columns and E channels."""
 
     rays: NDArray[np.float64]  # (A, E, 3) directions in the vehicle's frame
-    ground_m: NDArray[np.float64]  # (A, E) where each meets the ground; inf: nowhere
+    ground_m: NDArray[np.float64]  # (A, E) distance to the ground; inf: never met
     mount: NDArray[np.float64]  # (3, 4)
     first_rad: float  # azimuth of the first column, in [-pi, pi]
     step_rad: float  # between columns, positive: counter-clockwise
-    per_rad: float  # columns
+    per_rad: float  # columns per rad
     range_m: float
-    tilted: bool  # whether the sensor's z axis is another than the vehicle's
+    tilted: bool  # whether the sensor's z axis differs from the vehicle's
     looks_down: bool  # whether any ray meets the ground within the range
 
 
@@ -61,13 +60,13 @@ def make_fan(
     elevations_rad: NDArray[np.float64],
     range_m: float,
 ) -> Fan:
-    """The rays of a sensor.
+    """Create the rays of a sensor.
 
     Args:
-        mount: (3, 4) axes and place in the vehicle's frame.
-        azimuths_rad: of the first column, from one to the next, and how many; at most a full turn.
-        elevations_rad: (E,) of the channels over the sensor's own plane.
-        range_m: how far it sees along each ray.
+        mount: (3, 4) axes and position in the vehicle's frame.
+        azimuths_rad: first azimuth, step, and number of columns; at most a full circle.
+        elevations_rad: (E,) elevation of each channel in the sensor's frame.
+        range_m: range along each ray.
     """
     first_rad, step_rad, columns = azimuths_rad
     azimuth = (first_rad + step_rad * np.arange(columns))[:, np.newaxis]
@@ -80,7 +79,7 @@ def make_fan(
         ],
         axis=2,
     )
-    # Not by `@`: what a matrix product gives can depend on the machine's threads.
+    # `@` is avoided: its result can depend on the number of threads.
     rays = own[..., :1] * mount[:, 0] + own[..., 1:2] * mount[:, 1] + own[..., 2:] * mount[:, 2]
     down = -rays[:, :, 2]
     ground_m = np.full(down.shape, np.inf)
@@ -94,12 +93,12 @@ def make_fan(
 
 @kernel
 def _columns(fan: Fan, middle_rad: float, spread_rad: float) -> tuple[int, int, int]:
-    """The columns within `spread_rad` of an azimuth: [begin, end), and those before the third."""
+    """Return the columns within `spread_rad` of an azimuth: [begin, end) and [0, wrapped)."""
     count = fan.rays.shape[0]
     spread_rad += ANGLE_ERROR_RAD
     if spread_rad >= PI:
         return 0, count, 0
-    # From here on in columns.
+    # The unit is columns from here on.
     turn = TWO_PI * fan.per_rad
     low = (middle_rad - spread_rad - fan.first_rad) * fan.per_rad
     if low < 0.0:
@@ -117,7 +116,7 @@ def _columns(fan: Fan, middle_rad: float, spread_rad: float) -> tuple[int, int, 
 
 @kernel
 def _columns_of_ball(fan: Fan, x: float, y: float, z: float, radius: float) -> tuple[int, int, int]:
-    """The columns that can meet a ball at a place in the vehicle's frame."""
+    """Return the columns that can meet a ball, given in the vehicle's frame."""
     mount = fan.mount
     dx = x - mount[0, 3]
     dy = y - mount[1, 3]
@@ -138,12 +137,12 @@ def _ray_to_prism(
     closing: tuple[float, float, float],
     half: tuple[float, float, float],
 ) -> float:
-    """Distance along a ray to a box around the origin, 0 inside of it and inf if missed.
+    """Return the distance along a ray to a box around the origin; 0 inside, inf if missed.
 
-    `place`: where the ray starts, mirrored into the first octant. `closing`: the ray's direction,
-    towards the origin: how fast each coordinate falls. `half`: of the box's sides.
+    `place`: start of the ray, mirrored into the first octant. `closing`: decrease of each
+    coordinate per metre along the ray. `half`: half the sizes of the box.
     """
-    # Negative for a slab that the ray starts in; beyond any range for one that it turns away from.
+    # Negative if the ray starts inside the slab; beyond any range if it points away from it.
     enter_x = (place[0] - half[0]) / max(closing[0], _PARALLEL)
     enter_y = (place[1] - half[1]) / max(closing[1], _PARALLEL)
     enter_z = (place[2] - half[2]) / max(closing[2], _PARALLEL)
@@ -151,8 +150,8 @@ def _ray_to_prism(
     there_x = place[0] - closing[0] * distance
     there_y = place[1] - closing[1] * distance
     there_z = place[2] - closing[2] * distance
-    # The near side of a slab that was entered is not tested again: by rounding, rays would slip in
-    # between two faces.
+    # The near side of an entered slab is not tested again: rounding would let rays pass between two
+    # faces.
     inside_x = (there_x >= -half[0]) & (there_x <= max(place[0], half[0]))
     inside_y = (there_y >= -half[1]) & (there_y <= max(place[1], half[1]))
     inside_z = (there_z >= -half[2]) & (there_z <= max(place[2], half[2]))
@@ -161,7 +160,7 @@ def _ray_to_prism(
 
 @kernel
 def _between(columns: tuple[int, int, int], first: int, last: int) -> tuple[int, int, int, int]:
-    """Of the columns that `_columns` tells, those in [first, last): [begin, end) and a second."""
+    """Clip the two ranges of `_columns` to [first, last)."""
     begin, end, wrapped = columns
     begin = min(max(begin, first), last)
     end = min(max(end, begin), last)
@@ -173,7 +172,7 @@ def _between(columns: tuple[int, int, int], first: int, last: int) -> tuple[int,
 def _cast_at_prism(
     fan: Fan, prisms: NDArray[np.void], k: int, first: int, last: int, hits: NDArray[np.void]
 ) -> None:
-    """Let the rays that can meet a body meet it; of equally near bodies the smaller id counts."""
+    """Intersect a body with the rays that can meet it; on a tie, keep the smaller id."""
     prism = prisms[k]
     cos = prism["cos"]
     sin = prism["sin"]
@@ -192,7 +191,7 @@ def _cast_at_prism(
     begin, end, start, wrapped = _between(columns, first, last)
     if begin == end and start == wrapped:
         return
-    # The body's axes, each turned to point from the sensor towards the body.
+    # The body's axes, each flipped to point away from the sensor.
     along = dx * cos + dy * sin
     beside = dy * cos - dx * sin
     along_sign = math.copysign(1.0, along)
@@ -223,7 +222,7 @@ def _cast_at_prism(
 def _cast_at_wall(
     fan: Fan, walls: NDArray[np.void], k: int, first: int, last: int, hits: NDArray[np.void]
 ) -> None:
-    """Let the rays that can meet a wall meet it; bodies and earlier walls count before it."""
+    """Intersect a wall with the rays that can meet it; on a tie, keep the earlier hit."""
     wall = walls[k]
     x = fan.mount[0, 3]
     y = fan.mount[1, 3]
@@ -241,7 +240,7 @@ def _cast_at_wall(
         for e in range(rays.shape[1]):
             ray_x = rays[a, e, 0]
             ray_y = rays[a, e, 1]
-            # On which side of the ray the ends lie: walls that share an end leave no gap.
+            # Sides of the ray on which the ends lie; walls that share an end leave no gap.
             side_a = ray_x * ay - ray_y * ax
             side_b = ray_x * by - ray_y * bx
             if (side_a > 0.0) == (side_b > 0.0):
@@ -259,7 +258,7 @@ def _cast_at_wall(
 def _columns_of_wall(
     fan: Fan, wall: np.void, ax: float, ay: float, bx: float, by: float
 ) -> tuple[int, int, int]:
-    """The columns that can meet a wall whose ends are seen at a and b."""
+    """Return the columns that can meet a wall with ends a and b, given from the sensor."""
     if fan.tilted:
         half_height = 0.5 * wall["height"]
         half_length = 0.5 * hypot(bx - ax, by - ay)
@@ -275,13 +274,13 @@ def _columns_of_wall(
     across = ax * by - ay * bx
     along = ax * bx + ay * by
     if across == 0.0 and along == 0.0:
-        return 0, fan.rays.shape[0], 0  # the sensor is at an end of it
+        return 0, fan.rays.shape[0], 0  # the sensor is at an end of the wall
     from_a = rough_atan2(ay * yaw_cos - ax * yaw_sin, ax * yaw_cos + ay * yaw_sin)
-    # From a to b the short way round.
+    # The turn from a to b, the short way round.
     turn = rough_atan2(across, along)
     if abs(turn) > PI - 2.0 * ANGLE_ERROR_RAD:
-        return 0, fan.rays.shape[0], 0  # it may be the other way round
-    # Two angles are wrong, and not one.
+        return 0, fan.rays.shape[0], 0  # rounding may have chosen the long way round
+    # Both angles are approximate, so the error bound is added once more.
     return _columns(fan, from_a + 0.5 * turn, 0.5 * abs(turn) + ANGLE_ERROR_RAD)
 
 
@@ -296,10 +295,10 @@ def cast(
     last: int,
     hits: NDArray[np.void],
 ) -> None:
-    """Find what each ray of a fan meets first; the ground only where nothing else is.
+    """Find the first hit of each ray of a fan; the ground counts only where nothing else is hit.
 
-    `prisms`: PRISM (C,) of the panorama. `walls`: WALL (num_walls,) of the panorama. `last`: the
-    one after the last that is cast. `hits`: HIT (A, E), overwritten in these columns.
+    `prisms`: PRISM (C,) of the panorama. `walls`: WALL (num_walls,) of the panorama. `first`,
+    `last`: the columns [first, last) to cast. `hits`: HIT (A, E), overwritten in these columns.
     """
     for a in range(first, last):
         for e in range(hits.shape[1]):

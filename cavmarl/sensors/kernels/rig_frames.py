@@ -1,17 +1,17 @@
-"""What all mounted sensors have in common: places, errors, rates, stamps, counts, and lost samples.
+"""Common parts of mounted sensors: poses, errors, sampling times, counts, and lost samples.
 
-When samples are taken is a pure function of a world's tick: sample k is due k · ticks / samples
-ticks after the phase, and delivered by the first tick at or after that. So nothing has to be kept,
-and no migration, reset or repeated tick can move it.
+The sampling schedule is a pure function of a world's tick: sample k is due k · ticks / samples
+ticks after the phase, and is delivered by the first tick at or after that time. So the schedule has
+no state that a migration, reset or repeated tick could change.
 
-Frames are right-handed: x forward, y to the left, z up. A direction is given by yaw (counter-
-clockwise seen from above), then pitch (positive upwards), then roll (positive with the left side
-up), each about the axes as turned by those before. The vehicle's origin lies on the ground below
-the centre of the body.
+Frames are right-handed: x forward, y left, z up. An orientation is given by yaw (counter-clockwise
+seen from above), then pitch (positive upwards), then roll (positive with the left side up), each
+about the axes that result from the previous rotations. The vehicle's origin lies on the ground
+below the centre of the body.
 
-Errors are a function of vehicle, tick, sensor and draw alone. A sensor's random numbers have a key
-of their own, mixed from that of the vehicle and the stream of the sensor, so that no two sensors
-share numbers and another sensor in the rig changes none.
+Errors depend only on vehicle, tick, sensor and draw. The key of a sensor's random numbers is mixed
+from the key of the vehicle and the stream of the sensor. So no two sensors share random numbers,
+and adding a sensor does not change those of another.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 
-# Numbers of draws, apart from those of the samples' numbers.
+# Draws of biases and dropouts, apart from the draws of samples.
 _BIAS = 1 << 28
 _DROPOUT = 1 << 29
 
 
 class Noise(NamedTuple):
-    """How wrong a sensor is."""
+    """The error model of a sensor."""
 
     stream: np.uint64
     noise: NDArray[np.float64]  # (channels,) standard deviation of each sample
-    bias: NDArray[np.float64]  # (channels,) of what stays the same for a vehicle's episode
+    bias: NDArray[np.float64]  # (channels,) standard deviation of the constant error of an episode
 
 
 @kernel
 def sensor_key(row: np.void, stream: np.uint64) -> np.uint64:
-    """The key of a sensor's random numbers on a vehicle."""
+    """Return the key of a sensor's random numbers on a vehicle."""
     return mix(row["rng_key"] ^ stream)
 
 
 @kernel
 def gauss(key: np.uint64, vehicle: int, tick: int, draw: int) -> float:
-    """A standard normal number.
+    """Draw a standard normal number.
 
-    Box and Muller: "A note on the generation of random normal deviates", 1958.
+    Source: Box and Muller, "A note on the generation of random normal deviates", 1958.
 
-    `draw`: which one of this tick, below 2**30.
+    `draw`: number of the draw in this tick, below 2**30.
     """
     radius = math.sqrt(-2.0 * log(1.0 - quick_uniform(key, vehicle, tick, 2 * draw)))
     return radius * cosine(TWO_PI * quick_uniform(key, vehicle, tick, 2 * draw + 1))
@@ -65,10 +65,10 @@ def gauss(key: np.uint64, vehicle: int, tick: int, draw: int) -> float:
 def error_of(
     noise: Noise, key: np.uint64, vehicle: int, tick: int, draw: int, channel: int
 ) -> float:
-    """What is added to a number that a sensor measures.
+    """Return the error of one measured number.
 
-    `draw`: number of the measured number among those of this tick, below 2**28. `channel`: which
-    one it belongs to.
+    `draw`: index of the number in this tick, below 2**28. `channel`: the channel to which the
+    number belongs.
     """
     error = 0.0
     if noise.noise[channel] > 0.0:
@@ -82,10 +82,10 @@ def error_of(
 def add_errors(
     noise: Noise, row: np.void, tick: int, sample: int, out: NDArray[np.float64]
 ) -> None:
-    """Add to each channel of a sample (channels,) its error.
+    """Add an error to each channel of a sample (channels,).
 
-    `row`: VEHICLE that carries it. `sample`: its number among those of the tick. `out`: the sample,
-    one number a channel.
+    `row`: VEHICLE that carries the sensor. `sample`: index of the sample in the tick. `out`: the
+    sample, one number per channel.
     """
     key = sensor_key(row, noise.stream)
     for channel in range(out.size):
@@ -95,7 +95,7 @@ def add_errors(
 
 @kernel
 def is_lost(row: np.void, stream: np.uint64, tick: int, sample: int, dropout: float) -> bool:
-    """Whether a sample of a tick is lost, with the chance of `dropout`."""
+    """Return whether a sample of a tick is lost, with probability `dropout`."""
     if dropout <= 0.0:
         return False
     key = sensor_key(row, stream)
@@ -103,18 +103,18 @@ def is_lost(row: np.void, stream: np.uint64, tick: int, sample: int, dropout: fl
 
 
 class Mount(NamedTuple):
-    """A place and a direction in the vehicle's frame."""
+    """A position and an orientation in the vehicle's frame."""
 
     place: NDArray[np.float64]  # (3,) m
-    turn: NDArray[np.float64]  # (3, 3) a vector of the sensor's frame in the vehicle's frame
+    turn: NDArray[np.float64]  # (3, 3) rotates a vector of the sensor's frame into the vehicle's
 
 
 @kernel
 def rotation(yaw: float, pitch: float, roll: float, out: NDArray[np.float64]) -> None:
-    """Write the matrix that turns a vector of the turned frame into the one around it.
+    """Write the matrix that rotates a vector of the rotated frame into the outer frame.
 
     `pitch`: rad, positive upwards. `roll`: rad, positive with the left side up. `out`: (3, 3),
-    overwritten; its columns are the turned frame's axes.
+    overwritten; its columns are the axes of the rotated frame.
     """
     cos_yaw, sin_yaw = cos_sin(yaw)
     cos_pitch, sin_pitch = cos_sin(pitch)
@@ -132,7 +132,7 @@ def rotation(yaw: float, pitch: float, roll: float, out: NDArray[np.float64]) ->
 
 @kernel
 def turned(matrix: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A vector, turned by a matrix (3, 3)."""
+    """Return a vector rotated by a matrix (3, 3)."""
     return (
         matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
         matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
@@ -144,13 +144,13 @@ def turned(matrix: NDArray[np.float64], x: float, y: float, z: float) -> tuple[f
 def sensor_pose(
     row: np.void, mount: Mount, body: NDArray[np.float64], axes: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Where a sensor is in the world, and how it is turned.
+    """Compute the position and orientation of a sensor in the world.
 
     Args:
-        row: VEHICLE that carries it.
-        mount: on the vehicle.
-        body: (3, 3), overwritten: a vector of the vehicle's frame in the world.
-        axes: (3, 3), overwritten: a vector of the sensor's frame in the world.
+        row: VEHICLE that carries the sensor.
+        mount: pose of the sensor on the vehicle.
+        body: (3, 3), overwritten: rotation from the vehicle's frame to the world's.
+        axes: (3, 3), overwritten: rotation from the sensor's frame to the world's.
 
     Returns:
         x, y, z in m.
@@ -165,26 +165,26 @@ def sensor_pose(
 
 
 class SensorSchedule(NamedTuple):
-    """The rate of a sensor: `samples` in `ticks` ticks, in lowest terms."""
+    """The rate of a sensor: `samples` per `ticks`, in lowest terms."""
 
     samples: int
     ticks: int
     phase: int  # tick of sample 0
     ticks_per_step: int
-    slots: int  # the most samples in a step
+    slots: int  # largest number of samples in a step
 
 
 class Due(NamedTuple):
-    """What one sensor has to deliver in the present tick of each world."""
+    """The samples that one sensor must deliver in the present tick of each world."""
 
-    num: NDArray[np.int64]  # (W,) samples
-    first: NDArray[np.int64]  # (W,) number of the first one, since the reset
-    slot: NDArray[np.int64]  # (W,) where it is written; the last of a step lies in the last slot
+    num: NDArray[np.int64]  # (W,) number of samples
+    first: NDArray[np.int64]  # (W,) index of the first sample since the reset
+    slot: NDArray[np.int64]  # (W,) slot of the first; the last sample of a step has the last slot
 
 
 @kernel
 def taken(schedule: SensorSchedule, tick: int) -> int:
-    """How many samples are taken at or before a tick."""
+    """Return the number of samples taken at or before a tick."""
     since = tick - schedule.phase
     if since < 0:
         return 0
@@ -193,10 +193,10 @@ def taken(schedule: SensorSchedule, tick: int) -> int:
 
 @kernel
 def stamp_of(schedule: SensorSchedule, number: int, tick: int, tick_s: float) -> float:
-    """The time of a sample in s since the reset, delivered by `tick`.
+    """Return the time of a sample that is delivered by `tick`, in s since the reset.
 
-    Of a sensor with several samples a tick it may lie between two; all others sense the state of
-    the tick, and that is what the stamp says.
+    With several samples per tick, this time may lie between two ticks. Otherwise it is the time of
+    the tick, whose state the sensor measures.
     """
     if schedule.samples <= schedule.ticks:
         return tick * tick_s
@@ -207,11 +207,11 @@ def stamp_of(schedule: SensorSchedule, number: int, tick: int, tick_s: float) ->
 def call_due(
     schedule: SensorSchedule, ticks: NDArray[np.int64], chosen: NDArray[np.bool_], due: Due
 ) -> bool:
-    """Write what is due in the chosen worlds, and nothing for the others.
+    """Write the samples that are due in the chosen worlds, and none in the others.
 
     `ticks`: (W,) since each world's reset.
 
-    Returns whether anything is.
+    Returns whether any sample is due.
     """
     found = False
     for w in range(ticks.size):
@@ -231,7 +231,7 @@ def call_due(
 
 
 POSE = record(
-    ("id", np.int64),  # of the vehicle; -1: none
+    ("id", np.int64),  # id of the vehicle; -1: none
     ("x", np.float64),  # as in VEHICLE
     ("y", np.float64),
     ("z", np.float64),
@@ -248,7 +248,7 @@ POSE = record(
 
 @kernel
 def call_roll(worlds: Worlds, ids: NDArray[np.int64]) -> None:
-    """Write the vehicle of each owned agent to `ids` (W, A)."""
+    """Write the vehicle id of each owned agent to `ids` (W, A)."""
     for w in range(worlds.ticks.size):
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
@@ -258,7 +258,7 @@ def call_roll(worlds: Worlds, ids: NDArray[np.int64]) -> None:
 
 @kernel
 def note_poses(worlds: Worlds, poses: NDArray[np.void]) -> None:
-    """Write where each owned agent is, and how it moves, to `poses`, POSE (W, A)."""
+    """Write pose and motion of each owned agent to `poses`, POSE (W, A)."""
     for w in range(worlds.ticks.size):
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
@@ -292,11 +292,12 @@ def deliver(
     fresh: NDArray[np.int64],
     data: NDArray[np.uint8],
 ) -> None:
-    """Stamp and count the samples that owned agents have got in this tick; lose some of them.
+    """Stamp and count the samples that owned agents got in this tick, and drop some of them.
 
-    `stream`: of the sensor's random numbers. `dropout`: chance that a sample is lost. `stamp_s`:
-    (W, A, S) in s since the reset. `lost`: (W, A, S) which ones are lost. `fresh`: (W, A) samples
-    of this step, up to now. `data`: (W, A, S, bytes); of lost samples all zeros.
+    `stream`: stream of the sensor's random numbers. `dropout`: probability that a sample is lost.
+    `stamp_s`: (W, A, S) in s since the reset. `lost`: (W, A, S) whether each sample is lost.
+    `fresh`: (W, A) number of samples of this step so far. `data`: (W, A, S, bytes); lost samples
+    are zeros.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:

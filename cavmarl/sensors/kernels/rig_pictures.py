@@ -1,8 +1,8 @@
-"""What cameras and bird's-eye grids on agents' vehicles see.
+"""Cameras and bird's-eye grids on agents' vehicles.
 
-In a bird's-eye grid, later ones cover earlier ones: ground, roads, lane lines, buildings, bodies in
-the order of their ids. It is that of a sensor that looks along its own x axis; row 0 is farthest
-ahead, column 0 farthest to the left.
+In a bird's-eye grid, objects are drawn in this order, later ones over earlier ones: ground, roads,
+lane lines, buildings, bodies by id. The grid is aligned with the sensor's x axis; row 0 is farthest
+ahead, column 0 farthest left.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
 
 
 class BirdsEye(NamedTuple):
-    """Where the grid lies in the vehicle's frame, and scratch."""
+    """The pose of a grid in the vehicle's frame, and scratch."""
 
-    x: float  # of the sensor, m
+    x: float  # m, position of the sensor
     y: float
-    cos: float  # of its yaw
+    cos: float  # cosine of its yaw
     sin: float
-    ahead_m: float  # from the sensor to the upper edge of the grid
-    left_m: float  # and to the left one
+    ahead_m: float  # distance from the sensor to the upper edge of the grid
+    left_m: float  # distance from the sensor to the left edge
     cell_m: float
     edges: NDArray[np.float64]  # (4, 4)
     face: NDArray[np.float64]  # (4, 2) corners in the grid, in cells: column, row
@@ -59,12 +59,12 @@ class BirdsEye(NamedTuple):
 def make_birds_eye(
     mount: NDArray[np.float64], ahead_m: float, left_m: float, cell_m: float
 ) -> BirdsEye:
-    """A grid.
+    """Create a grid.
 
     Args:
-        mount: (3, 4) axes and place in the vehicle's frame, not tilted.
-        ahead_m: from the sensor to the upper edge.
-        left_m: from the sensor to the left edge.
+        mount: (3, 4) axes and position in the vehicle's frame, not tilted.
+        ahead_m: distance from the sensor to the upper edge.
+        left_m: distance from the sensor to the left edge.
         cell_m: side of a cell.
     """
     return BirdsEye(
@@ -82,7 +82,7 @@ def make_birds_eye(
 
 @kernel
 def _set_corner(grid: BirdsEye, c: int, x: float, y: float) -> None:
-    """Bring a corner from the vehicle's frame into the grid."""
+    """Transform a corner from the vehicle's frame to the grid."""
     dx = x - grid.x
     dy = y - grid.y
     grid.face[c, 0] = (grid.left_m - (dy * grid.cos - dx * grid.sin)) / grid.cell_m
@@ -91,7 +91,7 @@ def _set_corner(grid: BirdsEye, c: int, x: float, y: float) -> None:
 
 @kernel
 def _fill(grid: BirdsEye, semantic: int, out: NDArray[np.uint8]) -> None:
-    """Fill the cells whose centres lie in the convex quad of the set corners."""
+    """Fill the cells whose centres lie in the convex quad of the current corners."""
     height, width = out.shape
     face = grid.face
     top = min(min(face[0, 1], face[1, 1]), min(face[2, 1], face[3, 1]))
@@ -144,7 +144,7 @@ def _fill_line(
 def look_down(grid: BirdsEye, panorama: Panorama, counts: Counts, out: NDArray[np.uint8]) -> None:
     """Fill the grid.
 
-    `grid`: where it lies. `panorama`: what stands around the vehicle, prisms ordered by id. `out`:
+    `grid`: its pose. `panorama`: the surroundings of the vehicle, prisms ordered by id. `out`:
     (rows, columns), overwritten.
     """
     out[:] = GROUND
@@ -152,7 +152,7 @@ def look_down(grid: BirdsEye, panorama: Panorama, counts: Counts, out: NDArray[n
         for c in range(4):
             _set_corner(grid, c, panorama.strips[k, c, 0], panorama.strips[k, c, 1])
         _fill(grid, ROAD, out)
-    # As wide as a cell's diagonal reaches: a line shows in every row that it crosses.
+    # Half a cell to each side, so that a line shows in every row that it crosses.
     half_m = 0.5 * grid.cell_m
     for k in range(counts.strips):
         if panorama.lined[k] > 0.0:
@@ -175,9 +175,9 @@ def look_down(grid: BirdsEye, panorama: Panorama, counts: Counts, out: NDArray[n
 
 @kernel
 def camera_reach_m(camera: CameraPose, width: int, height: int) -> float:
-    """How far from the vehicle's place something can be that a pixel shows, m.
+    """Return the largest distance of a visible point from the vehicle's position, m.
 
-    The range is a depth along the axis; corners of the picture see farther.
+    The range is a depth along the axis; the corners of the picture see farther.
     """
     across = 0.5 * width / camera.focal
     up = 0.5 * height / camera.focal
@@ -210,15 +210,14 @@ def take_pictures(
     classes: bool | None,
     data: NDArray[np.unsignedinteger],
 ) -> None:
-    """Write the pictures that are due of the owned agents: depths, colours, or classes.
+    """Write the pictures that are due for the owned agents: depths, colours, or classes.
 
-    `lines`: (W, agents, 2) rows [first, last) of each agent's picture that are written. `noise`: of
-    depths, what is as far as the range has none. `scratch`: (rows of `picture`, W), and
-    `scratch_bits`, the same memory, for depths only. `palette`: for colours only. `classes`: True
-    for them only.
+    `lines`: (W, agents, 2) rows [first, last) of each agent's picture to write. `noise`: of depths
+    less than the range, or of colours. `scratch`: (rows of `picture`, W), and `scratch_bits`, the
+    same memory; for depths only. `palette`: for colours only. `classes`: True for classes only.
     `data`: (W, agents, S, H, W) float16 as bits, m; or uint8, (…, 3) for colours.
 
-    Numba leaves out the branches of what is None.
+    Numba leaves out the branches of arguments that are None.
     """
     band, width = picture.face.shape
     reach_m = camera_reach_m(camera, width, picture.height)
@@ -258,7 +257,7 @@ def take_pictures(
 def _add_noise(
     noise: Noise, row: np.void, tick: int, range_m: float, first: int, depths: NDArray[np.float32]
 ) -> None:
-    """Make depths (rows, W) less than the range wrong, from a centimetre to the range.
+    """Add errors to depths (rows, W) below the range; the results lie between 1 cm and the range.
 
     `first` is their first row in the picture.
     """
@@ -275,7 +274,7 @@ def _add_noise(
 def _add_colour_noise(
     noise: Noise, row: np.void, tick: int, first: int, out: NDArray[np.uint8]
 ) -> None:
-    """Make each colour (rows, W, 3) wrong, from 0 to 255; `first` is the first row."""
+    """Add errors to colours (rows, W, 3), within 0 and 255; `first`: first row in the picture."""
     key = sensor_key(row, noise.stream)
     rows, width, _ = out.shape
     for j in range(rows):
@@ -299,7 +298,7 @@ def fill_grids(
 ) -> None:
     """Write the bird's-eye grids (W, agents, S, rows, columns) that are due; see `take_pictures`.
 
-    `reach_m` is the distance from the vehicle's place to the farthest corner of the grid.
+    `reach_m`: distance from the vehicle's position to the farthest corner of the grid.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:

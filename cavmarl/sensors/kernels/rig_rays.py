@@ -1,8 +1,8 @@
-"""What lidars and radars on agents' vehicles sense.
+"""Lidars and radars on agents' vehicles.
 
-A target of a radar is a body or a building of which a ray of the fan meets something first; its
-echo is the nearest of those. The radial speed is that of the target's centre less that of the
-sensor, along the ray: positive where the distance grows. The ground and clutter give no echo.
+A radar target is a body or a building that a ray of the fan hits first; its echo is the nearest of
+these hits. The radial speed is the speed of the target's centre relative to the sensor, along the
+ray, positive if the distance grows. The ground and clutter give no echo.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ TARGET = record(
     ("range", np.float64),  # m
     ("azimuth", np.float64),  # rad in the sensor's frame, positive to the left
     ("speed", np.float64),  # m/s, positive away
-    ("body", np.int64),  # 1: a body, 0: a building
-    ("id", np.int64),  # of the vehicle, or number of the building
+    ("body", np.int64),  # 1: body, 0: building
+    ("id", np.int64),  # id of the vehicle, or number of the building
 )
 
 
 @kernel
 def _radial_speed(fan: Fan, panorama: Panorama, ego: np.void, hit: np.void, a: int) -> float:
-    """Of what column `a` has met."""
+    """Return the radial speed of the object that column `a` has hit."""
     ray_x = fan.rays[a, 0, 0]
     ray_y = fan.rays[a, 0, 1]
-    # The sensor turns with the vehicle, about its centre.
+    # The sensor moves with the vehicle, which turns about its centre.
     x = -(ego["speed"] - ego["yaw_rate"] * fan.mount[1, 3])
     y = -(ego["yaw_rate"] * fan.mount[0, 3])
     if hit["what"] >= 0:
@@ -48,7 +48,7 @@ def _radial_speed(fan: Fan, panorama: Panorama, ego: np.void, hit: np.void, a: i
 
 @kernel
 def _place_of(targets: NDArray[np.void], found: int, body: int, number: int) -> int:
-    """Where a target is in the list; `found` if it is new."""
+    """Return the index of a target in the list; `found` if the target is new."""
     for k in range(found - 1, -1, -1):
         if targets[k]["body"] == body and targets[k]["id"] == number:
             return k
@@ -56,8 +56,8 @@ def _place_of(targets: NDArray[np.void], found: int, body: int, number: int) -> 
 
 
 @kernel
-def _before(target: np.void, other: np.void) -> bool:
-    """Whether a target comes before another: by range, then by kind and number."""
+def _comes_before(target: np.void, other: np.void) -> bool:
+    """Return whether a target comes before another: by range, then by kind and number."""
     if target["range"] != other["range"]:
         return bool(target["range"] < other["range"])
     if target["body"] != other["body"]:
@@ -74,12 +74,11 @@ def detect(
     targets: NDArray[np.void],
     order: NDArray[np.int32],
 ) -> int:
-    """List what the rays have met, nearest first.
+    """List the targets that the rays have hit, nearest first, and return their number.
 
     `fan`: of one channel. `hits`: HIT (A, 1), from `cast`. `targets`: TARGET (A,), overwritten up
-    to the returned number, in no order. `order`: (A,) likewise: which target is the next nearest.
-
-    Returns how many there are.
+    to the returned number, unordered. `order`: (A,), overwritten up to the same number with the
+    indices of targets, nearest first.
     """
     found = 0
     for a in range(hits.shape[0]):
@@ -100,21 +99,21 @@ def detect(
         found = max(found, place + 1)
     for k in range(found):
         place = k
-        while place > 0 and _before(targets[k], targets[order[place - 1]]):
+        while place > 0 and _comes_before(targets[k], targets[order[place - 1]]):
             order[place] = order[place - 1]
             place -= 1
         order[place] = k
     return found
 
 
-# Rays that are written together, a cache line of them: with 1,024 or more in a layer the same place
-# of all layers is kept in one set of the cache, which does not hold them.
+# Rays are written in blocks of one cache line. Without blocks, a layer of 1,024 or more rays would
+# map the same ray of all layers to one set of the cache, which cannot hold them.
 BLOCK = 16
 
 
 @kernel
 def reach_of(fan: Fan) -> float:
-    """How far from the vehicle's place something can be that a ray meets, m."""
+    """Return the largest distance of a hit from the vehicle's position, m."""
     return fan.range_m + hypot(fan.mount[0, 3], fan.mount[1, 3])
 
 
@@ -131,11 +130,10 @@ def measure_lidar(
     hits: NDArray[np.void],
     data: NDArray[np.float32],
 ) -> None:
-    """Write what is due of the owned agents.
+    """Write the samples that are due for the owned agents.
 
-    `lines`: (W, agents, 2) columns [first, last) of each agent's rays that are written. `noise`: of
-    the sensor; what meets nothing has none. `hits`: HIT (A, E), scratch. `data`: (W, agents, S, E,
-    A) distances in m.
+    `lines`: (W, agents, 2) columns [first, last) of each agent's rays to write. `noise`: applies to
+    hits only. `hits`: HIT (A, E), scratch. `data`: (W, agents, S, E, A) distances in m.
     """
     reach_m = reach_of(fan)
     noisy = noise.noise[0] > 0.0 or noise.bias[0] > 0.0
@@ -174,9 +172,9 @@ def _add_noise(
     last: int,
     out: NDArray[np.float32],
 ) -> None:
-    """Make the distances (E, A) that are less than the range wrong, from 0 to the range.
+    """Add errors to distances (E, A) below the range, in the columns [first, last).
 
-    In the columns [first, last).
+    The results lie between 0 and the range.
     """
     key = sensor_key(row, noise.stream)
     layers, rays = out.shape
@@ -201,9 +199,9 @@ def measure_radar(
     order: NDArray[np.int32],
     data: NDArray[np.float32],
 ) -> None:
-    """Write what is due of the owned agents.
+    """Write the samples that are due for the owned agents.
 
-    `fan`: its rays, of one channel. `hits`: HIT (A, 1), scratch. `targets`: TARGET (A,), scratch.
+    `fan`: rays of one channel. `hits`: HIT (A, 1), scratch. `targets`: TARGET (A,), scratch.
     `order`: (A,), scratch. `data`: (W, agents, S, targets, 3) range in m, azimuth in rad, radial
     speed in m/s.
     """

@@ -1,7 +1,7 @@
-"""The end of a step: what the agents of one shard observe, and their terms.
+"""The end of a step: observations and reward terms of the agents of one shard.
 
-One function a sensor: it writes its features, scaled numbers in [-1, 1], from position `at` on. The
-scales stand here; the names and meanings of the features in `sensors/observed/`.
+There is one function per sensor. It writes the sensor's features, scaled to [-1, 1], from position
+`at` on. The scales are defined here; names and meanings of the features are in `sensors/observed/`.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ ROOM_SCALE = 200.0  # m
 TO_GO_SCALE = 1000.0  # m
 LENGTH_SCALE = 20.0  # m
 WHEELBASE_SCALE = 10.0  # m
-HALF_S = 5.0  # a time of this length is a soonness of 0.5
-SLOWEST_MPS = 1.0  # a standing vehicle is taken to come on with
+HALF_S = 5.0  # a time of this length has a soonness of 0.5
+SLOWEST_MPS = 1.0  # the vehicle is assumed to approach at least this fast, even if it stands
 
 
 @kernel
@@ -61,7 +61,7 @@ def unit(value: float) -> float:
 
 @kernel
 def soonness(time: float) -> float:
-    """1 now, 0.5 in `HALF_S`, 0 in a long time: seconds count where they are few."""
+    """Return the soonness of a time: 1 now, 0.5 in `HALF_S`, towards 0 in a long time."""
     return HALF_S / (HALF_S + time)
 
 
@@ -69,7 +69,7 @@ def soonness(time: float) -> float:
 def observe_ego(
     roads: RoadArrays, plans: NDArray[np.void], row: np.void, out: NDArray[np.float32]
 ) -> None:
-    """The vehicle itself, its lane and what its plan asks of it."""
+    """Write the features of the vehicle, its lane, and the lane change that its plan needs."""
     lane = roads.lanes[row["lane"]]
     step = plans[row["goal"], row["lane"]]
     _, _, _, cos, sin, _ = lane_pose(
@@ -93,7 +93,7 @@ def observe_ego(
 
 @kernel
 def observe_size(kind: np.void, row: np.void, out: NDArray[np.float32]) -> None:
-    """What the vehicle's type sets apart, behind `observe_ego`."""
+    """Write size and limits of the vehicle's type, after `observe_ego`."""
     out[EGO_FEATURES] = unit(row["length"] / LENGTH_SCALE)
     out[EGO_FEATURES + 1] = unit(row["width"] / OFFSET_SCALE)
     out[EGO_FEATURES + 2] = unit(kind["wheelbase"] / WHEELBASE_SCALE)
@@ -111,7 +111,7 @@ def observe_route(
     sensors: Sensors,
     out: NDArray[np.float32],
 ) -> None:
-    """Points of the way ahead in the ego frame; beyond the way's end its last point."""
+    """Write points of the path ahead in the ego frame; the last one repeats beyond its end."""
     cos_heading, sin_heading = cos_sin(row["heading"])
     scale = sensors.route_points * sensors.route_spacing_m
     lane = row["lane"]
@@ -138,9 +138,9 @@ def observe_route(
 def observe_neighbors(
     rows: NDArray[np.void], i: int, grid: Grid, sensors: Sensors, out: NDArray[np.float32]
 ) -> None:
-    """The nearest vehicles in the ego frame, nearest first; zeros where there are fewer.
+    """Write the nearest vehicles in the ego frame, nearest first; missing vehicles are zeros.
 
-    Those behind `sensors.walls` are left out.
+    Vehicles behind `sensors.walls` are left out.
     """
     if sensors.neighbors == 0:
         return
@@ -183,7 +183,7 @@ def observe_neighbors(
 
 @kernel
 def gives_way_on(roads: RoadArrays, link: int, signal: int) -> bool:
-    """Whether a driver on this link has to give way to some other link now."""
+    """Return whether a driver on this link must yield to another link now."""
     if signal == SIGNAL_GREEN_MAJOR or signal == SIGNAL_OFF:
         return False
     first = roads.links[link]["first_conflict"]
@@ -205,9 +205,9 @@ def observe_signal(
     sensors: Sensors,
     out: NDArray[np.float32],
 ) -> None:
-    """The next stop line on the way with a signal, or where another vehicle has the right of way.
+    """Write the next stop line on the path with a signal or a duty to yield.
 
-    `time` is that of the tick, in s since the world's reset.
+    `time`: time of the tick, in s since the world's reset.
     """
     at = sensors.signal_at
     lane = row["lane"]
@@ -242,7 +242,7 @@ def observe_signal(
 def observe_lidar(
     rows: NDArray[np.void], i: int, grid: Grid, sensors: Sensors, out: NDArray[np.float32]
 ) -> None:
-    """Distances along the rays, 1 where nothing is; then, if asked for, relative speeds."""
+    """Write the distances along the rays, 1 without a hit, then any relative speeds."""
     rays = sensors.lidar_rays
     if rays == 0:
         return
@@ -250,7 +250,7 @@ def observe_lidar(
     at = sensors.lidar_at
     for k in range(rays):
         echo = sensors.echoes[k]
-        # Most rays meet nothing: no division for these.
+        # Most rays hit nothing; avoid the division for them.
         if echo["id"] < 0:
             out[at + k] = 1.0
             continue
@@ -272,21 +272,21 @@ def sense(
     chosen: NDArray[np.bool_],
     outputs: Outputs,
 ) -> None:
-    """Write what every owned agent of the chosen worlds gets, at its own index.
+    """Write observations and terms of every owned agent of the chosen worlds, at its own index.
 
     A vehicle that entered during the step has not acted: it is observed, its terms are 0, and it
-    does not end. `observe_optional` and `fill_stacks` complete the observations. The terms are
-    summed in `rewards.kernels.reward`, when all shards have written theirs.
+    does not end. `observe_optional` and `fill_stacks` complete the observations.
+    `rewards.kernels.reward` sums the terms when all shards have written theirs.
 
-    `worlds`: committed rows at the end of the step, ghosts among them. `outputs`: cleared where
-    chosen; written at the indices of owned agents.
+    `worlds`: committed rows at the end of the step, including ghosts. `outputs`: cleared in the
+    chosen worlds; written at the indices of owned agents.
     """
     step_s = tick_s * ticks_per_step
     for w in range(worlds.ticks.shape[0]):
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        is_filled = False  # many zones have no agents
+        is_filled = False  # fill the grid on first use: many zones have no agents
         for i in range(worlds.num_owned[w]):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:

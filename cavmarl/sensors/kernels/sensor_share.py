@@ -1,4 +1,4 @@
-"""The rows of a whole world for sensor workers, and the agents that each of them senses."""
+"""The rows of a whole world for sensor workers, and the agents that each worker senses."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 def gather_rows(
     worlds: Worlds, agent_arrays: bool, rows: NDArray[np.void], num_rows: NDArray[np.int64]
 ) -> None:
-    """Put the owned rows of a zone behind those that are there.
+    """Append the owned rows of a zone to `rows`.
 
-    `agent_arrays`: only those of agents; otherwise only the others. `num_rows`: (W,) how many there
-    are.
+    `agent_arrays`: append only the rows of agents; otherwise only the rows of other vehicles.
+    `num_rows`: (W,) number of rows, updated.
     """
     for w in range(worlds.ticks.size):
         at = num_rows[w]
@@ -30,7 +30,7 @@ def gather_rows(
 
 @kernel
 def take_rows(rows: NDArray[np.void], num_rows: NDArray[np.int64], own: NDArray[np.void]) -> None:
-    """Copy the rows of all worlds, VEHICLE (W, C), to memory of one's own."""
+    """Copy the rows of all worlds, VEHICLE (W, C), to private memory."""
     for w in range(num_rows.size):
         for i in range(num_rows[w]):
             own[w, i] = rows[w, i]
@@ -44,17 +44,18 @@ def put_first(
     spare: NDArray[np.void],
     num_owned: NDArray[np.int64],
 ) -> int:
-    """Put the agents that a worker senses for before the others: it owns them, the rest are ghosts.
+    """Move the agents that a worker senses to the front; it owns these rows, the rest are ghosts.
 
     Args:
-        rows: VEHICLE (W, C), agents before the others.
-        num_agents: (W,) how many agents.
-        lines: (W, A, 2) [first, last) that it writes of each agent's frame; none: others do.
+        rows: VEHICLE (W, C), agents before the other vehicles.
+        num_agents: (W,) number of agents.
+        lines: (W, A, 2) lines [first, last) of each agent's frame that the worker writes; may be
+            empty.
         spare: VEHICLE (1,), scratch.
-        num_owned: (W,) overwritten with how many are first.
+        num_owned: (W,) overwritten with the number of owned rows.
 
     Returns:
-        how many are first in all worlds.
+        the number of owned rows in all worlds.
     """
     total = 0
     for w in range(num_agents.size):

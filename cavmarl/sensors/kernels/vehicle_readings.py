@@ -1,4 +1,4 @@
-"""What sensors tell of the vehicle that carries them: inertia, place, wheels, lane, and events."""
+"""Readings of the vehicle that carries the sensor: inertia, position, wheels, lane, and events."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ GRAVITY_MPS2 = 9.80665  # standard gravity
 
 
 @kernel
-def feel(
+def measure_motion(
     row: np.void, pose: np.void, share: float, tick_s: float, mount: Mount, out: NDArray[np.float64]
 ) -> None:
-    """Specific force and angular rate at a place on a vehicle, within its last tick.
+    """Write specific force and angular rate at a place on a vehicle, within its last tick.
 
     The vehicle's centre moves with `speed` at the slip angle of the kinematic bicycle, whose
     tangent is half that of the steering angle. In the vehicle's frame, with the yaw rate r:
 
         force = (a cos slip - v r sin slip, a sin slip + v r cos slip, 0)  of the centre
-              + (-r' y - r² x, r' x - r² y, 0)                        of a place beside it
-              + g (sin pitch, 0, cos pitch)                           what holds it up
+              + (-r' y - r² x, r' x - r² y, 0)                        of a place off the centre
+              + g (sin pitch, 0, cos pitch)                           reaction to gravity
         rate  = (r sin pitch, -pitch', r cos pitch)
 
-    Speed, acceleration, yaw rate, steering and pitch lie on the straight line from the state before
-    the tick to that after it; r' and pitch' are its slopes. What a change of the slip angle adds is
-    left out: the steering of the bicycle jumps.
+    Speed, acceleration, yaw rate, steering and pitch are interpolated linearly between the states
+    before and after the tick; r' and pitch' are the slopes. The change of the slip angle is
+    neglected, because the steering of the bicycle jumps.
 
-    `row`: VEHICLE, after the tick. `pose`: POSE before it; of another vehicle: it was as it is now.
-    `share`: of the tick that has passed, in (0, 1]. `out`: (6,) m/s² and rad/s, along the sensor's
-    axes.
+    `row`: VEHICLE after the tick. `pose`: POSE before it; if it is of another vehicle, the state of
+    `row` is used. `share`: elapsed share of the tick, in (0, 1]. `out`: (6,) m/s² and rad/s, along
+    the sensor's axes.
     """
     left = 1.0 - share if pose["id"] == row["id"] else 0.0
     speed = row["speed"] + left * (pose["speed"] - row["speed"])
@@ -78,10 +78,9 @@ def measure_inertia(
     scratch: NDArray[np.float64],
     data: NDArray[np.float32],
 ) -> None:
-    """Write what is due of the owned agents.
+    """Write the samples that are due for the owned agents.
 
-    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6) as `feel` gives
-    it.
+    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6) force and rate.
     """
     for w in range(worlds.ticks.size):
         num = due.num[w]
@@ -93,7 +92,7 @@ def measure_inertia(
                 continue
             agent = row["agent"]
             for k in range(num):
-                feel(row, before[w, agent], (k + 1) / num, tick_s, mount, scratch)
+                measure_motion(row, before[w, agent], (k + 1) / num, tick_s, mount, scratch)
                 add_errors(noise, row, worlds.ticks[w], k, scratch)
                 for channel in range(scratch.size):
                     data[w, agent, due.slot[w] + k, channel] = scratch[channel]
@@ -109,11 +108,11 @@ def measure_places(
     places: NDArray[np.float64],
     measured: NDArray[np.bool_],
 ) -> None:
-    """Write where the antennas are of the owned agents that are due.
+    """Write the antenna positions of the owned agents that are due.
 
-    `due`: in this tick, one sample at most. `noise`: of the sensor, along the axes of the map.
+    `due`: at most one sample in this tick. `noise`: of the sensor, along the axes of the map.
     `scratch`: (2, 3, 3), overwritten. `places`: (W, A, 3) x, y, z in m. `measured`: (W, A) set for
-    those that are written.
+    agents whose position is written.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:
@@ -137,10 +136,10 @@ def measure_odometry(
     scratch: NDArray[np.float64],
     data: NDArray[np.float32],
 ) -> None:
-    """Write what is due of the owned agents.
+    """Write the samples that are due for the owned agents.
 
-    Of n samples in a tick, the k-th lies a share of k / n on the straight line from the state
-    before the tick to that after it; one that entered in this tick was before as it is now.
+    Of n samples in a tick, the k-th is interpolated at k / n between the states before and after
+    the tick. A vehicle that entered in this tick has the same state before and after.
 
     `before`: POSE (W, A) of the tick before. `scratch`: (3,). `data`: (W, A, S, 3) speed in m/s,
     yaw rate in rad/s, distance in m since departure.
@@ -166,14 +165,14 @@ def measure_odometry(
                     data[w, agent, due.slot[w] + k, channel] = scratch[channel]
 
 
-_WINDOW_M = 15.0  # around the vehicle's place on its lane, where the sensor's is looked for
+_WINDOW_M = 15.0  # search window for the sensor's lane position, around the vehicle's
 
 
 @kernel
 def _way_ahead(
     roads: RoadArrays, plans: NDArray[np.void], row: np.void, ahead: float
 ) -> tuple[float, float]:
-    """X and y of a place on the way of a vehicle, or of the way's end."""
+    """Return x and y of a point on a vehicle's path, or of the path's end."""
     lane = row["lane"]
     s = row["s"] + ahead
     while s > roads.lanes[lane]["length_m"]:
@@ -190,9 +189,9 @@ def _way_ahead(
 
 @kernel
 def bend(x0: float, y0: float, x1: float, y1: float, x2: float, y2: float) -> float:
-    """Curvature of the circle through three points in 1/m, positive to the left; 0 if two are one.
+    """Return the curvature of the circle through three points in 1/m, positive to the left.
 
-    Four times the triangle's area over the product of its sides.
+    It is four times the triangle's area over the product of its sides; 0 if two points coincide.
     """
     ax, ay = x1 - x0, y1 - y0
     bx, by = x2 - x1, y2 - y1
@@ -214,11 +213,11 @@ def measure_lane_boundary(
     scratch: NDArray[np.float64],
     data: NDArray[np.float32],
 ) -> None:
-    """Write what is due of the owned agents.
+    """Write the samples that are due for the owned agents.
 
-    `lookahead_m`: length of the way that the curvature is that of. `axes`: (2, 3, 3), scratch.
-    `scratch`: (5,). `data`: (W, A, S, 5) to the left boundary, to the right one, and the lane's
-    width in m; direction of the sensor from that of the lane in rad; curvature in 1/m.
+    `lookahead_m`: length of the path over which the curvature is measured. `axes`: (2, 3, 3),
+    scratch. `scratch`: (5,). `data`: (W, A, S, 5) distances to the left and right boundary and
+    width of the lane in m; direction of the sensor relative to the lane in rad; curvature in 1/m.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:
@@ -262,19 +261,19 @@ def report_events(
 ) -> None:
     """Write a report for each owned agent with an event in this tick.
 
-    Earlier reports move towards the first slot, the newest is the last.
+    Earlier reports move towards the first slot; the newest report is the last.
 
     Args:
         worlds: committed rows.
         before: POSE (W, A) of the tick before.
-        ticks_per_step: ticks a step; with each step VEHICLE["events"] begins anew.
-        tick_s: seconds a tick.
-        due: which worlds are asked.
-        stream: of the sensor's random numbers.
-        dropout: chance that a report is lost.
+        ticks_per_step: ticks per step; VEHICLE["events"] is cleared at each step.
+        tick_s: seconds per tick.
+        due: the worlds in which reports are due.
+        stream: stream of the sensor's random numbers.
+        dropout: probability that a report is lost.
         stamp_s: (W, A, S) in s since the reset.
-        lost: (W, A, S) which ones are lost.
-        fresh: (W, A) reports of this step, up to now.
+        lost: (W, A, S) whether each report is lost.
+        fresh: (W, A) number of reports of this step so far.
         data: (W, A, S, 2) EVENT_* bits, and the id of the vehicle that was hit, or -1.
     """
     for w in range(worlds.ticks.size):

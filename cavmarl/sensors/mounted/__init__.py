@@ -1,1 +1,1 @@
-"""Sensors mounted on agents' vehicles, each with a place, a rate, a range and errors of its own."""
+"""Sensors mounted on agents' vehicles, each with its own pose, rate, range and errors."""

@@ -1,4 +1,4 @@
-"""What imaging sensors see of a map: its lanes as strips and its buildings, indexed by place."""
+"""The static scene for imaging sensors: lanes as strips, and buildings, in spatial indices."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.kernels.panorama import SEMANTIC_OF_CLASS
 
 CELL_M = 32.0
-# Long straight strips are cut, so that what is near a vehicle is found by the middles of strips.
+# Long straight strips are cut, because the index finds strips by their centres.
 STRIP_M = 24.0
-# Neighbour lanes are not quite as close as their widths say: else ground would show in between.
+# Strips overlap slightly, so that no ground shows between neighbouring lanes.
 OVERLAP_M = 0.05
-# A sharp bend is not carried farther out than this many half widths.
+# At a sharp bend, the mitre is at most this many half widths long.
 LONGEST_MITRE = 2.0
 
 _CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestrian"}
 
 
 def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
-    """The backdrop of a map.
+    """Build the static scene of a map.
 
-    `types`: VTYPE (num_types,) of the vehicles that can be seen.
+    `types`: VTYPE (num_types,) of the vehicles that sensors can see.
 
-    Raises ConfigError: a class of vehicles that has no semantic class.
+    Raises ConfigError: a vehicle class has no semantic class.
     """
     strips, lined = lane_strips(network)
     walls, roofs = network.walls, network.roofs
@@ -51,16 +51,16 @@ def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
 
 
 def _semantics(types: NDArray[np.void]) -> NDArray[np.uint8]:
-    """(num_types,) the semantic class of each type."""
+    """Return the semantic class (num_types,) of each type."""
     names = [_CLASS_NAMES.get(vclass, f"number {vclass}") for vclass in types["vclass"].tolist()]
     unknown = sorted(set(names) - set(SEMANTIC_OF_CLASS))
     if unknown:
-        raise ConfigError(f"vehicle class {', '.join(unknown)}: cameras have no class for it")
+        raise ConfigError(f"vehicle class {', '.join(unknown)}: not in SEMANTIC_OF_CLASS")
     return np.array([SEMANTIC_OF_CLASS[name] for name in names], np.uint8)
 
 
 def _index(corners: NDArray[np.float64]) -> tuple[Grid, NDArray[np.intp]]:
-    """An index of shapes (n, corners, 2) by their middles, and the order that it counts them in."""
+    """Index shapes (n, corners, 2) by their centres; return the index and its order."""
     if len(corners) == 0:
         return make_grid((0.0, 0.0, 1.0, 1.0), CELL_M, 0), np.zeros(0, np.intp)
     middles = corners.mean(axis=1)
@@ -75,10 +75,11 @@ def _index(corners: NDArray[np.float64]) -> tuple[Grid, NDArray[np.intp]]:
 
 
 def lane_strips(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The lanes of a map in convex pieces.
+    """Cut the lanes of a map into convex pieces.
 
-    Returns (n, 4, 2) corners in m: right and left at the start, left and right at the end; pieces
-    of one lane share corners. (n,) 1 where the sides are lane lines, 0 inside junctions.
+    Returns corners (n, 4, 2) in m: right and left at the start, left and right at the end;
+    consecutive pieces of a lane share corners. Also returns flags (n,): 1 where the sides are lane
+    lines, 0 inside junctions.
     """
     lanes, points = network.lanes, network.points
     of = np.repeat(np.arange(len(lanes)), lanes["num_points"])
@@ -91,7 +92,7 @@ def lane_strips(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.f
     # The last point repeats the direction of the segment before it.
     along = before + after
     size = hypot_all(along[:, 0], along[:, 1])
-    # Of a lane that turns back on the spot, which has no middle direction, the one after counts.
+    # A lane that turns back on the spot has no mean direction; use the direction after the turn.
     along = np.where(
         size[:, np.newaxis] > 1e-6, along / np.maximum(size, 1e-6)[:, np.newaxis], after
     )

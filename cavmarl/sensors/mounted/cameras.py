@@ -1,4 +1,4 @@
-"""Cameras: depth, classes and colours of what a pinhole camera shows; and the bird's-eye grid."""
+"""Pinhole cameras for depth, semantic classes and colours, and the bird's-eye grid."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ C = TypeVar("C", bound=CameraConfig)
 
 
 def camera_of(config: CameraConfig) -> CameraPose:
-    """Where a camera is on its vehicle, and what it shows."""
+    """Return a camera's pose on its vehicle and its optics."""
     fov_rad = math.radians(config.fov_deg)
     return make_camera(mount_matrix(config), config.width, fov_rad, config.range_m)
 
 
 class _Camera(ImagingSensor[C]):
-    """What all cameras have."""
+    """Base class of the cameras."""
 
     kernel = take_pictures
     written_as: ClassVar[DTypeLike] = np.uint8
-    _own: tuple[Any, ...]  # what is for its kind alone: scratch, the same as bits, palette, classes
+    _own: tuple[Any, ...]  # the last arguments: scratch, the same as bits, palette, classes
 
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         super().__init__(name, config, platform)
@@ -53,7 +53,7 @@ class _Camera(ImagingSensor[C]):
 
     @staticmethod
     def reach_m(config: C, largest_radius_m: float) -> float:
-        """The range in the corners of the picture, to the nearest side of a body."""
+        """Return the range at the picture's corners plus the largest radius of a body."""
         reach_m = camera_reach_m(camera_of(config), config.width, config.height)
         return reach_m + largest_radius_m
 
@@ -68,7 +68,7 @@ class _Camera(ImagingSensor[C]):
 
 
 class DepthCamera(_Camera[DepthCameraConfig]):
-    """Depth along the optical axis, as float16 in m."""
+    """A camera that measures depth along the optical axis, as float16 in m."""
 
     dtype = np.float16
     written_as = np.uint16
@@ -84,7 +84,7 @@ class DepthCamera(_Camera[DepthCameraConfig]):
 
 
 class SemanticCamera(_Camera[SemanticCameraConfig]):
-    """The class of what each pixel shows; see `kernels.panorama`."""
+    """A camera that returns the semantic class of each pixel; see `kernels.panorama`."""
 
     dtype = np.uint8
     _own = (None, None, None, True)
@@ -95,7 +95,7 @@ class SemanticCamera(_Camera[SemanticCameraConfig]):
 
 
 class RgbCamera(_Camera[RgbCameraConfig]):
-    """The colour of each pixel: that of its class, in the light of its face and the haze."""
+    """A camera that returns the colour of each pixel: the class's colour, shaded and hazy."""
 
     dtype = np.uint8
     _own = (None, None, colours(), None)
@@ -106,7 +106,7 @@ class RgbCamera(_Camera[RgbCameraConfig]):
 
 
 class BevGrid(ImagingSensor[BevGridConfig]):
-    """The class of each cell's centre, seen from above; see `kernels.panorama`."""
+    """Semantic classes from above, sampled at cell centres; see `kernels.panorama`."""
 
     dtype = np.uint8
     kernel = fill_grids
@@ -124,7 +124,7 @@ class BevGrid(ImagingSensor[BevGridConfig]):
 
     @staticmethod
     def reach_m(config: BevGridConfig, largest_radius_m: float) -> float:
-        """To its farthest corner, and the nearest side of a body."""
+        """Return the distance to the farthest corner plus the largest radius of a body."""
         farthest_m = hypot(max(config.ahead_m, config.behind_m), config.aside_m)
         return farthest_m + hypot(config.x_m, config.y_m) + largest_radius_m
 

@@ -1,4 +1,4 @@
-"""`SensorFrames`: where the samples of one sensor go, for all agents of W worlds."""
+"""`SensorFrames`: the samples of one sensor, for all agents of W worlds."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 
 class SensorFrames(NamedTuple):
-    """The samples of a sensor; S is the most that it takes in one step.
+    """The samples of a sensor; S is the largest number of samples in a step.
 
-    The newest sample is the last one. Of the last step are the last `fresh` of them; those before
-    are older. Agents without a vehicle have zeros.
+    The newest sample is the last one. The last `fresh` samples were taken in the last step; the
+    samples before them are older. Agents without a vehicle have zeros.
     """
 
     data: NDArray[Any]  # (W, A, S, …)
-    stamp_s: NDArray[np.float64]  # (W, A, S) when it was taken, in s since the reset
-    lost: NDArray[np.bool_]  # (W, A, S) it was lost: its data is zeros
-    fresh: NDArray[np.int64]  # (W, A) samples of the last step, lost ones among them
+    stamp_s: NDArray[np.float64]  # (W, A, S) time of the sample, in s since the reset
+    lost: NDArray[np.bool_]  # (W, A, S) whether the sample is lost; its data is zero
+    fresh: NDArray[np.int64]  # (W, A) samples of the last step, including lost ones
 
     def part(self, first: int, last: int) -> SensorFrames:
-        """Those of some of the worlds, as views."""
+        """Return the frames of the worlds [first, last), as views."""
         parts: list[Any] = [array[first:last] for array in self]
         return SensorFrames(*parts)
 
@@ -31,10 +31,10 @@ class SensorFrames(NamedTuple):
         return SensorFrames(*copies)
 
     def of(self, world: int, agent: int) -> SensorFrames:
-        """A copy of those of one agent, without the axes of worlds and agents."""
+        """Return a copy of one agent's frames, without the axes of worlds and agents."""
         copies: list[Any] = [array[world, agent].copy() for array in self]
         return SensorFrames(*copies)
 
 
 Frames: TypeAlias = Mapping[str, SensorFrames]
-"""By the sensor's name, in the order of the rig."""
+"""Frames by sensor name, in the order of the rig."""

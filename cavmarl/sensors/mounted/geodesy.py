@@ -1,7 +1,7 @@
-"""From the map to the earth and back: WGS 84 latitude and longitude in degrees, height in m.
+"""Conversion between map coordinates and WGS 84: latitude and longitude in degrees, height in m.
 
-A map that says how it is projected is taken at its word; one that does not is put onto the plane
-that touches the earth at an origin. z is taken for the height above the origin's.
+If the map states its projection, that is used. Otherwise the map lies in the plane that touches the
+ellipsoid at an origin. z is the height above the origin.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ _AXIS_M = 6_378_137.0
 _FLATTENING = 1.0 / 298.257223563
 _SQUARED_ECCENTRICITY = _FLATTENING * (2.0 - _FLATTENING)
 _OF_HEIGHTS = ("+geoidgrids=", "+geoid_crs=", "+vunits=", "+vto_meter=")
-_ROUNDS = 6  # of the height's fixed point, each good for two digits and more
+_ROUNDS = 6  # fixed-point iterations for the height; each adds at least two digits
 
 
 class Geodesy(Protocol):
-    """Where a map lies on the earth."""
+    """The position of a map on the earth."""
 
     def to_earth(self, points: Points) -> Points:
-        """Latitude, longitude, height (n, 3) of places x, y, z (n, 3) of the map."""
+        """Convert map coordinates x, y, z (n, 3) to latitude, longitude, height (n, 3)."""
         ...
 
     def to_map(self, places: Points) -> Points:
-        """x, y, z (n, 3) of latitudes, longitudes, heights (n, 3)."""
+        """Convert latitude, longitude, height (n, 3) to map coordinates x, y, z (n, 3)."""
         ...
 
 
 def geodesy_of(network: RoadNetwork, config: GnssConfig) -> Geodesy:
-    """Where a map lies: as it says itself, else where the sensor's settings put it.
+    """Return the map's own projection, or else a tangent plane at the sensor's configured origin.
 
     Raises MissingExtraError: the map is projected, and pyproj is not installed; MapError: PROJ does
     not know the projection.
@@ -54,7 +54,7 @@ def geodesy_of(network: RoadNetwork, config: GnssConfig) -> Geodesy:
 class ProjectedMap:
     """A map with a projection.
 
-    `geo`: how it is projected. `height_m`: of z = 0 above the ellipsoid.
+    `geo`: the projection. `height_m`: height of z = 0 above the ellipsoid.
     """
 
     def __init__(self, geo: GeoReference, height_m: float) -> None:
@@ -78,12 +78,12 @@ class ProjectedMap:
 
 
 class TangentPlane:
-    """A map on the plane that touches the ellipsoid at an origin, x east and y north.
+    """A map in the plane that touches the ellipsoid at an origin, x east and y north.
 
-    By way of earth-centred coordinates (Hofmann-Wellenhof, Lichtenegger, Wasle: "GNSS", 2008,
-    chapter 8).
+    The conversion uses earth-centred coordinates (Hofmann-Wellenhof, Lichtenegger, Wasle: "GNSS",
+    2008, chapter 8).
 
-    `latitude_deg`: of the map's (0, 0). `longitude_deg`: of the map's (0, 0). `height_m`: of z = 0
+    `latitude_deg`, `longitude_deg`: position of the map's (0, 0). `height_m`: height of z = 0
     there, above the ellipsoid.
     """
 
@@ -108,13 +108,13 @@ class TangentPlane:
 
 
 def _in_the_plane(projection: str) -> str:
-    """A PROJ string without what it says of heights, for which PROJ may need files of its own."""
+    """Remove the vertical part of a PROJ string, for which PROJ may need extra files."""
     words = projection.split()
     return " ".join(word for word in words if not word.startswith(_OF_HEIGHTS))
 
 
 def _turned(points: Points, axes: Points) -> Points:
-    """Return points (n, 3) times axes (3, 3); sums of a BLAS differ between processors."""
+    """Return points (n, 3) times axes (3, 3); a BLAS's sums would depend on the processor."""
     found: Points = points[:, :1] * axes[0] + points[:, 1:2] * axes[1] + points[:, 2:] * axes[2]
     return found
 
@@ -125,7 +125,7 @@ def _sin_cos(angle_deg: float) -> tuple[float, float]:
 
 
 def _to_centred(places: Points) -> Points:
-    """Earth-centred x, y, z (n, 3) in m of latitudes, longitudes, heights (n, 3)."""
+    """Convert latitude, longitude, height (n, 3) to earth-centred x, y, z (n, 3) in m."""
     latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1])
     height_m = places[:, 2]
     normal_m = _normal_m(latitude)
@@ -135,7 +135,7 @@ def _to_centred(places: Points) -> Points:
 
 
 def _from_centred(points: Points) -> Points:
-    """The inverse of `_to_centred`, for places away from the poles."""
+    """Invert `_to_centred`, for points away from the poles."""
     x, y, polar_m = points.T
     across_m = hypot_all(x, y)
     latitude = atan2_all(polar_m, across_m * (1.0 - _SQUARED_ECCENTRICITY))

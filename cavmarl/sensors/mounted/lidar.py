@@ -1,4 +1,4 @@
-"""Sensors that cast rays: lidar, of one layer or of several, and radar."""
+"""Sensors that cast rays: single-layer and multi-layer lidar, and radar."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ C = TypeVar("C", LidarRigConfig, RadarConfig)
 
 
 def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
-    """The first ray, from one to the next, and how many: in rad, counter-clockwise.
+    """Return the azimuth of the first ray and the step in rad, counter-clockwise, and the number.
 
-    All around they begin forward; less than that, from the right edge to the left one.
+    A full circle begins straight ahead; a smaller field of view goes from its right edge to its
+    left edge.
     """
     if fov_deg == 360.0 or rays == 1:
         return 0.0, 2.0 * math.pi / rays, rays
@@ -39,16 +40,16 @@ def lidar_fan(config: LidarRigConfig) -> Fan:
 
 
 class _Rays(ImagingSensor[C]):
-    """What lidar and radar have."""
+    """Base class of lidar and radar."""
 
     @staticmethod
     def reach_m(config: C, largest_radius_m: float) -> float:
-        """Its range, from where it is mounted to the nearest side of a body."""
+        """Return the range, measured from the mount, plus the largest radius of a body."""
         return config.range_m + hypot(config.x_m, config.y_m) + largest_radius_m
 
 
 class Lidar(_Rays[LidarRigConfig]):
-    """Distances to bodies, buildings and the ground, layer by layer from the lowest."""
+    """A lidar: distances to bodies, buildings and the ground, by layer from the lowest."""
 
     dtype = np.float32
     kernel = measure_lidar
@@ -72,9 +73,9 @@ class Lidar(_Rays[LidarRigConfig]):
 
 
 class Radar(_Rays[RadarConfig]):
-    """The nearest bodies and buildings, with range, azimuth and radial speed, nearest first.
+    """A radar: range, azimuth and radial speed of the nearest bodies and buildings, nearest first.
 
-    The rest of the list is zeros.
+    Unused rows of the list are zeros.
     """
 
     dtype = np.float32

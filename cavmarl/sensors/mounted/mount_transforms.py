@@ -1,4 +1,4 @@
-"""Mounting transforms: settings → `Mount`, and points from frame to frame."""
+"""Mounts: settings converted to a `Mount`, and transforms of points between frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ROUNDING_M = 1e-9
 
 
 def mount_of(config: MountedConfig) -> Mount:
-    """The place and the direction of a sensor, as kernels take them."""
+    """Return the position and orientation of a sensor as a bundle for kernels."""
     turn = np.zeros((3, 3))
     yaw, pitch, roll = map(math.radians, (config.yaw_deg, config.pitch_deg, config.roll_deg))
     rotation(yaw, pitch, roll, turn)
@@ -27,20 +27,20 @@ def mount_of(config: MountedConfig) -> Mount:
 
 
 def mount_matrix(config: MountedConfig) -> NDArray[np.float64]:
-    """(3, 4): the sensor's axes (ahead, left, up) as columns and its place, in the vehicle's frame.
+    """Return the (3, 4) matrix of a mount, in the vehicle's frame, for rays and cameras.
 
-    What rays and cameras take of a mount.
+    Its columns are the sensor's axes (ahead, left, up) and its position.
     """
     mount = mount_of(config)
     return np.column_stack([mount.turn, mount.place])
 
 
 def check_place(name: str, config: MountedConfig, body: np.void) -> None:
-    """Refuse a sensor outside of the body that it is mounted on.
+    """Refuse a sensor that lies outside the body on which it is mounted.
 
     `body`: VTYPE of agents' vehicles.
 
-    Raises ConfigError: with the nearest place on the body.
+    Raises ConfigError: the sensor lies outside; the message has the nearest valid position.
     """
     half_m, half_width_m, height_m = 0.5 * body["length"], 0.5 * body["width"], body["height"]
     for key, low, high in (
@@ -51,34 +51,34 @@ def check_place(name: str, config: MountedConfig, body: np.void) -> None:
         value = getattr(config, key)
         if not low - _ROUNDING_M <= value <= high + _ROUNDING_M:
             raise ConfigError(
-                f"rig.{name}.{key} = {value!r}: outside of the vehicle, whose body reaches from "
-                f"{low:g} to {high:g}; the nearest is {min(max(value, low), high):g}"
+                f"rig.{name}.{key} = {value!r}: outside the vehicle's body, which reaches from "
+                f"{low:g} to {high:g}; the nearest valid value is {min(max(value, low), high):g}"
             )
 
 
 def transform(turn: Points, place: Points, points: Points) -> Points:
-    """Points (n, 3) of a frame that is turned and placed so, in the frame around it."""
+    """Transform points (n, 3) from a frame with this rotation and origin to the outer frame."""
     return points @ turn.T + place
 
 
 def sensor_to_vehicle(mount: Mount, points: Points) -> Points:
-    """Points (n, 3) of the sensor's frame in the vehicle's."""
+    """Transform points (n, 3) from the sensor's frame to the vehicle's."""
     return transform(mount.turn, mount.place, points)
 
 
 def vehicle_to_sensor(mount: Mount, points: Points) -> Points:
-    """Points (n, 3) of the vehicle's frame in the sensor's."""
+    """Transform points (n, 3) from the vehicle's frame to the sensor's."""
     return (points - mount.place) @ mount.turn
 
 
 def vehicle_to_world(row: np.void, points: Points) -> Points:
-    """Points (n, 3) of the frame of a VEHICLE in the world's."""
+    """Transform points (n, 3) from the frame of a VEHICLE to the world's."""
     turn, place = _pose(row)
     return transform(turn, place, points)
 
 
 def world_to_vehicle(row: np.void, points: Points) -> Points:
-    """Points (n, 3) of the world in the frame of a VEHICLE."""
+    """Transform points (n, 3) from the world's frame to that of a VEHICLE."""
     turn, place = _pose(row)
     return (points - place) @ turn
 

@@ -1,4 +1,4 @@
-"""`MountedSensor`: what every type of sensor is made of."""
+"""`MountedSensor`: the base class of all mounted sensors."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ C = TypeVar("C", bound=MountedConfig)
 
 
 class SensedScene(NamedTuple):
-    """What the agents of one zone can see, in the present tick."""
+    """The scene that the agents of one zone can sense in the present tick."""
 
-    roads: RoadArrays  # of the whole map
+    roads: RoadArrays  # the whole map
     lane_grid: LaneGrid
     plans: NDArray[np.void]
-    travel: TripTables  # types of vehicles
-    worlds: Worlds  # the committed rows: first the zone's own, then ghosts
-    grid: Grid  # scratch: the spatial index of one world; callers that ask it fill it
-    before: NDArray[np.void]  # POSE (W, A) of all agents in the tick before
+    travel: TripTables  # vehicle types
+    worlds: Worlds  # the committed rows: the zone's own rows, then ghosts
+    grid: Grid  # scratch: spatial index of one world, filled by the sensor that uses it
+    before: NDArray[np.void]  # POSE (W, A) of all agents at the tick before
 
 
 class Platform(NamedTuple):
-    """What sensors are mounted on."""
+    """The vehicles and worlds that sensors are mounted in."""
 
     network: RoadNetwork
     body: np.void  # VTYPE of agents' vehicles
@@ -47,25 +47,25 @@ class Platform(NamedTuple):
     num_agents: int
     sim_dt_s: float
     ticks_per_step: int
-    capacity: int  # the most rows of a world
-    backdrop: Backdrop  # what cameras and rays meet of the map
+    capacity: int  # largest number of rows of a world
+    backdrop: Backdrop  # static scene for cameras and rays
 
 
 class MountedSensor(ABC, Generic[C]):
     """One sensor of the rig, on the vehicles of all agents of W worlds.
 
     Attributes:
-        name: in the rig.
-        config: its settings.
-        mount: where on the vehicle.
-        frame: name of the frame that its directions are in.
-        lines: (W, A, 2) which lines [first, last) of each agent's frame `sense` writes: all,
-            unless others write the rest.
+        name: name in the rig.
+        config: settings of the sensor.
+        mount: pose on the vehicle.
+        frame: name of the frame of its directions.
+        lines: (W, A, 2) lines [first, last) of each agent's frame that `sense` writes: all, unless
+            other processes write the rest.
     """
 
     dtype: ClassVar[DTypeLike]
-    kernel: ClassVar[Callable[..., None]]  # takes what `arguments` lists
-    stamps_itself: ClassVar[bool] = False  # it has no rate: it also writes stamps and counts
+    kernel: ClassVar[Callable[..., None]]  # called with the values of `arguments`
+    stamps_itself: ClassVar[bool] = False  # no rate: the kernel also writes stamps and counts
 
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         self.name = name
@@ -79,7 +79,7 @@ class MountedSensor(ABC, Generic[C]):
 
     @cached_property
     def noise(self) -> Noise:
-        """What kernels take of `noise` and `bias`, one number a channel."""
+        """Return `noise` and `bias` for kernels, one number per channel."""
         assert isinstance(self.config, SampledConfig)
         channels = len(self.config.units)
         noise, bias = np.array(self.config.noise), np.array(self.config.bias)
@@ -91,38 +91,38 @@ class MountedSensor(ABC, Generic[C]):
 
     @staticmethod
     def bounds(config: C) -> Bounds:
-        """The least and the largest number of a sample, in its shape; none where noise is added."""
+        """Return the least and the largest values of a sample, in its shape; infinite if noisy."""
         return np.full(config.shape, -np.inf), np.full(config.shape, np.inf)
 
     @staticmethod
     def reach_m(config: C, largest_radius_m: float) -> float:
-        """How far from the vehicle's centre the centre of another can be that it can tell."""
+        """Return the largest distance at which the sensor can sense a vehicle, centre to centre."""
         return 0.0
 
     @staticmethod
     def num_lines(config: C) -> int:
-        """Into how many lines a frame can be divided, each of which can be written by itself."""
+        """Return the number of lines of a frame that can be written separately."""
         return 1
 
     @abstractmethod
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
-        """What the kernel takes to write the data that are due, for the agents of a zone."""
+        """Return the kernel's arguments for the samples that are due in one zone."""
 
     def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write the data of all samples that are due, for the agents that the scenes own.
 
-        What is written may depend on the agent's row, the others' rows within reach and the tick,
-        and on nothing else: not on how rows are ordered, nor on which zone asks.
+        The data may depend only on the agent's row, the other rows within reach, and the tick. It
+        must not depend on the order of rows or on the zone.
 
-        `scenes`: one a zone. `due`: how many samples, and to which slots. `frames`: `data` is
-        written; stamps, counts and losses are the rig's business.
+        `scenes`: one per zone. `due`: number of samples, and their slots. `frames`: only `data` is
+        written; the rig writes stamps, counts and losses.
         """
         for scene in scenes:
             self._measure(*self.arguments(scene, due, frames))
 
 
 class ImagingSensor(MountedSensor[C]):
-    """A sensor that looks around: at bodies, and at what stands on the map."""
+    """A sensor of the surroundings: bodies and the static scene."""
 
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         super().__init__(name, config, platform)
@@ -130,10 +130,10 @@ class ImagingSensor(MountedSensor[C]):
         self._panorama = make_panorama(platform.backdrop, platform.capacity)
 
     def view(self, scene: SensedScene, due: Due) -> tuple[Any, ...]:
-        """The first arguments of all their kernels."""
+        """Return the first arguments of the kernels of all imaging sensors."""
         return scene.worlds, scene.grid, self._backdrop, due
 
 
 def stream_of(name: str) -> np.uint64:
-    """The stream of a sensor's random numbers: of its name, whatever else is mounted."""
+    """Return the stream of a sensor's random numbers; it depends on the sensor's name only."""
     return np.uint64(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest()))

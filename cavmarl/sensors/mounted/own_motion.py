@@ -1,4 +1,4 @@
-"""Sensors of the vehicle itself: odometry, IMU, GNSS, the lane that it is on, and events."""
+"""Sensors of the vehicle itself: odometry, IMU, GNSS, the current lane, and events."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from cavmarl.sensors.mounted.mounted_sensor import (
 
 
 class Odometry(MountedSensor[OdometryConfig]):
-    """What the wheels tell: speed, yaw rate and driven distance of the vehicle's centre."""
+    """Wheel odometry: speed, yaw rate and travelled distance of the vehicle's centre."""
 
     dtype = np.float32
     kernel = measure_odometry
@@ -48,7 +48,7 @@ class Odometry(MountedSensor[OdometryConfig]):
 
 
 class Imu(MountedSensor[ImuConfig]):
-    """What accelerometers and gyroscopes tell at the sensor's place, along its axes."""
+    """Accelerometers and gyroscopes at the sensor's position, along its axes."""
 
     dtype = np.float32
     kernel = measure_inertia
@@ -64,9 +64,10 @@ class Imu(MountedSensor[ImuConfig]):
 
 
 class LaneBoundary(MountedSensor[LaneBoundaryConfig]):
-    """What a camera that looks for markings tells of the lane that the vehicle is on.
+    """Lane markings as a camera detects them.
 
-    Its boundaries, width, direction and curvature.
+    Measures the distances to both boundaries, and the width, direction and curvature of the current
+    lane.
     """
 
     dtype = np.float32
@@ -83,10 +84,10 @@ class LaneBoundary(MountedSensor[LaneBoundaryConfig]):
 
 
 class Gnss(MountedSensor[GnssConfig]):
-    """The place of the antenna, with its errors, taken to the earth by the map's projection.
+    """The position of the antenna, with errors, converted to the earth by the map's projection.
 
     Attributes:
-        geodesy: from the map to the earth and back.
+        geodesy: conversion between map and earth.
     """
 
     dtype = np.float64
@@ -110,7 +111,7 @@ class Gnss(MountedSensor[GnssConfig]):
         return (scene.worlds, self.mount, due, self.noise, self._scratch, *measured)
 
     def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
-        """Measure places on the map, then take all of them to the earth together."""
+        """Measure positions on the map, then convert all of them to the earth at once."""
         self._measured[:] = False
         super().sense(scenes, due, frames)
         worlds, agents = np.nonzero(self._measured)
@@ -119,7 +120,7 @@ class Gnss(MountedSensor[GnssConfig]):
 
 
 class Collision(MountedSensor[CollisionConfig]):
-    """EVENT_* bits of what has just happened to the vehicle, and what it hit."""
+    """EVENT_* bits of events of the present tick, and the vehicle that was hit."""
 
     dtype = np.int64
     kernel = report_events

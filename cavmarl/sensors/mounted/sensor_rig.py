@@ -1,4 +1,4 @@
-"""`Rig`: all mounted sensors of W worlds, and what is due of them in each tick."""
+"""`Rig`: all mounted sensors of W worlds, and their schedule."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from cavmarl.sensors.registry import mount
 
 
 class Turn(NamedTuple):
-    """What a sensor has to do in the present tick."""
+    """The work of one sensor in the present tick."""
 
-    place: int  # its number in the rig
-    sensor: MountedSensor[Any]  # itself
-    due: Due  # how many samples, and to which slots
-    frames: SensorFrames  # where they go
+    place: int  # position in the rig
+    sensor: MountedSensor[Any]  # the sensor
+    due: Due  # number of samples, and their slots
+    frames: SensorFrames  # where the samples are written
 
 
 Sense: TypeAlias = Callable[[Sequence[SensedScene], Sequence[Turn]], None]
@@ -38,7 +38,7 @@ Sense: TypeAlias = Callable[[Sequence[SensedScene], Sequence[Turn]], None]
 
 
 def sense_here(scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-    """One sensor after the other, in this process."""
+    """Run the sensors one after another in this process."""
     for turn in turns:
         turn.sensor.sense(scenes, turn.due, turn.frames)
 
@@ -46,11 +46,11 @@ def sense_here(scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
 class Rig:
     """The sensors of all agents of W worlds.
 
-    `settings`: of the sensors, by name. `frames`: where their samples go. `ids`: (W, A) int64, the
-    vehicle that each agent's samples are of; kept from tick to tick.
+    `settings`: settings of the sensors, by name. `frames`: destination of their samples. `ids`: (W,
+    A) int64, the vehicle of each agent's samples; kept from tick to tick.
 
     Attributes:
-        sense: senses what is due.
+        sense: writes the samples that are due.
     """
 
     def __init__(
@@ -76,23 +76,23 @@ class Rig:
 
     @property
     def sensors(self) -> list[MountedSensor[Any]]:
-        """All of them, in the order of the rig."""
+        """All sensors, in the order of the rig."""
         return [mounted.turn.sensor for mounted in self._mounted]
 
     @property
     def before(self) -> NDArray[np.void]:
-        """POSE (W, A) of the tick before."""
+        """POSE (W, A) at the tick before."""
         return self._before
 
     def begin(self, scenes: Sequence[SensedScene]) -> None:
-        """Note the poses of all agents before the tick."""
+        """Store the poses of all agents before the tick."""
         self._before["id"] = -1
         for scene in scenes:
             self._note_poses(scene.worlds, self._before)
 
     def reset(self, scenes: Sequence[SensedScene], chosen: NDArray[np.bool_]) -> None:
-        """Forget what there was in the chosen worlds (W,), and take what is due at the reset."""
-        if self._is_new:  # kernels are loaded now, and not in the first tick that asks for them
+        """Clear the chosen worlds (W,) and take the samples that are due at the reset."""
+        if self._is_new:  # load the kernels now, not in the first tick that needs them
             self._is_new = False
             for mounted in self._mounted:
                 mounted.rehearse(scenes)
@@ -103,7 +103,7 @@ class Rig:
         self._take(scenes, chosen)
 
     def end(self, scenes: Sequence[SensedScene]) -> None:
-        """Take what is due in the present tick."""
+        """Take the samples that are due in the present tick."""
         ticks = scenes[0].worlds.ticks
         begins = (ticks - 1) % self._platform.ticks_per_step == 0
         if begins.any():
@@ -127,7 +127,7 @@ class Rig:
             mounted.deliver(scenes)
 
     def arrays(self) -> Iterator[NDArray[Any]]:
-        """All that outlives a tick."""
+        """Yield all arrays that outlive a tick."""
         yield self._ids
         for mounted in self._mounted:
             yield from mounted.frames
@@ -150,12 +150,12 @@ class _Mounted:
         self._deliver = specialized(deliver)
 
     def clear(self, chosen: NDArray[np.bool_]) -> None:
-        """Write zeros for some worlds (W,), or agents (W, A)."""
+        """Write zeros for the chosen worlds (W,) or agents (W, A)."""
         for array in self.frames:
             array[chosen] = 0
 
     def rehearse(self, scenes: Sequence[SensedScene]) -> None:
-        """Take a sample in every world, and leave everything as it was."""
+        """Take a sample in every world, then restore the frames."""
         kept = self.frames.copy()
         for array, value in zip(self.turn.due, (1, 0, 0), strict=True):
             array[:] = value
@@ -165,11 +165,11 @@ class _Mounted:
             array[...] = before
 
     def is_due(self, ticks: NDArray[np.int64], chosen: NDArray[np.bool_]) -> bool:
-        """Whether anything is, in the chosen worlds (W,); how much is noted in its turn."""
+        """Write how many samples are due in the chosen worlds (W,); return whether any is."""
         return self._call_due(self._schedule, ticks, chosen, self.turn.due)
 
     def deliver(self, scenes: Sequence[SensedScene]) -> None:
-        """Stamp and count what it has sensed, and lose some of it."""
+        """Stamp and count the new samples, and drop some of them."""
         sensor, frames = self.turn.sensor, self.frames
         if sensor.stamps_itself:
             return
@@ -189,7 +189,7 @@ class _Mounted:
 
 
 def _schedule_of(config: MountedConfig, platform: Platform, slots: int) -> SensorSchedule:
-    """Of a sensor with a rate; without one it is asked in every tick."""
+    """Return a sensor's schedule; a sensor without a rate runs in every tick."""
     ticks_per_step = platform.ticks_per_step
     if isinstance(config, SampledConfig):
         rate = cadence(config.rate_hz, platform.sim_dt_s)

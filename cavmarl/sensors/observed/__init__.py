@@ -1,7 +1,8 @@
-"""The sensors that agents observe: one file each, and `SENSORS`, the only list of them.
+"""The sensors that agents observe: one file per sensor, and `SENSORS`, the only list of them.
 
-A file holds what the sensor adds to an observation, how far it looks and, if it is optional, what
-its kernel takes. CONTRIBUTING.md says how to add one; `sensors.registry` takes those from outside.
+Each file defines the sensor's part of an observation, its reach and, for an optional sensor, the
+settings of its kernel. CONTRIBUTING.md shows how to add a sensor; `sensors.registry` registers
+those of other packages.
 """
 
 from __future__ import annotations
@@ -52,20 +53,20 @@ SENSORS: tuple[Sensor, ...] = (
     messages_sensor.SENSOR,
     way_sensor.SENSOR,
     conflicts_sensor.SENSOR,
-    history_sensor.SENSOR,  # the last one: see `carried_from`
+    history_sensor.SENSOR,  # must be last: see `carried_from`
 )
 
-# The nearest vehicles of which walls may hide some.
+# Number of nearest vehicles that are tested for being hidden by walls.
 MAX_NEIGHBORS_TRIED = 256
 
 
 def sensors_of(config: SensorsConfig) -> tuple[Sensor, ...]:
-    """The sensors that a world can have: those of the package, on or off, then the registered."""
+    """Return all sensors of the package, on or off, followed by the registered sensors in use."""
     return (*SENSORS, *(REGISTERED_SENSORS[name] for name in config.registered))
 
 
 def feature_names(config: SensorsConfig) -> list[tuple[str, str]]:
-    """Sensor and feature of each number of a frame of an observation."""
+    """Return the sensor and the feature of each number of an observation frame."""
     return [
         (sensor.name, feature.name)
         for sensor in sensors_of(config)
@@ -74,7 +75,7 @@ def feature_names(config: SensorsConfig) -> list[tuple[str, str]]:
 
 
 def layout(config: SensorsConfig) -> dict[str, slice]:
-    """Where each sensor's features lie in a frame; sensors that are off are left out."""
+    """Return the slice of each sensor's features in a frame, without the sensors that are off."""
     places: dict[str, slice] = {}
     start = 0
     for sensor in sensors_of(config):
@@ -86,14 +87,15 @@ def layout(config: SensorsConfig) -> dict[str, slice]:
 
 
 def frame_size(config: SensorsConfig) -> int:
-    """Numbers in one frame; a flat observation holds `config.stack` of them."""
+    """Return the number of values in a frame; a flat observation holds `config.stack` frames."""
     return sum(place.stop - place.start for place in layout(config).values())
 
 
 def carried_from(config: SensorsConfig) -> int:
-    """From where on an observation holds what the next one takes from it; its size: nothing.
+    """Return the index from which an observation is carried over to the next one.
 
-    What comes before is the oldest frame, or what is observed anew in every step.
+    Everything before this index is the oldest frame or is observed anew in each step. If nothing is
+    carried over, the index equals the observation's size.
     """
     if config.stack > 1:
         return frame_size(config)
@@ -102,21 +104,23 @@ def carried_from(config: SensorsConfig) -> int:
 
 
 def largest_radius_m(types: NDArray[np.void]) -> float:
-    """Half the diagonal of the largest body, in m: no part of one is further from its centre.
+    """Return half the diagonal of the largest body, in m: an upper bound from centre to corner.
 
     Args:
-        types: VTYPE (num_types,), `TripTables.types`: those of agents and of all others.
+        types: VTYPE (num_types,), `TripTables.types`: the types of agents and of all other
+            vehicles.
     """
     return 0.5 * float(hypot_all(types["length"], types["width"]).max())
 
 
 def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
-    """How far from an agent's centre the centre of a vehicle can be that it can tell, in m.
+    """Return the largest distance at which an agent can sense a vehicle, centre to centre, in m.
 
-    A vehicle that is further away changes no number of an observation and no term of the package.
-    Sensors that ask for centres reach as far as they look, `lanes` too: it takes none that is
-    further away in the plane. Rays end at bodies, whose centres are up to half a diagonal behind.
-    Of the terms, time to collision alone looks at others; it is always on.
+    A vehicle that is further away changes no number of an observation and no reward term of the
+    package. Sensors of vehicle centres reach as far as their range, including `lanes`, which
+    ignores vehicles that are further away in the plane. Rays end at bodies, whose centres can be
+    half a diagonal behind the hit. Time to collision is the only reward term that depends on other
+    vehicles; it is always on.
     """
     sensors = sensors_of(config)
     reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
@@ -124,7 +128,7 @@ def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
 
 
 def _starts(config: SensorsConfig) -> dict[str, int]:
-    """Where each sensor begins in a frame; 0 for those that are off."""
+    """Return the index in a frame at which each sensor begins; 0 for sensors that are off."""
     places = layout(config)
     return {
         sensor.name: places[sensor.name].start if sensor.name in places else 0 for sensor in SENSORS
@@ -132,7 +136,7 @@ def _starts(config: SensorsConfig) -> dict[str, int]:
 
 
 def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
-    """The settings and the scratch memory that `sense` takes."""
+    """Return the settings and the scratch memory of the kernel `sense`."""
     walls = walls_of(network, config.neighbors.through_walls)
     near = MAX_NEIGHBORS_TRIED if len(walls.segments) else config.neighbors.count
     places = layout(config)
@@ -175,9 +179,9 @@ def optional_arrays(
     most_told: int,
     capacity: int,
 ) -> OptionalSensors | None:
-    """Return what `observe_optional` takes; None if all optional sensors are off.
+    """Return the settings of the kernel `observe_optional`; None if all optional sensors are off.
 
-    `most_told`: vehicles that an inbox keeps. `capacity`: rows of a world.
+    `most_told`: number of vehicles that an inbox keeps. `capacity`: rows per world.
     """
     optional = [sensor for sensor in SENSORS if sensor.settings is not None]
     places = layout(config)

@@ -1,6 +1,6 @@
-"""The `conflicts` sensor: the vehicles that come nearest to the own way.
+"""The `conflicts` sensor: the vehicles that come closest to the agent's path.
 
-The scales are those of the kernel `observing_conflicts`.
+The scales are defined in the kernel `observing_conflicts`.
 """
 
 from __future__ import annotations
@@ -31,41 +31,41 @@ _RELATIVE = f"v / ({SPEED_HALF_MPS:g} m/s + abs(v))"
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """Nine numbers a vehicle, or up to twelve; first what comes nearest and soonest; or 0."""
+    """List nine to twelve features per vehicle; the closest and soonest approach comes first."""
     rows: tuple[tuple[str, str, str, float], ...] = (
         (
             "near",
-            f"how near it comes: {GAP_HALF_M:g} m / ({GAP_HALF_M:g} m + gap); 0: there is none",
+            f"closeness: {GAP_HALF_M:g} m / ({GAP_HALF_M:g} m + gap); 0: none",
             "",
             0.0,
         ),
         (
             "soon",
-            f"how soon: {WHEN_HALF_S:g} s / ({WHEN_HALF_S:g} s + time); 0: there is none",
+            f"soonness: {WHEN_HALF_S:g} s / ({WHEN_HALF_S:g} s + time); 0: none",
             "",
             0.0,
         ),
-        ("x", "forward place, ego frame", _PLACE, -1.0),
-        ("y", "place to the left, ego frame", _PLACE, -1.0),
-        ("vx", "forward velocity minus the own one, ego frame", _RELATIVE, -1.0),
-        ("vy", "velocity to the left, ego frame", _RELATIVE, -1.0),
-        ("cos", "cosine of its heading minus the own one", "", -1.0),
-        ("sin", "sine of its heading minus the own one", "", -1.0),
+        ("x", "longitudinal position, ego frame", _PLACE, -1.0),
+        ("y", "lateral position, left positive, ego frame", _PLACE, -1.0),
+        ("vx", "longitudinal velocity minus the ego speed, ego frame", _RELATIVE, -1.0),
+        ("vy", "lateral velocity, left positive, ego frame", _RELATIVE, -1.0),
+        ("cos", "cosine of its heading relative to the ego heading", "", -1.0),
+        ("sin", "sine of its heading relative to the ego heading", "", -1.0),
         (
             "first",
-            "1 if it goes first at the next junction, or is on it; -1 if it gives way; else 0",
+            "1 if it has priority at the next junction or is on it; -1 if it yields; else 0",
             "",
             -1.0,
         ),
     )
     if config.conflicts.heard:
-        age = "how old the message is that tells of it, if it is not seen"
+        age = "age of the message about it, if the vehicle is not seen"
         rows += (
-            ("seen", "1 if it is seen; 0: a message tells of it, or there is none", "", 0.0),
+            ("seen", "1 if seen; 0 if known from a message only, or none", "", 0.0),
             ("age", age, f"{AGE_SCALE_S:g} s", 0.0),
         )
     if config.conflicts.indicators:
-        rows += (("turn", "1 if it indicates that it turns left, -1: right; else 0", "", -1.0),)
+        rows += (("turn", "1 if it indicates a left turn, -1 a right turn, else 0", "", -1.0),)
     return [
         Feature(f"{name}_{k}", f"vehicle {k}: {meaning}", scale, low)
         for k in range(config.conflicts.count)
@@ -86,7 +86,7 @@ def reach_m(config: SensorsConfig) -> float:
 def settings(
     config: SensorsConfig, at: int, walls: Walls, most_told: int, capacity: int
 ) -> ConflictsSensor:
-    """What the kernel takes; `most_told`: vehicles that an inbox keeps; `capacity`: of the grid."""
+    """Return the kernel's settings; `most_told`: vehicles per inbox; `capacity`: rows per world."""
     given = config.conflicts
     capacity = capacity if given.count else 0
     return ConflictsSensor(

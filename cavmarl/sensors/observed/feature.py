@@ -1,4 +1,4 @@
-"""`Sensor` and `Feature`: how a sensor that agents observe describes itself."""
+"""`Sensor` and `Feature`: the description of a sensor that agents observe."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Row = tuple[str, str, str]
 class Feature:
     """One number of an observation."""
 
-    name: str  # unique within its sensor
-    meaning: str  # what it is, with frame and sign
-    scale: str = ""  # the number that 1.0 stands for, with its unit; empty for flags
+    name: str  # unique within the sensor
+    meaning: str  # meaning of the number, with frame and sign
+    scale: str = ""  # the quantity that 1.0 stands for, with its unit; empty for flags
     low: float = -1.0  # smallest value
     high: float = 1.0  # largest value
 
@@ -32,7 +32,7 @@ def features_of(rows: Iterable[Row]) -> list[Feature]:
 
 
 def numbered(count: int, subject: str, rows: Iterable[Row]) -> list[Feature]:
-    """Return the rows of each of several things, one thing after the other."""
+    """Return the rows for each of `count` objects; `{}` in `subject` is the object's number."""
     listed = list(rows)
     return [
         Feature(f"{name}_{k}", f"{subject.format(k)}: {meaning}", scale)
@@ -55,24 +55,24 @@ def _float32(config: SensorsConfig) -> DTypeLike:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor."""
+    """A sensor that agents observe."""
 
-    name: str  # its key
-    # its features in order; none where it is switched off
+    name: str  # its key in the configuration
+    # its features in order; none if it is off
     features: Callable[[SensorsConfig], list[Feature]]
-    reach_m: Callable[[SensorsConfig], float] = _nowhere  # how far it looks for others, in m
-    # of its part of a Dict observation; -1 stands for all features
+    reach_m: Callable[[SensorsConfig], float] = _nowhere  # sensing range, in m
+    # shape of its part of a Dict observation; -1 stands for the number of features
     shape: Callable[[SensorsConfig], tuple[int, ...]] = _flat
-    dtype: Callable[[SensorsConfig], DTypeLike] = _float32  # of that part
-    # of an optional sensor, which `observe_optional` writes: what its kernel takes
+    dtype: Callable[[SensorsConfig], DTypeLike] = _float32  # dtype of that part
+    # arguments of the kernel, for an optional sensor, which `observe_optional` writes
     settings: Callable[[SensorSetup], tuple[Any, ...]] | None = None
-    # whether it looks that far for any part of a body, and not for its centre
+    # whether the reach is to the nearest part of a body, not to its centre
     sees_bodies: bool = False
-    # of a sensor from outside of the package: its numbers, of a view of one agent, or of several
+    # computes the numbers of a sensor of another package from an AgentView or a BatchView
     sense: Callable[[Any], Any] | None = None
     batched: bool = False
 
     def reach_of_centres_m(self, config: SensorsConfig, largest_radius_m: float) -> float:
-        """How far away the centre of a vehicle can be that the sensor can tell, in m."""
+        """Return the largest distance at which the sensor senses a vehicle's centre, in m."""
         reach_m = self.reach_m(config)
         return reach_m + largest_radius_m if reach_m > 0.0 and self.sees_bodies else reach_m

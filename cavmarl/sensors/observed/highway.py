@@ -1,4 +1,4 @@
-"""What highway-env's features of a vehicle mean, and the ranges that they are mapped from."""
+"""Meanings and default ranges of highway-env's features of a vehicle."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from cavmarl.sensors.observed.feature import Feature
 MAX_SPEED_MPS = 40.0  # Vehicle.MAX_SPEED
 LANE_WIDTH_M = 4.0  # AbstractLane.DEFAULT_WIDTH
 
-# No velocities differ by more: driving/kernels/motion/motion.py keeps speeds from 0 to 60 m/s.
+# No relative velocity is larger: driving/kernels/motion/motion.py keeps speeds within 0–60 m/s.
 MAX_RELATIVE_MPS = 120.0
 
 _MEANINGS = {
-    "presence": ("1 if there is one", ""),
-    "x": ("place, to the east", "m"),
-    "y": ("place, to the south", "m"),
+    "presence": ("1 if there is a vehicle", ""),
+    "x": ("position, to the east", "m"),
+    "y": ("position, to the south", "m"),
     "vx": ("velocity, to the east", "m/s"),
     "vy": ("velocity, to the south", "m/s"),
     "heading": ("heading, clockwise from east", "rad"),
     "cos_h": ("cosine of its heading", ""),
     "sin_h": ("sine of its heading, clockwise from east", ""),
-    "cos_d": ("cosine of the direction to its goal", ""),
-    "sin_d": ("sine of the direction to its goal, clockwise from east", ""),
-    "long_off": ("way along its lane", "m"),
-    "lat_off": ("place beside its lane's middle, right positive", "m"),
-    "ang_off": ("heading minus its lane's direction, right positive", "rad"),
+    "cos_d": ("cosine of the direction to its destination", ""),
+    "sin_d": ("sine of the direction to its destination, clockwise from east", ""),
+    "long_off": ("distance along its lane", "m"),
+    "lat_off": ("lateral offset from its lane's centre, right positive", "m"),
+    "ang_off": ("heading relative to its lane's direction, right positive", "rad"),
 }
 
-# What features that are not mapped can be.
+# Bounds of features without a range.
 _LIMITS = {
     "presence": (0.0, 1.0),
     "vx": (-MAX_RELATIVE_MPS, MAX_RELATIVE_MPS),
@@ -47,10 +47,10 @@ _NO_LIMIT = (-math.inf, math.inf)
 
 
 def default_ranges(network: RoadNetwork) -> dict[str, tuple[float, ...]]:
-    """highway-env's ranges where none are set.
+    """Return highway-env's default ranges of features.
 
-    There, `y` spans the lanes of the road on which the first observation is made, and stays so. A
-    constant of the map stands for that here: the lanes of its widest road.
+    In highway-env, the range of `y` spans the lanes of the road of the first observation. Here it
+    spans the lanes of the widest road of the map, so that it is a constant of the map.
     """
     outside = network.edges[~network.edges["internal"]]
     y = LANE_WIDTH_M * float(outside["num_lanes"].max())
@@ -64,7 +64,7 @@ def default_ranges(network: RoadNetwork) -> dict[str, tuple[float, ...]]:
 
 
 def range_table(ranges: Mapping[str, tuple[float, ...]]) -> NDArray[np.float64]:
-    """(NUM_VEHICLE_FEATURES, 2) by code, nan where there is no range."""
+    """Return the ranges (NUM_VEHICLE_FEATURES, 2) by feature code; nan where there is none."""
     table = np.full((len(VEHICLE_FEATURES), 2), np.nan)
     for name, bounds in ranges.items():
         table[VEHICLE_FEATURES.index(name)] = bounds
@@ -76,7 +76,7 @@ def codes(features: tuple[str, ...]) -> NDArray[np.int64]:
 
 
 def goal_places(network: RoadNetwork, plans: NDArray[np.void]) -> NDArray[np.float64]:
-    """(M, G, 2) x and y of each goal of each map in m: the end of its edge's lane at the kerb."""
+    """Return x and y (M, G, 2) of each goal of each map, in m: the end of its edge's kerb lane."""
     places = np.zeros((len(network.maps), len(plans), 2))
     for own, row in zip(places, network.maps, strict=True):
         first, end = row["first_lane"], row["first_lane"] + row["num_lanes"]
@@ -90,14 +90,14 @@ def goal_places(network: RoadNetwork, plans: NDArray[np.void]) -> NDArray[np.flo
 def vehicle_feature(
     name: str, label: str, subject: str, ranges: Mapping[str, tuple[float, ...]], clip: bool
 ) -> Feature:
-    """One feature of a vehicle.
+    """Return one feature of a vehicle.
 
     Args:
         name: one of `VEHICLE_FEATURES`.
-        label: the name that it gets.
-        subject: whose it is; begins the meaning.
-        ranges: what is mapped to [-1, 1].
-        clip: whether what was mapped is clipped.
+        label: the feature's name in the observation.
+        subject: the vehicle; begins the meaning.
+        ranges: values that are mapped to [-1, 1], by feature.
+        clip: whether mapped values are clipped.
     """
     meaning, unit = _MEANINGS[name]
     text = f"{subject}: {meaning}"

@@ -1,4 +1,4 @@
-"""The `history` sensor: what the vehicle was told to do, and its speeds."""
+"""The `history` sensor: recent controls and speeds of the agent's vehicle."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _SPEED = f"{SPEED_SCALE:g} m/s"
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """Three numbers a step, the last one first; those before the vehicle entered are its first."""
+    """List three features per step, last step first; steps before entry repeat the first step."""
     rows = (
-        ("throttle", "acceleration that was asked for", "10 m/s²"),
+        ("throttle", "commanded acceleration", "10 m/s²"),
         ("steering", "front wheel angle, left positive", "pi/4 rad"),
         ("speed", "speed along the heading", _SPEED),
     )
@@ -29,7 +29,6 @@ def shape(config: SensorsConfig) -> tuple[int, ...]:
 
 
 def settings(config: SensorsConfig, at: int) -> HistorySensor:
-    """What the kernel takes."""
     return HistorySensor(at, config.history.steps * HISTORY_FEATURES)
 
 

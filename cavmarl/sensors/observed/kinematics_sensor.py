@@ -1,4 +1,4 @@
-"""highway-env's `Kinematics`: a table of the vehicles near one, the own one first."""
+"""highway-env's `Kinematics`: a table of the vehicles near the agent, its own vehicle first."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.sensors.kernels.kinematics_observation import PERCEPTION_M, Kinemat
 from cavmarl.sensors.observed.feature import Feature, Sensor
 from cavmarl.sensors.observed.highway import codes, default_ranges, range_table, vehicle_feature
 
-# The range of y is the map's; whatever it is, it becomes [-1, 1].
+# The map sets the range of y; whatever its size, it is mapped to [-1, 1].
 _DEFAULT_RANGES = {
     "x": (-200.0, 200.0), "y": (-4.0, 4.0), "vx": (-80.0, 80.0), "vy": (-80.0, 80.0)
 }  # fmt: skip
@@ -22,7 +22,7 @@ _RELATIVE = ("x", "y", "vx", "vy")
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """Row by row; rows without a vehicle are 0."""
+    """List the features row by row; rows without a vehicle are 0."""
     kinematics = config.kinematics
     ranges = kinematics.features_range or _DEFAULT_RANGES
     if not kinematics.normalize:
@@ -32,7 +32,7 @@ def features(config: SensorsConfig) -> list[Feature]:
         for name in kinematics.features:
             subject = f"vehicle {row}"
             if name in _RELATIVE and not kinematics.absolute:
-                subject += " (0 itself, others less its own)"
+                subject += " (row 0: ego; other rows: relative to ego)"
             feature = vehicle_feature(name, f"{name}_{row}", subject, ranges, kinematics.clip)
             if name == "y" and ranges is _DEFAULT_RANGES:
                 feature = replace(feature, scale="4 m · lanes of the widest road")
@@ -45,14 +45,14 @@ def shape(config: SensorsConfig) -> tuple[int, ...]:
 
 
 def reach_m(config: SensorsConfig) -> float:
-    """highway-env's perception distance, if it is on."""
+    """Return highway-env's perception distance, or 0 if the sensor is off."""
     return PERCEPTION_M if config.kinematics.vehicles_count else 0.0
 
 
 def settings(
     config: SensorsConfig, at: int, network: RoadNetwork, goals: NDArray[np.float64]
 ) -> KinematicsSensor:
-    """What the kernel takes; `goals` are the places of `highway.goal_places`."""
+    """Return the kernel's settings; `goals`: see `highway.goal_places`."""
     kinematics = config.kinematics
     ranges = kinematics.features_range or default_ranges(network)
     table = range_table(ranges if kinematics.normalize else {})

@@ -10,12 +10,12 @@ from cavmarl.sensors.kernels.lidar_2d import ECHO
 from cavmarl.sensors.observed.feature import Feature, Sensor
 from cavmarl.sensors.observed.highway import MAX_RELATIVE_MPS
 
-# Within a body distances are negative, by no more than its length.
+# Within a body distances are negative, at most by the body's length.
 LONGEST_BODY_M = 30.0
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """Distance and speed of each cell in turn."""
+    """List the distance and speed of each cell in turn."""
     lidar = config.lidar_observation
     scale = _scale(config)
     reach = lidar.maximum_range_m / scale
@@ -27,15 +27,15 @@ def features(config: SensorsConfig) -> list[Feature]:
         found += [
             Feature(
                 f"distance_{cell}",
-                f"distance {where}; the range where nothing is",
+                f"distance {where}; the range if the cell is empty",
                 f"{scale:g} m",
                 -inside,
                 reach,
             ),
             Feature(
                 f"speed_{cell}",
-                f"velocity of what is {where} minus the own one, away from here; "
-                "the range where nothing is",
+                f"radial speed of the object {where} relative to ego, positive away; "
+                "the range if the cell is empty",
                 f"{scale:g} m/s",
                 -speed,
                 speed,

@@ -7,18 +7,18 @@ from cavmarl.sensors.observed.feature import Feature, Sensor, features_of
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """Distances of all rays, then, with `speeds`, the relative speeds of what they met."""
+    """List the distances of all rays and, with `speeds`, the relative speeds of the objects hit."""
     lidar = config.lidar
     step = 360.0 / max(lidar.rays, 1)
-    told = "velocity of what the ray met minus the own one, along the ray; 0 where nothing is"
+    meaning = "speed of the object hit relative to ego, along the ray; 0 if the ray hits nothing"
     return features_of(
         (
             f"distance_{k}",
-            f"distance along the ray {k * step:g}° left of straight ahead; 1 where nothing is",
+            f"distance along the ray {k * step:g}° left of straight ahead; 1: no hit",
             f"{lidar.range_m:g} m",
         )
         for k in range(lidar.rays)
-    ) + features_of((f"speed_{k}", told, "40 m/s") for k in range(lidar.rays * lidar.speeds))
+    ) + features_of((f"speed_{k}", meaning, "40 m/s") for k in range(lidar.rays * lidar.speeds))
 
 
 def reach_m(config: SensorsConfig) -> float:

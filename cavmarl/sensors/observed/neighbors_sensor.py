@@ -7,16 +7,16 @@ from cavmarl.sensors.observed.feature import Feature, Sensor, numbered
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """Seven numbers of each of the nearest vehicles, nearest first; all 0 where there are fewer."""
+    """List seven features per vehicle, nearest vehicle first; missing vehicles are 0."""
     scale = f"{config.neighbors.range_m:g} m"
     rows = (
-        ("present", "1 if there is one", ""),
-        ("x", "forward place, ego frame", scale),
-        ("y", "place to the left, ego frame", scale),
-        ("vx", "forward velocity minus the own one, ego frame", "40 m/s"),
-        ("vy", "velocity to the left minus the own one, ego frame", "40 m/s"),
-        ("cos", "cosine of its heading minus the own one", ""),
-        ("sin", "sine of its heading minus the own one", ""),
+        ("present", "1 if there is a vehicle", ""),
+        ("x", "longitudinal position, ego frame", scale),
+        ("y", "lateral position, left positive, ego frame", scale),
+        ("vx", "longitudinal velocity minus the ego speed, ego frame", "40 m/s"),
+        ("vy", "lateral velocity, left positive, ego frame", "40 m/s"),
+        ("cos", "cosine of its heading relative to the ego heading", ""),
+        ("sin", "sine of its heading relative to the ego heading", ""),
     )
     return numbered(config.neighbors.count, "neighbour {}", rows)
 

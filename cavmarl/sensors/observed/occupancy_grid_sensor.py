@@ -16,7 +16,7 @@ _DEFAULT_RANGES = {"vx": (-80.0, 80.0), "vy": (-80.0, 80.0)}
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """Layer by layer; in a layer column by column from west to east, in a column to the south."""
+    """List the features by layer, then column (west to east), then row (north to south)."""
     grid = config.occupancy_grid
     columns, rows = grid.shape
     ranges = grid.features_range or _DEFAULT_RANGES
@@ -27,7 +27,7 @@ def features(config: SensorsConfig) -> list[Feature]:
                 label = f"{name}_{column}_{row}"
                 subject = f"cell {column}, {row}"
                 if name == "on_road":
-                    feature = Feature(label, f"{subject}: 1 if a lane's middle is in it", "", 0.0)
+                    feature = Feature(label, f"{subject}: 1 if it has a centre line", "", 0.0)
                 else:
                     feature = vehicle_feature(name, label, f"vehicle in {subject}", ranges, False)
                 found.append(_bounded(feature, grid))
@@ -35,7 +35,7 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def _bounded(feature: Feature, grid: OccupancyGridConfig) -> Feature:
-    """The feature with the bounds and the scale that clipping and images give it."""
+    """Return the feature with the bounds and scale that result from clipping or images."""
     if grid.as_image:
         scale = f"255 is {feature.scale}" if feature.scale else "255 is 1"
         return Feature(feature.name, feature.meaning, scale, 0.0, 255.0)
@@ -46,7 +46,7 @@ def _bounded(feature: Feature, grid: OccupancyGridConfig) -> Feature:
 
 
 def shape(config: SensorsConfig) -> tuple[int, ...]:
-    """(layers, columns along x, rows along y)."""
+    """Return (layers, columns along x, rows along y)."""
     return len(config.occupancy_grid.features), *config.occupancy_grid.shape
 
 
@@ -55,7 +55,7 @@ def dtype(config: SensorsConfig) -> DTypeLike:
 
 
 def reach_m(config: SensorsConfig) -> float:
-    """To the furthest corner, if it is on."""
+    """Return the distance to the furthest corner, or 0 if the sensor is off."""
     grid = config.occupancy_grid
     if not grid.features:
         return 0.0
@@ -65,7 +65,7 @@ def reach_m(config: SensorsConfig) -> float:
 def settings(
     config: SensorsConfig, at: int, network: RoadNetwork, goals: NDArray[np.float64]
 ) -> OccupancyGrid:
-    """What the kernel takes; `goals` are the places of `highway.goal_places`."""
+    """Return the kernel's settings; `goals`: see `highway.goal_places`."""
     grid = config.occupancy_grid
     columns, rows = grid.shape
     table = range_table(grid.features_range or _DEFAULT_RANGES)

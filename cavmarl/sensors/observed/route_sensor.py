@@ -1,4 +1,4 @@
-"""The `route` sensor: points of the way ahead."""
+"""The `route` sensor: points along the path ahead."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from cavmarl.sensors.observed.feature import Feature, Sensor
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """X (forward) and y (left) of points of the way ahead in the ego frame."""
+    """List x (forward) and y (left) of points along the path ahead, in the ego frame."""
     route = config.route
     scale = f"{route.points * route.spacing_m:g} m"
     return [
         Feature(
             f"{axis}_{k}",
-            f"{side} of the point {(k + 1) * route.spacing_m:g} m along the way, ego frame",
+            f"{side} of the point {(k + 1) * route.spacing_m:g} m along the path, ego frame",
             scale,
         )
         for k in range(route.points)
-        for axis, side in (("x", "forward place"), ("y", "place to the left"))
+        for axis, side in (("x", "longitudinal position"), ("y", "lateral position"))
     ]
 
 

@@ -1,4 +1,4 @@
-"""`SensorSetup`: what the settings of an optional sensor are made of."""
+"""`SensorSetup`: the inputs for the settings of an optional sensor."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from cavmarl.roads.network import RoadNetwork
 
 @dataclass(frozen=True)
 class SensorSetup:
-    """The world of a sensor, and the place of its numbers."""
+    """The world of a sensor, and the position of its features in a frame."""
 
     config: SensorsConfig
-    at: int  # where its numbers begin in a frame
+    at: int  # index of the sensor's first feature in a frame
     network: RoadNetwork
     goals: NDArray[np.float64]  # see `highway.goal_places`
-    most_told: int  # vehicles that an inbox keeps
-    capacity: int  # rows of a world
+    most_told: int  # number of vehicles that an inbox keeps
+    capacity: int  # rows per world
 
 
 def walls_of(network: RoadNetwork, through_walls: bool) -> Walls:

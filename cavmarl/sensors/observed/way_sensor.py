@@ -1,6 +1,6 @@
-"""The `way` sensor: the way ahead by its shape, its lanes and the stop lines on it.
+"""The `way` sensor: the shape, lanes and stop lines of the path ahead.
 
-The scales are those of the kernel `observing_way`.
+The scales are defined in the kernel `observing_way`.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ _SPEED = f"{SPEED_SCALE:g} m/s"
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """Four numbers a place, nearest first; then five a line, or six with `timing`."""
+    """List four features per point, nearest first, then five or six per stop line."""
     found = []
     for k, distance in enumerate(config.way.distances_m):
-        where = f"{distance:g} m along the way"
+        where = f"{distance:g} m along the path"
         found += [
-            Feature(f"left_{k}", f"place to the left of what is {where}", f"{distance:g} m"),
+            Feature(f"left_{k}", f"lateral position {where}, left positive", f"{distance:g} m"),
             Feature(
                 f"curvature_{k}",
-                f"curvature from the place before to {where}, left positive",
+                f"curvature from the previous point to {where}, left positive",
                 f"{CURVATURE_SCALE:g} 1/m",
             ),
             Feature(f"width_{k}", f"width of the lane {where}", f"{WIDTH_SCALE:g} m", 0.0),
             Feature(f"limit_{k}", f"speed limit {where}", _SPEED, 0.0),
         ]
-    near = f"{LINE_HALF_M:g} m / ({LINE_HALF_M:g} m + way)"
+    near = f"{LINE_HALF_M:g} m / ({LINE_HALF_M:g} m + distance)"
     for k in range(config.way.lines):
         rows = [
-            ("line", f"how near stop line {k} is along the way: {near}; 0: there is none"),
-            ("line_red", f"1 if the signal of line {k} is red, or asks to stop first"),
+            ("line", f"closeness of stop line {k} along the path: {near}; 0: no line"),
+            ("line_red", f"1 if the signal of line {k} is red, or it requires a stop first"),
             ("line_yellow", f"1 if the signal of line {k} is yellow"),
             ("line_green", f"1 if the signal of line {k} is green"),
-            ("line_yields", f"1 if others have the right of way behind line {k}"),
+            ("line_yields", f"1 if other vehicles have the right of way behind line {k}"),
         ]
         if config.way.timing:
             rows.append(
@@ -53,7 +53,6 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 def settings(config: SensorsConfig, at: int) -> WaySensor:
-    """What the kernel takes."""
     given = config.way
     distances = np.array(given.distances_m, dtype=np.float64)
     return WaySensor(at, distances, given.lines, given.range_m, given.timing)

@@ -1,4 +1,4 @@
-"""Demand from SUMO's files: vehicles with their departures, origins, destinations and types."""
+"""Demand from SUMO's files: vehicles with departures, origins, destinations and types."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""`DefinitionCollector`: takes definitions as they are read and keeps little of each.
+"""`DefinitionCollector`: takes definitions as they are read and stores little of each.
 
-Names are resolved when all files are read: SUMO's rule that a definition stands before its use is
-not needed here. What occurs often is kept once: routes, types, and lists of stops become numbers at
-once; of a vehicle one row of figures is left.
+Names are resolved after all files have been read, so definitions may stand after their use, unlike
+in SUMO. Frequent content is stored once: routes, types and lists of stops become numbers, and each
+vehicle becomes one row of numbers.
 
-When vehicles of flows depart follows SUMO's rules.
+Departure times of flows follow SUMO's rules.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, Element
 from cavmarl.traffic.demand.rerouting_device import device
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 
-DAY_MS = 86_400_000  # SUMO lets flows without an end last so long
-MIN_RATE = 1e-12  # 1/s: less is never
-MAX_NUMBER = 1 << 40  # of a flow without a number: beyond every cap
+DAY_MS = 86_400_000  # SUMO's length of a flow without an end
+MIN_RATE = 1e-12  # 1/s, lower limit of rates
+MAX_NUMBER = 1 << 40  # for flows without a number: larger than every cap
 
 _EXPONENTIAL = re.compile(r"exp\(([^()]*)\)")
 _PER_HOUR = ("vehsPerHour", "perHour")
@@ -57,7 +57,7 @@ class Timing(NamedTuple):
     rate: float
 
     def expected(self, begin_ms: int, end_ms: int) -> float:
-        """How many vehicles depart in a span of time, in the mean."""
+        """Return the mean number of vehicles that depart in a span of time."""
         span = max(min(self.end_ms, end_ms) - max(self.begin_ms, begin_ms), 0)
         if self.pattern != FLOW_REGULAR:
             return min(span / 1000.0 * self.rate, float(self.number))
@@ -71,11 +71,12 @@ def single_timing(depart_ms: int) -> Timing:
 
 
 def flow_timing(element: Element, horizon_ms: int) -> Timing:
-    """The timing of a <flow>.
+    """Return the timing of a <flow>.
 
-    `horizon_ms`: end of the simulation, where the flow names none; -1: a day after its begin.
+    `horizon_ms`: end of a flow that names none; -1: one day after its begin.
 
-    Raises DemandError: no rate or too many, a rate that is not positive, an end before the begin.
+    Raises DemandError: there is no rate or several, a rate is not positive, or the flow ends before
+    it begins.
     """
     rates = [key for key in _RATES if key in element.attrs]
     if len(rates) > 1:
@@ -92,7 +93,7 @@ def flow_timing(element: Element, horizon_ms: int) -> Timing:
     number = element.whole("number", MAX_NUMBER, least=0)
     if not rates:
         period = (end - begin) // max(number, 1)
-        # The last one departs before the end, whatever was lost in rounding.
+        # The last vehicle departs before the end despite rounding.
         return Timing(FLOW_REGULAR, begin, max(end, begin + 1), period, number, 0.0)
     if "number" in element.attrs:
         end = MAX_TIME_MS
@@ -104,7 +105,7 @@ def _rate(
 ) -> tuple[int, int, int, int, int, float]:
     exponential = _EXPONENTIAL.fullmatch(element.attrs[key].strip()) if key == "period" else None
     if exponential:
-        rate = element.saying(period=exponential[1]).number("period", 0.0, above=MIN_RATE)
+        rate = element.with_attrs(period=exponential[1]).number("period", 0.0, above=MIN_RATE)
         return FLOW_EXPONENTIAL, begin, end, 0, number, rate
     if key == "probability":
         chance = element.number(key, 0.0, above=MIN_RATE, most=1.0)
@@ -115,7 +116,7 @@ def _rate(
         period = int(min(3_600_000.0 / element.number(key, 0.0, above=0.0) + 0.5, MAX_TIME_MS))
     if period <= 0:
         raise element.error(
-            f"has {key}='{element.attrs[key]}'", "one vehicle a millisecond is most"
+            f"has {key}='{element.attrs[key]}'", "the maximum is one vehicle per millisecond"
         )
     return FLOW_REGULAR, begin, end, period, number, 0.0
 
@@ -124,9 +125,9 @@ _NO_DEPARTURE = ("triggered", "containerTriggered", "split", "now")
 _WAY = ("from", "to", "via", "fromJunction", "toJunction", "viaJunctions", "fromTaz", "toTaz")
 _OFF_MAP = ("fromXY", "toXY", "viaXY", "fromLonLat", "toLonLat", "viaLonLat")
 _UNUSED = ("departEdge", "arrivalEdge", "departPosLat", "arrivalPosLat", "insertionChecks")
-# Attributes of routes and stops that do not say where they lead.
+# Attributes of routes and stops that do not define the way.
 _LOOKS = frozenset(("color", "cost", "savings", "exitTimes", "routeLength", "reason"))
-# Old names of SUMO's that its own files still hold.
+# SUMO's old names, which its own files still contain.
 _RENAMED = {"beginLane": "departLane", "beginPos": "departPos", "beginSpeed": "departSpeed"}
 
 
@@ -136,9 +137,9 @@ class DefinitionCollector:
     Attributes:
         named: elements by kind and id: vType, route, their distributions, stopping places,
             rerouters.
-        routes: elements that say a route, one for each way of saying: a <route>, or a trip.
-        types: the name of each type that is used, by first use.
-        stops: lists of <stop> elements, equal lists once.
+        routes: elements that define a route, one per definition: a <route>, or a trip.
+        types: the name of each used type, by first use.
+        stops: lists of <stop> elements; equal lists are stored once.
         ids: of vehicles, trips and flows, by row.
     """
 
@@ -148,7 +149,7 @@ class DefinitionCollector:
         begin_ms: int,
         end_ms: int,
         max_departures: int,
-        departs: Mapping[str, str],  # attributes of departures that name none
+        departs: Mapping[str, str],  # attributes of departures without their own
     ) -> None:
         self.report = report
         self.named: dict[str, dict[str, Element]] = {}
@@ -168,10 +169,10 @@ class DefinitionCollector:
         self._latest_ms: dict[str, int] = {}  # by file
 
     def take(self, element: Element) -> None:
-        """Keep one definition.
+        """Store one definition.
 
-        Raises DemandError: an attribute is missing or wrong, an id occurs twice; CapacityError:
-        more departures than the cap.
+        Raises DemandError: an attribute is missing or wrong, or an id occurs twice; CapacityError:
+        there are more departures than the cap.
         """
         if element.name in ("vehicle", "trip", "flow"):
             self._take_vehicles(element)
@@ -188,7 +189,7 @@ class DefinitionCollector:
                     self._name("route", child)
 
     def elements(self) -> NDArray[np.void]:
-        """ELEMENT (num_elements,); `types`, `routes`, `first_stop` count this object's lists."""
+        """Return ELEMENT (num_elements,); types, routes and first_stop index the lists here."""
         table = np.frombuffer(self._rows, dtype=np.float64).reshape(-1, len(ELEMENT.names or ()))
         elements = np.zeros(len(self.ids), dtype=ELEMENT)
         for column, name in enumerate(ELEMENT.names or ()):
@@ -197,7 +198,7 @@ class DefinitionCollector:
 
     def _name(self, kind: str, element: Element) -> None:
         name = element.text("id")
-        # Types and their distributions share names, and so do routes and theirs.
+        # Types share names with type distributions, and routes with route distributions.
         for other in (kind, f"{kind}Distribution", kind.removesuffix("Distribution")):
             known = self.named.get(other, {}).get(name)
             if known is not None:
@@ -238,7 +239,7 @@ class DefinitionCollector:
             self._stops(element),
             0,
             *device(element),
-            *_how(element),
+            *_entry_and_exit(element),
         )
         self.ids.append(name)
         self._rows.extend(row)
@@ -304,13 +305,13 @@ class DefinitionCollector:
 
 
 def _key(element: Element) -> tuple[object, ...]:
-    """What an element says of the way, without the place where it says so."""
-    says = (item for item in element.attrs.items() if item[0] not in _LOOKS)
-    return (element.name, *says, *(_key(child) for child in element.children))
+    """Return the content of an element that defines a way, without its place in the file."""
+    items = (item for item in element.attrs.items() if item[0] not in _LOOKS)
+    return (element.name, *items, *(_key(child) for child in element.children))
 
 
-def _how(element: Element) -> tuple[float, ...]:
-    """The last fields of ELEMENT: how a vehicle enters and leaves, by default as in SUMO 1.28."""
+def _entry_and_exit(element: Element) -> tuple[float, ...]:
+    """Return the last fields of ELEMENT: entering and leaving, with SUMO 1.28's defaults."""
     return (
         _lane(element, "departLane", LANE_BEST),
         *_coded(element, "departPos", POS_BASE),
@@ -328,11 +329,11 @@ def _lane(element: Element, key: str, default: int) -> int:
 
 
 def _coded(element: Element, key: str, default: int, least: float = -math.inf) -> tuple[int, float]:
-    """The code of a word, or the code of a given number and the number."""
+    """Return the code of a keyword, or the code for a given number and the number."""
     if key not in element.attrs:
         return default, 0.0
     code = CODES[key].get(element.attrs[key])
     if code is not None:
         return code, 0.0
-    # POS_GIVEN and SPEED_GIVEN are one number.
+    # POS_GIVEN and SPEED_GIVEN are equal.
     return POS_GIVEN, element.number(key, 0.0, least=least, words=CODES[key])

@@ -1,4 +1,4 @@
-"""`DemandFile`: the demand of SUMO's files on one map, immutable, from which episodes are drawn."""
+"""`DemandFile`: the demand of SUMO files on one map; immutable; episodes are drawn from it."""
 
 from __future__ import annotations
 
@@ -46,30 +46,30 @@ _COPIED = (
 
 @dataclass(frozen=True, eq=False)
 class DemandFile:
-    """Vehicles that are to drive on a map; see `records` for the dtypes."""
+    """The vehicles that are to drive on a map; see `demand_records` for the dtypes."""
 
-    network: RoadNetwork  # the roads that all rows point into
+    network: RoadNetwork  # the network that all rows refer to
     types: NDArray[np.void]
-    type_ids: tuple[str, ...]  # their names
-    routes: NDArray[np.void]  # ROUTE (num_routes,), equal routes once
+    type_ids: tuple[str, ...]  # names of `types`
+    routes: NDArray[np.void]  # ROUTE (num_routes,); equal routes are stored once
     route_edges: NDArray[np.int32]  # EDGE rows that ROUTE points into
-    route_ids: tuple[str, ...]  # their names, "" for those inside vehicles
-    stops: NDArray[np.void]  # STOP (num_stops,) that ROUTE and ELEMENT point into
+    route_ids: tuple[str, ...]  # names of `routes`, "" for routes inside vehicles
+    stops: NDArray[np.void]  # STOP (num_stops,) that ROUTE and ELEMENT refer to
     elements: NDArray[np.void]  # ELEMENT (num_elements,), in the order of the files
     element_ids: tuple[str, ...]  # ids of vehicles, trips and flows
     type_choices: Choices  # lists of VTYPE rows with probabilities
     route_choices: Choices  # lists of ROUTE rows with probabilities
-    # sorted keys type * num_routes + route of vehicles that cannot drive their route; empty unless
-    # such were to be skipped
+    # sorted keys type * num_routes + route of vehicles that cannot drive their route; only filled
+    # if such vehicles are skipped
     bad_pairs: NDArray[np.int64]
-    rerouters: Rerouters  # what sends vehicles another way on certain edges
+    rerouters: Rerouters  # rules that reroute vehicles on certain edges
     device: DeviceOptions  # options of the rerouting device for all vehicles
-    # (num_edges, n) LANE row by SUMO's index on the edge, -1 where there is none
+    # (num_edges, n) LANE row by SUMO's index on the edge, -1 if there is none
     lane_table: NDArray[np.int32]
     begin_ms: int  # start of the simulation that the files are meant for
-    end_ms: int  # its end; `MAX_TIME_MS` if they name none
+    end_ms: int  # end of the simulation; `MAX_TIME_MS` if the files name none
     step_ms: int
-    report: DemandReport  # what was read and what was tolerated
+    report: DemandReport  # counts of elements that were read and tolerated
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -79,7 +79,7 @@ class DemandFile:
 
     @property
     def content_hash(self) -> str:
-        """SHA-256 of all that episodes are drawn from, hex."""
+        """SHA-256 (hex) of everything that episodes depend on."""
         digest = hashlib.sha256()
         for field in fields(self):
             value = getattr(self, field.name)
@@ -100,12 +100,12 @@ class DemandFile:
         return digest.hexdigest()
 
     def draw(self, key: int, until_s: float | None = None) -> NDArray[np.void]:
-        """The orders of one episode: a pure function of the key.
+        """Draw the orders of one episode, a pure function of the key.
 
         `key`: of the world and episode, see `math.rng.world_key`. `until_s`: no vehicle departs
-        at or after this time; the end of the files' simulation if None.
+        at or after this time; None: the end of the files' simulation.
 
-        Returns ORDER (n,), sorted by departure, at one time in the order of the files.
+        Returns ORDER (n,), sorted by departure, then in the order of the files.
         """
         end_ms = self.end_ms if until_s is None else min(self.end_ms, round(until_s * 1000.0))
         rows, numbers, times = departures_ms(self.elements, key, self.begin_ms, end_ms)
@@ -123,9 +123,9 @@ class DemandFile:
         own = element["first_stop"] >= 0
         for name in ("first_stop", "num_stops"):
             orders[name] = np.where(own, element[name], self.routes[name][routes])
-        chance = self._said("reroute", element, types, self.device.chance)
+        chance = self._device_setting("reroute", element, types, self.device.chance)
         orders["reroute"] = chances(key, rows, numbers, DRAW_REROUTE) < chance
-        orders["reroute_period_ms"] = self._said(
+        orders["reroute_period_ms"] = self._device_setting(
             "reroute_period_ms", element, types, self.device.period_ms
         )
         for name in _COPIED:
@@ -135,19 +135,19 @@ class DemandFile:
 
     @property
     def may_look(self) -> bool:
-        """Whether some vehicle may have a rerouting device."""
+        """Whether any vehicle may have a rerouting device."""
         return any(
             bool((chance > 0.0).any())
             for chance in (self.elements["reroute"], self.types["reroute"])
         ) or (self.device.chance > 0.0 and len(self.elements) > 0)
 
-    def _said(
+    def _device_setting(
         self, field: str, element: NDArray[np.void], types: NDArray[np.int32], default: float
     ) -> NDArray[np.float64]:
-        """What vehicles (n,) say of their device, else their types, else the configuration."""
-        said: NDArray[np.float64] = self.types[field][types].astype(np.float64)
-        said = np.where(said < 0.0, default, said)
-        return np.where(element[field] < 0, said, element[field])
+        """Return a device setting of vehicles (n,): their own, their type's, or the default."""
+        setting: NDArray[np.float64] = self.types[field][types].astype(np.float64)
+        setting = np.where(setting < 0.0, default, setting)
+        return np.where(element[field] < 0, setting, element[field])
 
     def _pick(
         self,
@@ -158,11 +158,11 @@ class DemandFile:
         key: int,
         stream: int,
     ) -> NDArray[np.int32]:
-        """What each vehicle (n,) gets of what its element has to choose from."""
+        """Return what each vehicle (n,) draws from the choice of its element."""
         return choices.pick(self.elements[field][rows], chances(key, rows, numbers, stream))
 
     def vehicle_id(self, order: np.void) -> str:
-        """SUMO's name of the vehicle of one ORDER ()."""
+        """Return SUMO's name of the vehicle of one ORDER ()."""
         row = int(order["element"])
         name = self.element_ids[row]
         return f"{name}.{order['number']}" if self.elements[row]["flow"] else name
@@ -172,11 +172,11 @@ class DemandFile:
         return f"{self.report.files[int(element['file'])]}, line {element['line']}"
 
     def to_report(self) -> str:
-        """Lines for a terminal: what was read and what was tolerated."""
+        """Return lines for a terminal: counts of read and tolerated elements."""
         return self.report.to_report()
 
     def _place(self, orders: NDArray[np.void], element: NDArray[np.void]) -> None:
-        """Lanes as LANE rows, positions from the start of the edge and on it."""
+        """Convert lanes to LANE rows, and positions to distances from the start of the edge."""
         route = self.routes[orders["route"]]
         ends = {
             "depart": self.route_edges[route["first_edge"]],
@@ -205,14 +205,14 @@ def read_demand(
         paths: `.rou.xml` and `.add.xml` files, plain or gzipped, in any order; a `.sumocfg` stands
             for the files and the times that it names.
         network: the map.
-        on_bad_route: what to do with vehicles whose class cannot drive their route, and with stops
-            off the route: refuse the file, or leave them out and count them in the report.
-        max_departures: the most vehicles that the files may make.
+        on_bad_route: how to handle vehicles whose class cannot drive their route, and stops off
+            the route: refuse the file, or leave them out and count them in the report.
+        max_departures: maximum number of vehicles.
 
     Raises:
-        DemandError: files are missing or broken, contradict themselves, or are another map's.
+        DemandError: files are missing, broken, contradictory, or made for another map.
         RouteError: a route does not connect for a class that drives it.
-        CapacityError: the files make more than `max_departures`.
+        CapacityError: the files have more than `max_departures` vehicles.
     """
     if on_bad_route not in ("error", "skip"):
         raise DemandError(f"on_bad_route='{on_bad_route}': choose 'error' or 'skip'")
@@ -251,7 +251,7 @@ def read_demand(
 
 
 def _configuration(paths: Sequence[Path]) -> SumoConfigFile:
-    """All files to read, with what the last configuration among `paths` says of their vehicles."""
+    """Return the last configuration among `paths`, with all files to read."""
     files: list[Path] = []
     config = SumoConfigFile(None, (), 0, -1, 1000, DeviceOptions(), {})
     for path in map(Path, paths):
@@ -261,5 +261,5 @@ def _configuration(paths: Sequence[Path]) -> SumoConfigFile:
         else:
             files.append(path)
     if not files:
-        raise DemandError("no file of demand was given: name a .rou.xml or a .sumocfg")
+        raise DemandError("no demand file is given; name a .rou.xml or a .sumocfg")
     return replace(config, files=tuple(files))

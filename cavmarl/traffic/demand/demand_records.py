@@ -1,7 +1,7 @@
-"""The arrays of a demand file: elements as they stand in the file, and the orders drawn from them.
+"""The arrays of a demand file: elements as in the file, and the orders drawn from them.
 
-Units: metres, seconds, metres a second; times of elements are whole milliseconds as in SUMO, so
-that a flow's vehicles depart at exactly SUMO's times. Indices that point at nothing are -1.
+Units: m, s, m/s. Times of elements are whole milliseconds as in SUMO, so that a flow's vehicles
+depart at exactly SUMO's times. Indices without a target are -1.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ from numpy.typing import NDArray
 from cavmarl.core.records import record
 from cavmarl.traffic.demand.element import Element
 
-# Lanes: a LANE row (in an ORDER) or SUMO's index on the edge (in an ELEMENT), or one of these.
-LANE_FIRST = -1  # the one nearest to the kerb that the class may use
+# Lanes: a LANE row (in an ORDER), SUMO's index on the edge (in an ELEMENT), or one of these codes.
+LANE_FIRST = -1  # the lane nearest to the kerb that the class may use
 LANE_RANDOM = -2
-LANE_FREE = -3  # the least occupied one
-LANE_ALLOWED = -4  # the least occupied one of those the class may use
-LANE_BEST = -5  # the one on which the route can be followed furthest
-LANE_CURRENT = -6  # arrival: whichever it drives on
+LANE_FREE = -3  # the lane with the fewest vehicles
+LANE_ALLOWED = -4  # of the lanes that the class may use, the one with the fewest vehicles
+LANE_BEST = -5  # the lane that the route can follow furthest
+LANE_CURRENT = -6  # arrival: the present lane
 
 POS_GIVEN = 0
 POS_BASE = 1  # the rear bumper at the start of the lane (SUMO's default)
 POS_RANDOM = 2
 POS_FREE = 3  # the first gap
-POS_RANDOM_FREE = 4  # random, and where that is taken the first gap
+POS_RANDOM_FREE = 4  # random; if that place is taken, the first gap
 POS_LAST = 5  # behind the last vehicle
 POS_MAX = 6  # arrival: at the end of the lane
 
 SPEED_GIVEN = 0
 SPEED_RANDOM = 1
-SPEED_MAX = 2  # the most that is safe there
+SPEED_MAX = 2  # the highest safe speed
 SPEED_DESIRED = 3  # limit times speed factor
 SPEED_LIMIT = 4
-SPEED_LAST = 5  # of the last vehicle on the lane
-SPEED_AVERAGE = 6  # of the vehicles on the lane
-SPEED_CURRENT = 7  # arrival: whichever it has
+SPEED_LAST = 5  # speed of the last vehicle on the lane
+SPEED_AVERAGE = 6  # mean speed of the vehicles on the lane
+SPEED_CURRENT = 7  # arrival: the present speed
 
 _DEPART_POS = {
     "base": POS_BASE,
@@ -56,7 +56,7 @@ _DEPART_SPEED = {
     "avg": SPEED_AVERAGE,
 }
 
-# The words that may stand for a number, by attribute.
+# The keywords that may replace a number, by attribute.
 CODES = {
     "departLane": {
         "first": LANE_FIRST,
@@ -73,15 +73,15 @@ CODES = {
     "arrivalSpeed": {"current": SPEED_CURRENT},
 }
 
-UNTIL_ABSOLUTE = 0  # the clock
-UNTIL_FLOW = 1  # the clock of the flow's first vehicle: later ones are as late as they depart
-UNTIL_DEPARTURE = 2  # the vehicle's departure (stops of routes that stand alone)
+UNTIL_ABSOLUTE = 0  # by the clock
+UNTIL_FLOW = 1  # by the clock for the first vehicle; later ones shift with their departure
+UNTIL_DEPARTURE = 2  # from the vehicle's departure (stops of standalone routes)
 
-FLOW_REGULAR = 0  # also single vehicles: flows of one
+FLOW_REGULAR = 0  # also single vehicles, as flows of one
 FLOW_EXPONENTIAL = 1  # gaps are exponentially distributed
-FLOW_PROBABILITY = 2  # each second one with this chance
+FLOW_PROBABILITY = 2  # one vehicle in each second with this probability
 
-_HOW = [
+_ENTRY_AND_EXIT = [
     ("depart_lane", np.int32),  # LANE_* or a lane, see above
     ("depart_pos_code", np.int8),  # POS_*
     ("depart_pos", np.float64),  # m from the start of the edge, of the front bumper
@@ -92,7 +92,7 @@ _HOW = [
     ("arrival_pos", np.float64),
     ("arrival_speed_code", np.int8),
     ("arrival_speed", np.float64),
-    ("speed_factor", np.float64),  # of this vehicle; NaN: drawn from its type
+    ("speed_factor", np.float64),  # of this vehicle; NaN: drawn for its type
 ]
 
 ELEMENT = record(
@@ -103,15 +103,15 @@ ELEMENT = record(
     ("begin_ms", np.int64),  # departure of the first vehicle
     ("end_ms", np.int64),  # no vehicle departs at or after it
     ("period_ms", np.int64),  # of FLOW_REGULAR
-    ("number", np.int64),  # at most so many vehicles
-    ("rate", np.float64),  # 1/s of FLOW_EXPONENTIAL, chance a second of FLOW_PROBABILITY
+    ("number", np.int64),  # maximum number of vehicles
+    ("rate", np.float64),  # FLOW_EXPONENTIAL: 1/s; FLOW_PROBABILITY: probability per second
     ("types", np.int32),  # choice among VTYPE rows
     ("routes", np.int32),  # choice among ROUTE rows
     ("first_stop", np.int32),  # STOP rows [first_stop, first_stop + num_stops)
     ("num_stops", np.int32),
-    ("reroute", np.float64),  # chance that the vehicle looks for its way itself; -1: its type's
-    ("reroute_period_ms", np.int64),  # how often; 0: once, -1: as its type
-    *_HOW,
+    ("reroute", np.float64),  # probability of a rerouting device; -1: as its type
+    ("reroute_period_ms", np.int64),  # period of searches; 0: one search, -1: as its type
+    *_ENTRY_AND_EXIT,
 )
 
 ORDER = record(
@@ -120,46 +120,46 @@ ORDER = record(
     ("number", np.int32),  # of the vehicle in its flow, from 0
     ("vtype", np.int32),  # VTYPE row
     ("route", np.int32),  # ROUTE row
-    ("first_stop", np.int32),  # STOP rows, in the order in which they are reached
+    ("first_stop", np.int32),  # STOP rows, in the order of the route
     ("num_stops", np.int32),
-    ("reroute", np.bool_),  # looks for its way itself when it has entered, …
-    ("reroute_period_ms", np.int64),  # … and then so often; 0: not again
-    *_HOW,
+    ("reroute", np.bool_),  # whether the vehicle searches for its way after entering …
+    ("reroute_period_ms", np.int64),  # … and the period of further searches; 0: none
+    *_ENTRY_AND_EXIT,
 )
 
 ROUTE = record(
     ("first_edge", np.int32),  # route_edges[first_edge : first_edge + num_edges]
     ("num_edges", np.int32),
-    ("exact", np.bool_),  # False: edges to pass through, the way between them is to be found
+    ("exact", np.bool_),  # False: the edges are waypoints of a way still to be found
     ("first_stop", np.int32),  # STOP rows that all its vehicles make
     ("num_stops", np.int32),
 )
 
 STOP = record(
     ("lane", np.int32),  # LANE row
-    ("at_edge", np.int32),  # position of its edge in the route; -1 on routes to be found
+    ("at_edge", np.int32),  # index of the stop's edge in the route; -1 on routes still to be found
     ("start", np.float64),  # m on the lane (LANE["length_m"]), where the stop begins
-    ("end", np.float64),  # m on the lane, where the front bumper comes to rest
-    ("duration", np.float64),  # s at least
-    ("until", np.float64),  # s, not before; -1: none
-    ("until_from", np.int8),  # UNTIL_*: what `until` is counted from
-    ("parking", np.bool_),  # beside the road: others pass
+    ("end", np.float64),  # m on the lane, where the front bumper stops
+    ("duration", np.float64),  # s, minimum
+    ("until", np.float64),  # s, earliest end; -1: none
+    ("until_from", np.int8),  # UNTIL_*: reference of `until`
+    ("parking", np.bool_),  # beside the road, so that others pass
 )
 
 
 class Options(NamedTuple):
-    """One list to choose from: rows and their weights, in the order of the file."""
+    """One choice: rows and their weights, in the order of the file."""
 
     rows: tuple[int, ...]
     weights: tuple[float, ...]
 
 
 class Choices:
-    """Many lists to choose from, each with probabilities, drawn from by arrays.
+    """Many choices with probabilities, for drawing whole arrays.
 
     Attributes:
         start: (C + 1,) options of choice c are [start[c], start[c + 1]).
-        rows: (num_options,) what is chosen.
+        rows: (num_options,) the rows to choose from.
         upper: (num_options,) choice + cumulative probability: one ascending array for all.
     """
 
@@ -182,7 +182,7 @@ class Choices:
         return self.rows[self.start[choice] : self.start[choice + 1]]
 
     def pick(self, choices: NDArray[np.int32], chances: NDArray[np.float64]) -> NDArray[np.int32]:
-        """The rows (n,) that numbers (n,) in [0, 1) choose from lists (n,)."""
+        """Return the rows (n,) that numbers (n,) in [0, 1) select from choices (n,)."""
         place = np.searchsorted(self.upper, choices + chances, side="right")
         # A sum can round up to the next list's range.
         return self.rows[np.clip(place, self.start[choices], self.start[choices + 1] - 1)]
@@ -192,11 +192,11 @@ MAX_WEIGHT = 1e9
 
 
 def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
-    """Names in one attribute, their weights in another.
+    """Return pairs of name and weight from two attributes.
 
     `key`: "vTypes" or "routes".
 
-    Returns pairs of name and weight; None where `probabilities` says nothing.
+    The weight is None if there is no attribute `probabilities`.
     """
     names = source.attrs.get(key, "").split()
     texts = source.attrs.get("probabilities", "").split()
@@ -205,16 +205,16 @@ def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
             f"has {len(texts)} probabilities for {len(names)} {key}", "give one for each"
         )
     weights: list[float | None] = [
-        source.saying(probabilities=text).number("probabilities", 1.0, least=0.0, most=MAX_WEIGHT)
-        for text in texts
+        part.number("probabilities", 1.0, least=0.0, most=MAX_WEIGHT)
+        for part in (source.with_attrs(probabilities=text) for text in texts)
     ]
     return list(zip(names, weights or [None] * len(names), strict=True))
 
 
 def weighted(source: Element, found: Sequence[tuple[int, float]]) -> Options:
-    """What is found to choose from, without what is never chosen.
+    """Return a choice of the members with a positive weight.
 
-    Raises DemandError: nothing is left.
+    Raises DemandError: there are none.
     """
     kept = [(row, weight) for row, weight in found if weight > 0.0]
     if not kept:

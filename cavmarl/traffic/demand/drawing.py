@@ -1,4 +1,4 @@
-"""Drawing an episode's orders: every random number a function of key, element and vehicle."""
+"""Drawing an episode's orders: each random number is a function of key, element and vehicle."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CHUNK = 4096
 def chances(
     key: int, elements: NDArray[np.integer], numbers: NDArray[np.integer], stream: int
 ) -> NDArray[np.float64]:
-    """Numbers (n,) in [0, 1), one for each vehicle of an element."""
+    """Return numbers (n,) in [0, 1), one for each vehicle of an element."""
     drawn = np.empty(len(elements))
     fill_uniform(np.uint64(key), elements.astype(np.int64), numbers.astype(np.int64), stream, drawn)
     return drawn
@@ -35,9 +35,9 @@ def chances(
 def departures_ms(
     elements: NDArray[np.void], key: int, begin_ms: int, end_ms: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """When vehicles of elements depart within [begin_ms, end_ms).
+    """Return when vehicles of elements depart within [begin_ms, end_ms).
 
-    Returns three arrays (n,): ELEMENT row, number of the vehicle in its flow, time in milliseconds.
+    The three arrays (n,) are ELEMENT row, number of the vehicle in its flow, and time in ms.
     """
     regular = _regular(elements, begin_ms, end_ms)
     parts = [regular]
@@ -58,7 +58,7 @@ def _regular(
     first = np.maximum(-((start - begin_ms) // period), 0)
     span = np.minimum(elements["end_ms"], end_ms) - start
     beyond = np.minimum(-(-span // period), elements["number"])
-    # Flows of one moment: all at once.
+    # A flow with period 0 departs all at once.
     at_once = (elements["period_ms"] == 0) & (start >= begin_ms) & (start < end_ms)
     beyond = np.where(elements["period_ms"] == 0, at_once * elements["number"], beyond)
     first = np.where(elements["period_ms"] == 0, 0, first)
@@ -70,10 +70,10 @@ def _regular(
 
 
 def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]:
-    """Sums of random gaps after the begin, one number for each vehicle.
+    """Return times as sums of random gaps after the start, one draw per vehicle.
 
-    Gaps are exponential, -ln(1 - u) / rate, or count trials: with a chance p each full second the
-    next success comes after 1 + floor(ln(1 - u) / ln(1 - p)) of them, whatever a step's length is.
+    Gaps are exponential, -ln(1 - u) / rate, or count trials: with a probability p in each full
+    second, the next success comes after 1 + floor(ln(1 - u) / ln(1 - p)) trials, for any step.
     """
     trials = flow["pattern"] == FLOW_PROBABILITY
     rate, wanted = float(flow["rate"]), int(flow["number"])
@@ -96,10 +96,10 @@ def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]
 def speed_factors(
     types: NDArray[np.void], orders: NDArray[np.void], key: int
 ) -> NDArray[np.float64]:
-    """The speed factors (n,) of ORDER (n,): their own, or drawn from the normal law of their type.
+    """Return the speed factors (n,) of ORDER (n,): given, or normally distributed by their type.
 
-    As in SUMO a number beyond the type's bounds is drawn again; after `SPEED_FACTOR_TRIES` it is
-    cut.
+    As in SUMO, a number beyond the type's bounds is drawn again; after `SPEED_FACTOR_TRIES` it is
+    clipped.
     """
     kind = types[orders["vtype"]]
     low, high = kind["min_speed_factor"], kind["max_speed_factor"]

@@ -1,6 +1,6 @@
-"""`Element`: one XML element with its place, and the checked values of its attributes.
+"""`Element`: one XML element with its place in the file, and checked access to its attributes.
 
-`DemandReport` counts what was found in demand files, and what was tolerated in them.
+`DemandReport` counts what was read from demand files, and what was tolerated in them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from difflib import get_close_matches
 
 from cavmarl.core.errors import CavmarlError, DemandError
 
-# A century: later times are mistakes, and far from the end of the integers.
+# A century: later times are mistakes, and it is far from integer overflow.
 MAX_TIME_MS = 100 * 366 * 86_400_000
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -24,7 +24,7 @@ _UNIT_MS = (1000, 60_000, 3_600_000, 86_400_000)
 
 
 def parse_time_ms(text: str) -> int | None:
-    """Milliseconds of "12.5", "HH:MM:SS" or "D:HH:MM:SS", rounded as SUMO does; None: no time."""
+    """Parse "12.5", "HH:MM:SS" or "D:HH:MM:SS" to ms, rounded like SUMO; None: not a time."""
     parts = text.strip().split(":")
     if len(parts) not in (1, 3, 4) or not all(map(_NUMBER.fullmatch, parts)):
         return None
@@ -35,10 +35,10 @@ def parse_time_ms(text: str) -> int | None:
 
 
 def near(name: str, known: Iterable[str]) -> str:
-    """The names most like a misspelt one, for the end of a message."""
+    """Return names similar to an unknown one, for the end of a message."""
     names = list(known)
     matches = get_close_matches(name, names, n=3) or names[:3]
-    return f"near it: {', '.join(matches)}" if matches else "there is none"
+    return f"similar names: {', '.join(matches)}" if matches else "the files have none"
 
 
 def _or(words: Iterable[str]) -> str:
@@ -47,13 +47,13 @@ def _or(words: Iterable[str]) -> str:
 
 @dataclass(slots=True)
 class Element:
-    """An XML element."""
+    """An XML element with its place."""
 
-    name: str  # of its tag
-    attrs: dict[str, str]  # its attributes as they stand
-    path: str  # of its file
-    line: int  # where it starts
-    children: list[Element] = field(default_factory=list)  # the elements inside, in order
+    name: str  # name of the tag
+    attrs: dict[str, str]  # attributes as written
+    path: str  # path of the file
+    line: int  # line of the start tag
+    children: list[Element] = field(default_factory=list)  # direct children, in order
 
     @property
     def place(self) -> str:
@@ -62,17 +62,17 @@ class Element:
     def error(
         self, problem: str, cure: str, failure: type[CavmarlError] = DemandError
     ) -> CavmarlError:
-        """An error that names this element, its place and the cure."""
+        """Return an error that names this element, its place and the cure."""
         known = f' id="{self.attrs["id"]}"' if "id" in self.attrs else ""
         return failure(f"{self.place}: <{self.name}{known}> {problem}: {cure}")
 
-    def saying(self, **attrs: str) -> Element:
-        """This element with other attributes: parts of a composed one, checked on their own."""
+    def with_attrs(self, **attrs: str) -> Element:
+        """Return this element with other attributes, for checking parts of a value."""
         kept = {key: self.attrs[key] for key in ("id",) if key in self.attrs}
         return Element(self.name, {**kept, **attrs}, self.path, self.line)
 
     def text(self, key: str) -> str:
-        """An attribute that must be there and hold something."""
+        """Return a required attribute that is not empty."""
         value = self.attrs.get(key, "").strip()
         if not value:
             raise self.error(f"has no {key}", f"give it the attribute '{key}'")
@@ -88,9 +88,9 @@ class Element:
         most: float = math.inf,
         words: Iterable[str] = (),
     ) -> float:
-        """A finite number in [least, most] and greater than `above`.
+        """Return a finite number in [least, most] and greater than `above`.
 
-        `words`: what else may stand there, for the error.
+        `words`: keywords that are also allowed, for the error.
         """
         if key not in self.attrs:
             return default
@@ -114,7 +114,7 @@ class Element:
         return int(text)
 
     def flag(self, key: str, default: bool) -> bool:
-        """A truth value in one of SUMO's spellings."""
+        """Return a boolean in any of SUMO's spellings."""
         if key not in self.attrs:
             return default
         text = self.attrs[key].strip().lower()
@@ -123,7 +123,7 @@ class Element:
         return text in _TRUE
 
     def time_ms(self, key: str, default: int | None = None) -> int:
-        """A time that is not negative, in milliseconds."""
+        """Return a non-negative time in milliseconds."""
         if key not in self.attrs and default is not None:
             return default
         text = self.text(key)
@@ -144,7 +144,7 @@ class Element:
 
 @dataclass
 class Tally:
-    """How often something was tolerated, and where first."""
+    """How often something was tolerated, and its first place."""
 
     count: int
     first: str
@@ -154,29 +154,29 @@ class Tally:
 class DemandReport:
     """Counts of one reading."""
 
-    files: list[str] = field(default_factory=list)  # that were read, in order
-    # number of elements by what they are: "vehicle", "flow", "route", …
+    files: list[str] = field(default_factory=list)  # files that were read, in order
+    # number of elements by kind: "vehicle", "flow", "route", …
     read: dict[str, int] = field(default_factory=dict)
-    # what was left out or taken for something near, by a sentence that says so
+    # things left out or replaced, by a phrase that describes them
     tolerated: dict[str, Tally] = field(default_factory=dict)
 
     def count(self, kind: str) -> None:
         self.read[kind] = self.read.get(kind, 0) + 1
 
     def tolerate(self, what: str, place: str, count: int = 1) -> None:
-        """More occurrences of something that was let pass."""
+        """Count occurrences of something that was tolerated."""
         tally = self.tolerated.setdefault(what, Tally(0, place))
         tally.count += count
 
     def lines(self) -> list[str]:
-        """What was tolerated: how often, what, and where first."""
+        """Return for each tolerated thing its count, description and first place."""
         return [
             f"{tally.count:>8} {what} (first: {tally.first})"
             for what, tally in sorted(self.tolerated.items())
         ]
 
     def to_report(self) -> str:
-        """Lines for a terminal: what was read, then what was tolerated and where first."""
+        """Return lines for a terminal: what was read, then what was tolerated."""
         lines = [f"read {path}" for path in self.files]
         lines += [f"  {count:>8} {kind}" for kind, count in sorted(self.read.items())]
         if self.tolerated:

@@ -1,4 +1,4 @@
-"""`MapIndex`: what demand asks of a road network, by the source's names."""
+"""`MapIndex`: a road network's edges, lanes and connections by the names in demand files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class MapIndex:
 
     Attributes:
         network: the roads.
-        edge_row: EDGE row by id, junction-internal edges left out.
+        edge_row: EDGE row by id, without edges inside junctions.
         lane_row: LANE row by id.
-        lane_table: (num_edges, n) LANE row by SUMO's index on the edge, -1 where there is none:
-            SUMO counts pavements, too.
-        permissions: (num_edges,) classes that some lane of the edge is open to.
+        lane_table: (num_edges, n) LANE row by SUMO's index on the edge, -1 if there is none;
+            SUMO also counts pavements.
+        permissions: (num_edges,) classes that may use at least one lane of the edge.
     """
 
     def __init__(self, network: RoadNetwork) -> None:
@@ -41,7 +41,7 @@ class MapIndex:
         self._movements = self._connections()
 
     def _connections(self) -> dict[tuple[int, int], int]:
-        """The classes that may drive from one edge straight to another."""
+        """Return the classes that may drive directly from one edge to another."""
         lanes, links = self.network.lanes, self.network.links
         allowed = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
         pairs = zip(
@@ -56,7 +56,7 @@ class MapIndex:
         return found
 
     def edge(self, name: str, element: Element) -> int:
-        """The EDGE row of an id.
+        """Return the EDGE row of an id.
 
         Raises DemandError: the map has no such edge.
         """
@@ -65,29 +65,29 @@ class MapIndex:
             raise element.error(
                 f"names the edge '{name}', which the map '{self.network.name}' does not have or "
                 "not for road vehicles",
-                f"is this the file of another map? {near(name, self.edge_row)}",
+                f"use files that were made for this map; {near(name, self.edge_row)}",
             )
         return row
 
     def edges(self, text: str, element: Element) -> tuple[int, ...]:
-        """The EDGE rows of ids between blanks.
+        """Return the EDGE rows of ids separated by blanks.
 
         Raises:
-            DemandError: the map lacks one of them; when it lacks most, the file is another map's.
+            DemandError: the map lacks an edge; if it lacks most, the file is for another map.
         """
         names = text.split()
         unknown = [name for name in names if name not in self.edge_row]
         if len(unknown) * 2 > len(names) > 1:
             some = ", ".join(list(self.edge_row)[:5])
             raise element.error(
-                f"names {len(names)} edges of which the map '{self.network.name}' has "
+                f"names {len(names)} edges, of which the map '{self.network.name}' has only "
                 f"{len(names) - len(unknown)}",
-                f"this is the file of another map: the edges of this one are called {some} …",
+                f"use files that were made for this map; its edges are named {some} …",
             )
         return tuple(self.edge(name, element) for name in names)
 
     def lane(self, name: str, element: Element) -> int:
-        """The LANE row of an id.
+        """Return the LANE row of an id.
 
         Raises DemandError: the map has no such lane.
         """
@@ -101,22 +101,22 @@ class MapIndex:
         return row
 
     def open_lane(self, edge: int, permissions: int) -> int:
-        """The lane nearest to the kerb that a class may use; the first one if there is none."""
+        """Return the lane nearest to the kerb that a class may use, else the first lane."""
         row = self.network.edges[edge]
         lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
         return int(row["first_lane"]) + int(np.argmax(lanes["permissions"] & permissions != 0))
 
     def scale(self, lane: int) -> float:
-        """Metres on our lane, measured along its polyline, for each metre on SUMO's."""
+        """Return metres along this lane's polyline per metre of SUMO's lane length."""
         row = self.network.lanes[lane]
         return float(row["length_m"]) / float(self.network.edges[row["edge"]]["length_m"])
 
     def gap(
         self, edges: NDArray[np.int32] | tuple[int, ...], exact: bool, permissions: int
     ) -> str | None:
-        """Why a class cannot follow edges in a row: a clause, or None if it can.
+        """Return the reason why a class cannot follow a row of edges, or None if it can.
 
-        `exact`: whether each must lead straight to the next. `permissions`: bits of the class.
+        `exact`: whether each edge must lead directly to the next. `permissions`: bits of the class.
         """
         names = self.network.edge_ids
         rows = [int(edge) for edge in edges]
@@ -137,7 +137,7 @@ class MapIndex:
     def route_error(self, element: Element, gap: str) -> CavmarlError:
         return element.error(
             f"cannot be driven: {gap}",
-            "mend the route (duarouter --repair), or skip such (traffic.on_bad_route = skip)",
+            "repair the route (duarouter --repair), or set traffic.on_bad_route = skip",
             RouteError,
         )
 

@@ -1,4 +1,4 @@
-"""<rerouter>: which vehicles get another way, where and when, and which edges are closed."""
+"""<rerouter>s: rules that give vehicles another way, and edges that are closed for a time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, Element, n
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.route_records import RouteTable
 
-MAX_INTERVALS = 30_000  # each has random numbers of its own
+MAX_INTERVALS = 30_000  # each has its own random numbers
 MAX_RULES = 300_000  # intervals times edges
 KEEP_DESTINATION = -1  # in place of an EDGE row
 _ACTED_ON = ("closingReroute", "destProbReroute", "routeProbReroute")
@@ -26,19 +26,19 @@ _NOT_MODELLED = ("timeThreshold", "radius", "file")
 RULE = record(
     ("begin_s", np.float64),  # clock
     ("end_s", np.float64),
-    ("chance", np.float64),  # that a vehicle follows it
-    ("edge", np.int32),  # EDGE row on which it is asked
-    ("closes", np.bool_),  # it is about vehicles whose way leads over a closed edge
+    ("chance", np.float64),  # probability that a vehicle follows the rule
+    ("edge", np.int32),  # EDGE row on which the rule applies
+    ("closes", np.bool_),  # whether it applies only to vehicles whose way uses a closed edge
     ("goals", np.int32),  # choice among EDGE rows or KEEP_DESTINATION; -1: none
     ("routes", np.int32),  # choice among ROUTE rows; -1: none
-    ("interval", np.int32),  # equal for the edges of one interval: one draw for all
+    ("interval", np.int32),  # equal for all edges of an interval, so that vehicles draw once
 )
 
 CLOSING = record(
     ("begin_s", np.float64),
     ("end_s", np.float64),
     ("edge", np.int32),  # EDGE row
-    ("classes", np.int64),  # bits of those that it is closed to
+    ("classes", np.int64),  # bits of the classes that may not use the edge
 )
 
 
@@ -46,11 +46,11 @@ CLOSING = record(
 class Rerouters:
     """All rerouters of the files."""
 
-    rules: NDArray[np.void]  # RULE (n,), one for each interval and edge, in the order of the files
-    types: NDArray[np.bool_]  # (num_intervals, num_types) which VTYPE rows an interval is about
+    rules: NDArray[np.void]  # RULE (n,), one per interval and edge, in the order of the files
+    types: NDArray[np.bool_]  # (num_intervals, num_types) the VTYPE rows of an interval
     closings: NDArray[np.void]  # CLOSING (m,)
-    goals: Choices  # what RULE["goals"] points into
-    routes: Choices  # what RULE["routes"] points into
+    goals: Choices  # choices of RULE["goals"]
+    routes: Choices  # choices of RULE["routes"]
 
     def __post_init__(self) -> None:
         for array in (self.rules, self.types, self.closings):
@@ -72,14 +72,14 @@ def read_rerouters(
     known_types: Collection[str],
     report: DemandReport,
 ) -> Rerouters:
-    """The rerouters of files; what is not acted on is counted in `report`.
+    """Read the rerouters of files; ignored parts are counted in `report`.
 
-    `elements`: <rerouter>s with what they hold. `routes`: gets the routes that they name.
-    `type_ids`: names by VTYPE row. `known_types`: names of all types, those that drive on no road
-    included.
+    `elements`: <rerouter>s with their children. `routes`: receives the routes that they name.
+    `type_ids`: names by VTYPE row. `known_types`: names of all types, including those that use no
+    road.
 
-    Raises DemandError: edges, routes, types, times or chances that cannot be; CapacityError: more
-    than `MAX_INTERVALS` intervals, or `MAX_RULES` times edges.
+    Raises DemandError: an edge, route, type, time or probability is invalid; CapacityError: there
+    are more than `MAX_INTERVALS` intervals, or more than `MAX_RULES` intervals times edges.
     """
     reader = _Reader(index, routes, type_ids, known_types, report)
     for element in elements:
@@ -154,8 +154,9 @@ class _Reader:
             raise interval.error("ends before it begins", "let end be after begin")
         if len(self._types) == MAX_INTERVALS or len(self._rules) + len(edges) > MAX_RULES:
             raise interval.error(
-                f"is beyond {MAX_INTERVALS} intervals of rerouters, or {MAX_RULES} times edges",
-                "use fewer",
+                f"is beyond {MAX_INTERVALS} intervals of rerouters, or {MAX_RULES} intervals times "
+                "edges",
+                "use fewer intervals or edges",
                 CapacityError,
             )
         span = begin_ms / 1000.0, end_ms / 1000.0
@@ -185,7 +186,7 @@ class _Reader:
         lists: list[Options],
         row_of: Callable[[Element], int],
     ) -> int:
-        """The number of a new list to choose from, or -1 where it would be empty."""
+        """Add a choice and return its number, or -1 if it would be empty."""
         found = []
         for child in children:
             weight = child.number("probability", 1.0, least=0.0, most=MAX_WEIGHT)
@@ -210,7 +211,7 @@ class _Reader:
 
 
 def _closed_classes(closing: Element) -> int:
-    """The bits of the classes that an edge is closed to; all unless it says otherwise."""
+    """Return the bits of the classes an edge is closed to; all classes by default."""
     if "allow" in closing.attrs and "disallow" in closing.attrs:
         raise closing.error("has allow and disallow", "leave one of them")
     for key in ("allow", "disallow"):

@@ -1,4 +1,4 @@
-"""SUMO's rerouting device: which vehicles have it, how often they look, what they know."""
+"""SUMO's rerouting device: its share of vehicles, its period, and its measurements of speed."""
 
 from __future__ import annotations
 
@@ -11,43 +11,43 @@ _PREFIX = "device.rerouting."
 
 
 def device(element: Element) -> tuple[float, int]:
-    """What the parameters of a vehicle or a type say of the device.
+    """Return the settings of the device in the parameters of a vehicle or a type.
 
     Args:
         element: a <vType>, <vehicle>, <trip> or <flow> with its <param> children.
 
     Returns:
-        The chance of having it and the period in ms of looking for a way; -1 where nothing is said.
+        The probability of having it, and the period of searches in ms; -1 if not given.
 
     Raises:
-        DemandError: a chance outside [0, 1], a time that is none.
+        DemandError: a probability outside [0, 1], or an invalid time.
     """
     params = element.params()
-    said = {key: value for key, value in params.items() if key.startswith(_PREFIX)}
-    values = element.saying(**said)
+    settings = {key: value for key, value in params.items() if key.startswith(_PREFIX)}
+    values = element.with_attrs(**settings)
     chance = values.number(f"{_PREFIX}probability", -1.0, least=0.0, most=1.0)
     if "has.rerouting.device" in params:
-        has = element.saying(**{"has.rerouting.device": params["has.rerouting.device"]})
+        has = element.with_attrs(**{"has.rerouting.device": params["has.rerouting.device"]})
         chance = float(has.flag("has.rerouting.device", False))
     return chance, values.time_ms(f"{_PREFIX}period", -1)
 
 
 class DeviceOptions(NamedTuple):
-    """What a `.sumocfg` says of the device for all vehicles; the defaults are SUMO's."""
+    """Settings of the device in a `.sumocfg` for all vehicles; the defaults are SUMO's."""
 
-    chance: float = 0.0  # of having it, where vehicle and type say nothing
-    period_ms: int = 0  # between searches, likewise; 0: once
-    adaptation_steps: int = 180  # how many samples of the edges' speeds are averaged
+    chance: float = 0.0  # probability of having it, if neither vehicle nor type sets it
+    period_ms: int = 0  # between searches, if neither vehicle nor type sets it; 0: one search
+    adaptation_steps: int = 180  # number of averaged samples of the edges' speeds
     adaptation_interval_ms: int = 1000  # between samples
 
     @classmethod
     def of(cls, options: Mapping[str, Element]) -> DeviceOptions:
-        """From the options of a configuration, each an element with a `value`.
+        """Read the options of a configuration, each an element with a `value`.
 
-        Raises DemandError: values that cannot be, or an average that is not kept here.
+        Raises DemandError: a value is invalid, or asks for an average that is not supported.
         """
         own = {
-            key.removeprefix(_PREFIX): element.saying(**{key: element.attrs["value"]})
+            key.removeprefix(_PREFIX): element.with_attrs(**{key: element.attrs["value"]})
             for key, element in options.items()
             if key.startswith(_PREFIX)
         }
@@ -56,11 +56,11 @@ class DeviceOptions(NamedTuple):
             if element.number(f"{_PREFIX}adaptation-weight", 0.0) > 0.0:
                 raise element.error(
                     "asks for an exponential average",
-                    "leave it out and name device.rerouting.adaptation-steps",
+                    "remove it and set device.rerouting.adaptation-steps",
                 )
         found = cls()
         if "probability" in own:
-            # SUMO's default is -1: no vehicle.
+            # SUMO's default -1 means no vehicle.
             key = f"{_PREFIX}probability"
             chance = own["probability"].number(key, 0.0, least=-1.0, most=1.0)
             found = found._replace(chance=max(chance, 0.0))
@@ -73,6 +73,6 @@ class DeviceOptions(NamedTuple):
             element = own["adaptation-interval"]
             interval_ms = element.time_ms(f"{_PREFIX}adaptation-interval")
             if interval_ms < 1000 or interval_ms % 1000:
-                raise element.error("is not made here", "write whole seconds, 1 at least")
+                raise element.error("is not supported", "write whole seconds, at least 1")
             found = found._replace(adaptation_interval_ms=interval_ms)
         return found

@@ -1,4 +1,4 @@
-"""`Resolver`: gives the names in collected definitions their rows, and checks them on the map."""
+"""`Resolver`: replaces names in collected definitions by rows, and checks them on the map."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from cavmarl.traffic.demand.type_table import TypeTable
 from cavmarl.traffic.trip_ways import TripWays
 
 log = logging.getLogger(__name__)
-NAMED = 5  # of the ids that are left out
+NAMED = 5  # maximum number of left-out ids that are named
 
-# Classes with lanes of their own that road networks leave out: see `sumo_net.selection`.
+# Classes whose own lanes are missing in road networks: see `sumo_net.selection`.
 _PARTLY_MAPPED = sum(1 << VEHICLE_CLASSES.index(name) for name in ("bicycle", "tram"))
 
 
 class Resolver:
-    """The second half of reading: all definitions are known.
+    """The second stage of reading, after all definitions are known.
 
     Attributes:
         types: all types.
         routes: all routes and stops.
-        ids: of the elements that are kept, by row.
+        ids: ids of the remaining elements, by row.
     """
 
     def __init__(self, collector: DefinitionCollector, index: MapIndex, skip: bool) -> None:
@@ -59,7 +59,7 @@ class Resolver:
         self._route_options = self._options_of(elements, list(collector.routes.values()))
         self._bad: set[tuple[int, int]] = set()
         keep = self._check(elements, ids)
-        self._tell_left_out([ids[row] for row in np.flatnonzero(~keep)])
+        self._warn_left_out([ids[row] for row in np.flatnonzero(~keep)])
         self._elements = elements[keep]
         self.ids = [ids[row] for row in np.flatnonzero(keep)]
         self._check_ids()
@@ -69,15 +69,15 @@ class Resolver:
         return self._elements
 
     def type_choices(self) -> Choices:
-        """What `types` of the elements points into."""
+        """Return the choices that ELEMENT["types"] refers to."""
         return Choices([options or Options((), ()) for options in self._type_options])
 
     def route_choices(self) -> Choices:
-        """What `routes` of the elements points into."""
+        """Return the choices that ELEMENT["routes"] refers to."""
         return Choices([options or Options((), ()) for options in self._route_options])
 
     def rerouters(self) -> Rerouters:
-        """All <rerouter>s; the routes that they name join the others."""
+        """Return all <rerouter>s; the routes that they name are added to `routes`."""
         return read_rerouters(
             list(self._named.get("rerouter", {}).values()),
             self._index,
@@ -88,15 +88,16 @@ class Resolver:
         )
 
     def bad_pairs(self) -> NDArray[np.int64]:
-        """Keys type * num_routes + route that cannot be driven."""
+        """Return the keys type * num_routes + route that cannot be driven."""
         num_routes = len(self.routes.names)
         return np.array(sorted(t * num_routes + r for t, r in self._bad), dtype=np.int64)
 
-    def _tell_left_out(self, ids: list[str]) -> None:
+    def _warn_left_out(self, ids: list[str]) -> None:
         if ids:
             some = ", ".join(ids[:NAMED]) + (", …" if len(ids) > NAMED else "")
             files = ", ".join(self._report.files)
-            log.warning("%s: %d cannot drive their routes, left out: %s", files, len(ids), some)
+            text = "%s: left out %d vehicles and flows that cannot drive their routes: %s"
+            log.warning(text, files, len(ids), some)
 
     def _stub(self, elements: NDArray[np.void], ids: Sequence[str], row: int) -> Element:
         element = elements[row]
@@ -126,7 +127,7 @@ class Resolver:
         ]
 
     def _check(self, elements: NDArray[np.void], ids: list[str]) -> NDArray[np.bool_]:
-        """Which elements can drive; those that cannot are refused or counted."""
+        """Return which elements can drive; the others are refused or counted."""
         fields = ["types", "routes", "depart_lane", "arrival_lane"]
         seen, first, which = np.unique(
             np.stack([elements[name] for name in fields], axis=1),
@@ -136,7 +137,7 @@ class Resolver:
         )
         counts = np.bincount(which.ravel(), minlength=len(seen))
         fits = np.ones(len(seen), dtype=bool)
-        # In the order of the files, so that the first mistake is the one that is named.
+        # In the order of the files, so that the first mistake is reported.
         for case in np.argsort(first):
             types, routes, depart_lane, arrival_lane = (int(value) for value in seen[case])
             user = self._stub(elements, ids, int(first[case]))
@@ -154,7 +155,7 @@ class Resolver:
         return keep
 
     def _drives(self, types: int, routes: int, user: Element) -> bool:
-        """Whether any choice can be driven; in the strict mode, all have to."""
+        """Return whether any option can be driven; unless bad routes are skipped, all must be."""
         some = False
         for vtype in self._options(self._type_options, types).rows:
             permissions = self.types.permissions(vtype)
@@ -169,7 +170,7 @@ class Resolver:
         return some
 
     def _gap(self, route: int, permissions: int) -> str | None:
-        """Why a class cannot drive a route; trips have their ways looked for where one may lack."""
+        """Return why a class cannot drive a route; if bad routes are skipped, also search ways."""
         edges, exact = self.routes.edges(route), self.routes.exact(route)
         gap = self._index.gap(edges, exact, permissions)
         if gap is None and self._skip and not exact:
@@ -180,9 +181,9 @@ class Resolver:
         return gap
 
     def _tolerates(self, vtype: int, user: Element) -> bool:
-        """Whether vehicles of a type that have no way are left out, not refused."""
+        """Return whether vehicles of this type without a way are left out instead of refused."""
         if self.types.permissions(vtype) & ~_PARTLY_MAPPED == 0:
-            what = f"type '{self.types.names[vtype]}' without a way: maps leave out its own lanes"
+            what = f"type '{self.types.names[vtype]}' without a way: maps lack its own lanes"
             self._report.tolerate(what, user.place)
             return True
         return self._skip
@@ -193,7 +194,7 @@ class Resolver:
         return options
 
     def _missing_lane(self, routes: int, lane: int, end: int) -> str:
-        """The first or last edge (end 0 or -1) of a route that has no such lane; "" if all do."""
+        """Return a route's first or last edge (end 0 or -1) if it lacks a lane, else ""."""
         table = self._index.lane_table
         for route in self._options(self._route_options, routes).rows:
             edge = self.routes.edges(route)[end]
@@ -202,7 +203,7 @@ class Resolver:
         return ""
 
     def _has_lane(self, types: int, routes: int, lane: int, user: Element) -> bool:
-        """Whether all that is chosen from can enter on a lane, by SUMO's index or a code."""
+        """Return whether all options can enter on a lane, given as SUMO's index or a code."""
         if lane < 0:
             return True
         name = self._missing_lane(routes, lane, 0)
@@ -216,12 +217,12 @@ class Resolver:
             if problem and not self._tolerates(vtype, user):
                 raise user.error(
                     f"has departLane='{lane}', {problem}",
-                    "write departLane='best', or skip such (traffic.on_bad_route = skip)",
+                    "write departLane='best', or set traffic.on_bad_route = skip",
                 )
         return not problem
 
     def _check_ids(self) -> None:
-        """Vehicles must not have the names that a flow gives."""
+        """Refuse vehicles with a name that a flow gives to its vehicles."""
         flows = {name: row for row, name in enumerate(self.ids) if self._elements[row]["flow"]}
         for row, name in enumerate(self.ids):
             stem, _, number = name.rpartition(".")
@@ -235,7 +236,7 @@ class Resolver:
                     )
 
     def _place_stops(self, lists: list[list[Element]]) -> None:
-        """Replace the numbers of lists of stops by STOP rows, along each route that has them."""
+        """Replace the numbers of lists of stops by STOP rows along each route."""
         placed: dict[tuple[int, int, bool], tuple[int, int]] = {}
         for row in np.flatnonzero(self._elements["first_stop"] >= 0):
             element = self._elements[row]

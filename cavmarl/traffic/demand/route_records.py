@@ -1,4 +1,4 @@
-"""Routes: from edges, trips and distributions to ROUTE records, each stored once."""
+"""Routes: edges, trips and distributions converted to ROUTE records, each stored once."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class Stop(NamedTuple):
 
 
 class StopReader:
-    """Finds the lanes of stops, and their places in routes.
+    """Finds the lanes of stops and their places in routes.
 
     Attributes:
         places: elements of bus stops, parking areas, … by id.
-        skip: whether stops off the route are counted and left out, or refused.
+        skip: whether stops off the route are left out and counted, instead of refused.
     """
 
     def __init__(
@@ -56,17 +56,17 @@ class StopReader:
         self._report = report
 
     def edges(self, stops: Sequence[Element]) -> list[int]:
-        """The EDGE rows of stops: where a trip with stops has to pass."""
+        """Return the EDGE rows of stops, which a trip with stops has to pass."""
         lanes = self._index.network.lanes
         return [int(lanes[self._lane(stop)]["edge"]) for stop in stops]
 
     def along(
         self, stops: Sequence[Element], edges: Sequence[int], exact: bool, until_from: int
     ) -> list[Stop]:
-        """Stops in the order in which a route reaches them.
+        """Return stops in the order in which a route reaches them.
 
         `stops`: the <stop> elements in the order of the file. `edges`: EDGE rows of the route.
-        `exact`: whether the route is those edges, or a way between them.
+        `exact`: whether the edges are the whole route, or waypoints.
 
         Raises DemandError: a stop is not on the route after the one before it.
         """
@@ -94,12 +94,12 @@ class StopReader:
             name = self._index.network.edge_ids[edge]
             raise element.error(
                 f"on edge '{name}' lies off the route, or before the stop above it",
-                "put stops in the order of the route, or skip it (traffic.on_bad_route = skip)",
+                "put stops in the order of the route, or set traffic.on_bad_route = skip",
             )
         self._report.tolerate("stop off its route is left out", element.place)
 
     def _source(self, stop: Element) -> Element:
-        """What holds lane and positions: the stop itself or the stopping place it names."""
+        """Return the element with lane and positions: the stop or the stopping place it names."""
         for kind in sorted(STOPPING_PLACES & stop.attrs.keys()):
             name = stop.attrs[kind]
             place = self.places.get(name)
@@ -141,7 +141,7 @@ class StopReader:
         )
 
     def _span(self, source: Element, lane: int) -> tuple[float, float]:
-        """Start and end on SUMO's lane, m; negative ones count from its end."""
+        """Return start and end in m on SUMO's lane; negative positions count from its end."""
         network = self._index.network
         length = float(network.edges[network.lanes[lane]["edge"]]["length_m"])
         end = source.number("endPos", length)
@@ -151,7 +151,7 @@ class StopReader:
         if source.flag("friendlyPos", False):
             end = min(max(end, 0.0), length)
             start = min(max(start, 0.0), end)
-        # SUMO's own files are written with two decimals.
+        # SUMO writes positions with two decimals.
         if not 0.0 <= start <= end <= length + 0.01:
             raise self._bad_span(source, length)
         return start, min(end, length)
@@ -164,16 +164,16 @@ class StopReader:
         )
 
 
-MAX_ROUTE_EDGES = 50_000_000  # of all routes together
+MAX_ROUTE_EDGES = 50_000_000  # sum over all routes
 
 _PLACES = ("Junction", "Taz", "XY", "LonLat")
 
 
 class RouteTable:
-    """ROUTE, STOP and edge rows as they are found; equal routes share a row.
+    """ROUTE, STOP and edge rows, added as they are found; equal routes share a row.
 
     Attributes:
-        stop_reader: places the stops.
+        stop_reader: finds the places of stops.
         names: id by ROUTE row, "" for routes without one.
     """
 
@@ -197,14 +197,14 @@ class RouteTable:
         self._stops: list[Stop] = []
 
     def options(self, source: Element) -> Options:
-        """The routes to choose from that an element says.
+        """Return the routes that an element defines or names, as a choice.
 
         Args:
             source: a <route>, a <routeDistribution>, a trip or flow with `from` and `to`, or a
                 vehicle or flow that names a route.
 
         Raises:
-            DemandError: edges, routes or stops that do not exist; nothing to choose from.
+            DemandError: an edge, route or stop does not exist, or the choice is empty.
         """
         if source.name == "route":
             return Options((self._route(source),), (1.0,))
@@ -224,11 +224,11 @@ class RouteTable:
         return self._edges[row]
 
     def exact(self, row: int) -> bool:
-        """Whether a route is its edges, or a way to be found between them."""
+        """Return whether a route is given by all its edges, or only by waypoints."""
         return self._rows[row][2]
 
     def stops_with(self, row: int, stops: Sequence[Element], until_from: int) -> tuple[int, int]:
-        """STOP rows (first, number) of a vehicle's own stops together with those of its route."""
+        """Return STOP rows (first, number) of a vehicle's own stops and those of its route."""
         own = self.stop_reader.along(stops, self._edges[row], self.exact(row), until_from)
         _, _, exact, first, number = self._rows[row]
         both = self._stops[first : first + number] + own
@@ -237,7 +237,7 @@ class RouteTable:
         return self._store_stops(both)
 
     def arrays(self) -> tuple[NDArray[np.void], NDArray[np.int32], NDArray[np.void]]:
-        """ROUTE (R,), the EDGE rows that they point into, STOP (num_stops,)."""
+        """Return ROUTE (R,), their EDGE rows, and STOP (num_stops,)."""
         edges = np.fromiter((edge for edges in self._edges for edge in edges), dtype=np.int32)
         routes = np.array(self._rows, dtype=ROUTE)
         return routes, edges, np.array(self._stops, dtype=STOP)
@@ -269,7 +269,7 @@ class RouteTable:
         return self._store(edges, True, placed, source.attrs.get("id", ""))
 
     def _way(self, source: Element) -> int:
-        """A trip: the edges to pass through, in order, each named once in a row."""
+        """Store a trip: the edges to pass in order, without immediate repetitions."""
         for place in _PLACES:
             if f"from{place}" in source.attrs or f"to{place}" in source.attrs:
                 raise source.error(

@@ -1,4 +1,4 @@
-"""SUMO's configuration files: which network, which demand, from when to when."""
+"""SUMO's configuration files: network, demand files and times."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class SumoConfigFile:
-    """What a `.sumocfg` says of network, demand and time."""
+    """The settings of a `.sumocfg` that concern network, demand and time."""
 
     net_file: Path | None  # the road network; None if the file names none
     files: tuple[Path, ...]  # additional files, then route files, in SUMO's order of reading
     begin_ms: int  # start of the simulation
-    end_ms: int  # its end; -1: when the demand has ended
-    step_ms: int  # length of its step
+    end_ms: int  # end of the simulation; -1: when the demand has ended
+    step_ms: int  # length of a step
     rerouting: DeviceOptions  # options of the rerouting device
-    departs: Mapping[str, str]  # departLane and departSpeed of vehicles that name none
+    departs: Mapping[str, str]  # departLane and departSpeed of vehicles without their own
 
 
 class _Handler(ContentHandler):
@@ -62,7 +62,7 @@ class _Handler(ContentHandler):
 def read_sumo_config(path: Path) -> SumoConfigFile:
     """Read a `.sumocfg`.
 
-    Raises DemandError: it is missing, is no SUMO configuration, or holds times that are none.
+    Raises DemandError: the file is missing, is no SUMO configuration, or has an invalid time.
     """
     handler = _Handler(path)
     read_xml(path, handler, DemandError)
@@ -74,7 +74,7 @@ def read_sumo_config(path: Path) -> SumoConfigFile:
 
     def time_ms(name: str, default: int) -> int:
         element = options.get(name)
-        # SUMO writes -1 for "no end".
+        # SUMO writes -1 for no end.
         if element is None or element.attrs["value"].strip().startswith("-1"):
             return default
         return element.time_ms("value")
@@ -82,7 +82,7 @@ def read_sumo_config(path: Path) -> SumoConfigFile:
     net = paths("net-file")
     step_ms = time_ms("step-length", 1000)
     if step_ms <= 0:
-        raise options["step-length"].error("is no length of a step", "write seconds above 0")
+        raise options["step-length"].error("is no valid step length", "write seconds above 0")
     return SumoConfigFile(
         net_file=net[0] if net else None,
         files=tuple(paths("additional-files") + paths("route-files")),
@@ -95,7 +95,7 @@ def read_sumo_config(path: Path) -> SumoConfigFile:
 
 
 def _departs(options: Mapping[str, Element]) -> dict[str, str]:
-    """The attributes of departures that a configuration names for all."""
+    """Return the attributes of departures that a configuration sets for all vehicles."""
     found = {}
     for key in ("departLane", "departSpeed"):
         element = options.get(f"default.{key.lower()}")

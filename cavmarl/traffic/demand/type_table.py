@@ -1,4 +1,4 @@
-"""Types: from vehicle types and their distributions to VTYPE records."""
+"""Vehicle types and their distributions converted to VTYPE records."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from cavmarl.traffic.demand.demand_records import MAX_WEIGHT, Options, listed, w
 from cavmarl.traffic.demand.element import DemandReport, Element, near
 from cavmarl.traffic.demand.rerouting_device import device
 
-MIN_SPEED_FACTOR = 0.2  # SUMO's cuts of the distribution of speed factors
+MIN_SPEED_FACTOR = 0.2  # SUMO's bounds of speed factors
 MAX_SPEED_FACTOR = 2.0
 
-# (least, most) of what a road vehicle can have, in SI units; with room for what studies try out.
+# (minimum, maximum) for a road vehicle in SI units, with room for unusual studies.
 _LIMITS = {
     "length": (0.1, 100.0),
     "width": (0.1, 10.0),
@@ -45,7 +45,7 @@ _LIMITS = {
 _SPEED_FACTOR = re.compile(r"normc?\(([^()]*)\)")
 _MODEL_PREFIX = "carFollowing-"
 
-# Attributes that change how a vehicle moves in SUMO and that are not modelled here.
+# Attributes that change how a vehicle moves in SUMO and are not modelled here.
 _UNUSED = frozenset(
     "actionStepLength apparentDecel collisionMinGapFactor hasDriverState impatience "
     "laneChangeModel latAlignment maxAccelProfile desAccelProfile maxSpeedLat minGapLat sigmaStep "
@@ -56,7 +56,7 @@ _UNUSED_PREFIXES = ("lc", "jm", "cc")
 
 
 def vehicle_class(element: Element) -> str:
-    """The class of a type, one of SUMO's."""
+    """Return SUMO's class of a type."""
     name = element.attrs.get("vClass", "passenger").strip()
     if name not in NEAREST_CLASS and name not in NO_ROAD_CLASSES:
         known = [*NEAREST_CLASS, *NO_ROAD_CLASSES]
@@ -65,9 +65,9 @@ def vehicle_class(element: Element) -> str:
 
 
 def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | None:
-    """One VTYPE () from a <vType>; None for a class that drives on no road.
+    """Return VTYPE () of a <vType>; None for a class that does not use roads.
 
-    Raises DemandError: a vehicle of that type cannot exist.
+    Raises DemandError: a value is impossible.
     """
     attrs = dict(element.attrs)
     for child in element.children:
@@ -113,7 +113,7 @@ def _number(element: Element, key: str, default: float) -> float:
 
 def _model(element: Element, report: DemandReport) -> int:
     name = element.attrs.get("carFollowModel", "Krauss").strip()
-    # SUMO 0.x wrote carFollowing-Krauss here, too.
+    # SUMO 0.x also wrote carFollowing-Krauss here.
     name = name.removeprefix(_MODEL_PREFIX)
     known = (*model_names(), *NEAREST_MODEL)
     if name not in known:
@@ -137,7 +137,7 @@ def _report_unused(element: Element, name: str, report: DemandReport) -> None:
 
 
 def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: float) -> None:
-    """Mean, deviation and cuts from "1.1", "norm(m,d)" or "normc(m,d,min,max)" and speedDev."""
+    """Set mean, deviation and bounds from "1.1", "norm(m,d)", "normc(m,d,min,max)", speedDev."""
     numbers = {"speedFactor": "1", "speedDev": element.attrs.get("speedDev", str(deviation))}
     numbers["least"], numbers["most"] = str(MIN_SPEED_FACTOR), str(MAX_SPEED_FACTOR)
     text = element.attrs.get("speedFactor", "1").strip()
@@ -148,12 +148,12 @@ def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: flo
     if "speedDev" in element.attrs and len(parts) > 1:
         parts[1] = numbers["speedDev"]
     numbers.update(zip(("speedFactor", "speedDev", "least", "most"), parts, strict=False))
-    values = element.saying(**numbers)
+    values = element.with_attrs(**numbers)
     record["speed_factor"] = mean = values.number("speedFactor", 1.0, above=0.0)
     record["speed_dev"] = values.number("speedDev", deviation, least=0.0)
     record["min_speed_factor"] = least = values.number("least", MIN_SPEED_FACTOR, least=0.0)
     record["max_speed_factor"] = most = values.number("most", MAX_SPEED_FACTOR, above=0.0)
-    # A fixed factor may lie anywhere; of a distribution something has to be left between the cuts.
+    # A fixed factor may be any; for a distribution, the mean must lie between the bounds.
     if record["speed_dev"] > 0.0 and not least <= mean <= most:
         raise element.error(
             f"has speedFactor='{text}', whose mean is not between {least:g} and {most:g}",
@@ -162,7 +162,7 @@ def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: flo
 
 
 class TypeTable:
-    """VTYPE rows of all types that files define, and of SUMO's own that they use.
+    """VTYPE rows of all types that the files define, and of SUMO's default types that they use.
 
     Attributes:
         names: id by row.
@@ -175,18 +175,18 @@ class TypeTable:
         self._rows: list[NDArray[np.void]] = []
         self._row: dict[str, int] = {}
         self._report = report
-        # Wrong types are refused whether vehicles use them or not.
+        # Invalid types are refused even if no vehicle uses them.
         for name, element in self._types.items():
             self._resolve(name, element)
         for name, vclass in DEFAULT_TYPES.items():
             self._types.setdefault(name, Element("vType", {"id": name, "vClass": vclass}, "", 0))
 
     def options(self, name: str, user: Element) -> Options | None:
-        """The types to choose from under a name; None if vehicles of it drive on no road.
+        """Return the choice of types under a name; None if its vehicles do not use roads.
 
-        `name`: of a type or a distribution. `user`: the element that names it.
+        `name`: of a type or a distribution. `user`: the element that contains the name.
 
-        Raises DemandError: there is neither, or nothing to choose from.
+        Raises DemandError: the name is unknown, or the choice is empty.
         """
         if name in self._distributions:
             return self._distribution(self._distributions[name])
@@ -197,7 +197,7 @@ class TypeTable:
         return None if row < 0 else Options((row,), (1.0,))
 
     def records(self) -> NDArray[np.void]:
-        """VTYPE (num_types,)."""
+        """Return VTYPE (num_types,)."""
         records = np.zeros(len(self._rows), dtype=VTYPE)
         for row, record in enumerate(self._rows):
             records[row] = record

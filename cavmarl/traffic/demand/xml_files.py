@@ -1,4 +1,4 @@
-"""Reading demand files as streams: elements with their lines, one definition at a time."""
+"""Reading demand files as streams, one definition with its lines at a time."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from cavmarl.core.errors import DemandError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 from cavmarl.traffic.demand.element import DemandReport, Element, near
 
-MAX_INCLUDES = 16  # files inside files
-MAX_INSIDE = 100_000  # elements of one definition, at any depth
+MAX_INCLUDES = 16  # maximum depth of files that include each other
+MAX_INSIDE = 100_000  # elements in one definition, at any depth
 
 _ROOTS = frozenset(("routes", "additional", "add", "trips", "flows", "vtypes", "vTypes"))
 STOPPING_PLACES = frozenset(
@@ -22,7 +22,7 @@ _DEFINITIONS = STOPPING_PLACES | frozenset(
     "vType vTypeDistribution route routeDistribution vehicle trip flow rerouter".split()
 )
 
-# What SUMO's files may hold beside vehicles. Signal programs are read elsewhere.
+# Other elements in SUMO's files. Signal programs are read elsewhere.
 _SKIPPED = frozenset(
     "person personFlow container containerFlow calibrator variableSpeedSign vTypeProbe "
     "routeProbe e1Detector inductionLoop instantInductionLoop e2Detector laneAreaDetector "
@@ -37,7 +37,7 @@ _PROGRAMS = frozenset(("tlLogic", "WAUT", "wautJunction"))
 
 
 class _Handler(ContentHandler):
-    """Builds each definition's small tree and hands it on when it ends."""
+    """Builds the tree of each definition and passes it on when it ends."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class _Handler(ContentHandler):
         self._take = take
         self._including = (*including, path.resolve())
         self._depth = 0  # of the element around the next one
-        self._skipping = 0  # depth of the element whose inside is of no interest
+        self._skipping = 0  # depth of the outermost skipped element
         self._tree: list[Element] = []  # from the definition to the innermost open element
         self._inside = 0  # elements of this definition so far
         self._interval: dict[str, str] = {}
@@ -105,8 +105,8 @@ class _Handler(ContentHandler):
             self._skip(element)
         elif element.name not in _ROOTS:
             raise element.error(
-                "is not the root of a file of demand",
-                f"SUMO's begin with {', '.join(f'<{root}>' for root in sorted(_ROOTS))}; "
+                "is not the root of a demand file",
+                f"demand files begin with {', '.join(f'<{root}>' for root in sorted(_ROOTS))}; "
                 f"{near(element.name, _ROOTS)}",
             )
 
@@ -122,7 +122,7 @@ class _Handler(ContentHandler):
         path = self._path.parent / element.text("href")
         if path.resolve() in self._including or len(self._including) > MAX_INCLUDES:
             raise element.error(
-                f"includes '{path}', which includes it", "files must not hold themselves"
+                f"includes '{path}', which includes it", "files must not include themselves"
             )
         _read(path, self._report, self._take, self._including)
         self._skipping = self._depth
@@ -137,13 +137,13 @@ def _read(
 
 
 def read_elements(path: Path, report: DemandReport, take: Callable[[Element], None]) -> None:
-    """Hand the definitions of a file and of those it includes to `take`, in their order.
+    """Pass the definitions of a file and its included files to `take`, in order.
 
-    Flows inside an <interval> get its begin and end. What is no demand is counted in `report`.
+    Flows inside an <interval> get its begin and end. Other elements are counted in `report`.
 
-    `path`: of a plain or gzipped file. `report`: where files, elements and what is skipped are
-    counted. `take`: gets each <vType>, <route>, <vehicle>, … with its children, when it has ended.
+    `path`: a plain or gzipped file. `report`: receives files and counts of elements. `take`: gets
+    each <vType>, <route>, <vehicle>, … with its children when it has ended.
 
-    Raises DemandError: the file is missing, is no XML, or has another root.
+    Raises DemandError: the file is missing, is not XML, or has another root.
     """
     _read(path, report, take, ())

@@ -1,10 +1,10 @@
-"""How waiting departures enter: the departure queue assigns lanes, the shards find gaps.
+"""How waiting departures enter: the departure queue assigns lanes, and the shards find gaps.
 
-One tick lets at most one vehicle try on each lane, in the order of the queue. Five calls make it:
-`rank_lanes` (each shard: how crowded lanes are), `assign_lanes` (the departure queue), `propose`
-(each shard: departures that find a safe gap in its own zone), `accept` (the departure queue: in the
-order of the queue, as long as there is room) and `admit` (each shard: into its rows or among its
-ghosts).
+In one tick at most one vehicle tries to enter each lane, in the order of the queue. There are five
+calls: `rank_lanes` (each shard: how crowded lanes are), `assign_lanes` (the departure queue),
+`propose` (each shard: departures with a safe gap in its own zone), `accept` (the departure queue:
+in its order, while the world has room) and `admit` (each shard: add the vehicles to its rows or to
+its ghosts).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from cavmarl.traffic.kernels.entering import (
 )
 from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays, is_seen, squared_distance, zone_of
 
-ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
+ENTER_ROOM_M = 0.3  # m; free space on all sides of an entering vehicle
 
 
 @kernel
@@ -60,13 +60,13 @@ def rank_lanes(
     worlds: Worlds,
     scratch: Scratch,
 ) -> None:
-    """Count vehicles around the places in this zone where departures may enter that choose a lane.
+    """Count vehicles around entry places in this zone, for departures that choose their lane.
 
-    A departure behind the last vehicle of a lane gets its place from the zone where the lane ends:
-    it alone sees all that are in view of the end.
+    A departure that enters behind the last vehicle of a lane gets its place from the zone where
+    the lane ends: only this zone sees all vehicles in view of the end.
 
-    `zone`: the shard's own. `departures`: `ranks` and `last_s` are written where a place, or a
-    lane's end, lies in this zone. `worlds`: `next_rows` is read.
+    `zone`: zone of this shard. `departures`: `ranks` is written for places in this zone, `last_s`
+    for lanes that end in it. `worlds`: `next_rows` is read.
     """
     for w in range(worlds.ticks.shape[0]):
         indexed = False
@@ -111,9 +111,9 @@ def rank_lanes(
 def assign_lanes(
     roads: RoadArrays, travel: TripTables, departures: DepartureQueue, keys: NDArray[np.uint64]
 ) -> None:
-    """Say on which lane each departure of the queue tries, -1: on none.
+    """Assign each queued departure the lane on which it tries to enter, or -1.
 
-    A lane is taken whether or not there is room: the one that waits longer goes first.
+    A lane is assigned to the longest-waiting departure, even if it finds no gap there.
 
     `departures`: `tries` and `lane_taken` are written.
     """
@@ -133,7 +133,7 @@ def assign_lanes(
 
 @kernel
 def _touches(own: np.void, other: np.void) -> bool:
-    """Whether a vehicle that enters, with some room around it, touches another one."""
+    """Return whether an entering vehicle, enlarged by a margin, touches another vehicle."""
     half_length = 0.5 * own["length"] + ENTER_ROOM_M
     half_width = 0.5 * own["width"] + ENTER_ROOM_M
     dx = other["x"] - own["x"]
@@ -167,7 +167,7 @@ def _touches_any(rows: NDArray[np.void], num: int, own: np.void) -> bool:
 
 @kernel
 def _link_ahead(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
-    """The link at the end of an entrant's lane: of its way, else the first, -1 where none is."""
+    """Return the link at the end of an entrant's lane: on its way, else the first; -1: none."""
     _, _, link = next_step(roads, travel, row["lane"], row["way"])
     here = roads.lanes[row["lane"]]
     return here["first_link"] if link < 0 and here["num_links"] > 0 else link
@@ -175,22 +175,24 @@ def _link_ahead(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
 
 @inlined_kernel
 def _num_behind(roads: RoadArrays, row: np.void) -> int:
-    """How many lanes lead to an entrant's lane, or beside it; 0 where it is far from its start."""
+    """Count the lanes that lead to the entrant's lane or beside it; 0 far from the lane's start."""
     far = row["s"] - 0.5 * row["length"] > SWEPT_BEYOND_M
     return 0 if far else int(roads.lanes[fed_lane(roads, row["lane"])]["num_into"])
 
 
 @inlined_kernel
 def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
-    """The link that the n-th of these lanes is part of, -1: none."""
+    """Return the link that contains the n-th lane counted by `_num_behind`, or -1."""
     here = roads.lanes[fed_lane(roads, row["lane"])]
     before = roads.lanes[roads.into[here["first_into"] + n]]
     return int(before["link"]) if before["internal"] else -1
 
 
 @kernel
-def _may_be_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
-    """Whether there are swept areas where a vehicle enters: ahead, or behind with one in them."""
+def may_entry_be_swept(
+    roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch
+) -> bool:
+    """Return whether swept areas lie where a vehicle enters: ahead, or occupied ones behind."""
     to_line = roads.lanes[row["lane"]]["length_m"] - row["s"]
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
     if ahead >= 0 and roads.links[ahead]["num_sweeps"] > 0:
@@ -216,8 +218,8 @@ def _may_be_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: 
 
 
 @kernel
-def _is_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
-    """Whether a vehicle enters where another one sweeps, ahead or at the start of its lane."""
+def is_entry_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
+    """Return whether a vehicle enters an area that another one sweeps, ahead or behind it."""
     here = roads.lanes[row["lane"]]
     half = 0.5 * row["length"]
     to_line = here["length_m"] - row["s"]
@@ -244,10 +246,10 @@ def propose(
     worlds: Worlds,
     scratch: Scratch,
 ) -> None:
-    """Put the departures that find a safe gap in this zone into `departures.passing`.
+    """Write departures that find a safe gap in this zone into `departures.passing`.
 
-    `demand`: the generator's tables. `zone`: the shard's own. `departures`: `passing` and `places`
-    are written. `worlds`: `next_rows` is read.
+    `demand`: the generator's tables. `zone`: zone of this shard. `departures`: `passing` and
+    `places` are written. `worlds`: `next_rows` is read.
     """
     for w in range(worlds.ticks.shape[0]):
         if departures.num_queue[w] == 0:
@@ -283,12 +285,12 @@ def propose(
             enter(roads, travel, worlds, w, departure, lane, s, speed, row)
             if _touches_any(rows, num, row):
                 continue
-            if _may_be_swept(roads, travel, row, scratch):
+            if may_entry_be_swept(roads, travel, row, scratch):
                 if not announced:
                     step, step_at = worlds.step[w], worlds.step_at[w]
                     register_links(roads, travel, rows, num, step, step_at, scratch)
                     announced = True
-                if _is_swept(roads, travel, row, scratch):
+                if is_entry_swept(roads, travel, row, scratch):
                     continue
             departures.places[w, n] = q
             departures.num_passing[w] = n + 1
@@ -296,10 +298,10 @@ def propose(
 
 @kernel
 def accept(departures: DepartureQueue, running: NDArray[np.int64], capacity: int) -> None:
-    """Take the proposals in the order of the queue; the rest stays in it.
+    """Accept proposals in the order of the queue; the other departures stay queued.
 
-    `departures`: `passing` keeps those taken; queue and counts are written. `running`: (W,)
-    vehicles of each world, in all zones. `capacity`: most that a world can hold.
+    `departures`: the accepted proposals remain in `passing`; queue and counts are written.
+    `running`: (W,) vehicles of each world in all zones. `capacity`: maximum number per world.
     """
     for w in range(running.size):
         proposed = departures.num_passing[w]
@@ -326,7 +328,7 @@ def accept(departures: DepartureQueue, running: NDArray[np.int64], capacity: int
 
 @kernel
 def _take_from_queue(departures: DepartureQueue, w: int, taken: int) -> None:
-    """Close the gaps that the accepted ones, whose places rise, leave in the queue."""
+    """Remove the accepted departures, whose places are in ascending order, from the queue."""
     if taken == 0:
         return
     kept = departures.places[w, 0]
@@ -344,11 +346,10 @@ def _take_from_queue(departures: DepartureQueue, w: int, taken: int) -> None:
 def admit(
     zones: ZoneArrays, halo: Halo, zone: int, departures: DepartureQueue, worlds: Worlds
 ) -> None:
-    """Write the accepted departures into `next_rows`: as owned in its zone, as ghost near it.
+    """Write accepted departures into `next_rows`: as owned rows in their zone, as ghosts near it.
 
-    `halo`: how far this zone sees. `zone`: the shard's own. `departures`: `passing` is read.
-    `worlds`:
-    `next_rows` and how many they are.
+    `halo`: how far this zone sees. `zone`: zone of this shard. `departures`: `passing` is read.
+    `worlds`: `next_rows` and the numbers of rows are written.
     """
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]
@@ -357,7 +358,7 @@ def admit(
             num = worlds.num_rows[w]
             if zone_of(zones, row["x"], row["y"]) == zone:
                 owned = worlds.num_owned[w]
-                rows[num] = rows[owned]  # a ghost moves back
+                rows[num] = rows[owned]  # move the first ghost to the end
                 rows[owned] = row
                 rows[owned]["owner"] = zone
                 worlds.num_owned[w] = owned + 1

@@ -1,4 +1,4 @@
-"""Barriers that close lanes: vehicles that make a stop without an end, until they may drive on."""
+"""Barriers that close lanes: vehicles whose stop has no end until the lane is opened."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from cavmarl.core.records.codes import INSERT_OPEN
 @kernel
 def drive_on(
     inserted: NDArray[np.float64],  # as in `Commands`
-    first_stop: int,  # STOP row of the barrier on lane 0; those of other lanes follow
-    worlds: Worlds,  # rows are written, of ghosts too
+    first_stop: int,  # STOP row of the barrier on lane 0; the rows of other lanes follow
+    worlds: Worlds,  # rows are written, including ghosts
 ) -> None:
     """End the stops of the barriers on lanes that are opened."""
     for w in range(inserted.shape[0]):
@@ -31,7 +31,7 @@ def drive_on(
 
 @kernel
 def withdraw(departures: DepartureQueue, w: int, stop: int) -> None:
-    """Take the departures that would make a barrier's stop out of the queue."""
+    """Remove departures that would stand as the barrier of this stop from the queue."""
     kept = 0
     for q in range(departures.num_queue[w]):
         if departures.queue[w, q]["stop"] == stop:

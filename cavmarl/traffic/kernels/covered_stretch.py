@@ -1,4 +1,4 @@
-"""Which stretch of a lane a body of a scripted actor covers."""
+"""The stretch of a lane that the body of a scripted actor covers."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from cavmarl.core.math.geometry import project
 def covered_stretch(
     points: NDArray[np.void],  # POINT
     lane: np.void,  # LANE
-    body: NDArray[np.float64],  # (n, 2) places all over the body, m
+    body: NDArray[np.float64],  # (n, 2) sample points of the body, m
 ) -> tuple[float, float]:
-    """The first and the last place along the lane that lie below the body; first inf: none."""
+    """Return the first and last place on the lane below the body; if none, first is inf."""
     reach = 0.5 * lane["width_m"]
     first, last = math.inf, -math.inf
     for k in range(len(body)):

@@ -1,7 +1,7 @@
-"""The seeded demand generator, the queue before the gates, and vehicles that leave.
+"""The seeded demand generator, the queue of departures, and the settlement of leaving vehicles.
 
-A departure is numbered and drawn when it is ordered, and enters when there is a safe gap at its
-place; until then it waits in the queue, in the order of ids. None is dropped.
+A departure gets its number and random draws when it is ordered. It waits in the queue, which is
+sorted by id, until it finds a safe gap at its place. No departure is dropped.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.traffic.kernels.barriers import withdraw
 from cavmarl.traffic.kernels.entering import speed_at
 
-PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
+PLACE_TRIES = 24  # places tried for a vehicle at reset; then the vehicle is queued
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
-END_ROOM_M = 12.0  # no vehicle starts nearer than this to the end of a lane, unless it is shorter
-PLACE_SHARE = 0.7  # of the speed limit, with which vehicles drive that are placed at reset
-WANDER_M = 150.0  # nearer to its goal than this a vehicle of a closed world picks another
+END_ROOM_M = 12.0  # m between a new vehicle and the end of its lane, if the lane is long enough
+PLACE_SHARE = 0.7  # initial speed of vehicles placed at reset, as a share of the speed limit
+WANDER_M = 150.0  # m; in a closed world, a vehicle this near to its goal picks another goal
 GOAL_TRIES = 8
-REROUTE_S = 45.0  # one on a route so long
-GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes another way
+REROUTE_S = 45.0  # s; a stuck vehicle with a route takes a detour after this wait
+GIVE_UP_S = 10.0  # s; a stuck vehicle without a route takes another way after this wait
 
 
 @kernel
@@ -75,7 +75,7 @@ def _order(
     agent: int,
     trips: TripTable,
 ) -> None:
-    """Number and draw one departure and put it at the end of the queue."""
+    """Number and draw one departure and append it to the queue."""
     key = keys[w]
     own_map = map_of(key, roads.maps.shape[0])
     departure = departures.queue[w, _number(demand, departures, ticks[w], key, w)]
@@ -95,7 +95,7 @@ def _order(
 
 @kernel
 def _number(demand: Demand, departures: DepartureQueue, tick: int, key: np.uint64, w: int) -> int:
-    """Put a numbered departure of the generator's type at the end of the queue; its place."""
+    """Append a numbered departure of the generator's type to the queue; return its place."""
     vehicle = departures.next_id[w]
     departures.next_id[w] = vehicle + 1
     place: int = departures.num_queue[w]
@@ -127,10 +127,10 @@ def insert(
     ticks: NDArray[np.int64],
     keys: NDArray[np.uint64],
 ) -> None:
-    """Put what is to enter from outside at the end of the queue.
+    """Append the vehicles that are inserted from outside to the queue.
 
-    It drives to the first goal, from a drawn one on, that is farther than `WANDER_M`; on a lane
-    that leads to none it stands at its end. A barrier has the last STOP rows, one a lane.
+    The vehicle drives to the first goal farther than `WANDER_M`, starting from a random goal. If
+    its lane leads to none, it stops at the lane's end. Barriers use the last STOP rows, one a lane.
     """
     lanes = roads.lanes.shape[0]
     for w in range(ticks.size):
@@ -164,7 +164,7 @@ def insert(
 
 @kernel
 def _draw(trips: TripTable, own_map: int, key: np.uint64, vehicle: int, attempt: int) -> int:
-    """Which of the trips of a map a vehicle makes."""
+    """Draw the trip of a vehicle from the trips of its map."""
     first = trips.first[own_map]
     count = trips.first[own_map + 1] - first
     drawn: int = first + np.int64(below(key, vehicle, 0, STREAM_ORIGIN + attempt, count))
@@ -173,7 +173,7 @@ def _draw(trips: TripTable, own_map: int, key: np.uint64, vehicle: int, attempt:
 
 @kernel
 def _send(roads: RoadArrays, departure: np.void, lane: int, goal: int) -> None:
-    """Set where a departure of the generator starts and where it goes."""
+    """Set the start and the goal of a generated departure."""
     departure["lane"] = lane
     departure["goal"] = goal
     departure["way"] = goal * roads.lanes.shape[0]
@@ -191,7 +191,7 @@ def enter(
     speed: float,
     row: np.void,
 ) -> None:
-    """Write the record of a vehicle that enters; `row` already holds the blank."""
+    """Write the record of an entering vehicle; `row` already holds the blank record."""
     kind = travel.types[departure["vtype"]]
     row["id"] = departure["id"]
     row["agent"] = departure["agent"]
@@ -243,12 +243,12 @@ def populate(
     worlds: Worlds,
     chosen: NDArray[np.bool_],
 ) -> None:
-    """Fill the chosen worlds at reset: agents first, then the background, each at a free place.
+    """Fill the chosen worlds at reset, each vehicle at a free place: agents, then background.
 
-    A vehicle for which `PLACE_TRIES` places were taken waits in the queue.
+    A vehicle for which all of `PLACE_TRIES` places were occupied waits in the queue.
 
-    `demand`: the generator's tables. `worlds`: written where chosen; ticks and keys are already
-    those of the new episode.
+    `demand`: the generator's tables. `worlds`: written where chosen; ticks and keys must already
+    be those of the new episode.
     """
     for w in range(worlds.ticks.shape[0]):
         if not chosen[w]:
@@ -295,10 +295,10 @@ def populate(
 
 @kernel
 def _needs_goal(demand: Demand, roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
-    """Whether a vehicle picks another goal: near it where trips do not end, or stuck.
+    """Return whether a vehicle needs another goal: near its goal if trips are endless, or stuck.
 
-    Agents are never stuck; stuck is a vehicle that has stood for `GIVE_UP_S` at the end of a lane
-    that its way does not follow.
+    A background vehicle is stuck if it has waited for `GIVE_UP_S` at the end of a lane that its
+    way does not follow. Agents are never stuck.
     """
     if row["driver"] == DRIVER_AGENT:
         return demand.endless and row["to_go"] <= WANDER_M
@@ -322,7 +322,7 @@ def _is_stuck(roads: RoadArrays, travel: TripTables, row: np.void, patience_s: f
 
 @kernel
 def _take_detour(roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
-    """Send a vehicle of the demand file on to its goal without the lane change it waits for."""
+    """Let a vehicle of the demand file take a way to its goal without the missed lane change."""
     way = travel.first_detour + row["goal"] * roads.lanes.shape[0]
     step = travel.steps[way + row["lane"]]
     if step["next"] < 0 or way == row["way"]:
@@ -343,9 +343,9 @@ def choose_goals(
     worlds: Worlds,
     dt: float,
 ) -> None:
-    """Give the vehicles of `next_rows` that need it another goal, if one is in reach.
+    """Give vehicles of `next_rows` that need another goal one within reach, if any.
 
-    Asked about once a second. What an agent is farther from its goal by is no way driven back.
+    Runs once a second. A goal farther away does not count as lost progress of an agent.
     """
     turns = max(1, round(1.0 / dt))
     for w in range(worlds.ticks.shape[0]):
@@ -381,7 +381,7 @@ def choose_goals(
 
 @kernel
 def _next_leaving(departures: DepartureQueue, w: int, first: int) -> int:
-    """Where in `departures.passing` the smallest id stands of those from `first` on."""
+    """Return the index of the smallest id in `departures.passing`, from `first` on."""
     found = first
     for n in range(first + 1, departures.num_passing[w]):
         if departures.passing[w, n]["id"] < departures.passing[w, found]["id"]:
@@ -399,17 +399,17 @@ def settle(
     keys: NDArray[np.uint64],
     dt: float,
 ) -> None:
-    """Count the vehicles that have left, and order those that follow.
+    """Count the vehicles that have left, and order their successors.
 
-    They go in the order of their ids, so that those that follow get the same numbers wherever the
-    rows lay.
+    Vehicles are handled in the order of their ids, so that their successors get the same numbers
+    wherever the rows were stored.
 
     `demand`: the generator's tables. `departures`: counts, sums and queue are written; `passing`
-    holds those that left, and is emptied.
+    holds the vehicles that left, and is emptied.
     """
     for w in range(ticks.size):
         for n in range(departures.num_passing[w]):
-            # Those before n are not read any more.
+            # Rows before n are not read again.
             found = _next_leaving(departures, w, n)
             row = departures.passing[w, found]
             agent = row["agent"]
@@ -439,7 +439,7 @@ def settle(
 
 @kernel
 def call_orders(departures: DepartureQueue, ticks: NDArray[np.int64]) -> None:
-    """Put the ordered departures that are due by the coming tick at the end of the queue."""
+    """Append the ordered departures that are due by the coming tick to the queue."""
     for w in range(ticks.size):
         n = departures.next_order[w]
         while n < departures.num_orders[w] and departures.orders[w, n]["due"] <= ticks[w] + 1:

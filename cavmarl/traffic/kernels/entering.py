@@ -1,7 +1,7 @@
-"""Where and how fast a waiting departure enters, and whether it can now.
+"""The place and speed at which a waiting departure enters, and whether it can enter now.
 
-A departure says on which lane of its edge, where on it and how fast it wants to enter, in numbers
-or in SUMO's words. It enters only behind a gap that is safe for itself and for its follower.
+A departure requests a lane of its edge, a place on it and a speed, as numbers or as SUMO's
+keywords. It enters only if the gap is safe for itself and for its follower.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import accel_behind, speed_behind
 
-ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
-LEADER_M = 150.0  # how far ahead a leader is looked for
-ENTER_DECEL = 2.0  # m/s², braking that an entering vehicle may impose, or need at the lane's end
-BEST_LANE_M = 3000.0  # lanes on which a way goes on so far are equally good, as for SUMO,
-SAME_LENGTH = 0.99  # as are those where it goes on for this share of that: in bends they differ
-DRAW_LANE = 0  # draws of STREAM_DEPARTURE
+ENTER_GAP_M = 1.0  # m between bumpers, minimum gap of an entering vehicle
+LEADER_M = 150.0  # m; search distance for a leader
+ENTER_DECEL = 2.0  # m/s², maximum braking imposed on a follower, or needed at the lane's end
+BEST_LANE_M = 3000.0  # m; lanes that a way can follow this far are equally good, as in SUMO
+SAME_LENGTH = 0.99  # lanes with this share of the best distance are equal: lengths differ in bends
+DRAW_LANE = 0  # offset of draws in STREAM_DEPARTURE
 DRAW_SPEED = 1
 
 
@@ -54,7 +54,7 @@ def _may_use(travel: TripTables, departure: np.void, lane: int) -> bool:
 
 @kernel
 def crowd(scratch: Scratch, lane: int, s: float, view_m: float) -> int:
-    """How many vehicles are in view around a place on a lane."""
+    """Count the vehicles in view of a place on a lane."""
     found = 0
     for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
         found += abs(scratch.entries[k]["s"] - s) <= view_m
@@ -70,13 +70,13 @@ def entry_lane(
     ranks: NDArray[np.int64],
     taken: NDArray[np.bool_],
 ) -> int:
-    """The LANE where a departure enters in this tick, or -1 if another one tries there.
+    """Return the LANE row where a departure enters in this tick, or -1 if it must wait.
 
-    Whose lane is chosen by traffic takes the one with the fewest vehicles of those that it may use
-    (`best`: on which its way goes on the furthest without a lane change), the right one of two.
+    A departure that chooses by traffic takes the usable lane with the fewest vehicles (`best`: of
+    the lanes that its way follows furthest without a lane change); on a tie, the right one.
 
-    `departure`: that enters. `ranks`: how crowded each lane of its edge is; read where traffic
-    chooses. `taken`: (L,) lanes on which another one tries in this tick.
+    `departure`: the departure. `ranks`: how crowded each lane of its edge is; read if traffic
+    decides. `taken`: (L,) lanes on which another departure tries to enter in this tick.
     """
     code = departure["lane_code"]
     if code == LANE_GIVEN:
@@ -85,7 +85,7 @@ def entry_lane(
     first = edge["first_lane"]
     end = first + edge["num_lanes"]
     usable = 0
-    furthest = 0.0  # m from the start of a lane that a way goes on without a lane change
+    furthest = 0.0  # m that the way follows a lane without a lane change
     for lane in range(first, end):
         if _may_use(travel, departure, lane):
             usable += 1
@@ -108,7 +108,7 @@ def entry_lane(
             return -1 if taken[lane] else lane
         is_good = code != LANE_BEST or travel.steps[departure["way"] + lane]["room"] >= furthest
         if taken[lane] or not is_good:
-            continue  # where others try on all of the best, it waits
+            continue  # if all of the best lanes are taken, the departure waits
         rank = ranks[lane - first]
         if rank < best_rank:
             best = lane
@@ -127,10 +127,10 @@ def entry_place(
     tick: int,
     scratch: Scratch,
 ) -> float:
-    """Where on its lane the centre of a departure enters, in m.
+    """Return the place on its lane where the centre of a departure enters, in m.
 
-    Its whole body is on the lane, its front before the line; on one that is too short for both, its
-    rear is behind the start.
+    The whole body is on the lane, with its front before the line. If the lane is too short for
+    both, the rear is behind the start of the lane.
     """
     length = roads.lanes[lane]["length_m"]
     half = 0.5 * kind["length"]
@@ -150,7 +150,7 @@ def entry_place(
 
 @kernel
 def speed_at(roads: RoadArrays, kind: np.void, lane: int, s: float, wanted: float) -> float:
-    """At most `wanted`, at most the machine's, and slow before the end of the lane."""
+    """Return `wanted`, limited by the vehicle's maximum and by braking at the lane's end."""
     rest = max(roads.lanes[lane]["length_m"] - s - 0.5 * kind["length"] - 2.0, 0.0)
     return float(min(wanted, kind["max_speed"], math.sqrt(2.0 * ENTER_DECEL * rest)))
 
@@ -165,7 +165,7 @@ def _line_speed(
     s: float,
     wanted: float,
 ) -> float:
-    """At most `wanted`, and slow before a line where it may have to stop, or a lower limit."""
+    """Return `wanted`, limited so that the vehicle can brake for stops and lower limits ahead."""
     way = departure["way"]
     rest = max(roads.lanes[lane]["length_m"] - s - 0.5 * kind["length"] - 2.0, 0.0)
     while wanted * wanted > 2.0 * ENTER_DECEL * rest:
@@ -193,9 +193,9 @@ def _wanted_speed(
     leader: int,
     scratch: Scratch,
 ) -> float:
-    """The speed in m/s with which a departure would enter at place `s` of a lane without an end.
+    """Return the speed in m/s with which a departure would enter at `s` of an endless lane.
 
-    `leader`: the entry that it would follow, or -1.
+    `leader`: the entry of the leader, or -1.
     """
     here = roads.lanes[lane]
     code = departure["speed_code"]
@@ -224,11 +224,11 @@ def _behind_last_m(
     most: float,
     scratch: Scratch,
 ) -> float:
-    """How far before place `most`, the last one of its lane, a departure enters with `last`, in m.
+    """Return how far before `most`, the last place of the lane, a departure with `last` enters.
 
-    Behind the last vehicle in view of the end it keeps the gap from which it could stop; without
-    one it keeps its reaction time to the end, beyond which there may be others. It asks about
-    nothing further from the end: the zone there does not know it.
+    The result is in m. Behind the last vehicle in view of the end, the departure keeps the gap it
+    needs to stop. Without such a vehicle it keeps its reaction time to the end, because vehicles
+    may follow beyond. It reads nothing farther away, which the zone of the end does not know.
     """
     k = first_from(scratch, lane, roads.lanes[lane]["length_m"] - travel.view_m, departure["id"])
     wanted = _wanted_speed(roads, travel, key, departure, kind, lane, most, k, scratch)
@@ -243,7 +243,7 @@ def _behind_last_m(
 
 @inlined_kernel
 def _secure_m(kind: np.void, speed: float, leader: np.void) -> float:
-    """The gap in m, beyond the least one, to stop behind a leader that stops."""
+    """Return the gap in m, beyond the minimum, needed to stop behind a stopping leader."""
     stops_m = speed * speed / (2.0 * kind["decel"])
     leader_m = leader["speed"] * leader["speed"] / (2.0 * leader["decel"])
     return float(max(speed * kind["tau"] + stops_m - leader_m, 0.0))
@@ -261,9 +261,9 @@ def entry_speed(
     s: float,
     scratch: Scratch,
 ) -> float:
-    """The speed in m/s with which a departure enters somewhere, -1 if a leader is too near.
+    """Return the speed in m/s with which a departure can enter; -1: its leader is too near.
 
-    A steered vehicle that sticks out into its lane as it changes to the next one is a leader, too.
+    An agent that changes lanes and still protrudes into this lane also counts as a leader.
     """
     half = 0.5 * kind["length"]
     j = ahead_on(scratch, lane, s, departure["id"], travel.view_m)
@@ -286,7 +286,7 @@ def entry_speed(
         k, apart = next_askew(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
         if k >= 0:
             safe = min(safe, _safe_behind(kind, scratch.entries[k], apart - half))
-    # Behind the last vehicle, and with other speeds, it waits until what it wants is safe.
+    # Behind the last vehicle, or with a fixed speed, the departure waits for that speed.
     code = departure["speed_code"]
     slows = (code == SPEED_MAX or code == SPEED_RANDOM) and departure["pos_code"] != POS_LAST
     if safe < 0.0 or (safe < wanted and not slows):
@@ -304,9 +304,9 @@ def _safe_at_fork(
     s: float,
     scratch: Scratch,
 ) -> float:
-    """The speed in m/s that is safe behind those that have just turned off from a lane.
+    """Return the safe speed in m/s behind vehicles that have just turned off from the lane.
 
-    Their rears are before the place where the ways part. -1: one is too near; inf: there is none.
+    Only vehicles with their rear before the fork count. -1: one is too near; inf: there is none.
     """
     here = roads.lanes[lane]
     to_end = here["length_m"] - s
@@ -327,7 +327,7 @@ def _safe_at_fork(
 
 @kernel
 def _mean_speed(limit_mps: float, lane: int, s: float, view_m: float, scratch: Scratch) -> float:
-    """Mean speed in m/s of those on a lane, in view of place `s`; none: the limit."""
+    """Return the mean speed in m/s of vehicles on a lane in view of `s`; the limit if none."""
     total, number = 0.0, 0
     for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
         other = scratch.entries[k]
@@ -339,7 +339,7 @@ def _mean_speed(limit_mps: float, lane: int, s: float, view_m: float, scratch: S
 
 @kernel
 def _safe_behind(kind: np.void, leader: np.void, to_centre: float) -> float:
-    """The speed in m/s that is safe behind an entry whose centre is so far ahead; -1: too near."""
+    """Return the safe speed in m/s behind an entry `to_centre` m ahead; -1: it is too near."""
     gap = to_centre - leader["half"]
     if gap < ENTER_GAP_M:
         return -1.0
@@ -358,7 +358,7 @@ def follower_brakes(
     speed: float,
     scratch: Scratch,
 ) -> bool:
-    """Whether a follower, by whichever lane it comes, would have to brake hard for an entrant."""
+    """Return whether a follower on any lane would have to brake hard for an entrant."""
     half = 0.5 * kind["length"]
     for n in range(max(1, roads.lanes[lane]["num_into"])):
         k, apart = behind_by(
@@ -380,9 +380,9 @@ def _one_that_turns_off_brakes(
     speed: float,
     scratch: Scratch,
 ) -> bool:
-    """`follower_brakes` for those on a junction that come from a lane that leads here.
+    """Return whether a vehicle on another turn from a preceding lane brakes hard for an entrant.
 
-    They drive to another lane, and their bodies are not yet out of the way of this one.
+    Such vehicles leave for another lane, but their bodies still overlap the entrant's lane.
     """
     half = 0.5 * kind["length"]
     here = roads.lanes[lane]
@@ -419,7 +419,7 @@ def _brakes(
     speed: float,
     scratch: Scratch,
 ) -> bool:
-    """Whether entry k, whose centre is `apart` m behind the rear of an entrant, brakes hard."""
+    """Return whether entry k, its centre `apart` m behind the entrant's rear, brakes hard."""
     follower = scratch.entries[k]
     gap = apart - follower["half"]
     if gap < ENTER_GAP_M:

@@ -1,6 +1,6 @@
-"""Vehicles that are through leave their shard.
+"""Removal of vehicles from their shard when their trip has ended.
 
-The departure queue settles with them in `demand_generator.settle`.
+`demand_generator.settle` counts them and orders their successors.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:
 
 @kernel
 def _strike(worlds: Worlds, w: int, rows: NDArray[np.void], i: int, last: int) -> None:
-    """Of the rows that other zones may see row i is gone, and what has been row `last` is row i."""
+    """Remove row i from the rows that other zones may see, and renumber row `last` to i."""
     outer = worlds.outer[w]
     num = worlds.num_outer[w]
     place = 0
@@ -55,14 +55,14 @@ def leave(
     driver: int,
     ticks_per_step: int,
 ) -> None:
-    """Move the owned vehicles of one kind of driver that are through into `departures.passing`.
+    """Move owned vehicles of one driver kind whose trip has ended into `departures.passing`.
 
-    Background vehicles are through when they have arrived; agents that have acted also after a
+    Trips of background vehicles end at arrival. Trips of agents that have acted also end after a
     collision or off the road.
 
-    `departures`: `passing` is written. `worlds`: how many rows there are is written. `rows`:
-    VEHICLE (W, C), the rows to take from. `ticks_per_step`: ticks a step; agents that entered
-    within the last of them have not acted.
+    `departures`: `passing` is written. `worlds`: the numbers of rows are written. `rows`: VEHICLE
+    (W, C), the rows to take from. `ticks_per_step`: ticks of a step; agents that entered within
+    the last step have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
         if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:
@@ -77,7 +77,7 @@ def leave(
             last_owned = worlds.num_owned[w] - 1
             last = worlds.num_rows[w] - 1
             rows[w, i] = rows[w, last_owned]
-            rows[w, last_owned] = rows[w, last]  # a ghost moves up
+            rows[w, last_owned] = rows[w, last]  # move the last ghost into the gap
             worlds.num_owned[w] = last_owned
             worlds.num_rows[w] = last
             if worlds.num_outer[w] >= 0:
@@ -86,7 +86,7 @@ def leave(
 
 @kernel
 def drop_ghosts(departures: DepartureQueue, worlds: Worlds, rows: NDArray[np.void]) -> None:
-    """Forget the ghosts of vehicles that stand in `departures.passing`."""
+    """Remove ghosts of the vehicles in `departures.passing`."""
     for w in range(worlds.ticks.shape[0]):
         for n in range(departures.num_passing[w]):
             vehicle = departures.passing[w, n]["id"]

@@ -1,7 +1,7 @@
-"""SUMO's vehicles as rows: each stands where SUMO says it is, at the same tick.
+"""SUMO's vehicles as rows: each at the place that SUMO reports for the same tick.
 
-SUMO speaks of the middle of the front bumper, of degrees clockwise from north and of the place of
-the front on its lane; a row is about the centre of the body.
+SUMO reports the middle of the front bumper, its place on the lane, and degrees clockwise from
+north. A row describes the centre of the body.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from cavmarl.driving.kernels.lanes.route_following import distance_left, own_ste
 from cavmarl.driving.kernels.motion.motion import account, before_tick, lane_before
 from cavmarl.driving.kernels.motion.tracking import side_lane
 
-BODY_LANES = 8  # that lie between a front and its body's centre
+BODY_LANES = 8  # maximum number of lanes between the front and the centre of a body
 BLINKS_RIGHT = 1  # bits of SUMO's vehicle signals
 BLINKS_LEFT = 2
-EDGES_BEHIND = 2  # so many edges before that of its front, at most, a centre is, or one after it
+EDGES_BEHIND = 2  # edges from the front's edge back to the centre's, at most; or one ahead
 
 
 class Paths(NamedTuple):
-    """Routes of SUMO's as ways of ours, one a route and class of vehicles."""
+    """Routes of SUMO as ways of this package, one per route and vehicle class."""
 
-    first: NDArray[np.int64]  # (P + 1,) rows [first[p], first[p + 1]) of what follows
-    edges: NDArray[np.int32]  # EDGE rows, -1: not of this map
+    first: NDArray[np.int64]  # (P + 1,) path p has the rows [first[p], first[p + 1]) below
+    edges: NDArray[np.int32]  # EDGE rows, -1: not on this map
     ways: NDArray[np.int64]  # VEHICLE["way"] on that edge
     nowhere: int  # the way of a vehicle on no edge of its route
 
@@ -47,12 +47,12 @@ def mirror(
     w: int,
     dt: float,
 ) -> int:
-    """Bring a world's mirrored rows, in all zones, to where SUMO says they are.
+    """Update a world's mirrored rows, in all zones, to the state that SUMO reports.
 
-    `seen`: SEEN (n,) by rising numbers, with paths in the place of routes. `zoned`: the owned rows
-    of `side` are written; those that SUMO has no more have arrived. `side`: 0 or 1.
+    `seen`: SEEN (n,) by ascending number; the route field holds paths. `zoned`: the owned rows of
+    `side` are written; vehicles that SUMO no longer has are marked as arrived. `side`: 0 or 1.
 
-    Returns how many have arrived.
+    Returns the number of arrived vehicles.
     """
     gone = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -92,10 +92,10 @@ def greet(
     tick: int,
     key: np.uint64,
 ) -> None:
-    """Put a row for each vehicle that SUMO has let in into `departures.passing`, with a new id.
+    """Add a row with a new id to `departures.passing` for each vehicle that SUMO has inserted.
 
-    `seen`: as of `mirror`. `departed`: their numbers, rising. `departures`: passing, ids and counts
-    are written. `tick`: that they enter in. `key`: the root of all random numbers.
+    `seen`: as in `mirror`. `departed`: numbers of the inserted vehicles, ascending. `departures`:
+    passing, ids and counts are written. `tick`: tick of entering. `key`: root of random numbers.
     """
     for n in range(departed.size):
         place = _find(seen, departed[n])
@@ -124,7 +124,7 @@ def greet(
 
 @kernel
 def list_others(zoned: ZoneState, side: int, w: int, out: NDArray[np.void]) -> int:
-    """Copy all owned rows that SUMO does not move into `out`; how many they are."""
+    """Copy all owned rows that SUMO does not move into `out`; return their number."""
     found = 0
     for zone in range(zoned.num_owned.shape[0]):
         for i in range(zoned.num_owned[zone, w]):
@@ -144,14 +144,14 @@ def send_on(
     side: int,
     w: int,
 ) -> int:
-    """Give drivers of ours the other routes that SUMO has found for them.
+    """Put the package's drivers on other routes that SUMO has found for them.
 
-    A vehicle on no edge of its new route keeps the old one.
+    A vehicle that is on no edge of its new route keeps the old one.
 
-    `numbers`: (n,) VEHICLE["order"] of the vehicles meant, rising. `chosen`: (n,) their new paths.
+    `numbers`: (n,) VEHICLE["order"] of the vehicles, ascending. `chosen`: (n,) their new paths.
     `zoned`: the owned rows of `side` are written. `side`: 0 or 1.
 
-    Returns how many have taken it.
+    Returns the number of vehicles that take their new route.
     """
     taken = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -172,7 +172,7 @@ def send_on(
 
 @inlined_kernel
 def _find(seen: NDArray[np.void], number: int) -> int:
-    """Where a number stands among rising ones, or -1."""
+    """Return the index of a number in ascending numbers, or -1."""
     low = 0
     high = seen.shape[0]
     while low < high:
@@ -217,12 +217,12 @@ def _stand_in(
 
 @inlined_kernel
 def _place_centre(roads: RoadArrays, seen: np.void, row: np.void) -> None:
-    """Lane, s and d of the centre, which may be on a lane before that of the front."""
+    """Set lane, s and d of the centre, which may be on a lane before that of the front."""
     lane = seen["lane"]
     here = roads.lanes[lane]
     if here["internal"]:
         row["link"] = here["link"]
-    # SUMO's lanes have a length of their own, which need not be that of their polyline.
+    # The length attribute of SUMO's lanes may differ from the length of their polyline.
     s = seen["pos"] * here["length_m"] / roads.edges[here["edge"]]["length_m"]
     s -= 0.5 * row["length"]
     for _ in range(BODY_LANES):
@@ -240,7 +240,7 @@ def _place_centre(roads: RoadArrays, seen: np.void, row: np.void) -> None:
 
 @inlined_kernel
 def _edge_to_be(roads: RoadArrays, lane: int) -> int:
-    """The edge of a lane; inside a junction the one that it leads to."""
+    """Return the edge of a lane; inside a junction, the edge that the lane leads to."""
     if roads.lanes[lane]["internal"]:
         lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
     return int(roads.lanes[lane]["edge"])
@@ -248,7 +248,7 @@ def _edge_to_be(roads: RoadArrays, lane: int) -> int:
 
 @inlined_kernel
 def _way_at(roads: RoadArrays, paths: Paths, path: int, at: int, lane: int) -> int:
-    """The way of a vehicle whose front is on the `at`-th edge of its route."""
+    """Return the way of a vehicle whose front is on the `at`-th edge of its route."""
     edge = _edge_to_be(roads, lane)
     first = paths.first[path]
     num = paths.first[path + 1] - first

@@ -1,13 +1,13 @@
-"""Ways of single vehicles: which vehicles ask for one, what it takes, and where it is kept.
+"""Searches for ways of single vehicles: which vehicles search, costs of ways, storage.
 
-A way that was found while the world runs is kept in a slot: room for one way's steps at the end of
-`TripTables.steps`. Slots belong to a world; which of them are free is seen from its vehicles.
+A way found at run time is stored in a slot: room for the steps of one way at the end of
+`TripTables.steps`. Each slot belongs to a world; the world's vehicles determine which are free.
 
-The speed on every edge is sampled, smoothed, and put in the place of the limits, as SUMO's
-rerouting device does it (Behrisch, Krajzewicz, Wang: "Comparing performance and quality of traffic
+The measured speed of each edge is sampled, smoothed, and used instead of the limit, as in SUMO's
+rerouting device (Behrisch, Krajzewicz, Wang: "Comparing performance and quality of traffic
 assignment techniques for microscopic road traffic simulations", DTA 2008): the mean speed of an
-edge's vehicles, averaged over the last samples. Everything that is summed is whole millimetres a
-second, so that no result depends on the order of rows or of parts of a map.
+edge's vehicles, averaged over the last samples. Sums are integers in mm/s, so that no result
+depends on the order of rows or of parts of a map.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SCRIPTED, EVENT
 from cavmarl.roads.kernels.plans import change_cost
 from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
 
-REACTION_S = 1.0  # at its speed, before a driver brakes for another turn
-CHANGE_ROOM_M = 30.0  # that every lane change before the next junction needs
+REACTION_S = 1.0  # s at the present speed before a driver brakes for another turn
+CHANGE_ROOM_M = 30.0  # m needed for each lane change before the next junction
 
 
 @kernel
@@ -37,15 +37,15 @@ def find_asking(
     looks: NDArray[np.void],
     asking: NDArray[np.int64],
 ) -> int:
-    """The vehicles that ask for their way in this second, by rising id.
+    """List the vehicles that search for a way in this second, by ascending id.
 
-    These are background vehicles of the demand on a road, without a stop to make, whose time to
-    look has come or that have come to an edge with rerouters.
+    They are background vehicles of the demand on a road that have no stop ahead, and whose next
+    search is due or that have come to an edge with rerouters.
 
-    `has_rules`: (num_edges,) where rerouters stand. `looks`: LOOK, by VEHICLE["order"]; edges
-    without rerouters are noted as seen. `asking`: room for their rows.
+    `has_rules`: (num_edges,) whether an edge has rerouters. `looks`: LOOK, by VEHICLE["order"];
+    edges without rerouters are noted as seen. `asking`: receives the rows of the vehicles.
 
-    Returns how many.
+    Returns the number of vehicles.
     """
     found = 0
     for i in range(num):
@@ -81,19 +81,19 @@ def find_way(
     steps: NDArray[np.void],
     cost: NDArray[np.float64],
 ) -> int:
-    """Write the steps of the way that a plan leads along from a lane.
+    """Write the steps of the way from a lane along a plan.
 
     Args:
-        roads: the road arrays, with the speeds that count now.
+        roads: the road arrays, with the current speeds as limits.
         plan: PLAN (L,) of the goal, made with the same speeds.
         lane: LANE row outside junctions.
-        permission: bits of the class that drives.
-        edges: room for EDGE rows.
-        steps: PLAN, room for the steps; those of the lane's edge come first.
+        permission: bits of the vehicle class.
+        edges: scratch for EDGE rows.
+        steps: PLAN, receives the steps; the steps of the lane's edge come first.
         cost: scratch, as long as `steps`.
 
     Returns:
-        how many steps were written; 0 where there is no way or it is too long for the room.
+        the number of steps written; 0 if there is no way or it does not fit into `steps`.
     """
     if plan[lane]["to_go"] == math.inf:
         return 0
@@ -110,9 +110,9 @@ def find_way(
 
 @kernel
 def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -> float:
-    """Seconds from the start of a lane to the end of its way, lane changes counted in.
+    """Return seconds from the start of a lane to the end of its way, including lane changes.
 
-    `roads`: the road arrays, with the speeds that count. `steps`: PLAN, where the way lies. `way`:
+    `roads`: the road arrays, with the current speeds. `steps`: PLAN that contains the way. `way`:
     VEHICLE["way"].
     """
     total: float = 0.0
@@ -140,10 +140,10 @@ def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -
 def has_room(
     roads: RoadArrays, travel: TripTables, row: np.void, steps: NDArray[np.void], way: int
 ) -> bool:
-    """Whether a vehicle can still follow another way from its lane on without braking hard.
+    """Return whether a vehicle can change to another way from its lane without hard braking.
 
-    `travel`: types, and the way that it has. `row`: VEHICLE outside junctions. `steps`: PLAN, where
-    the other way lies. `way`: where in it, as VEHICLE["way"].
+    `travel`: types, and the present way. `row`: VEHICLE outside junctions. `steps`: PLAN that
+    contains the other way. `way`: its place there, as VEHICLE["way"].
     """
     step = steps[way + row["lane"]]
     present = travel.steps[row["way"] + row["lane"]]
@@ -165,7 +165,7 @@ def mark_slots(
     slot_steps: int,
     used: NDArray[np.bool_],
 ) -> None:
-    """Which slots of a world hold the way of a vehicle.
+    """Mark the slots of a world that hold the way of a vehicle.
 
     `first_slot`: PLAN row of the world's first slot. `used`: (num_slots,), written.
     """
@@ -178,7 +178,7 @@ def mark_slots(
 
 @kernel
 def slot_of(roads: RoadArrays, row: np.void, first_slot: int, slot_steps: int) -> int:
-    """The slot of a vehicle's way, or -1 where all may drive on that way."""
+    """Return the slot of a vehicle's way, or -1 if the way is not in a slot."""
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
@@ -197,13 +197,13 @@ def take_slot(
     slot_steps: int,
     used: NDArray[np.bool_],
 ) -> bool:
-    """Put the steps of a new way into a slot, and the vehicle on it.
+    """Store the steps of a new way in a slot, and put the vehicle on it.
 
     `travel`: its steps from `first_slot` on are written. `row`: VEHICLE, written. `found`: PLAN,
-    the steps; those of the vehicle's edge come first. `first_slot`: PLAN row of the world's first
-    slot. `used`: (num_slots,) which are taken, written.
+    the steps; the steps of the vehicle's edge come first. `first_slot`: PLAN row of the world's
+    first slot. `used`: (num_slots,) occupied slots, written.
 
-    Returns whether there was a slot.
+    Returns whether a slot was free.
     """
     slot = slot_of(roads, row, first_slot, slot_steps)
     if slot < 0:
@@ -222,14 +222,14 @@ def take_slot(
 
 @kernel
 def put_on_way(travel: TripTables, row: np.void, way: int) -> None:
-    """Let a vehicle outside junctions follow another way from its lane on."""
+    """Put a vehicle outside junctions on another way from its lane on."""
     row["way"] = way
     row["leg"] += 1
     row["to_go"] = travel.steps[way + row["lane"]]["to_go"] - row["s"]
 
 
-CLOSED_S = 1e9  # time to drive along a closed lane: any way around it is faster
-LEAST_MPS = 0.001  # nothing is slower, so that a jam has a travel time
+CLOSED_S = 1e9  # s to drive along a closed lane; any way around it is faster
+LEAST_MPS = 0.001  # minimum speed, so that a jam has a finite travel time
 
 
 @kernel
@@ -239,7 +239,7 @@ def _millimetres(speed: float) -> int:
 
 @kernel
 def limit_speeds(roads: RoadArrays, past: NDArray[np.int32], speed_sums: NDArray[np.int64]) -> None:
-    """Let all samples be what an empty map has.
+    """Set all samples to the speeds of an empty map.
 
     `past`: (N, num_edges) mm/s, written. `speed_sums`: (num_edges,) mm/s, written: the sums over
     the N samples.
@@ -265,12 +265,12 @@ def sample_speeds(
     lane_counts: NDArray[np.int64],
     lane_sums: NDArray[np.int64],
 ) -> None:
-    """Sample the mean speed of every edge; the sample takes the place of the oldest one.
+    """Sample the mean speed of every edge; the sample replaces the oldest one.
 
     A lane without vehicles counts as one vehicle at its limit; vehicles that make a stop or follow
     a script do not count.
 
-    `number`: of the sample, since the reset. `past`: (N, num_edges) the last samples in mm/s.
+    `number`: samples since the reset. `past`: (N, num_edges) the last samples in mm/s.
     `speed_sums`: (num_edges,) their sums. `lane_counts`: (L,) scratch. `lane_sums`: (L,) scratch.
     """
     lane_counts[:] = 0
@@ -306,15 +306,15 @@ def slow_lanes(
     permission: int,
     lanes: NDArray[np.void],
 ) -> None:
-    """Write speeds into a copy of the lanes, so that plans over it see how traffic is now.
+    """Write the current speeds into a copy of the lanes, for plans that consider traffic.
 
     Args:
         roads: the road arrays.
         speed_sums: (num_edges,) mm/s, see `sample_speeds`.
-        samples: how many samples a sum has; 0: the limits are what counts.
-        closed: (num_edges,) bits of the classes that an edge is closed to.
-        permission: bits of the class that drives.
-        lanes: LANE (L,), of which "speed_mps" is written.
+        samples: number of samples in each sum; 0: use the limits.
+        closed: (num_edges,) bits of the classes that may not use an edge.
+        permission: bits of the vehicle class.
+        lanes: LANE (L,); "speed_mps" is written.
     """
     for lane in range(lanes.shape[0]):
         row = roads.lanes[lane]

@@ -1,1 +1,1 @@
-"""Scripted conflicts: casts, scripts, motions, and the library of scenarios."""
+"""Staged conflicts: scenes, actors, scripts, motions, and the library of scenarios."""

@@ -1,6 +1,6 @@
-"""`Cast`: the actors of a scene as rows of a world.
+"""`Cast`: the agents and actors of a scene as rows of a world.
 
-Of its agents the first begins in the conflict, the others behind it.
+The first agent starts in the conflict, the other agents start behind it.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from cavmarl.traffic.scenarios.movement_scripts import actor_types, bodies_of, c
 from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.streets import Streets
 
-APART_M = 6.0  # between the centres of two agents, one behind the other,
-APART_S = 2.0  # and the way of this time
-START_M = 5.0  # of a lane on which no vehicle begins
+APART_M = 6.0  # m between the centres of consecutive agents,
+APART_S = 2.0  # plus the distance driven in this time
+START_M = 5.0  # m at the start of a lane where no vehicle is placed
 
 
 def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
-    """The seats of `num` agents, that of the scene first.
+    """Return the seats of `num` agents, that of the scene first.
 
-    The others come after it on its own approach, with the same speed and the same goal, on lanes
-    outside junctions along which no actor rides: actors react to no vehicle.
+    The other agents follow on the approach of the first, with its speed and goal. Their lanes are
+    outside junctions, and no actor rides along them, because actors do not react to vehicles.
 
-    Raises ConfigError: there is no room for so many behind the first.
+    Raises ConfigError: there is no room for this many agents behind the first.
     """
     rides = [act for actor in scene.actors for act in actor.acts if isinstance(act, Ride)]
     closed = {lane for ride in rides for lane in ride.lanes}
@@ -50,8 +50,8 @@ def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
             if before is None or before in closed:
                 raise ConfigError(
                     f"population.agents = {num}: behind the agent of the scene at '{scene.place}' "
-                    f"on the map '{streets.network.name}' there is room for {len(seats) - 1} "
-                    f"more; ask for at most {len(seats)}, or name another scenario.place"
+                    f"on the map '{streets.network.name}' there is room for only {len(seats) - 1} "
+                    f"more; set at most {len(seats)}, or choose another scenario.place"
                 )
             lane = before
             s += streets.length_m(lane)
@@ -62,7 +62,7 @@ def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
     return seats
 
 
-SEAT_CLEAR_M = 30.0  # around the seat of an agent that is not the first
+SEAT_CLEAR_M = 30.0  # m around the seat of every agent except the first
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Cast:
     """The actors of a scene, ready to enter worlds."""
 
     scene: Scene
-    scripts: Scripts  # its tables
-    firsts: list[int]  # FRAME of each actor at the beginning
+    scripts: Scripts  # tables of the scripts
+    firsts: list[int]  # first FRAME of each actor
     types: NDArray[np.void]  # VTYPE rows of all bodies
     vtypes: list[int]  # (n,) VTYPE row of each actor, among all types of a world
     seats: list[Seat]  # of the agents
-    goal: int  # of all of them, a row of the plans' table
+    goal: int  # row of the plans' table; the same for all agents
 
     @staticmethod
     def of(
@@ -86,12 +86,12 @@ class Cast:
         dt: float,
         num_agents: int = 1,
     ) -> Cast:
-        """The cast of a scene.
+        """Return the cast of a scene.
 
-        `goals`: row of the plans' table by EDGE. `first_type`: how many types of vehicles there are
-        without the actors'. `num_agents`: of a world.
+        `goals`: row of the plans' table by EDGE. `first_type`: number of vehicle types before those
+        of the actors. `num_agents`: agents per world.
 
-        Raises ConfigError: the scene has no room for so many agents.
+        Raises ConfigError: the scene has no room for this many agents.
         """
         seats = take_seats(Streets(network), scene, num_agents)
         scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)
@@ -108,13 +108,12 @@ class Cast:
         w: int,
         blank: NDArray[np.void],
     ) -> None:
-        """Put the agents and the actors into a world that has just been populated.
+        """Place the agents and the actors in a world that has just been populated.
 
-        Other vehicles in the scene are left out. Agents keep their ids, actors get the next
-        ones.
+        Other vehicles in the scene are removed. Agents keep their ids, and actors get the next ids.
 
-        `worlds`: the rows of world w are written; it is not divided yet. `blank`: VEHICLE (1,), the
-        record that every vehicle starts from.
+        `worlds`: the rows of world w are written; it is not divided yet. `blank`: VEHICLE (1,),
+        template of every vehicle's record.
         """
         rows = worlds.rows[w]
         others = rows[: worlds.num_owned[w]]
@@ -149,7 +148,7 @@ class Cast:
         worlds.num_owned[w] = worlds.num_rows[w] = num
 
     def _is_clear(self, roads: RoadArrays, rows: NDArray[np.void]) -> NDArray[np.bool_]:
-        """(n,) which vehicles stand neither in the scene nor where an agent begins."""
+        """Return which vehicles (n,) are neither in the scene nor near the seat of an agent."""
         clear: NDArray[np.bool_] = (
             hypot_all(rows["x"] - self.scene.x, rows["y"] - self.scene.y) > self.scene.clear_m
         )
@@ -160,7 +159,7 @@ class Cast:
         return clear
 
     def _departure(self, roads: RoadArrays, agent: int, seat: Seat) -> np.void:
-        """What an agent's entry takes of a DEPARTURE."""
+        """Return a DEPARTURE with the fields that the entry of an agent reads."""
         departure: np.void = np.zeros(1, DEPARTURE)[0]
         for name in ("order", "stop", "stops_end"):
             departure[name] = -1

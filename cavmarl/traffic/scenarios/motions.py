@@ -1,4 +1,4 @@
-"""What an actor of a script can do, and where that takes it in each tick."""
+"""The actions of a scripted actor, and the pose of the actor in each tick."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from cavmarl.driving.kernels.junctions.approach import MAX_LINKS_AHEAD
 from cavmarl.driving.kernels.junctions.stop_line_registration import registration_distance_m
 from cavmarl.roads.network import RoadNetwork
 
-ACCEL_MPS2 = 2.5  # how actors speed up and slow down
-CREEP_MPS = 0.2  # on the last centimetres before they stand
+ACCEL_MPS2 = 2.5  # acceleration and braking of actors
+CREEP_MPS = 0.2  # minimum speed on the last centimetres before standstill
 
 
 class Pose(NamedTuple):
-    """Where an actor is in one tick."""
+    """The state of an actor in one tick."""
 
-    x: float  # of its centre, m
+    x: float  # m, centre of the body
     y: float
     heading: float
-    speed: float  # along it in m/s, negative backwards
-    beside: int  # LANE row on whose level it is
+    speed: float  # m/s along the heading, negative backwards
+    beside: int  # LANE row at whose height the actor is
     pitch: float = 0.0
     # lane, s and d of an actor that rides along lanes; None: it moves freely
     on: tuple[int, float, float] | None = None
-    link: int = -1  # LINK row that it is on or has entered last
-    # the distance to the stop line, and the LINK row, of each link that it is on or will be on soon
+    link: int = -1  # LINK row that the actor is on or entered last
+    # (distance to the stop line, LINK row) of each link that it is on or will be on soon
     claims: tuple[tuple[float, int], ...] = ()
-    cue: int = -1  # that it waits for, or -1
+    cue: int = -1  # number of the cue it waits for, or -1
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Wait:
 
 @dataclass(frozen=True)
 class Await:
-    """Stay until a cue has come, one of those of the scene, by its number."""
+    """Wait until a cue of the scene has come, given by its number."""
 
     cue: int
 
@@ -69,20 +69,20 @@ class Await:
 class Move:
     """Move freely along a line, from standstill to standstill."""
 
-    # (n, 3) x, y and heading, close enough together that straight lines between them will do; a
-    # single row is a place to stand at
+    # (n, 3) x, y and heading, dense enough for linear interpolation; a single row is a place to
+    # stand at
     line: NDArray[np.float64]
-    beside: int  # LANE row of the road on which, or beside which, this is
-    speed_mps: float = 0.0  # on the way
+    beside: int  # LANE row of the road on or beside which the line lies
+    speed_mps: float = 0.0  # speed between the ends
     backwards: bool = False  # whether a vehicle reverses
 
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float
     ) -> Iterator[Pose]:
-        """The poses of each tick.
+        """Yield the pose of each tick.
 
-        `length`: of the body, m. `last`: the pose before; None: this one begins the script, with a
-        pose of its own.
+        `length`: of the body, m. `last`: the previous pose; None at the start of the script, when
+        the first pose is yielded as well.
         """
         line = self.line
         if last is None:
@@ -103,12 +103,12 @@ class Move:
 
 @dataclass(frozen=True)
 class Ride:
-    """Ride along the middle of lanes as built-in drivers do, but without reacting to others."""
+    """Ride along the centre of lanes like a built-in driver, but without reacting to others."""
 
-    lanes: tuple[int, ...]  # LANE rows one after the other, those inside junctions among them
+    lanes: tuple[int, ...]  # consecutive LANE rows, including those inside junctions
     start_m: float  # of the centre, from the start of the first lane
     end_m: float  # of the centre, from the start of the first lane
-    speed_mps: float  # on the way
+    speed_mps: float  # speed between the ends
     start_mps: float = 0.0  # at the beginning
     end_mps: float = 0.0  # at the end
 
@@ -138,7 +138,7 @@ class Ride:
         )
 
     def _place(self, network: RoadNetwork, u: float) -> tuple[int, float]:
-        """Lane and s of a place of its way; beyond the ends, on the lines of the end lanes."""
+        """Return lane and s of a place on the way; beyond its ends, s exceeds the end lane."""
         for lane in self.lanes[:-1]:
             here = float(network.lanes["length_m"][lane])
             if u < here:
@@ -151,7 +151,7 @@ class Ride:
         return x, y
 
     def _entered(self, network: RoadNetwork, lane: int) -> int:
-        """The link that is on the way to a lane, and was entered last."""
+        """Return the last link entered on the way to a lane."""
         at = self.lanes.index(lane)
         for before, after in reversed(list(pairwise(self.lanes[: at + 1]))):
             if (link := _link_between(network, before, after)) >= 0:
@@ -161,7 +161,7 @@ class Ride:
     def _claims(
         self, network: RoadNetwork, u: float, speed: float, length: float
     ) -> Iterator[tuple[float, int]]:
-        """The links that it is on, or will be on soon, as `junctions.approach` lists them."""
+        """Yield the links that the actor is on or will be on soon, as in `junctions.approach`."""
         reach = registration_distance_m(speed)
         line_m, ahead = 0.0, 0
         for before, after in pairwise(self.lanes):
@@ -180,11 +180,11 @@ class Ride:
 
 
 Act = Move | Ride | Wait | Await
-"""One thing that an actor does."""
+"""One action of an actor."""
 
 
 def path_of(network: RoadNetwork, link: int) -> tuple[int, ...]:
-    """The lanes of a link, with the one that it leaves and the one that it reaches."""
+    """Return the lanes of a link, from the lane it leaves to the lane it reaches."""
     row = network.links[link]
     lanes = [int(row["from_lane"]), int(row["next_lane"])]
     while network.lanes["internal"][lanes[-1]]:
@@ -199,16 +199,16 @@ def arc(
     *,
     backwards: bool = False,
 ) -> NDArray[np.float64]:
-    """(n, 3) a circular arc of a vehicle's centre, from x, y and heading on.
+    """Return (n, 3) x, y and heading of the centre of a vehicle on a circular arc.
 
     Args:
-        start: x, y and heading.
-        radius_m: of the arc.
-        turn_rad: how far the heading turns, positive to the left.
+        start: x, y and heading at the start of the arc.
+        radius_m: radius of the arc.
+        turn_rad: change of the heading, positive to the left.
         backwards: whether the vehicle reverses.
     """
     x, y, heading = start
-    # Going forwards the centre of the circle lies on the side that the heading turns to.
+    # Forwards, the centre of the circle lies on the side that the heading turns to.
     side = math.copysign(1.0, turn_rad) * (-1.0 if backwards else 1.0)
     headings = heading + np.linspace(0.0, turn_rad, max(2, int(abs(turn_rad) / 0.05) + 1))
     middle_x, middle_y = (
@@ -228,7 +228,7 @@ def arc(
 def _course(
     far: float, start: float, speed: float, end: float, dt: float
 ) -> Iterator[tuple[float, float]]:
-    """Way and speed after each tick on a way of `far` m, the speeds in m/s."""
+    """Yield distance and speed after each tick over `far` m, with speeds in m/s."""
     u, present = 0.0, start
     while u < far:
         braking = math.sqrt(end * end + 2.0 * ACCEL_MPS2 * (far - u))
@@ -241,7 +241,7 @@ def _course(
 
 
 def _link_between(network: RoadNetwork, before: int, after: int) -> int:
-    """The LINK that leads from a lane outside junctions to what follows it, or -1."""
+    """Return the LINK from a lane outside junctions to the lane after it, or -1."""
     row = network.lanes[before]
     for link in range(row["first_link"], row["first_link"] + row["num_links"]):
         if network.links["next_lane"][link] == after:

@@ -1,11 +1,11 @@
-"""Scripts of pedestrians and vehicles, and what kernels take of them: one FRAME a tick.
+"""Scripts of pedestrians and vehicles, compiled for kernels into one FRAME per tick.
 
-An actor does one thing after the other: it moves along poses, rides along lanes, waits for a time,
-or waits for a cue. Built-in drivers take a body for an occupant of every lane that any part of it
-covers, and of those that it will cover within `FORESIGHT_S` when it moves freely: it stands there
-for them, so that they brake for actors about to step onto their lane.
+An actor performs its acts one after the other: it moves freely, rides along lanes, waits for a
+time, or waits for a cue. For built-in drivers, its body occupies every lane that it covers. While
+it moves freely, it also occupies lanes that it will cover within `FORESIGHT_S`, so that drivers
+brake for actors about to step onto their lane.
 
-`Shadows` finds which lanes a body covers, and which stretch of each.
+`Shadows` finds the lanes that a body covers, and the covered stretch of each.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from cavmarl.roads.routing import lane_grid
 from cavmarl.traffic.kernels.covered_stretch import covered_stretch
 from cavmarl.traffic.scenarios.motions import Act, Pose
 
-SAMPLE_M = 0.5  # between the points of a body that are looked at
-LEVEL_M = 4.0  # lanes that differ by more in height are one above the other
-BESIDE_M = 1.0  # so far beside a lane nothing covers it, however numbers are rounded
-FARTHEST_M = 200.0  # from an actor to a lane
+SAMPLE_M = 0.5  # spacing of the sample points of a body
+LEVEL_M = 4.0  # lanes with a larger difference in height are on different levels
+BESIDE_M = 1.0  # bodies farther than this beside a lane never cover it, despite rounding
+FARTHEST_M = 200.0  # maximum distance from an actor to a lane
 ON_ROAD = (1 << len(VEHICLE_CLASSES)) - 1
 
 
@@ -40,16 +40,16 @@ class Shadow(NamedTuple):
     """A stretch of a lane that a body covers."""
 
     start: float  # in m along the lane
-    end: float  # in m along the lane
+    end: float  # m/s of the body along the lane, at least 0
     speed: float  # of the body along the lane in m/s, not below 0
 
     def joined(self, other: Shadow) -> Shadow:
-        """The stretch from the start of the first to the end of the last."""
+        """Return the smallest stretch that contains both stretches."""
         return Shadow(min(self.start, other.start), max(self.end, other.end), 0.0)
 
 
 class Shadows:
-    """Looks up lanes below bodies."""
+    """Finds the lanes below bodies."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network
@@ -57,11 +57,11 @@ class Shadows:
         self._found: dict[bytes, Mapping[int, Shadow]] = {}
 
     def of(self, pose: Pose, length: float, width: float) -> Mapping[int, Shadow]:
-        """By LANE row, what a body of this size covers in its place."""
+        """Return the stretch of each LANE row that a body of this size covers at its pose."""
         place = (pose.x, pose.y, pose.heading, pose.speed, pose.beside)
         key = struct.pack("7d", *place, length, width)  # with the signs of zeros
         found = self._found.get(key)
-        if found is None:  # bodies stand in one place for many ticks
+        if found is None:  # bodies keep one pose for many ticks
             found = self._found[key] = self._covered(pose, length, width)
         return found
 
@@ -80,7 +80,7 @@ class Shadows:
         return found
 
     def nearest(self, pose: Pose) -> tuple[int, float, float]:
-        """The lane whose stretch is nearest to a place, and s and d there."""
+        """Return the lane nearest to a place, with s and d there."""
         best, best_off = (pose.beside, 0.0, 0.0), math.inf
         for lane in self._around(pose.x, pose.y):
             if not self._is_level(lane, pose.beside):
@@ -97,17 +97,17 @@ class Shadows:
         return self._network.pose_on(lane, s)[2]
 
     def distance_m(self, lane: int, s: float, pose: Pose) -> float:
-        """From a place on a lane to an actor, in the plane."""
+        """Return the horizontal distance in m from a place on a lane to an actor."""
         x, y, *_ = self._network.pose_on(lane, s)
         return hypot(x - pose.x, y - pose.y)
 
     def _is_level(self, lane: int, other: int) -> bool:
-        """Whether two lanes that are near each other can be on the same road."""
+        """Return whether two neighbouring lanes can belong to the same road."""
         z = self._network.points["z"][self._network.lanes["first_point"][[lane, other]]]
         return bool(abs(z[0] - z[1]) < LEVEL_M)
 
     def _near(self, points: NDArray[np.float64]) -> list[int]:
-        """Lanes that may reach below some of the points, by rising rows."""
+        """Return lanes, ascending, that may reach below some of the points."""
         grid = self._grid
         columns, lines = ((points - (grid.min_x, grid.min_y)) // grid.cell_m).astype(np.int64).T
         columns, lines = columns.clip(0, grid.num_x - 1), lines.clip(0, grid.num_y - 1)
@@ -122,7 +122,7 @@ class Shadows:
         return found
 
     def _around(self, x: float, y: float) -> list[int]:
-        """Lanes of the nearest cells that have any, by rising rows."""
+        """Return the lanes, ascending, of the nearest cells that contain lanes."""
         step = self._grid.cell_m
         for ring in range(1, int(FARTHEST_M / step) + 1):
             offsets = np.arange(-ring, ring + 1) * step
@@ -144,7 +144,7 @@ class Shadows:
 
 
 def _outline(pose: Pose, length: float, width: float) -> NDArray[np.float64]:
-    """(n, 2) points all over a body, its corners among them."""
+    """Return (n, 2) sample points of a body, including its corners."""
     along = np.linspace(-0.5, 0.5, max(2, round(length / SAMPLE_M) + 1)) * length
     across = np.linspace(-0.5, 0.5, max(2, round(width / SAMPLE_M) + 1)) * width
     u, v = (grid.ravel() for grid in np.meshgrid(along, across))
@@ -152,7 +152,7 @@ def _outline(pose: Pose, length: float, width: float) -> NDArray[np.float64]:
     return np.stack([pose.x + u * cos - v * sin, pose.y + u * sin + v * cos], axis=1)
 
 
-FORESIGHT_S = 2.0  # drivers brake for actors that will be on their lane by then
+FORESIGHT_S = 2.0  # drivers brake for actors that will be on their lane within this time
 
 FRAME = record(
     ("x", np.float64),  # as in VEHICLE
@@ -161,13 +161,13 @@ FRAME = record(
     ("heading", np.float64),
     ("pitch", np.float64),
     ("speed", np.float64),
-    ("s", np.float64),  # on `lane`, which is the nearest one
+    ("s", np.float64),  # on `lane`, the nearest lane
     ("d", np.float64),
     ("lane", np.int32),
     ("link", np.int32),
-    ("following", np.int32),  # FRAME of the next tick; the last one follows itself
-    ("cue", np.int32),  # CUE without which it stays; -1: it goes on by itself
-    ("released_to", np.int32),  # goal to which a built-in driver takes it from here, or -1
+    ("following", np.int32),  # FRAME of the next tick; the last frame points to itself
+    ("cue", np.int32),  # CUE that the actor waits for; -1: it continues at once
+    ("released_to", np.int32),  # goal to which a built-in driver takes the actor from here, or -1
     ("first_cover", np.int32),  # COVER rows
     ("num_covers", np.int32),
     ("first_claim", np.int32),  # CLAIM rows
@@ -177,7 +177,7 @@ FRAME = record(
 COVER = record(
     ("s", np.float64),  # middle of the covered part of the lane, m
     ("half", np.float64),  # and half its length
-    ("speed", np.float64),  # m/s along the lane, not below 0
+    ("speed", np.float64),  # m/s along the lane, at least 0
     ("lane", np.int32),
 )
 
@@ -190,7 +190,7 @@ CUE = record(
     ("x", np.float64),  # an agent's centre is within `radius_m` of this place
     ("y", np.float64),
     ("radius_m", np.float64),
-    ("tick", np.int64),  # or this tick has come; -1: it does not matter
+    ("tick", np.int64),  # or this tick has come; -1: no tick
 )
 
 NO_SCRIPTS = Scripts(
@@ -199,7 +199,7 @@ NO_SCRIPTS = Scripts(
 
 
 class Body(NamedTuple):
-    """What an actor is; metres."""
+    """Class and size of an actor; in metres."""
 
     vclass: int
     length: float
@@ -216,7 +216,7 @@ BODIES: Mapping[str, Body] = {
 
 
 class Cue(NamedTuple):
-    """What an actor waits for: an agent within `radius_m` of (x, y), or the time `at_s`."""
+    """A cue for actors: an agent within `radius_m` of (x, y), or the time `at_s`."""
 
     x: float = 0.0
     y: float = 0.0
@@ -228,14 +228,14 @@ class Cue(NamedTuple):
 class Actor:
     """A road user that follows a script."""
 
-    body: str  # what it is: a name of `BODIES`
-    acts: Sequence[Act]  # what it does, one after the other; each begins where the one before ends
-    # EDGE to which a built-in driver takes it in the end; None: it stays
+    body: str  # a name of `BODIES`
+    acts: Sequence[Act]  # performed in order; each begins where the previous one ends
+    # EDGE to which a built-in driver takes the actor at the end; None: it stays
     released_to: int | None = None
 
 
 def actor_types() -> NDArray[np.void]:
-    """VTYPE rows of the bodies, in the order of `BODIES`; they drive as the generator's car."""
+    """Return the VTYPE rows of `BODIES`; they drive like the generator's car."""
     types = generated_types().repeat(len(BODIES))
     for row, body in zip(types, BODIES.values(), strict=True):
         for name, value in body._asdict().items():
@@ -251,7 +251,7 @@ def bodies_of(actors: Sequence[Actor]) -> list[int]:
 
 @dataclass
 class _Tables:
-    """Rows that are written one after the other."""
+    """Growing tables of rows."""
 
     frames: list[tuple[object, ...]] = field(default_factory=list)
     covers: list[tuple[float, float, float, int]] = field(default_factory=list)
@@ -267,10 +267,10 @@ def compile_scripts(
     goals: Mapping[int, int],
     dt: float,
 ) -> tuple[Scripts, list[int]]:
-    """The frames of all actors, and the first one of each.
+    """Return the compiled scripts of all actors, and the first FRAME of each.
 
-    `actors`: those that have a script. `cues`: by the numbers that `Await` has. `goals`: row of the
-    plans' table by EDGE, for actors that are released.
+    `actors`: actors with a script. `cues`: indexed by the numbers in `Await`. `goals`: row of the
+    plans' table by EDGE, for released actors.
     """
     tables = _Tables()
     shadows = Shadows(network)
@@ -336,7 +336,7 @@ def _write(
 def _foreseen(
     own: list[Mapping[int, Shadow]], poses: list[Pose], k: int, ahead: int
 ) -> dict[int, Shadow]:
-    """What an actor covers now or soon, as far as it does not wait for a cue before."""
+    """Return what an actor covers now or soon, up to its next wait for a cue."""
     seen = dict(own[k])
     for later in range(k, min(k + ahead, len(own) - 1)):
         if poses[later].cue >= 0:

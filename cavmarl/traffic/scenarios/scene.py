@@ -1,7 +1,7 @@
-"""A `Scene`: the actors, their scripts and the agent's start. Scenarios make them.
+"""`Scene`: the actors, their scripts and the agent's start, as made by scenarios.
 
-Their parameters are dataclass fields that know their range, their unit and what they are. Streams
-of scripted vehicles cross or join the agent's way.
+Parameters of scenarios are dataclass fields with a range, a unit and a description. The helpers for
+streams of scripted vehicles that cross or join the agent's way are here as well.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from cavmarl.traffic.scenarios.streets import Crossing, Streets
 
 @dataclass(frozen=True)
 class Seat:
-    """Where the agent's vehicle begins."""
+    """The start of an agent's vehicle."""
 
     lane: int
-    s: float  # of its centre on the lane, m
-    speed_mps: float  # at the beginning, and what its built-in driver would like to keep
-    goal_edge: int  # EDGE row where its trip ends
+    s: float  # m, of the centre on the lane
+    speed_mps: float  # initial speed, and the speed that its built-in driver keeps
+    goal_edge: int  # EDGE row where the trip ends
 
 
 class Outage(NamedTuple):
-    """A signal that goes dark: the name of the signal, and when, in s since the beginning."""
+    """A signal failure: the name of the signal, and the start in s after the reset."""
 
     signal: str
     at_s: float
@@ -37,16 +37,16 @@ class Outage(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """One conflict, played to an agent; others may come behind it."""
+    """One conflict staged for an agent; other agents may follow behind it."""
 
-    place: str  # where, by the map's name
-    x: float  # its middle, m
+    place: str  # name of the place on the map
+    x: float  # m, centre of the scene
     y: float
     seat: Seat
-    actors: Sequence[Actor]  # those that follow a script
-    cues: Sequence[Cue] = ()  # what they wait for, by the numbers of their `Await`s
-    clear_m: float = 90.0  # how far around the middle no other vehicle is in the beginning
-    outages: Sequence[Outage] = ()  # signals that go dark, and stay so
+    actors: Sequence[Actor]  # the scripted actors
+    cues: Sequence[Cue] = ()  # cues by the numbers in the actors' `Await`s
+    clear_m: float = 90.0  # radius around the centre without other vehicles at the start
+    outages: Sequence[Outage] = ()  # signals that go dark and stay dark
 
     @property
     def goal_edges(self) -> list[int]:
@@ -67,17 +67,17 @@ def switch(default: bool, what: str) -> Any:
 
 
 def describe(parameters: type[Any]) -> list[tuple[str, str, str, str]]:
-    """(name, default, range with unit, what it is) of each parameter of a dataclass."""
+    """Return (name, default, range with unit, description) of each parameter of a dataclass."""
     return [(f.name, f"{f.default:g}" if _is_number(f) else str(f.default).lower(), _range(f),
              f.metadata["what"]) for f in fields(parameters)]  # fmt: skip
 
 
 def checked(parameters: type[T], given: Mapping[str, bool | float], scenario: str) -> T:
-    """The parameters of a scenario with the given values.
+    """Return the parameters of a scenario with the given values.
 
     `parameters`: a dataclass of `setting`s and `switch`es. `given`: value by name.
 
-    Raises ConfigError: a name that it does not have, or a value out of range.
+    Raises ConfigError: a name is unknown, or a value is out of range.
     """
     kind: Any = parameters
     known = {f.name: f for f in fields(kind)}
@@ -111,13 +111,13 @@ def _range(about: Field[Any]) -> str:
 
 Meeting = tuple[Crossing, Scene]
 
-FREE_M = 20.0  # beyond the junction a built-in driver takes over
+FREE_M = 20.0  # beyond the junction, where a built-in driver takes over
 
 
 def approach(streets: Streets, link: int, far_m: float, speed_mps: float) -> Seat | None:
-    """A seat on the lane that a link leaves, `far_m` before its end; None where that is shorter.
+    """Return a seat `far_m` before the end of the link's first lane; None if that is too short.
 
-    `link`: LINK row that the agent is to drive over. `far_m`: of its centre to the end of the lane.
+    `link`: LINK row that the agent is to drive over. `far_m`: from its centre to the lane's end.
     """
     row = streets.network.links[link]
     lane, beyond = int(row["from_lane"]), int(row["to_lane"])
@@ -130,10 +130,10 @@ def approach(streets: Streets, link: int, far_m: float, speed_mps: float) -> Sea
 def stream(
     streets: Streets, link: int, middle_m: float, speed_mps: float, times_s: list[float]
 ) -> list[Actor] | None:
-    """Cars that drive over a link without reacting to others; None where there is no room for them.
+    """Return cars that drive over a link without reacting to others; None if there is no room.
 
-    `middle_m`: a place on its path, from the stop line. `speed_mps`: of all of them, all the time.
-    `times_s`: when each one's centre is at that place, rising.
+    `middle_m`: a place on the link, from the stop line. `speed_mps`: constant speed of all cars.
+    `times_s`: time of each car's centre at that place, ascending.
     """
     path = path_of(streets.network, link)
     far_m = times_s[-1] * speed_mps - middle_m
@@ -152,19 +152,19 @@ def stream(
 
 
 def meet_stream(
-    streets: Streets, place: Crossing, far_m: float, stream_mps: float, said: Any
+    streets: Streets, place: Crossing, far_m: float, stream_mps: float, parameters: Any
 ) -> Scene | None:
-    """An agent that meets the first car of a stream if it keeps its speed; None: no room for them.
+    """Stage an agent that meets the first car of a stream at constant speed; None: no room.
 
-    `place`: where both ways meet. `far_m`: from the agent to the junction in the beginning. `said`:
-    the scenario's parameters: `speed_mps` of the agent, how many `cars`, `gap_s` between their
-    centres, `lead_s` that the first is there before the agent.
+    `place`: where both ways meet. `far_m`: initial distance from the agent to the junction.
+    `parameters`: of the scenario: `speed_mps` of the agent, number of `cars`, `gap_s` between
+    their centres, `lead_s` of the first car before the agent.
     """
-    seat = approach(streets, place.link, far_m, said.speed_mps)
+    seat = approach(streets, place.link, far_m, parameters.speed_mps)
     if seat is None:
         return None
-    first_s = (far_m + place.middle_m) / said.speed_mps - said.lead_s
-    times_s = [first_s + k * said.gap_s for k in range(math.floor(said.cars))]
+    first_s = (far_m + place.middle_m) / parameters.speed_mps - parameters.lead_s
+    times_s = [first_s + k * parameters.gap_s for k in range(math.floor(parameters.cars))]
     actors = stream(streets, place.foe, place.foe_middle_m, stream_mps, times_s)
     if actors is None:
         return None
@@ -177,14 +177,14 @@ def meetings(
     crossings: Iterable[Crossing],
     far_m: float,
     stream_mps: float,
-    said: Any,
+    parameters: Any,
 ) -> dict[str, Meeting]:
-    """The first crossing of each lane where an agent meets a stream, and what is played there."""
+    """Return, for each lane, its first crossing with room for a stream, and the scene there."""
     found: dict[str, Meeting] = {}
     for crossing in crossings:
         name = streets.name(int(streets.network.links["from_lane"][crossing.link]))
         if name not in found:
-            scene = meet_stream(streets, crossing, far_m, stream_mps, said)
+            scene = meet_stream(streets, crossing, far_m, stream_mps, parameters)
             if scene is not None:
                 found[name] = crossing, scene
     return found

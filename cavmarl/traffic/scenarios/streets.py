@@ -1,4 +1,4 @@
-"""`Streets`: what scenarios ask about a map to find a place, and to say where things are."""
+"""`Streets`: queries on a road network, used by scenarios to find and describe places."""
 
 from __future__ import annotations
 
@@ -14,57 +14,57 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
 CAR = 1 << VEHICLE_CLASSES.index("passenger")
-STRAIGHT_RAD = 0.05  # the most that the direction of a straight lane changes
-BESIDE_M = 8.0  # the farthest between the middles of lanes of one road
+STRAIGHT_RAD = 0.05  # maximum change of direction of a straight lane
+BESIDE_M = 8.0  # maximum distance between the centres of neighbouring lanes of a road
 LOOK_MARGIN_M = 0.3
-ACROSS_M = 1.0  # from the middle of an area that two ways share to either, at most
+ACROSS_M = 1.0  # maximum distance of the centre of an area shared by two ways from each way
 
 
 class Crossing(NamedTuple):
     """Two movements over a junction that share an area."""
 
-    link: int  # LINK row of the one
-    foe: int  # LINK row of the other
-    middle_m: float  # of the area, from the stop line of the one
-    foe_middle_m: float  # of the area, from the stop line of the other
+    link: int  # LINK row of the first movement
+    foe: int  # LINK row of the second
+    middle_m: float  # centre of the area, from the stop line of the first movement
+    foe_middle_m: float  # centre of the area, from the stop line of the second
 
 
 class Opposite(NamedTuple):
-    """The lane beside another one in the opposite direction."""
+    """The neighbour of a lane in the opposite direction."""
 
     lane: int
-    s: float  # on it, m
-    apart_m: float  # between the middles of both
+    s: float  # m, place on the lane
+    apart_m: float  # distance between the centres of both lanes
 
 
 class Streets:
-    """Questions about a road network."""
+    """Queries on a road network."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
         self._grid = lane_grid(network)
-        self.inwards = -1 if network.left_hand else 1  # sign of the way to the middle of a road
+        self.inwards = -1 if network.left_hand else 1  # sign towards the road's middle
 
     def point(self, lane: int, s: float, d: float = 0.0) -> NDArray[np.float64]:
-        """(3,) x, y and heading of a place on a lane, `d` m to the left of its middle."""
+        """Return (3,) x, y and heading of a place on a lane, `d` m left of its centre."""
         x, y, _, cos, sin, _ = self.network.pose_on(lane, s)
         return np.array([x - d * sin, y + d * cos, atan2(sin, cos)])
 
     @property
     def _sides(self) -> tuple[str, str]:
-        """The neighbour of a lane towards the kerb, and that towards the middle of the road."""
+        """Fields of the neighbours towards the kerb and towards the middle of the road."""
         return ("left", "right") if self.network.left_hand else ("right", "left")
 
     @property
     def across(self) -> str:
-        """SUMO's letters of turns across the road."""
+        """SUMO's letters for turns across the road."""
         return "rR" if self.network.left_hand else "lL"
 
     def is_at_kerb(self, lane: int) -> bool:
         return int(self.network.lanes[self._sides[0]][lane]) < 0
 
     def inside(self, lane: int, s: float, aside_m: float) -> NDArray[np.float64]:
-        """`point` so far to the middle of the road."""
+        """Return `point`, `aside_m` closer to the middle of the road."""
         return self.point(lane, s, self.inwards * aside_m)
 
     def edge(self, lane: int) -> int:
@@ -74,14 +74,14 @@ class Streets:
         return float(self.network.lanes["length_m"][lane])
 
     def straights(self, least_m: float) -> list[int]:
-        """LANE rows outside junctions for cars that are straight and at least so long."""
+        """Return straight LANE rows for cars outside junctions, at least `least_m` long."""
         lanes = self.network.lanes
         good = ~lanes["internal"] & (lanes["permissions"] & CAR != 0)
         good &= lanes["length_m"] >= least_m
         return [lane for lane in np.flatnonzero(good).tolist() if self._bend(lane) < STRAIGHT_RAD]
 
     def kerbs_m(self, lane: int, s: float) -> tuple[float, float]:
-        """How far from the middle of a lane the whole road reaches to the kerb, and beyond."""
+        """Return how far the road reaches from a lane's centre, to the kerb and beyond."""
         lanes = self.network.lanes
         sides = []
         for side in self._sides:
@@ -96,7 +96,7 @@ class Streets:
         return near, far
 
     def opposite(self, lane: int, s: float) -> Opposite | None:
-        """The lane beyond the middle of the road, right beside another one, that leads back."""
+        """Return the neighbour of a lane in the opposite direction, if it is the next lane."""
         here = self.network.lanes[lane]
         if here[self._sides[1]] >= 0:
             return None
@@ -112,10 +112,10 @@ class Streets:
         return Opposite(other, place, abs(d))
 
     def crossings(self, directions: str, *, yields: bool, merges: bool) -> Iterator[Crossing]:
-        """Pairs of movements of cars that share an area, whose middle lies on both, or its end.
+        """Yield pairs of car movements that share an area at the centre of both, or at their end.
 
-        `directions`: SUMO's letters of the one, as `s` or `lL`. `yields`: whether it has to give
-        way to the other. `merges`: whether both lead into one lane.
+        `directions`: SUMO's letters for the first movement, such as `s` or `lL`. `yields`: whether
+        it must give way to the second. `merges`: whether both lead into one lane.
         """
         links, conflicts, lanes = self.network.links, self.network.conflicts, self.network.lanes
         ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
@@ -138,7 +138,7 @@ class Streets:
                 yield crossing
 
     def apart_m(self, crossing: Crossing) -> float:
-        """From the middle of the shared area on the way of the other to the way of the one."""
+        """Return the distance from the shared area's centre on the foe's way to the own way."""
         rest, lane = crossing.foe_middle_m, int(self.network.links["first_internal"][crossing.foe])
         while rest > self.length_m(lane) and self.network.lanes["internal"][lane]:
             rest -= self.length_m(lane)
@@ -154,7 +154,7 @@ class Streets:
         return nearest
 
     def movements(self, directions: str) -> list[int]:
-        """LINK rows over junctions for cars, in SUMO's directions, as `s` or `lL`."""
+        """Return LINK rows of car movements over junctions with SUMO's letters, as `s` or `lL`."""
         links, lanes = self.network.links, self.network.lanes
         ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
         good = (ends & CAR != 0) & (links["first_internal"] >= 0)
@@ -163,9 +163,9 @@ class Streets:
         return found
 
     def onward(self, lane: int) -> int | None:
-        """The lane for cars that follows another one beyond a junction, straight on if it can be.
+        """Return the car lane that follows a lane beyond a junction, preferably straight on.
 
-        None where no car can go on.
+        None if cars cannot continue.
         """
         links, lanes = self.network.links, self.network.lanes
         first = int(lanes["first_link"][lane])
@@ -177,7 +177,7 @@ class Streets:
         return int(links["to_lane"][ways[0]]) if ways else None
 
     def lanes_beside(self, lane: int) -> list[int]:
-        """A lane and all others of its road that lead the same way, from the kerb to the middle."""
+        """Return all lanes of the same road and direction, from the kerb to the middle."""
         outer, inner = (self.network.lanes[side] for side in self._sides)
         while outer[lane] >= 0:
             lane = int(outer[lane])
@@ -187,15 +187,15 @@ class Streets:
         return found
 
     def turn_rad(self, one: int, other: int) -> float:
-        """Between the directions of the ends of the lanes that two links leave, unsigned."""
+        """Return the unsigned angle between the ends of the lanes that two links leave."""
         ends = [int(self.network.links["from_lane"][link]) for link in (one, other)]
         first, second = (self.point(lane, self.length_m(lane))[2] for lane in ends)
         return abs(math.remainder(first - second, 2.0 * math.pi))
 
     def upstream(self, lane: int, far_m: float) -> tuple[tuple[int, ...], float] | None:
-        """Lanes that lead to a lane, itself the last, and the way from their start to its end.
+        """Return lanes that lead to a lane, and the total length up to its end.
 
-        None where there are not `far_m` of them.
+        The given lane is the last. None if there are less than `far_m`.
         """
         found, way_m = [lane], self.length_m(lane)
         while way_m < far_m:
@@ -207,7 +207,7 @@ class Streets:
         return tuple(found), way_m
 
     def before(self, lane: int) -> int | None:
-        """The first of the lanes from which cars come onto a lane; None: from nowhere."""
+        """Return the first lane from which cars enter a lane; None: there is none."""
         lanes, into = self.network.lanes, self.network.into
         row = lanes[lane]
         ends = into[row["first_into"] : row["first_into"] + row["num_into"]]
@@ -220,7 +220,7 @@ class Streets:
         return float(np.ptp(np.unwrap(self.network.lane_points(lane)["heading"])))
 
     def _lane_at(self, place: NDArray[np.float64]) -> int:
-        """The lane outside junctions that a place is on, or -1."""
+        """Return the lane outside junctions that contains a place, or -1."""
         grid, (x, y, _) = self._grid, place.tolist()
         column, line = int((x - grid.min_x) // grid.cell_m), int((y - grid.min_y) // grid.cell_m)
         if not (0 <= column < grid.num_x and 0 <= line < grid.num_y):

@@ -1,1 +1,1 @@
-"""SUMO as global traffic: a process of its own for each world, and what is taken from it."""
+"""SUMO as global traffic: one process for each world, and the data exchanged with it."""

@@ -1,6 +1,6 @@
-"""`RouteBook` and `StopBook`: routes and stops of SUMO's vehicles, written while worlds run.
+"""`RouteBook` and `StopBook`: routes and stops of SUMO's vehicles, stored while worlds run.
 
-Routes are ways, behind the table of all ways.
+Routes are stored as ways at the end of the table of all ways.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand.demand_records import STOP, UNTIL_ABSOLUTE
 from cavmarl.traffic.kernels.mirroring import Paths
 
-MAX_WAY_STEPS = 8_000_000  # of all worlds; memory that is never written is never taken
+MAX_WAY_STEPS = 8_000_000  # of all worlds; memory that is never written takes no space
 
 
 class RouteBook:
-    """The paths of W worlds, each a route as vehicles with certain permissions can drive it.
+    """The paths of W worlds: each a route as driven by vehicles with certain permissions.
 
-    `steps`: PLAN, the table of all ways. `first`: where in it these worlds' room begins; behind it
-    is nothing else. `permissions`: (num_types,) of VTYPE rows.
+    `steps`: PLAN, the table of all ways. `first`: start of the room for these worlds, which ends
+    the table. `permissions`: (num_types,) of VTYPE rows.
     """
 
     def __init__(
@@ -42,8 +42,8 @@ class RouteBook:
         nowhere["next"] = nowhere["link"] = -1
         nowhere["to_go"] = np.inf
         self._nowhere = first
-        # So many unused steps keep the ways of each world above all others: a way is a step's row
-        # minus that of a lane.
+        # These unused steps keep the ways of each world greater than all others: a way is the row
+        # of a step minus the row of a lane.
         self._first = first + 2 * lanes
         self._of_world = (len(steps) - self._first) // num_worlds
         self._masks, self._class_of_type = np.unique(permissions, return_inverse=True)
@@ -61,20 +61,20 @@ class RouteBook:
         return self._worlds[w].arrays(self._nowhere)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Let rows, VEHICLE or departures, mean the ways of so many worlds later."""
+        """Convert the ways of rows, VEHICLE or departures, to the world `worlds` later."""
         own = rows["way"] >= self._first - len(self._network.lanes)
         rows["way"] += own * (worlds * self._of_world)
 
     def enter(self, w: int, routes: list[list[int]]) -> None:
-        """Take up routes that SUMO has told of, EDGE rows of each, numbered in this order."""
+        """Add routes that SUMO has reported, each as EDGE rows, numbered in this order."""
         self._worlds[w].routes += [np.array(edges, dtype=np.int32) for edges in routes]
 
     def look_up(
         self, w: int, routes: NDArray[np.int32], vtypes: NDArray[np.int32]
     ) -> NDArray[np.int32]:
-        """The paths (n,) of vehicles of VTYPE rows (n,) on routes (n,).
+        """Return the paths (n,) of vehicles with VTYPE rows (n,) on routes (n,).
 
-        Raises CapacityError: there is no room for more.
+        Raises CapacityError: there is no room for more paths.
         """
         pages, classes = self._worlds[w], len(self._masks)
         pairs = routes.astype(np.int64) * classes + self._class_of_type[vtypes]
@@ -92,7 +92,7 @@ class RouteBook:
         if known is not None:
             return known
         rows = self._network.edges
-        # A route over edges that this map has left out is driven where it is on the map.
+        # A route with edges that this map has left out is driven on the other edges.
         num_lanes = np.where(edges >= 0, rows["num_lanes"][edges], 0)
         first_lane = np.where(edges >= 0, rows["first_lane"][edges], 0)
         begin = pages.end
@@ -100,8 +100,8 @@ class RouteBook:
         pages.end += int(num_lanes.sum())
         if pages.end > pages.begin + self._of_world:
             raise CapacityError(
-                f"SUMO's routes have over {self._of_world} steps in one world: fewer worlds, or "
-                "demand with fewer different routes"
+                f"SUMO's routes have over {self._of_world} steps in one world; use fewer worlds, "
+                "or demand with fewer different routes"
             )
         for piece in np.split(np.arange(len(edges)), np.flatnonzero(edges < 0)):
             part = edges[piece][edges[piece] >= 0]
@@ -113,13 +113,13 @@ class RouteBook:
 
 
 class _Pages:
-    """What is known of one world's routes.
+    """The routes and paths of one world.
 
     Attributes:
-        begin: of its steps.
-        end: of those in use.
-        routes: EDGE rows of each, by SUMO's number.
-        path_of: by route and class, or -1.
+        begin: first of the world's steps.
+        end: end of the steps in use.
+        routes: EDGE rows of each route, by SUMO's number.
+        path_of: path by route and class, or -1.
         known: paths by edges and permissions.
     """
 
@@ -134,7 +134,7 @@ class _Pages:
         self._ways = np.zeros(0, dtype=np.int64)
 
     def add(self, edges: NDArray[np.int32], mask: int, ways: NDArray[np.int64]) -> int:
-        """A new path's number."""
+        """Add a path and return its number."""
         number = self.known[edges.tobytes(), mask] = self._num
         begin = int(self._first[number])
         end = begin + len(edges)
@@ -153,7 +153,7 @@ class _Pages:
 
 
 def _with_room(array: NDArray[Any], used: int, wanted: int) -> NDArray[Any]:
-    """The same array, or one of twice the room with what is used: paths come one by one."""
+    """Return the array, or a copy with twice the wanted room, since paths come one by one."""
     if wanted <= len(array):
         return array
     larger = np.zeros(2 * wanted, dtype=array.dtype)
@@ -161,16 +161,16 @@ def _with_room(array: NDArray[Any], used: int, wanted: int) -> NDArray[Any]:
     return larger
 
 
-MAX_STOPS = 2_000_000  # of all worlds; memory that is never written is never taken
+MAX_STOPS = 2_000_000  # of all worlds; memory that is never written takes no space
 OF_WORLD = 200_000
 
-Told = tuple[int, float, float, float, float, bool]
-"""What SUMO says of a stop: LANE row, start and end in m on SUMO's lane, duration and until in s
-or -1, whether the road stays free."""
+ReportedStop = tuple[int, float, float, float, float, bool]
+"""A stop as SUMO reports it: LANE row, start and end in m on SUMO's lane, duration and until in s
+or -1, whether the vehicle parks beside the road."""
 
 
 class StopRange(NamedTuple):
-    """STOP rows [first, end) of a vehicle; -1, -1: it makes none."""
+    """STOP rows [first, end) of a vehicle; (-1, -1): no stops."""
 
     first: int
     end: int
@@ -180,19 +180,21 @@ NO_STOPS = StopRange(-1, -1)
 
 
 class StopBook:
-    """The stops of W worlds; equal lists of a world stand there once.
+    """The stops of W worlds; equal lists of stops in a world are stored once.
 
-    `table`: STOP, of all worlds.
+    `table`: STOP of all worlds.
     """
 
     def __init__(self, network: RoadNetwork, table: NDArray[np.void], num_worlds: int) -> None:
         lanes = network.lanes
-        # SUMO's lanes have a length of their own, which need not be that of their polyline.
+        # The length attribute of SUMO's lanes may differ from the length of their polyline.
         self._scale = lanes["length_m"] / network.edges["length_m"][lanes["edge"]]
         self._table = table
         self._of_world = len(table) // num_worlds
         self._ends = [w * self._of_world for w in range(num_worlds)]
-        self._known: list[dict[tuple[Told, ...], StopRange]] = [{} for _ in range(num_worlds)]
+        self._known: list[dict[tuple[ReportedStop, ...], StopRange]] = [
+            {} for _ in range(num_worlds)
+        ]
 
     @staticmethod
     def room(num_worlds: int) -> int:
@@ -203,31 +205,31 @@ class StopBook:
         self._known[w] = {}
 
     def enter(self, w: int, stops: Sequence[Sequence[float]]) -> StopRange:
-        """Where in the table the stops of a vehicle are, written if they are new.
+        """Return where the stops of a vehicle are in the table; new stops are written.
 
-        `stops`: `Told` of each, in the order in which it reaches them.
+        `stops`: `ReportedStop` of each, in the order of the vehicle's route.
 
-        Raises CapacityError: there is no room for more.
+        Raises CapacityError: there is no room for more stops.
         """
         if not stops:
             return NO_STOPS
-        told = tuple(_checked(stop) for stop in stops)
-        found = self._known[w].get(told)
+        reported = tuple(_checked(stop) for stop in stops)
+        found = self._known[w].get(reported)
         if found is None:
-            found = self._known[w][told] = self._write(w, told)
+            found = self._known[w][reported] = self._write(w, reported)
         return found
 
-    def _write(self, w: int, told: tuple[Told, ...]) -> StopRange:
+    def _write(self, w: int, reported: tuple[ReportedStop, ...]) -> StopRange:
         first = self._ends[w]
-        end = first + len(told)
+        end = first + len(reported)
         if end > (w + 1) * self._of_world:
             raise CapacityError(
-                f"SUMO's vehicles make over {self._of_world} stops in one world: fewer worlds, or "
-                "a shorter horizon_s"
+                f"SUMO's vehicles make over {self._of_world} stops in one world; use fewer "
+                "worlds, or a shorter horizon_s"
             )
-        rows = np.zeros(len(told), dtype=STOP)
+        rows = np.zeros(len(reported), dtype=STOP)
         for row, (lane, start, stop_end, duration_s, until_s, parking) in zip(
-            rows, told, strict=True
+            rows, reported, strict=True
         ):
             row["lane"], row["at_edge"] = lane, -1
             row["start"], row["end"] = start * self._scale[lane], stop_end * self._scale[lane]
@@ -238,12 +240,12 @@ class StopBook:
         return StopRange(first, end)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Let rows, VEHICLE or departures, mean the stops of so many worlds later."""
+        """Convert the stops of rows, VEHICLE or departures, to the world `worlds` later."""
         has_some = rows["stop"] >= 0
         for name in ("stop", "stops_end"):
             rows[name] += has_some * (worlds * self._of_world)
 
 
-def _checked(stop: Sequence[float]) -> Told:
+def _checked(stop: Sequence[float]) -> ReportedStop:
     lane, start, end, duration_s, until_s, parking = stop
     return int(lane), start, end, duration_s, until_s, bool(parking)

@@ -1,11 +1,11 @@
-"""What runs in the process of one SUMO: libsumo, or TraCI where there is none.
+"""The program of a SUMO process: it runs libsumo, or TraCI if libsumo is not installed.
 
-It is run by its file name and imports nothing of this package, so that it is up as soon as libsumo
-is. It is told the layout of all records when it is started. Its messages are a head of 32-bit
-numbers and then bytes: records, signal letters, and a line of JSON for what seldom happens.
+It is run by its file name and imports nothing of this package, so that it starts as fast as
+libsumo does. It receives the layouts of all records at its start. A message is a head of 32-bit
+numbers and then bytes: records, signal letters, and a line of JSON for rare events.
 
-SUMO holds one simulation a process: a second start would silently replace the first one. Here one
-is closed before the next is started.
+libsumo holds one simulation per process: a second start would silently replace the first. So the
+running simulation is closed before the next is started.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from numpy.typing import NDArray
 from cavmarl.core.processes import die_with_parent
 
 HEAD = np.dtype([("kind", "<i4"), ("records", "<i4"), ("letters", "<i4"), ("line", "<i4")])
-START, STEP, LOOK_UP = 0, 1, 2  # kinds of orders
+START, STEP, LOOK_UP = 0, 1, 2  # kinds of requests
 DONE, REFUSED = 0, 1  # kinds of answers
 
-NOWHERE = ""  # the lane of a vehicle on none: waiting or being teleported
-PUPPET = "cavmarl."  # begins the names of vehicles that are moved from outside
-FREE = 2  # moveToXY: wherever it is told, on a road or not
+NOWHERE = ""  # lane of a vehicle on no lane: waiting to enter, or being teleported
+PUPPET = "cavmarl."  # prefix of the names of vehicles that are moved from outside
+FREE = 2  # moveToXY: anywhere, on a road or not
 PARKS = 1 | 64  # flags of a stop: beside the road, at a parking area
-BY_ITSELF = 0  # speed and lane change modes: SUMO decides nothing for it
+BY_ITSELF = 0  # speed and lane change modes in which SUMO decides nothing
 
-# What is asked of every vehicle, by field of its record; the second only where it is read.
+# Getters read for each vehicle, by field of its record; _FIELDS_SEEN only if SUMO drives.
 _FIELDS = {"at": "getRouteIndex", "pos": "getLanePosition"}
 _FIELDS_SEEN = {
     "angle": "getAngle",
@@ -46,29 +46,29 @@ _FIELDS_SEEN = {
 
 
 class SumoSimulation:
-    """The one simulation of this process.
+    """The simulation of this process.
 
     Args:
-        told: what it is told once: names of lanes, edges, signals and types, layouts of records.
+        setup: sent once: names of lanes, edges, signals and types, layouts of records.
     """
 
-    def __init__(self, told: dict[str, Any]) -> None:
+    def __init__(self, setup: dict[str, Any]) -> None:
         self._sumo: Any = None
         self._runs = False
-        self._interface = told["interface"]
-        self._seen = np.dtype([tuple(field) for field in told["seen"]])
-        self.moved = np.dtype([tuple(field) for field in told["moved"]])
-        self._lane_row = {name: row for row, name in enumerate(told["lanes"])}
+        self._interface = setup["interface"]
+        self._seen = np.dtype([tuple(field) for field in setup["seen"]])
+        self.moved = np.dtype([tuple(field) for field in setup["moved"]])
+        self._lane_row = {name: row for row, name in enumerate(setup["lanes"])}
         self._lane_row[NOWHERE] = -1
-        self._edge_row = {name: row for row, name in enumerate(told["edges"])}
-        self._edges: list[str] = told["edges"]
-        self._signals: list[str] = told["signals"]
-        self._type_row: dict[str, int] = told["types"]
-        self._is_seen: bool = told["drives"]  # whether places of its vehicles are read
+        self._edge_row = {name: row for row, name in enumerate(setup["edges"])}
+        self._edges: list[str] = setup["edges"]
+        self._signals: list[str] = setup["signals"]
+        self._type_row: dict[str, int] = setup["types"]
+        self._is_seen: bool = setup["drives"]  # whether places of its vehicles are read
         self._forget()
 
     def _forget(self) -> None:
-        self._number: dict[str, int] = {}  # of vehicles on the road, by name
+        self._number: dict[str, int] = {}  # vehicle on the road: its number
         self._types: list[int] = []  # by number
         self._route_row: dict[str, int] = {}
         self._puppets: dict[int, str] = {}
@@ -95,7 +95,7 @@ class SumoSimulation:
             self._sumo.close()
 
     def look_up(self) -> dict[str, Any]:
-        """What the files have: types by name, and how many letters each signal has."""
+        """Return the content of the files: types by name, and number of letters by signal."""
         kinds, lights = self._sumo.vehicletype, self._sumo.trafficlight
         letters = {name: lights.getRedYellowGreenState(name) for name in lights.getIDList()}
         return {
@@ -104,13 +104,13 @@ class SumoSimulation:
         }
 
     def step(self, moved: NDArray[np.void]) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
-        """One step: puppets to their places, all other vehicles by SUMO."""
+        """Run one step: puppets are placed, SUMO moves all other vehicles."""
         self._place(moved)
         self._sumo.simulationStep()
-        return self.look()
+        return self.read_state()
 
-    def look(self) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
-        """Where vehicles are now, what signals show, and what is new."""
+    def read_state(self) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
+        """Return the records of vehicles, the letters of signals, and rare events."""
         line: dict[str, Any] = {"time_ms": self._time_ms()}
         lifted = [
             [self._number.pop(name), name]
@@ -138,9 +138,9 @@ class SumoSimulation:
     def _on_road(
         self,
     ) -> tuple[Sequence[str], NDArray[np.int32], NDArray[np.int32], list[list[Any]]]:
-        """The vehicles that stand or drive on the map's lanes, and which of them have come now.
+        """Find the vehicles on the map's lanes, and register those that have just entered.
 
-        Returns names, numbers and LANE rows, and what is to be said of vehicles that have come.
+        Returns names, numbers and LANE rows, and the reports of newly entered vehicles.
         """
         vehicle, none = self._vehicle, repeat(-1)
         names = vehicle.getIDList()
@@ -168,24 +168,24 @@ class SumoSimulation:
         return [*compress(names, is_here)], numbers[is_here], rows[is_here], fresh
 
     def _row_of(self, kind: str) -> int:
-        """The row of a type; a vehicle's own one, `type@vehicle`, counts as what it was made of."""
+        """Return the row of a type; a vehicle's own type, `type@vehicle`, counts as its origin."""
         row = self._type_row.get(kind, self._type_row.get(kind.partition("@")[0]))
         if row is None:
             raise LookupError(f"type '{kind}' is in none of the files")
         return row
 
     def _register(self, name: str, kind: int) -> list[Any]:
-        """A number for a vehicle of a type that has come, or has come back."""
+        """Number a vehicle that has entered, or entered again; return its report."""
         self._number[name] = len(self._types)
         self._types.append(kind)
         stops = [] if self._is_seen else self._stops(name)
         return [self._number[name], name, self._vehicle.getSpeedFactor(name), stops]
 
     def _stops(self, name: str) -> list[list[Any]]:
-        """Stops that a vehicle is to make: LANE row, start, end, duration, until, off the road.
+        """Return the coming stops of a vehicle: LANE row, start, end, duration, until, parking.
 
-        Times are in s, -1 where there is none. Those that end by neither, on no lane of the map, or
-        at which no vehicle stands are left out.
+        Times are in s, -1 if not given. Stops with neither time, off the map's lanes, or with a
+        waypoint's speed are left out.
         """
         found = []
         for stop in self._vehicle.getStops(name):
@@ -198,7 +198,7 @@ class SumoSimulation:
         return found
 
     def _routes(self, names: Sequence[str], line: dict[str, Any]) -> NDArray[np.int32]:
-        """Numbers of their routes; the edges of new ones go into the line."""
+        """Return the number of each vehicle's route; edges of new routes are added to `line`."""
         known = self._route_row
         ids = [*map(self._route_of, names)]
         rows = np.fromiter(map(known.get, ids, repeat(-1)), np.int32, len(ids))
@@ -212,7 +212,7 @@ class SumoSimulation:
         return rows
 
     def _place(self, moved: NDArray[np.void]) -> None:
-        """Bring the puppets to their places; new ones come, others go."""
+        """Place the puppets; add new ones and remove those that are no longer listed."""
         vehicle = self._vehicle
         present = set(vehicle.getIDList()) if len(moved) or self._puppets else set()
         wanted = {int(row["id"]) for row in moved}
@@ -242,10 +242,10 @@ class SumoSimulation:
 
 
 def _bare(sumo: Any, domain: str, getter: str) -> Callable[[str], Any]:
-    """A getter for names, of libsumo without the Python function that SWIG puts around it.
+    """Return a getter by name that skips the Python wrapper which SWIG generates for libsumo.
 
-    That one only hands on what it is given, and costs a fifth of the call. TraCI has none, nor may
-    another libsumo: there it is the usual one.
+    The wrapper only passes its arguments on, and takes a fifth of the call. If the interface has
+    no such inner function, as TraCI, return the usual getter.
     """
     inner = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
     usual: Callable[[str], Any] = getattr(getattr(sumo, domain), getter)
@@ -254,7 +254,7 @@ def _bare(sumo: Any, domain: str, getter: str) -> Callable[[str], Any]:
 
 
 def _describe(kinds: Any, name: str) -> dict[str, Any]:
-    """A type, in SUMO's units."""
+    """Return the parameters of a type in SUMO's units."""
     return {
         "vclass": kinds.getVehicleClass(name),
         "length": kinds.getLength(name),
@@ -273,14 +273,14 @@ def _describe(kinds: Any, name: str) -> dict[str, Any]:
 
 
 def _binary(interface: str) -> str:
-    """The first word of SUMO's command line; libsumo only looks that there is one."""
+    """Return the first word of SUMO's command line; libsumo ignores its value."""
     if interface == "libsumo":
         return "sumo"
     return str(importlib.import_module("sumolib").checkBinary("sumo"))
 
 
 def _read(wire: socket.socket, size: int) -> bytes:
-    """So many bytes; where the other side has gone this process ends."""
+    """Read `size` bytes; if the other side has closed, end this process."""
     parts = []
     while size:
         part = wire.recv(size)
@@ -291,7 +291,7 @@ def _read(wire: socket.socket, size: int) -> bytes:
     return b"".join(parts)
 
 
-def _order(wire: socket.socket) -> tuple[int, bytes, dict[str, Any]]:
+def _request(wire: socket.socket) -> tuple[int, bytes, dict[str, Any]]:
     head = np.frombuffer(_read(wire, HEAD.itemsize), HEAD)[0]
     records = _read(wire, int(head["records"]))
     line = _read(wire, int(head["line"]))
@@ -307,10 +307,10 @@ def _answer(
 
 
 def _serve(wire: socket.socket) -> NoReturn:
-    _, _, told = _order(wire)
-    simulation = SumoSimulation(told)
+    _, _, setup = _request(wire)
+    simulation = SumoSimulation(setup)
     while True:
-        kind, records, line = _order(wire)
+        kind, records, line = _request(wire)
         try:
             if kind == LOOK_UP:
                 started = simulation.start(line["words"])
@@ -318,10 +318,10 @@ def _serve(wire: socket.socket) -> NoReturn:
                 continue
             if kind == START:
                 simulation.start(line["words"])
-                found = simulation.look()
+                found = simulation.read_state()
             else:
                 found = simulation.step(np.frombuffer(records, simulation.moved))
-        except Exception as error:  # of SUMO's own kind, which the other side does not know
+        except Exception as error:  # SUMO's own error types are unknown to the other side
             _answer(wire, REFUSED, {"error": f"{type(error).__name__}: {error}"})
             continue
         seen, letters, news = found
@@ -329,9 +329,9 @@ def _serve(wire: socket.socket) -> NoReturn:
 
 
 def main() -> None:
-    """Live as long as the process that has started this one."""
+    """Serve requests until the process that started this one ends."""
     number, parent, dies_with_thread = map(int, sys.argv[1:])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other side, which closes
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side handles Ctrl-C and closes
     if dies_with_thread:
         die_with_parent()
     if os.getppid() == parent:

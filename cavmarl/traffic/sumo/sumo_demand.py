@@ -1,4 +1,4 @@
-"""`SumoDemand`: files of SUMO's that are known to fit a map, and what is needed to run them."""
+"""`SumoDemand`: SUMO files that are checked against a map, and all that is needed to run them."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergen
 
 @dataclass(frozen=True, eq=False)
 class SumoDemand:
-    """What a SUMO of this environment is started with."""
+    """The settings with which each SUMO of an environment is started."""
 
     network: RoadNetwork
-    map_file: Path  # the same, as SUMO reads them
+    map_file: Path  # the network, as SUMO reads it
     given: SumoInput  # demand and options
-    drives: bool  # SUMO moves its vehicles (`sumo-traffic`), and does not only order departures
-    max_vehicles: int  # that one world can hold
-    replay_bytes: int  # for what a world's SUMO is told in an episode
+    drives: bool  # whether SUMO moves its vehicles (`sumo-traffic`), or only orders departures
+    max_vehicles: int  # maximum per world
+    replay_bytes: int  # room for one world's log of an episode, see `ToldLog`
     dt_s: float
     interface: str  # `libsumo` or `traci`
-    version: str  # of SUMO
-    types: NDArray[np.void]  # VTYPE (num_types,) of its vehicles on roads
-    type_ids: tuple[str, ...]  # their names; of those on no road at the end
-    content_hash: str  # of all files
+    version: str  # version of SUMO
+    types: NDArray[np.void]  # VTYPE (num_types,) of the road vehicles
+    type_ids: tuple[str, ...]  # names of `types`, then of types that use no road
+    content_hash: str  # hash of all files
 
-    def told(self) -> dict[str, Any]:
-        """What its process is told once; types by VTYPE row of the world's table."""
-        return _told(self.network, self.interface) | {
+    def setup(self) -> dict[str, Any]:
+        """Return what a process receives once; types by VTYPE row of the world's table."""
+        return _names(self.network, self.interface) | {
             "drives": self.drives,
             "types": {
                 name: row + len(generated_types()) if row < len(self.types) else -1
@@ -59,28 +59,28 @@ class SumoDemand:
         }
 
     def words(self, folder: Path, seed: int) -> list[str]:
-        """Its command line; `folder` is for files that it reads."""
+        """Return SUMO's command line; `folder` is for files that it reads."""
         return _words(self.map_file, self.given, folder, self.dt_s, self.max_vehicles, seed)
 
 
 def read_sumo_demand(
     config: EnvConfig, network: RoadNetwork, map_file: Path, files: Sequence[Path]
 ) -> SumoDemand:
-    """Have SUMO read all files of an environment, and keep what it found.
+    """Let SUMO read all files of an environment, and return the checked demand.
 
-    `config`: the environment; its `traffic.source` is one of SUMO's. `map_file`: the same, as SUMO
-    reads them. `files`: one `.sumocfg`, or files of routes and additional files.
+    `config`: the environment; its `traffic.source` is one of SUMO's. `map_file`: the network, as
+    SUMO reads it. `files`: one `.sumocfg`, or files of routes and additional files.
 
-    Raises DemandError: SUMO refuses them on this map, with its words; or its signals are others;
-    MissingExtraError: SUMO is not installed.
+    Raises DemandError: SUMO refuses the files on this map (the error quotes SUMO), or its signals
+    differ from the map's; MissingExtraError: SUMO is not installed.
     """
     given = read_input(files)
     interface = choose_interface(config.sumo.interface)
-    process = SumoProcess(_told(network, interface) | {"types": {}, "drives": False})
+    process = SumoProcess(_names(network, interface) | {"types": {}, "drives": False})
     try:
         with tempfile.TemporaryDirectory() as folder:
             words = _words(map_file, given, Path(folder), config.clock.sim_dt_s, 1, 0)
-            # All of the demand, not only that of the first minutes.
+            # Read all of the demand, not only its first minutes.
             found = process.look_up([*words, "--route-steps=0"])
     except ConfigError as error:
         own = f", {given.net_file}" if given.net_file else ""
@@ -113,7 +113,7 @@ def read_sumo_demand(
     )
 
 
-def _told(network: RoadNetwork, interface: str) -> dict[str, Any]:
+def _names(network: RoadNetwork, interface: str) -> dict[str, Any]:
     return {
         "interface": interface,
         "lanes": list(network.lane_ids),
@@ -129,16 +129,16 @@ def _words(
     puppets.write_text(_puppets(), encoding="utf-8")
     own = int(given.options.get("max-num-vehicles", "-1"))
     more = {
-        # Contacts are judged here, and no vehicle is removed for one.
+        # This package detects contacts; SUMO removes no vehicle for one.
         "collision.action": "none",
         "max-num-vehicles": str(min(own, most) if own > 0 else most),
-        "random": "false",  # an unknown seed
+        "random": "false",  # true would draw an unknown seed
     }
     return command_words(map_file, given, folder, dt_s, seed, more, (puppets,))
 
 
 def _puppets() -> str:
-    """Types of our vehicles: they drive where they are put, and are never teleported."""
+    """Return types for vehicles that SUMO does not move; they are never teleported."""
     kinds = "".join(
         f'<vType id="cavmarl.{row}" vClass="ignoring" length="{kind["length"]}" '
         f'width="{kind["width"]}" height="{kind["height"]}" maxSpeed="{kind["max_speed"]}" '
@@ -149,7 +149,7 @@ def _puppets() -> str:
 
 
 def _types(described: list[dict[str, Any]]) -> NDArray[np.void]:
-    """VTYPE (n,) of what SUMO says about types; drivers of ours follow by Krauss's model."""
+    """Return VTYPE (n,) of SUMO's types; drivers of this package follow Krauss's model."""
     types = np.zeros(len(described), dtype=VTYPE)
     for row, kind in zip(types, described, strict=True):
         for name in _SAME_NAME:
@@ -168,7 +168,7 @@ def _check_signals(network: RoadNetwork, found: dict[str, int], files: Sequence[
         if found.get(name) != row["num_links"]:
             raise DemandError(
                 f"{', '.join(map(str, files))}: signal '{name}' has {found.get(name, 'no')} "
-                f"letters in SUMO and {row['num_links']} on the map '{network.name}': give files "
+                f"letters in SUMO and {row['num_links']} on the map '{network.name}'; give files "
                 "that were made for this map"
             )
 

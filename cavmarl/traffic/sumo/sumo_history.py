@@ -1,9 +1,9 @@
-"""`ToldLog`: where SUMO was told that our vehicles are, tick by tick since its reset.
+"""`ToldLog`: the places of this package's vehicles that SUMO has received, tick by tick.
 
-What SUMO does follows from its files, its seed and that. So a SUMO that is started anew and told
-the same comes to the same: the successor of a dead process needs no more.
+SUMO's state follows from its files, its seed and this log. A SUMO that is restarted and receives
+the same log reaches the same state, so a successor of a dead process needs nothing else.
 
-`SEEN` and `MOVED` are what goes between a world and its SUMO: fixed records, no objects.
+`SEEN` and `MOVED` are the records that a world and its SUMO exchange.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import SumoError
 
-# A vehicle of SUMO's, in its own conventions: the middle of the front bumper, degrees clockwise
-# from north, the place on the lane in the lane's own length. Where SUMO moves no vehicles here,
-# what follows `signals` is 0 but for `pos`.
+# A vehicle of SUMO in SUMO's conventions: the middle of the front bumper, degrees clockwise from
+# north, the place on the lane by the lane's length attribute. If SUMO only orders departures, all
+# fields from `x` on are 0, except `pos`.
 SEEN = np.dtype(
     [
-        ("number", np.int32),  # in the order in which they have come
+        ("number", np.int32),  # in the order of entering
         ("vtype", np.int32),  # VTYPE row
         ("lane", np.int32),  # LANE row of the front
-        ("route", np.int32),  # number of its route; of a path, once it is known here
-        ("at", np.int32),  # which edge of its route it is on
+        ("route", np.int32),  # number of the route; in this package, number of the path
+        ("at", np.int32),  # index of its present edge in the route
         ("signals", np.int32),  # SUMO's bits: 1 right, 2 left, 8 brake
         ("x", np.float64),  # m
         ("y", np.float64),
@@ -37,33 +37,33 @@ SEEN = np.dtype(
     ]
 )
 
-# A vehicle of ours, in SUMO's conventions.
+# A vehicle of this package in SUMO's conventions.
 MOVED = np.dtype(
     [
         ("id", np.int64),  # VEHICLE["id"]
-        ("x", np.float64),  # m, of the front
+        ("x", np.float64),  # m, of the front bumper
         ("y", np.float64),
         ("angle", np.float64),  # degrees
-        ("edge", np.int32),  # EDGE row outside junctions, near it
+        ("edge", np.int32),  # EDGE row outside junctions, near the vehicle
         ("kind", np.int32),  # VTYPE row
     ]
 )
 
 
-_TICKS, _SIZE, _IS_CUT, _HEAD = 0, 1, 2, 3  # words: ticks on record, words in use, given up
+_TICKS, _SIZE, _IS_CUT, _HEAD = 0, 1, 2, 3  # words: ticks, used words, whether recording stopped
 _WORD = 8
 _RECORD = MOVED.itemsize // _WORD  # words
 
 
 class ToldLog:
-    """Of one world, in one episode.
+    """The log of one world in one episode.
 
     Args:
-        most_bytes: that it may take; where an episode needs more, nothing is kept of it.
+        most_bytes: maximum size; if an episode needs more, nothing of it is kept.
 
     Attributes:
-        episode: counts how often it has been begun, by this process.
-        HEAD: so many words change; those behind are only ever added to.
+        episode: number of episodes begun by this process.
+        HEAD: number of words that change; words behind them are only appended.
     """
 
     HEAD: Final = _HEAD
@@ -74,18 +74,18 @@ class ToldLog:
         self.begin()
 
     def begin(self) -> None:
-        """Forget what there was; arrays that were given stay as they are."""
+        """Clear the log; arrays returned earlier stay as they are."""
         self.episode += 1
         self._words = np.zeros(_HEAD, dtype=np.int64)
         self._words[_SIZE] = _HEAD
 
     @property
     def words(self) -> NDArray[np.int64]:
-        """(n,) All of it, a view."""
+        """(n,) The whole log, as a view."""
         return self._words[: self._words.item(_SIZE)]
 
     def note(self, moved: NDArray[np.void]) -> None:
-        """Write down what SUMO is told of one more tick.
+        """Record the places that SUMO receives for one more tick.
 
         Args:
             moved: MOVED (n,).
@@ -108,30 +108,30 @@ class ToldLog:
         self._words[_SIZE] = end
 
     def take_up(self, words: NDArray[np.int64]) -> None:
-        """Go on from what another one's `words` were."""
+        """Continue from the `words` of another log."""
         self.begin()
         self._words = np.array(words, dtype=np.int64)
 
     def ticks(self, count: int) -> Iterator[NDArray[np.void]]:
-        """What SUMO was told in each of the first ticks: MOVED (n,).
+        """Return the places that SUMO received in each of the first ticks: MOVED (n,).
 
         Args:
-            count: of the ticks since its reset.
+            count: number of ticks since the reset.
 
         Raises:
-            SumoError: so many are not on record.
+            SumoError: fewer ticks are recorded.
         """
         words = self._words
         if words[_IS_CUT]:
             raise SumoError(
-                f"the record of what SUMO was told in {count} ticks takes more than "
+                f"the log of the places that SUMO received in {count} ticks exceeds "
                 f"{self._most * _WORD / 2**20:g} MiB, so it was not kept, and no other process can "
-                "take up this SUMO: reset the worlds, and raise sumo.replay_mib for the next time"
+                "replace this SUMO; reset the worlds, and raise sumo.replay_mib for the next time"
             )
         if words[_TICKS] < count:
             raise SumoError(
                 f"of {count} ticks of a SUMO {words.item(_TICKS)} are on record: no other process "
-                "can take it up; reset the worlds"
+                "can replace it; reset the worlds"
             )
         return _read(words, count)
 

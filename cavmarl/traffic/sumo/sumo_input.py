@@ -1,6 +1,6 @@
-"""What SUMO is given: a map, demand files, and the options of a `.sumocfg` that change traffic.
+"""The input of SUMO: a map, demand files, and the options of a `.sumocfg` that change traffic.
 
-And its command line, the same wherever it is run.
+Also SUMO's command line, which is the same wherever SUMO is run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ _INPUTS = {
     "a": "additional-files",
 }
 _DROPPED_SECTIONS = ("input", "output", "report", "gui_only", "time", "traci_server")
-# Options that change traffic and name no file. What only reports is left out; the rest is refused.
+# Options that change traffic and name no file. Options that only report are dropped; all others
+# are refused.
 _CHANGES_TRAFFIC = re.compile(
     r"step-method\.ballistic|extrapolate-departpos|no-internal-links|junction-taz|lateral-resolution"
     r"|scale|scale-suffix|max-num-[a-z]+|max-depart-delay|random-depart-offset|route-steps"
@@ -52,35 +53,35 @@ _REPORTS = re.compile(
     r".*(output|log|\.file$).*|device\.(ssm|fcd|tripinfo|vehroute|emissions|elechybrid|example)\..*"
     r"|no-warnings|verbose|aggregate-warnings|xml-validation.*"
 )
-# A file without these names nothing that SUMO writes. A reference to a character may hide them.
+# A file without these words makes SUMO write nothing. A character reference may hide them.
 _MAY_WRITE = re.compile(rb"\bfile\b|dest|output|&#|include", re.IGNORECASE)
 _COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 _ELSEWHERE = re.compile(r",|\$\{")  # a list of files; a variable of the environment
-_READ_FILES = {"rerouter", "variableSpeedSign"}  # elements whose `file` is read
-_NOWHERE = "NUL"  # as SUMO calls it
+_READ_FILES = {"rerouter", "variableSpeedSign"}  # elements whose `file` SUMO reads
+_NOWHERE = "NUL"  # SUMO's name of the null device
 _ASCII_BELOW = {"utf-8", "utf8", "ascii", "us-ascii", "iso-8859-1", "latin-1", "windows-1252"}
 
 
 @dataclass(frozen=True)
 class SumoInput:
-    """Files and options."""
+    """Demand files and options for SUMO."""
 
-    route_files: tuple[Path, ...]  # demand that SUMO reads as it goes
+    route_files: tuple[Path, ...]  # demand that SUMO reads during the run
     additional_files: tuple[Path, ...]  # types, stops, signal programs; read first
     begin_s: float = 0.0  # when the demand begins
-    # SUMO's own, of the configuration's sections that change what the traffic does
+    # SUMO's options from the sections of the configuration that change traffic
     options: dict[str, str] = field(default_factory=dict)
-    net_file: Path | None = None  # the map that a configuration names
+    net_file: Path | None = None  # the map named by the configuration
 
 
 def read_input(demand: Sequence[Path]) -> SumoInput:
-    """Sort demand files by what they are.
+    """Sort demand files by their kind.
 
     Args:
         demand: one `.sumocfg`, or files of routes, trips and flows and additional files.
 
     Raises:
-        ConfigError: no file, one that cannot be read, one that is neither.
+        ConfigError: there is no file, a file cannot be read, or it is no demand.
     """
     if not demand:
         raise ConfigError("no demand: give --demand FILE (.rou.xml, .add.xml or .sumocfg)")
@@ -95,22 +96,22 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
             additional.append(path.resolve())
         else:
             raise ConfigError(
-                f"{path}: <{root}> is no demand: give files of <routes> or <additional>, or one "
+                f"{path}: <{root}> is no demand; give files of <routes> or <additional>, or one "
                 ".sumocfg alone"
             )
     return SumoInput(tuple(routes), tuple(additional))
 
 
 def without_outputs(path: Path, folder: Path) -> Path:
-    """A map or demand by which SUMO writes nothing: a copy in `folder` where the file would.
+    """Return a map or demand file that makes SUMO write nothing: itself, or a copy in `folder`.
 
     Raises:
-        ConfigError: it includes another file, its encoding cannot be searched, or SUMO would take
-            its name for that of another file.
+        ConfigError: the file includes another file, its encoding cannot be searched, or SUMO
+            would read its name as that of another file.
     """
     if found := _ELSEWHERE.search(str(path)):
         raise ConfigError(
-            f"{path}: SUMO takes a name with {found[0]!r} for that of another file: rename it"
+            f"{path}: SUMO reads a name with {found[0]!r} as that of another file; rename the file"
         )
     if not _may_write(path, path.stat().st_mtime_ns):
         return path
@@ -127,17 +128,17 @@ def without_outputs(path: Path, folder: Path) -> Path:
 def _may_write(path: Path, changed_ns: int) -> bool:
     content = read_bytes(path)
     encoding = declared_encoding(content).lower() or "utf-8"
-    if encoding not in _ASCII_BELOW or 0 in content[:4]:  # UTF-16 and 32 begin with such a byte
-        raise ConfigError(f"{path}: encoded as {encoding} or UTF-16: save it as UTF-8")
-    if b"<![CDATA[" not in content:  # which may hold what looks like a comment
-        content = _COMMENT.sub(b"", content)  # netconvert tells its options in one
+    if encoding not in _ASCII_BELOW or 0 in content[:4]:  # UTF-16 and UTF-32 begin with a zero byte
+        raise ConfigError(f"{path}: encoded as {encoding} or UTF-16; save it as UTF-8")
+    if b"<![CDATA[" not in content:  # CDATA may contain text like a comment
+        content = _COMMENT.sub(b"", content)  # netconvert writes its options into a comment
     return bool(_MAY_WRITE.search(content))
 
 
 def _silence(element: Element, path: Path) -> bool:
-    """Send nowhere what SUMO would write by an element; whether it would write something."""
+    """Redirect the files that an element makes SUMO write; return whether there are any."""
     if element.tag == "include":
-        raise ConfigError(f"{path}: <include> is not followed: put the content into the file")
+        raise ConfigError(f"{path}: <include> is not followed; put the content into the file")
     changes = {}
     for name, value in element.attrib.items():
         if name == "file" and element.tag in _READ_FILES:
@@ -169,11 +170,11 @@ def _read_config(path: Path) -> SumoInput:
                 options[option.tag] = value
             else:
                 raise ConfigError(
-                    f"{path}: <{option.tag}>: is no option that changes traffic: take it out"
+                    f"{path}: option <{option.tag}> does not change traffic; remove it"
                 )
     missing = [name for group in files.values() for name in group if not isfile(name)]
     if missing:
-        raise ConfigError(f"{path}: names {missing[0]}, which is not there")
+        raise ConfigError(f"{path}: names {missing[0]}, which does not exist")
     return SumoInput(
         route_files=tuple(name.resolve() for name in files["route-files"]),
         additional_files=tuple(name.resolve() for name in files["additional-files"]),
@@ -189,7 +190,7 @@ def _root(path: Path) -> Element:
 
 
 def _root_tag(path: Path) -> str:
-    """Only that: demand of a day is too long to read it twice."""
+    """Return the root tag without reading the rest: a day's demand is too long to read twice."""
     with _readable(path):
         content = BytesIO(read_bytes(path))
         _, root = next(defusedxml.ElementTree.iterparse(content, ("start",), forbid_dtd=True))
@@ -198,27 +199,29 @@ def _root_tag(path: Path) -> str:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn what goes wrong with a file into a ConfigError that names it."""
+    """Convert errors of reading a file into a ConfigError that names the file."""
     try:
         yield
     except ParseError as error:
         raise ConfigError(f"{path}, line {error.position[0]}: broken XML ({error})") from error
     except DefusedXmlException as error:
-        raise ConfigError(f"{path}: declares a document type or entities: remove them") from error
+        raise ConfigError(f"{path}: declares a document type or entities; remove them") from error
     except (ValueError, LookupError) as error:
-        raise ConfigError(f"{path}: cannot be decoded ({error}): save it as UTF-8") from error
+        raise ConfigError(f"{path}: cannot be decoded ({error}); save it as UTF-8") from error
     except (gzip.BadGzipFile, EOFError) as error:
-        raise ConfigError(f"{path}: broken gzip ({error}): make the file again") from error
+        raise ConfigError(f"{path}: broken gzip ({error}); make the file again") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def _seconds(text: str, path: Path) -> float:
-    """SUMO's times: seconds, or [days:]hours:minutes:seconds."""
+    """Parse a time of SUMO: seconds, or [days:]hours:minutes:seconds."""
     try:
         parts = [float(part) for part in text.split(":")]
     except ValueError as error:
-        raise ConfigError(f"{path}: begin = '{text}' is no time") from error
+        raise ConfigError(
+            f"{path}: begin = '{text}' is no time; give seconds or hours:minutes:seconds"
+        ) from error
     weights = (86400.0, 3600.0, 60.0, 1.0)[-len(parts) :]
     return sum(part * weight for part, weight in zip(parts, weights, strict=True))
 
@@ -232,10 +235,10 @@ def command_words(
     more: dict[str, str] | None = None,
     additional: tuple[Path, ...] = (),
 ) -> list[str]:
-    """The words behind the program's name.
+    """Return the arguments of SUMO's command line.
 
-    `map_file`: a SUMO network. `folder`: for copies of files that write nothing. `seed`:
-    of SUMO's random numbers. `more`: options, which stand above those of the demand's
+    `map_file`: a SUMO network. `folder`: for copies of files that make SUMO write nothing. `seed`:
+    seed of SUMO's random numbers. `more`: options that override those of the demand's
     configuration. `additional`: further additional files.
     """
     copies = folder / "additional"
@@ -259,15 +262,15 @@ def command_words(
 
 
 def free_libsumo() -> object:
-    """This process's libsumo, in which nothing runs.
+    """Return this process's libsumo, in which no simulation runs.
 
-    Raises MissingExtraError: it is not installed; SumoError: a simulation runs in it: a second
-    start would silently replace it.
+    Raises MissingExtraError: libsumo is not installed; SumoError: a simulation runs in it, which a
+    second start would silently replace.
     """
     libsumo = require("libsumo", "sumo")
     if libsumo.isLoaded():
         raise SumoError(
-            "libsumo holds one simulation a process, and one runs in this one: close it, or start "
-            "the other one in a process of its own"
+            "libsumo holds one simulation per process, and one runs in this process; close it, or "
+            "start the other one in its own process"
         )
     return libsumo

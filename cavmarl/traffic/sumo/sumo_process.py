@@ -1,4 +1,4 @@
-"""`SumoProcess`: the process of one SUMO, as the world that it belongs to sees it."""
+"""`SumoProcess`: the process of one SUMO, used by the world that it belongs to."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_history import MOVED, SEEN
 
-ANSWER_S = 120.0  # a step that takes longer hangs
-END_S = 2.0  # for it to end by itself
-LAST_WORDS = 2000  # characters of what it has printed last
+ANSWER_S = 120.0  # a step that takes longer counts as hung
+END_S = 2.0  # time for the process to end by itself
+LAST_WORDS = 2000  # maximum number of quoted characters of its output
 
 
 class SumoAnswer(NamedTuple):
-    """What a SUMO says after a step."""
+    """SUMO's answer after a step."""
 
-    seen: NDArray[np.void]  # SEEN (n,) by rising numbers
-    letters: bytes  # codes of characters, of all signals one after the other
-    line: dict[str, Any]  # what is new: `departed`, `teleported`, `routes`
+    seen: NDArray[np.void]  # SEEN (n,) by ascending number
+    letters: bytes  # character codes of all signals, one after the other
+    line: dict[str, Any]  # rare events: `departed`, `teleported`, `routes`
 
 
 def choose_interface(wanted: str) -> str:
-    """`libsumo`, or `traci` where that is not installed, unless one is asked for.
+    """Return the wanted interface; for `auto`, `libsumo`, or `traci` if that is not installed.
 
-    Raises MissingExtraError: neither is there, or not the one that is wanted.
+    Raises MissingExtraError: the interface is not installed.
     """
     choices = ("libsumo", "traci") if wanted == "auto" else (wanted,)
     for name in choices:
@@ -51,18 +51,18 @@ def choose_interface(wanted: str) -> str:
 
 
 class SumoProcess:
-    """Starts the process; one order at a time.
+    """A process that runs SUMO and serves one request at a time.
 
     Args:
-        told: what it is told once; the layouts of records are added.
+        setup: sent once; the layouts of records are added.
 
     Attributes:
-        pid: of the process.
+        pid: process id.
     """
 
-    def __init__(self, told: Mapping[str, Any]) -> None:
+    def __init__(self, setup: Mapping[str, Any]) -> None:
         ours, theirs = socket.socketpair()
-        said = tempfile.TemporaryFile()
+        output = tempfile.TemporaryFile()
         with_thread = threading.current_thread() is threading.main_thread()
         words = [str(theirs.fileno()), str(os.getpid()), str(int(with_thread))]
         path = os.pathsep.join(part for part in sys.path if part)
@@ -70,46 +70,46 @@ class SumoProcess:
             process = subprocess.Popen(
                 [sys.executable, "-P", str(Path(child.__file__)), *words],
                 stdin=subprocess.DEVNULL,
-                stdout=said,
-                stderr=said,
+                stdout=output,
+                stderr=output,
                 pass_fds=(theirs.fileno(),),
                 env={
                     **os.environ,
                     "PYTHONPATH": path,
                     "OMP_NUM_THREADS": "1",
-                    # It follows pointers all over its memory: a step is up to a sixth faster.
+                    # SUMO's memory access is scattered; huge pages save up to a sixth of a step.
                     **huge_heap(),
                 },
             )
         ours.settimeout(ANSWER_S)
         self.pid = process.pid
-        self._wire, self._said, self._process = ours, said, process
+        self._wire, self._output, self._process = ours, output, process
         self._owner = os.getpid()
-        self._finalizer = weakref.finalize(self, _end, self._owner, process, ours, said)
-        self._send(child.START, {**told, "seen": SEEN.descr, "moved": MOVED.descr})
+        self._finalizer = weakref.finalize(self, _end, self._owner, process, ours, output)
+        self._send(child.START, {**setup, "seen": SEEN.descr, "moved": MOVED.descr})
 
     @property
     def lives(self) -> bool:
         return self._finalizer.alive
 
     def look_up(self, words: list[str]) -> dict[str, Any]:
-        """Begin with a command line, and say what its files have.
+        """Start SUMO with a command line, and return the content of its files.
 
-        Raises ConfigError: SUMO refuses them; SumoError: the process has ended.
+        Raises ConfigError: SUMO refuses the files; SumoError: the process has ended.
         """
         self._send(child.LOOK_UP, {"words": words})
         return self._receive().line
 
     def start(self, words: list[str]) -> SumoAnswer:
-        """Begin anew with a command line; errors as of `look_up`."""
+        """Start a new simulation with a command line; errors as in `look_up`."""
         self._send(child.START, {"words": words})
         return self._receive()
 
     def begin_step(self, moved: NDArray[np.void]) -> None:
-        """Let it take a step.
+        """Start a step without waiting for its answer.
 
         Args:
-            moved: MOVED (n,), where our vehicles are after it.
+            moved: MOVED (n,), the places of this package's vehicles after the step.
 
         Raises:
             SumoError: the process has ended.
@@ -117,7 +117,7 @@ class SumoProcess:
         self._send(child.STEP, {}, moved.tobytes())
 
     def end_step(self) -> SumoAnswer:
-        """What came of the step; errors as of `look_up`."""
+        """Return the answer of the step; errors as in `look_up`."""
         return self._receive()
 
     def close(self) -> None:
@@ -164,19 +164,19 @@ class SumoProcess:
         self.close()
         return SumoError(
             f"the process of SUMO {how}{words}\nThe world is as it was before the step; reset it "
-            "to go on"
+            "to continue"
         )
 
     def _last_words(self) -> str:
-        self._said.seek(0)
-        text = self._said.read().decode(errors="replace").strip()[-LAST_WORDS:]
+        self._output.seek(0)
+        text = self._output.read().decode(errors="replace").strip()[-LAST_WORDS:]
         return f": {text}" if text else ""
 
 
 def _end(
-    owner: int, process: subprocess.Popen[bytes], wire: socket.socket, said: IO[bytes]
+    owner: int, process: subprocess.Popen[bytes], wire: socket.socket, output: IO[bytes]
 ) -> None:
-    if is_fork(owner):  # it has no right to
+    if is_fork(owner):  # a forked process must not end SUMO
         return
     wire.close()
     with suppress(subprocess.TimeoutExpired):
@@ -184,4 +184,4 @@ def _end(
     if process.poll() is None:
         process.kill()
         process.wait()
-    said.close()
+    output.close()

@@ -1,12 +1,12 @@
-"""`SumoTraffic`: SUMO's part in a tick of W worlds, in one place however they are divided.
+"""`SumoTraffic`: SUMO's part in a tick of W worlds, in one place for any division.
 
-`sumo-traffic`: SUMO moves its vehicles, which are rows here, and sees ours. Each side that moves a
-vehicle from tick t to t + 1 has seen all others at t: ours move first, for
-that needs nothing but t; then SUMO takes its step and is told where ours have come to.
+`sumo-traffic`: SUMO moves its vehicles, which are rows here, and sees the vehicles of this
+package. Both sides move their vehicles from tick t to t + 1 by the state at t: this package moves
+first, which needs only t; then SUMO receives the new places and takes its step.
 
 `sumo-demand`: SUMO runs the demand by itself. A vehicle that departs there is ordered here at the
-same tick, with its type, route, stops, lane and speed factor; one rerouted there is rerouted here;
-its signals are ours.
+same tick, with its type, route, stops, lane and speed factor. A vehicle that is rerouted there is
+rerouted here. Signals show SUMO's phases.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
 
 
 class _Shown(NamedTuple):
-    """What a world's signals have shown the last time."""
+    """The last state of a world's signals."""
 
-    letters: NDArray[np.uint8]  # codes of characters, of all signals one after the other
+    letters: NDArray[np.uint8]  # character codes of all signals, one after the other
     phase: NDArray[np.int32]  # (num_signals,) PHASE rows
 
 
 class ShownSignals:
-    """Finds the phase of each signal that shows the same letters.
+    """Finds the phase of each signal by its letters.
 
     `network`: the roads, with all programs that SUMO has.
     """
@@ -66,14 +66,14 @@ class ShownSignals:
     def show(self, w: int, letters: bytes, phase: NDArray[np.int32]) -> None:
         """Write the PHASE rows of a world's signals.
 
-        `letters`: of all signals, one after the other. `phase`: (num_signals,) is written.
+        `letters`: letters of all signals, one after the other. `phase`: (num_signals,) is written.
 
-        Raises SumoError: a signal shows what no program of the map's has.
+        Raises SumoError: a signal shows letters that no program of the map has.
         """
         codes, last = np.frombuffer(letters, dtype=np.uint8), self._last[w]
         if last is None:
             changed, rows = np.arange(len(self._parts)), np.zeros(len(self._parts), dtype=np.int32)
-        else:  # most of them show what they have shown in the tick before
+        else:  # most signals show the same letters as in the tick before
             changed, rows = np.unique(self._signal_of[codes != last.letters]), last.phase
         for signal in changed.tolist():
             part = letters[self._parts[signal]]
@@ -81,8 +81,8 @@ class ShownSignals:
             if row is None:
                 self._last[w] = None
                 raise SumoError(
-                    f"signal '{self._ids[signal]}' shows '{part.decode()}', which no "
-                    "phase of its programs does: give all of its programs as <tlLogic> in the map "
+                    f"signal '{self._ids[signal]}' shows '{part.decode()}', which is no "
+                    "phase of its programs; give all of its programs as <tlLogic> in the map "
                     "or in an additional file of the demand"
                 )
             rows[signal] = row
@@ -93,13 +93,13 @@ class ShownSignals:
 class SumoTraffic:
     """SUMO beside W worlds.
 
-    `travel`: types and ways, with room for its routes behind. `first_step`: where that room begins.
-    `zoned`: the rows of all zones. `blank`: VEHICLE (1,), the record that every vehicle starts
-    from.
+    `travel`: types and ways, with room for SUMO's routes at the end. `first_step`: start of that
+    room. `zoned`: the rows of all zones. `blank`: VEHICLE (1,), template of every vehicle's
+    record.
 
     Attributes:
         drives: whether SUMO moves its vehicles.
-        worlds: its worlds.
+        worlds: SUMO's worlds.
     """
 
     def __init__(
@@ -135,14 +135,14 @@ class SumoTraffic:
         ).astype(np.int32)
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
-        """Start SUMO anew in the chosen worlds (W,); errors as of `SumoWorlds.begin`."""
+        """Restart SUMO in the chosen worlds (W,); errors as in `SumoWorlds.begin`."""
         for w in np.flatnonzero(chosen).tolist():
             self.worlds.begin(w, int(worlds.keys[w]))
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
-        """From the next reset on keep what SUMO is told, one log a world, for `catch_up`.
+        """Log what SUMO receives from the next reset on, one log per world, for `catch_up`.
 
-        There is none where SUMO moves no vehicle: then it is told nothing.
+        Returns the logs; empty if SUMO moves no vehicles, since then it receives nothing.
         """
         if self.drives and not self.worlds.logs:
             num_worlds = self._zoned.rows.shape[2]
@@ -152,28 +152,28 @@ class SumoTraffic:
     def catch_up(self, worlds: Worlds) -> None:
         """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
 
-        Raises SumoError: SUMO has been told where ours are, and that is not on record.
+        Raises SumoError: SUMO had received the places of vehicles, and they are not recorded.
         """
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
-            told: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
+            logged: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
             if self.drives:
                 log = self.worlds.logs[w] if self.worlds.logs else ToldLog(0)
-                told = log.ticks(tick)
+                logged = log.ticks(tick)
             self.worlds.begin(w, int(key))
-            for passed, moved in enumerate(told):
+            for passed, moved in enumerate(logged):
                 self.worlds.step_one(w, passed, moved)
 
     def step(self, worlds: Worlds, side: int) -> None:
-        """Let SUMO take its step; errors as of `SumoWorlds.step`.
+        """Let SUMO take its step; errors as in `SumoWorlds.step`.
 
-        `worlds`: of any shard. `side`: where the next rows are.
+        `worlds`: the worlds of any shard. `side`: side that holds the next rows.
         """
         self.worlds.step(worlds.ticks.tolist(), lambda w: self._moved(w, side))
 
     def mirror(self, worlds: Worlds, side: int) -> int:
-        """Bring SUMO's vehicles to where they are after its step; arguments as of `step`.
+        """Move SUMO's vehicles to their places after its step; arguments as in `step`.
 
-        Returns how many vehicles leave, in all worlds.
+        Returns the number of vehicles that leave, in all worlds.
         """
         return sum(
             self._mirror(
@@ -190,7 +190,7 @@ class SumoTraffic:
         )
 
     def forgive(self, departures: DepartureQueue) -> None:
-        """Mark the leaving vehicles that have not arrived but been lifted off the road."""
+        """Clear the events of leaving vehicles that SUMO has teleported: they have not arrived."""
         for w, num in enumerate(departures.num_passing.tolist()):
             leaving = departures.passing[w, :num]
             lifted = np.isin(leaving["order"], self.worlds.at(w).teleported)
@@ -199,11 +199,11 @@ class SumoTraffic:
     def let_in(
         self, departures: DepartureQueue, worlds: Worlds, running: NDArray[np.int64]
     ) -> bool:
-        """Fill `departures.passing` with the vehicles that SUMO has let in; whether there are any.
+        """Fill `departures.passing` with vehicles that SUMO has inserted; return whether any.
 
-        `running`: (W,) vehicles that are in each world.
+        `running`: (W,) vehicles in each world.
 
-        Raises CapacityError: more than there is room for.
+        Raises CapacityError: a world has too little room.
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
@@ -226,9 +226,9 @@ class SumoTraffic:
         return bool(departures.num_passing.any())
 
     def order(self, departures: DepartureQueue, worlds: Worlds) -> None:
-        """Put the vehicles that SUMO has let in at the end of the queue, with routes of theirs.
+        """Queue the vehicles that SUMO has inserted, with their routes.
 
-        Raises CapacityError: more wait than there is room for.
+        Raises CapacityError: more vehicles wait than there is room for.
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
@@ -246,7 +246,7 @@ class SumoTraffic:
                 departures.num_queue[w] += 1
 
     def send_on(self, departures: DepartureQueue, worlds: Worlds, side: int) -> None:
-        """Give our vehicles, driving and waiting, the routes that SUMO has changed."""
+        """Put this package's vehicles, driving and waiting, on the routes that SUMO has changed."""
         for w in range(len(worlds.ticks)):
             now, paths = self.worlds.at(w), self.worlds.paths(w)
             if not len(now.rerouted):
@@ -263,14 +263,14 @@ class SumoTraffic:
                 row["way"] = self._way(w, path, 0, int(row["lane"]))
 
     def show(self, worlds: Worlds) -> None:
-        """Let the signals of all worlds show what SUMO's do."""
+        """Show the signal phases of SUMO in all worlds."""
         for w, phase in enumerate(worlds.signal_phase):
             self._shown.show(w, self.worlds.at(w).letters, phase)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Let rows of a world, VEHICLE or departures, be those of so many worlds later.
+        """Convert rows, VEHICLE or departures, to those of the world `worlds` later.
 
-        Their ways and stops are written, which stand in another part of the tables there.
+        Ways and stops are written, because each world has its own part of their tables.
         """
         self.worlds.book.shift(rows, worlds)
         self.worlds.stops.shift(rows, worlds)
@@ -279,7 +279,7 @@ class SumoTraffic:
         self.worlds.close()
 
     def _moved(self, w: int, side: int) -> NDArray[np.void]:
-        """MOVED (n,) by rising ids: our vehicles as SUMO is to see them."""
+        """Return MOVED (n,) by ascending id: the vehicles that SUMO does not move."""
         if not self.drives:
             return np.zeros(0, dtype=MOVED)
         num = self._list_others(self._zoned, side, w, self._others)
@@ -296,7 +296,7 @@ class SumoTraffic:
         return moved
 
     def _fill(self, row: np.void, seen: np.void, w: int) -> None:
-        """Where, in what and by which route a vehicle departs."""
+        """Write the place, type and route with which a vehicle departs."""
         lane = int(seen["lane"])
         edge = self._roads.edges[self._roads.lanes[lane]["edge"]]
         row["agent"] = row["goal"] = -1
@@ -308,7 +308,7 @@ class SumoTraffic:
         row["way"] = self._way(w, int(seen["route"]), int(seen["at"]), lane)
 
     def _way(self, w: int, path: int, at: int, lane: int) -> int:
-        """The way from a lane on a path, from the `at`-th edge on."""
+        """Return the way from a lane along a path, from its `at`-th edge on."""
         paths = self.worlds.paths(w)
         part = slice(int(paths.first[path]) + at, int(paths.first[path + 1]))
         places = np.flatnonzero(paths.edges[part] == self._edge_of_lane[lane])
@@ -318,5 +318,5 @@ class SumoTraffic:
         if wanted > len(self._others):
             raise CapacityError(
                 f"SUMO's demand needs room for {wanted} vehicles, the world has {len(self._others)}"
-                ": raise sumo.max_vehicles"
+                "; raise sumo.max_vehicles"
             )

@@ -1,7 +1,7 @@
-"""`SumoWorlds`: W worlds of SUMO's beside W of ours, tick by tick.
+"""`SumoWorlds`: W simulations of SUMO beside W worlds, tick by tick.
 
-Each has a process and a seed of its own. A tick that is begun again gets the answer that it has
-had: no SUMO takes a step twice.
+Each has its own process and seed. A tick that is repeated gets the stored answer, so no SUMO takes
+a step twice.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ log = logging.getLogger(__name__)
 
 
 class SumoTick(NamedTuple):
-    """What SUMO says about one tick of one world."""
+    """The state that SUMO reports for one tick of one world."""
 
-    tick: int  # that this is the state of
-    seen: NDArray[np.void]  # SEEN (n,) by rising numbers, with paths in the place of routes
-    letters: bytes  # of all signals
-    departed: NDArray[np.int64]  # (m,) numbers of vehicles that have come, rising
-    speed_factors: NDArray[np.float64]  # (m,) theirs
-    # (m, 2) STOP rows [first, end) that they are to make, -1: none; (0, 2) where SUMO moves them
+    tick: int  # tick of this state
+    seen: NDArray[np.void]  # SEEN (n,) by ascending number; the route field holds paths
+    letters: bytes  # letters of all signals
+    departed: NDArray[np.int64]  # (m,) numbers of vehicles that have entered, ascending
+    speed_factors: NDArray[np.float64]  # (m,) of the departed vehicles
+    # (m, 2) STOP rows [first, end) of their stops, -1: none; (0, 2) if SUMO moves them
     stops: NDArray[np.int64]
-    teleported: tuple[int, ...]  # numbers of vehicles that have been lifted off the road
-    rerouted: NDArray[np.int64]  # (r,) numbers of those on another route than a tick before, rising
+    teleported: tuple[int, ...]  # numbers of vehicles taken off the road
+    rerouted: NDArray[np.int64]  # (r,) numbers of vehicles with a changed route, ascending
 
 
 class SumoWorlds:
-    """The processes and what they have said last.
+    """The SUMO processes and their last answers.
 
-    `book`: where their routes are written. `stops`: where their stops are written.
+    `book`: receives their routes. `stops`: receives their stops.
 
     Attributes:
-        book: of their routes.
-        stops: of their stops.
+        book: their routes.
+        stops: their stops.
         names: by world, SUMO's names of the vehicles by number.
-        teleports: (W,) vehicles that SUMO has put elsewhere since each reset.
-        logs: by world, what SUMO has been told since its reset; none: not kept.
+        teleports: (W,) vehicles that SUMO has teleported since each reset.
+        logs: by world, what SUMO has received since its reset; empty: not kept.
     """
 
     def __init__(
@@ -74,15 +74,15 @@ class SumoWorlds:
         return tuple(p.pid for p in self._processes if p is not None and p.lives)
 
     def begin(self, w: int, key: int) -> None:
-        """Start a world's SUMO anew, for an episode.
+        """Restart a world's SUMO for an episode.
 
-        `key`: the root of its random numbers.
+        `key`: root of its random numbers.
 
         Raises ConfigError: SUMO refuses its files; SumoError: the process ended.
         """
         process = self._processes[w]
         if process is None or not process.lives:
-            process = self._processes[w] = SumoProcess(self._demand.told())
+            process = self._processes[w] = SumoProcess(self._demand.setup())
         self._ticks[w] = None
         self.book.begin(w)
         self.stops.begin(w)
@@ -98,50 +98,52 @@ class SumoWorlds:
         self._ticks[w] = self._take(w, 0, answer)
 
     def at(self, w: int) -> SumoTick:
-        """What is known of a world's present tick."""
+        """Return the state of a world's present tick."""
         tick = self._ticks[w]
         if tick is None:
-            raise SumoError("the process of SUMO has ended: reset the world to go on")
+            raise SumoError("the process of SUMO has ended; reset the world to continue")
         return tick
 
     def paths(self, w: int) -> Paths:
         return self.book.paths(w)
 
     def step(self, ticks: Sequence[int], moved: Callable[[int], NDArray[np.void]]) -> None:
-        """Let the SUMOs of all worlds take a step, side by side.
+        """Let the SUMOs of all worlds take a step, in parallel.
 
         Args:
-            ticks: (W,) since reset, before the step.
-            moved: MOVED (n,) of a world: where vehicles of ours are after the step.
+            ticks: (W,) since the reset, before the step.
+            moved: returns MOVED (n,) of a world: its vehicles after the step.
 
         Raises:
-            SumoError: a process has ended; its world has to be reset; a world is not at the tick
-                that its SUMO is at.
+            SumoError: a process has ended, and its world has to be reset; or a world and its SUMO
+                are at different ticks.
         """
         asked = []
         for w, tick in enumerate(ticks):
             last = self.at(w)
-            if last.tick == tick + 1:  # the tick has been begun before
+            if last.tick == tick + 1:  # the tick has been run before
                 continue
             if last.tick != tick:
-                raise SumoError(f"world {w} is at tick {tick}, its SUMO at {last.tick}")
+                raise SumoError(
+                    f"world {w} is at tick {tick}, its SUMO at tick {last.tick}; reset the world"
+                )
             asked.append(w)
-        told = {}
+        places = {}
         try:
             for w in asked:
-                told[w] = moved(w)
-                self._process(w).begin_step(told[w])
+                places[w] = moved(w)
+                self._process(w).begin_step(places[w])
             for w in asked:
                 self._ticks[w] = self._take(w, ticks[w] + 1, self._process(w).end_step())
-                self._note(w, told[w])
+                self._note(w, places[w])
         except (SumoError, ConfigError) as error:
-            # Others may have taken the step, and their worlds have not.
+            # Other SUMOs may have taken the step, but their worlds have not.
             for w in asked:
                 self._ticks[w] = None
             raise SumoError(f"world {w}: {error}") from error
 
     def step_one(self, w: int, tick: int, moved: NDArray[np.void]) -> None:
-        """Let the SUMO of one world take a step from a tick; errors as of `step`."""
+        """Let the SUMO of one world take a step from a tick; errors as in `step`."""
         process = self._process(w)
         process.begin_step(moved)
         self._ticks[w] = self._take(w, tick + 1, process.end_step())
@@ -159,7 +161,7 @@ class SumoWorlds:
     def _process(self, w: int) -> SumoProcess:
         process = self._processes[w]
         if process is None:
-            raise SumoError("SUMO has not been started: reset the world first")
+            raise SumoError("SUMO has not been started; reset the world first")
         return process
 
     def _take(self, w: int, tick: int, answer: SumoAnswer) -> SumoTick:
@@ -167,7 +169,7 @@ class SumoWorlds:
         should_be = self._begin_ms + tick * self._tick_ms
         if line["time_ms"] != should_be:
             raise SumoError(
-                f"world {w}: SUMO's clock says {line['time_ms']} ms, ours {should_be} ms"
+                f"world {w}: SUMO's clock shows {line['time_ms']} ms instead of {should_be} ms"
             )
         self.book.enter(w, line.get("routes", []))
         seen["route"] = self.book.look_up(w, seen["route"], seen["vtype"])

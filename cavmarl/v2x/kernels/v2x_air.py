@@ -1,10 +1,9 @@
-"""The packets of one tick on the air: by place, by sender, and how much of it they take.
+"""The packets of one tick in the channel: by position and sender, and the channel load.
 
-Most packets are CAMs, one of every vehicle. What a receiver takes of them: all within reach are
-listed first. Their distances and random numbers are then taken in one loop over what lies together,
-which the compiler makes vector instructions of; only what is looked up in tables comes one by one.
-What takes whole bundles of arrays is inlined: handed over for every receiver, they would take
-longer than the rest.
+Most packets are CAMs, one per vehicle. A receiver first lists all packets within reach. Their
+distances and random numbers are then computed in one loop over contiguous memory, which the
+compiler vectorizes; only table look-ups are done one by one. Functions that take whole bundles of
+arrays are inlined: passing a bundle per receiver would take longer than the rest.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from cavmarl.v2x.kernels.v2x_records import (
 def _fill_air(
     air: Air, packets: NDArray[np.void], num: int, cams: bool, access: NDArray[np.bool_]
 ) -> None:
-    """Sort the packets that are on the air into cells: CAMs, or all others."""
+    """Sort the packets that have channel access into cells: the CAMs, or all others."""
     start = air.cells.start
     cell = air.cells.cell
     start[:] = 0
@@ -62,7 +61,7 @@ def _fill_air(
 
 @inlined_kernel
 def count_within(air: Air, x: float, y: float, radius_m: float) -> int:
-    """How many packets are sent within a distance."""
+    """Return the number of packets sent within a distance."""
     cells = air.cells
     if radius_m == math.inf:
         return int(cells.start[cells.start.size - 1])
@@ -82,27 +81,27 @@ def count_within(air: Air, x: float, y: float, radius_m: float) -> int:
 
 @inlined_kernel
 def load_around(channel: Channel, scratch: V2xScratch, x: float, y: float) -> float:
-    """Share of the tick that all packets take that one hears there; above 1, they do not fit."""
+    """Return the channel load around a position; above 1, not all packets fit in the tick."""
     count = count_within(scratch.cams, x, y, channel.sensing_m)
     count += count_within(scratch.others, x, y, channel.sensing_m)
     return channel.load * count
 
 
 @kernel
-def _place_of(sender: int, slots: int) -> int:
-    """Where the search for a sender begins in a table of `slots` places, a power of 2."""
+def _first_slot(sender: int, slots: int) -> int:
+    """Return the first slot to search for a sender in a table of `slots` places, a power of 2."""
     place: int = np.int64(mix(np.uint64(sender)) & np.uint64(slots - 1))  # type: ignore[assignment]
     return place
 
 
 @kernel
 def list_cams(scratch: V2xScratch, packets: NDArray[np.void], num: int) -> None:
-    """Make `scratch.cam_of` the table of the CAMs that are on the air, by sender."""
+    """Fill the hash table `scratch.cam_of` with the sent CAMs, by sender."""
     table = scratch.cam_of
     table[:] = -1
     for p in range(num):
         if scratch.access[p] and packets[p]["kind"] == KIND_CAM:
-            place = _place_of(packets[p]["sender"], table.size)
+            place = _first_slot(packets[p]["sender"], table.size)
             while table[place] >= 0:
                 place = (place + 1) & (table.size - 1)
             table[place] = p
@@ -111,17 +110,17 @@ def list_cams(scratch: V2xScratch, packets: NDArray[np.void], num: int) -> None:
 @inlined_kernel
 def find_cam(scratch: V2xScratch, packets: NDArray[np.void], sender: int) -> int:
     table = scratch.cam_of
-    place = _place_of(sender, table.size)
+    place = _first_slot(sender, table.size)
     while table[place] >= 0 and packets[table[place]]["sender"] != sender:
         place = (place + 1) & (table.size - 1)
     return int(table[place])
 
 
 @kernel
-def let_on_the_air(
+def grant_access(
     channel: Channel, mail: Mail, w: int, slot: int, key: np.uint64, scratch: V2xScratch
 ) -> None:
-    """Sort the packets of a tick by place; where the air is too busy, not all of them get on it."""
+    """Grant channel access and sort the packets of a tick by place; an overload blocks some."""
     packets = mail.packets[w, slot]
     num = mail.num_packets[w, slot]
     scratch.access[:num] = True
@@ -146,7 +145,7 @@ def let_on_the_air(
 def hears(
     channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
 ) -> bool:
-    """Whether a receiver receives the packet of that word, sent within reach from (x, y)."""
+    """Return whether a receiver receives a packet that is sent within reach from (x, y)."""
     if channel.sure:
         return True
     number = draw(me["word"], word)
@@ -155,7 +154,7 @@ def hears(
 
 @inlined_kernel
 def band_of(distance_m: float) -> int:
-    """In which band of distance a packet is counted."""
+    """Return the distance band in which a packet is counted."""
     return min(int(distance_m * BANDS_PER_M), NUM_BANDS - 1)
 
 
@@ -170,7 +169,7 @@ def refresh_by_cams(
     box: NDArray[np.void],
     num: int,
 ) -> None:
-    """Let those that a receiver knows tell the newest of themselves."""
+    """Update the reports of known senders with their own newest CAMs."""
     limit = channel.reach_m * channel.reach_m
     for k in range(num):
         p = find_cam(scratch, packets, box[k]["subject"])
@@ -192,7 +191,7 @@ def refresh_by_cams(
 def _list_within(
     air: Air, own: int, x: float, y: float, reach_m: float, limit: float, heard: HeardCams
 ) -> int:
-    """List the packets of others within a distance; returns how many."""
+    """List the packets of other senders within a distance, and return their number."""
     cells = air.cells
     near = 0
     first_column, last_column = cell_columns(cells, x, reach_m)
@@ -200,7 +199,7 @@ def _list_within(
     for j in range(first_row, last_row + 1):
         begin = cells.start[j * cells.num_x + first_column]
         end = cells.start[j * cells.num_x + last_column + 1]
-        # Here and below a place is written in any case: whether it is in is unpredictable.
+        # The place is always written, here and below, because a branch would be unpredictable.
         for b in range(begin, end):
             dx = air.x[b] - x
             dy = air.y[b] - y
@@ -214,7 +213,7 @@ def _list_within(
 
 @inlined_kernel
 def _drop_lost(channel: Channel, me: np.void, level: int, scratch: V2xScratch, num: int) -> int:
-    """Of the first `num` in `scratch.heard` keep those that are received; returns how many."""
+    """Keep those of the first `num` in `scratch.heard` that are received; return their number."""
     air = scratch.cams
     place = scratch.heard.place
     squared = scratch.heard.squared
@@ -234,7 +233,7 @@ def _drop_lost(channel: Channel, me: np.void, level: int, scratch: V2xScratch, n
     for k in range(num):
         distance_m = distances[k]
         is_received = numbers[k] < chance_at(clear, distance_m)
-        # What is received even behind a building needs no look whether one is there.
+        # A packet that is received even behind a building needs no test for buildings.
         if (
             has_walls
             and is_received
@@ -250,7 +249,7 @@ def _drop_lost(channel: Channel, me: np.void, level: int, scratch: V2xScratch, n
 
 
 @inlined_kernel
-def let_in_cams(
+def add_cams(
     channel: Channel,
     mail: Mail,
     w: int,
@@ -262,7 +261,7 @@ def let_in_cams(
     box: NDArray[np.void],
     num: int,
 ) -> int:
-    """Let the nearest of those in that a receiver did not know; returns how many it knows then."""
+    """Add the nearest senders that a receiver did not know; return the new number of known ones."""
     air = scratch.cams
     reach_m = channel.reach_m
     limit = reach_m * reach_m
@@ -277,7 +276,7 @@ def let_in_cams(
             dy = packets[p]["y"] - y
             reachable -= dx * dx + dy * dy <= limit
         if num == box.size:
-            # Stations further away than all that it knows are left out.
+            # Ignore stations farther away than all known ones.
             limit = min(limit, scratch.squared[num - 1])
             reach_m = math.sqrt(limit)
         heard = _list_within(air, own, x, y, reach_m, limit, scratch.heard)
@@ -291,7 +290,7 @@ def let_in_cams(
     for k in range(heard):
         if num < box.size or scratch.heard.squared[k] <= scratch.squared[num - 1]:
             b = scratch.heard.place[k]
-            # A CAM tells of its sender.
+            # The subject of a CAM is its sender.
             if find(box, num, air.sender[b]) < 0:
                 report = reports[packets[air.which[b]]["first"]]
                 num = insert(box, num, scratch.squared, report, x, y)

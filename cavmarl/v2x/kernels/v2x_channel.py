@@ -1,7 +1,7 @@
-"""Whether a packet is received: range, path loss, buildings, other packets, and chance.
+"""The reception of a packet: range, path loss, buildings, interference, and chance.
 
-A packet's random number depends on the pair (sender, receiver), the tick and the kind, and not
-on the order or the zone in which it is drawn.
+A packet's random number depends on the pair (sender, receiver), the tick and the kind, but not on
+the order or zone in which it is drawn.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.rng import STREAM_V2X, mix, quick_uniform
 from cavmarl.core.math.walls import Walls, is_cut
 
-STREAM_ACCESS = STREAM_V2X + 16  # one a kind of packet
+STREAM_ACCESS = STREAM_V2X + 16  # one per kind of packet
 STREAM_EQUIPPED = STREAM_V2X + 32
 
-# SplitMix64's increment, as in `rng`.
+# Increment of SplitMix64, as in `rng`.
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _SHIFT_11 = np.uint64(11)
 _SHIFT_32 = np.uint64(32)
@@ -26,25 +26,25 @@ _ULP = 1.0 / (1 << 53)
 
 
 class Channel(NamedTuple):
-    """The air; see `v2x.channel.make_channel`.
+    """A radio channel; see `v2x.channel.make_channel`.
 
-    Chances of reception are tables of B levels of busy air by whole metres, from 0 m on; in between
-    they change evenly, and the last but one and the last hold for all that is further away.
+    Probabilities of reception are tables of B levels of channel load by whole metres, from 0 m on.
+    Values in between are interpolated linearly; the last interval extends to all larger distances.
     """
 
-    reach_m: float  # no reception further away; inf: no limit
-    sure: bool  # all within reach receive
-    external: bool  # a network simulator decides receptions
-    clear: NDArray[np.float64]  # (B, K) in the line of sight
-    blocked: NDArray[np.float64]  # (B, K) behind a building; (0, K): buildings do not matter
-    sensing_m: float  # up to where a station hears that another sends
-    load: float  # share of a tick that a packet takes; 0: the air takes any number
+    reach_m: float  # no reception beyond; inf: no limit
+    sure: bool  # whether all receivers within reach receive
+    external: bool  # whether a network simulator decides receptions
+    clear: NDArray[np.float64]  # (B, K) in line of sight
+    blocked: NDArray[np.float64]  # (B, K) behind a building; (0, K): buildings are ignored
+    sensing_m: float  # range in which a station senses others' transmissions
+    load: float  # share of a tick that a packet takes; 0: unlimited capacity
     walls: Walls
 
 
 @kernel
 def receiver_word(key: np.uint64, receiver: int) -> np.uint64:
-    """A receiver's half of its random numbers.
+    """Return the receiver's half of a random number.
 
     `receiver`: station.
     """
@@ -53,42 +53,42 @@ def receiver_word(key: np.uint64, receiver: int) -> np.uint64:
 
 @kernel
 def packet_word(sender: int, tick: int, kind: int) -> np.uint64:
-    """A packet's half of the random numbers of its receptions."""
+    """Return the packet's half of the random numbers of its receptions."""
     stream = (np.uint64(STREAM_V2X + kind) << _SHIFT_32) + np.uint64(tick)
     return mix(mix(np.uint64(sender) * _GOLDEN) ^ (stream * _GOLDEN))
 
 
 @kernel
 def draw(of_receiver: np.uint64, of_packet: np.uint64) -> float:
-    """The number of one reception, uniform in [0, 1)."""
+    """Return the random number of one reception, uniform in [0, 1)."""
     return float(mix(of_receiver ^ of_packet) >> _SHIFT_11) * _ULP
 
 
 @kernel
 def is_equipped(key: np.uint64, vehicle: int, share: float) -> bool:
-    """Whether a background vehicle sends, of which `share` does."""
+    """Return whether a background vehicle is equipped to send; `share` of them are."""
     return share >= 1.0 or quick_uniform(key, vehicle, 0, STREAM_EQUIPPED) < share
 
 
 @kernel
 def gets_access(key: np.uint64, sender: int, tick: int, kind: int, busy: float) -> bool:
-    """Whether a packet gets on the air within its tick.
+    """Return whether a packet gets channel access within its tick.
 
-    Stations wait until the air is free (CSMA). Where more is to be sent than the air can carry,
-    `busy` > 1, as much gets on it as it can carry; what does not is out of date and given up.
+    Stations wait until the channel is free (CSMA). If the load `busy` exceeds 1, only as many
+    packets as fit get access; the others become outdated and are dropped.
     """
     return busy <= 1.0 or quick_uniform(key, sender, tick, STREAM_ACCESS + kind) * busy < 1.0
 
 
 @kernel
 def busy_level(channel: Channel, busy: float) -> int:
-    """The row of the tables for a share of the time in which the air is busy, from 0 to 1."""
+    """Return the table row for a channel busy ratio from 0 to 1."""
     return int(busy * (channel.clear.shape[0] - 1) + 0.5)
 
 
 @kernel
 def chance_at(chances: NDArray[np.float64], distance_m: float) -> float:
-    """A table's chance (K,) at a distance."""
+    """Return a table's probability (K,) at a distance."""
     below = min(int(distance_m), chances.size - 2)
     low = chances[below]
     return float(low + (chances[below + 1] - low) * (distance_m - below))
@@ -105,14 +105,14 @@ def is_heard(
     from_y: float,
     distance_m: float,
 ) -> bool:
-    """Whether a packet within reach is received.
+    """Return whether a packet within reach is received.
 
-    `level`: of `busy_level`. `number`: of `draw`. `x`: m, the receiver's place. `from_x`: m, the
-    sender's. `distance_m`: between them.
+    `level`: from `busy_level`. `number`: from `draw`. `x`, `y`: position of the receiver, m.
+    `from_x`, `from_y`: position of the sender, m. `distance_m`: between them.
     """
     if number >= chance_at(channel.clear[level], distance_m):
         return False
-    # What is received even behind a building needs no look whether one is there.
+    # A packet that is received even behind a building needs no test for buildings.
     if channel.blocked.shape[0] == 0 or number < chance_at(channel.blocked[level], distance_m):
         return True
     return not is_cut(channel.walls, x, y, from_x, from_y)

@@ -1,7 +1,7 @@
-"""One tick of a bus of messages: stations send, packets travel, receivers keep what they hear.
+"""One tick of a message bus: stations send, packets travel, receivers store what they receive.
 
-What a receiver keeps does not depend on the order of packets: first the subjects that it knows get
-their newest reports, then the nearest others are let in.
+The contents of an inbox do not depend on the order of packets: first, known subjects get their
+newest reports; then, the nearest new subjects are added.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from cavmarl.core.math.neighbors import cell_columns, cell_rows, fill_grid
 from cavmarl.core.records.arrays import RoadArrays, SharedState, ZoneState
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.v2x.kernels.v2x_air import (
+    add_cams,
     band_of,
+    grant_access,
     hears,
-    let_in_cams,
-    let_on_the_air,
     list_cams,
     load_around,
     refresh_by_cams,
@@ -57,7 +57,7 @@ def _take_others(
     num: int,
     new: bool,
 ) -> int:
-    """Take the reports of packets of one kind: of subjects that are known, or of new ones."""
+    """Store the reports of packets of one kind, for known or for new subjects."""
     air = scratch.others
     cells = air.cells
     limit = channel.reach_m * channel.reach_m
@@ -85,7 +85,7 @@ def _take_others(
                 continue
             for k in range(packet["first"], packet["first"] + packet["count"]):
                 report = reports[k]
-                # Of a SPAT the subject is a signal, and no vehicle.
+                # The subject of a SPAT is a signal, not a vehicle.
                 if kind != KIND_SPAT and report["subject"] == me["id"]:
                     continue
                 place = find(box, num, report["subject"])
@@ -109,7 +109,7 @@ def _receive_objects(
     box: NDArray[np.void],
     num: int,
 ) -> int:
-    """Take what is told of vehicles, by themselves and by stations that see them."""
+    """Receive reports of vehicles, by the vehicles themselves and by stations that see them."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
     refresh_by_cams(channel, me, level, packets, reports, scratch, box, num)
@@ -118,7 +118,7 @@ def _receive_objects(
             channel, mail, w, me, level, packets, reports, scratch, KIND_CPM, box, num, False
         )
     sort_by_distance(box, num, scratch.squared, me["x"], me["y"])
-    num = let_in_cams(channel, mail, w, me, level, packets, reports, scratch, box, num)
+    num = add_cams(channel, mail, w, me, level, packets, reports, scratch, box, num)
     if with_seen:
         num = _take_others(
             channel, mail, w, me, level, packets, reports, scratch, KIND_CPM, box, num, True
@@ -139,7 +139,7 @@ def _receive_others(
     box: NDArray[np.void],
     num: int,
 ) -> int:
-    """Take what is told of events, or of signals."""
+    """Receive reports of events, or of signals."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
     _take_others(channel, mail, w, me, level, packets, reports, scratch, kind, box, num, False)
@@ -196,16 +196,16 @@ def deliver(
     latency: int,
     scratch: V2xScratch,
 ) -> None:
-    """Let all receivers of a world receive the packets of one slot.
+    """Deliver the packets of one slot to all receivers of a world.
 
-    `mail`: inboxes and counts are written. `slot`: of the packets that are received now. `latency`:
-    how many ticks ago they were sent. `scratch`: `receivers` filled.
+    `mail`: inboxes and counts are written. `slot`: slot of the packets that are received now.
+    `latency`: ticks since they were sent. `scratch`: `receivers` filled.
     """
     kinds = scratch.kinds
     kinds[:] = 0
     for p in range(mail.num_packets[w, slot]):
         kinds[mail.packets[w, slot, p]["kind"]] += 1
-    let_on_the_air(channel, mail, w, slot, key, scratch)
+    grant_access(channel, mail, w, slot, key, scratch)
     list_cams(scratch, mail.packets[w, slot], mail.num_packets[w, slot])
     before = mail.counts[w, COUNT_RECEIVED]
     scratch.tally[:] = 0
@@ -220,7 +220,7 @@ def deliver(
 
 
 @kernel
-def _put_in_order(
+def _expire_and_sort(
     box: NDArray[np.void], tick: int, squared: NDArray[np.float64], x: float, y: float
 ) -> int:
     num = forget(box, tick)
@@ -231,19 +231,21 @@ def _put_in_order(
 
 @kernel
 def age(mail: Mail, w: int, r: int, tick: int, scratch: V2xScratch) -> None:
-    """Take out of a receiver's inboxes what is too old, and put the rest in order."""
+    """Remove expired reports from a receiver's inboxes, and sort the rest."""
     me = scratch.receivers[r]
-    _put_in_order(mail.objects[w, r], tick, scratch.squared, me["x"], me["y"])
-    _put_in_order(mail.events[w, r], tick, scratch.squared, me["x"], me["y"])
-    _put_in_order(mail.signals[w, r], tick, scratch.squared, me["x"], me["y"])
+    _expire_and_sort(mail.objects[w, r], tick, scratch.squared, me["x"], me["y"])
+    _expire_and_sort(mail.events[w, r], tick, scratch.squared, me["x"], me["y"])
+    _expire_and_sort(mail.signals[w, r], tick, scratch.squared, me["x"], me["y"])
 
 
 @kernel
-def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, scratch: V2xScratch) -> None:
-    """Deliver one packet to one receiver, as a network simulator has decided.
+def receive_packet(
+    mail: Mail, w: int, slot: int, p: int, r: int, delay: int, scratch: V2xScratch
+) -> None:
+    """Deliver one packet to one receiver, as decided by a network simulator.
 
-    `mail`: inboxes and counts are written. `r`: the receiver, which is there. `delay`: ticks since
-    it was sent. `scratch`: `receivers` filled.
+    `mail`: inboxes and counts are written. `r`: an existing receiver. `delay`: ticks since it was
+    sent. `scratch`: `receivers` filled.
     """
     me = scratch.receivers[r]
     packet = mail.packets[w, slot, p]
@@ -254,7 +256,7 @@ def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, scratch: V2
     else:
         box = mail.signals[w, r]
     tick = packet["tick"] + delay
-    num = _put_in_order(box, tick, scratch.squared, me["x"], me["y"])
+    num = _expire_and_sort(box, tick, scratch.squared, me["x"], me["y"])
     for k in range(packet["first"], packet["first"] + packet["count"]):
         report = mail.reports[w, slot, k]
         if report["subject"] == me["id"] or report["expires"] < tick:
@@ -280,7 +282,7 @@ def _place_receivers(
     mail: Mail,
     scratch: V2xScratch,
 ) -> None:
-    """Note where the agents and the roadside units are; new ones have empty inboxes."""
+    """Write the positions of agents and roadside units; new receivers get empty inboxes."""
     receivers = scratch.receivers
     num_agents = receivers.size - units.size
     for r in range(num_agents):
@@ -327,17 +329,17 @@ def exchange_messages(
     """Send what is due in the present tick of some worlds, and receive what arrives in it.
 
     Args:
-        sending: when stations send what.
-        channel: the air.
+        sending: schedule of the stations.
+        channel: the radio channel.
         roads: the road arrays.
         types: VTYPE (num_types,).
         units: UNIT (num_units,), the roadside units.
         common: clocks, keys and signals of the worlds.
-        zoned: the vehicles of all zones.
-        side: on which of their sides the committed rows are.
-        first: of the worlds.
-        last: the one after the last.
-        mail: what outlives the tick; written.
+        zoned: vehicles of all zones.
+        side: side of the zones' rows that holds the committed ones.
+        first: first world.
+        last: end of the worlds, exclusive.
+        mail: state that outlives the tick; written.
         scratch: overwritten.
     """
     for w in range(first, last):
@@ -368,11 +370,11 @@ def exchange_messages(
 def hand_out(
     receptions: NDArray[np.void], tick: int, latency: int, mail: Mail, w: int, scratch: V2xScratch
 ) -> None:
-    """Let receivers have what a network simulator says that they receive in this tick.
+    """Deliver the receptions of this tick that a network simulator has returned.
 
-    `receptions`: RECEPTION (n,), of packets that are in flight, by receivers that are there.
-    `latency`: the longest delay, in ticks. `mail`: inboxes and counts are written. `scratch`:
-    `receivers` as `exchange_messages` has left them.
+    `receptions`: RECEPTION (n,), of packets in flight and existing receivers. `latency`: the
+    longest delay, in ticks. `mail`: inboxes and counts are written. `scratch`: `receivers` as left
+    by `exchange_messages`.
     """
     for r in range(scratch.receivers.size):
         if scratch.receivers[r]["id"] >= 0:
@@ -380,6 +382,6 @@ def hand_out(
     for k in range(receptions.size):
         sent = receptions[k]["tick"]
         slot = sent % (latency + 1)
-        learn(
+        receive_packet(
             mail, w, slot, receptions[k]["packet"], receptions[k]["receiver"], tick - sent, scratch
         )

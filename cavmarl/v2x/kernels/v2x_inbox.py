@@ -1,4 +1,4 @@
-"""An inbox: the nearest subjects that a receiver knows of, each by the newest report."""
+"""An inbox: the nearest subjects that a receiver knows, each with its newest report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavmarl.core.compiled import kernel
 
 @kernel
 def empty(box: NDArray[np.void], first: int) -> None:
-    """Take out the reports from place `first` on."""
+    """Remove the reports from place `first` on."""
     for k in range(first, box.size):
         report = box[k]
         report["subject"] = -1
@@ -19,7 +19,7 @@ def empty(box: NDArray[np.void], first: int) -> None:
 
 @kernel
 def forget(box: NDArray[np.void], tick: int) -> int:
-    """Take out what is too old; returns how many reports are left, at the beginning."""
+    """Remove expired reports; return the number of the remaining ones, moved to the front."""
     num = 0
     for k in range(box.size):
         if box[k]["sender"] < 0:
@@ -33,7 +33,7 @@ def forget(box: NDArray[np.void], tick: int) -> int:
 
 @kernel
 def find(box: NDArray[np.void], num: int, subject: int) -> int:
-    """Where a subject is in the inbox, or -1."""
+    """Return the place of a subject in the inbox, or -1."""
     for k in range(num):
         if box[k]["subject"] == subject:
             return k
@@ -42,9 +42,9 @@ def find(box: NDArray[np.void], num: int, subject: int) -> int:
 
 @kernel
 def is_better(report: np.void, other: np.void) -> bool:
-    """Whether a report of a subject is to be kept in the place of another: the newest is.
+    """Return whether a report of a subject replaces another one: the newer report wins.
 
-    Of several of one tick it is what the subject says itself, then that of the smallest sender.
+    Of several reports of one tick, the subject's own report wins, then that of the smallest sender.
     """
     if report["tick"] != other["tick"]:
         return bool(report["tick"] > other["tick"])
@@ -64,7 +64,7 @@ def _squared(report: np.void, x: float, y: float) -> float:
 def sort_by_distance(
     box: NDArray[np.void], num: int, squared: NDArray[np.float64], x: float, y: float
 ) -> None:
-    """Put the first `num` reports in order: nearest first, then by subject.
+    """Sort the first `num` reports by distance, then by subject.
 
     `box`: REPORT (N,). `squared`: (at least N,) their squared distances from (x, y) in m²,
     overwritten.
@@ -76,7 +76,7 @@ def sort_by_distance(
             is_sorted = False
     if is_sorted:
         return
-    # Neighbours change places: the order of the last tick is nearly that of this one.
+    # Insertion sort, since the order of the last tick is nearly right.
     for k in range(1, num):
         place = k
         while place > 0 and not _is_before(
@@ -96,7 +96,7 @@ def _is_before(
 
 @kernel
 def _swap(box: NDArray[np.void], squared: NDArray[np.float64], place: int) -> None:
-    """Let a report and the one before it change places."""
+    """Swap a report with the one before it."""
     a = box[place - 1]
     b = box[place]
     a["subject"], b["subject"] = b["subject"], a["subject"]
@@ -127,10 +127,10 @@ def insert(
     x: float,
     y: float,
 ) -> int:
-    """Put a report of a new subject in its place, if it is near enough; returns how many there are.
+    """Insert a report of a new subject by distance, if it is near enough; return the new number.
 
-    `box`: REPORT (N,), in order. `squared`: their squared distances, in m². `report`: of a subject
-    that is not there. `x`: m, where the receiver is.
+    `box`: REPORT (N,), sorted. `squared`: their squared distances, in m². `report`: of a subject
+    that is not in the box. `x`, `y`: position of the receiver, m.
     """
     distance = _squared(report, x, y)
     place = num

@@ -1,4 +1,4 @@
-"""Which vehicles a station sees, to tell others of them: what a CPM is made of."""
+"""The vehicles that a station sees and reports to others in a CPM."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.v2x.kernels.v2x_records import MAX_NEAR, V2xScratch
 
 @kernel
 def _stands_between(body: np.void, x: float, y: float, cos: float, sin: float, far: float) -> bool:
-    """Whether a body stands on the line of length `far` from (x, y) in direction (cos, sin)."""
+    """Return whether a body blocks the line of length `far` from (x, y) in direction (cos, sin)."""
     dx = body["x"] - x
     dy = body["y"] - y
     along = dx * cos + dy * sin
@@ -39,23 +39,23 @@ def visible(
     walls: Walls,
     over_bodies: bool,
 ) -> int:
-    """The nearest vehicles whose centres a station sees, in the plane.
+    """Find the nearest vehicles whose centres a station sees, in the plane.
 
-    One is hidden if the body of a nearer one or a wall stands on the straight line to its centre.
+    A vehicle is hidden if a nearer body or a wall blocks the straight line to its centre.
 
     Args:
         scratch: `bodies` filled; `seen` gets rows of `everybody`, nearest first.
-        own: row of the station itself; -1: it is no vehicle.
-        x: m, its place.
-        y: likewise.
-        z: likewise; vehicles on another level are not seen.
-        range_m: how far it sees.
-        most: how many at most.
-        walls: of buildings.
-        over_bodies: whether bodies do not hide others: it stands on a mast.
+        own: row of the station itself; -1: the station is no vehicle.
+        x: position of the station, m.
+        y: position of the station, m.
+        z: height of the station, m; vehicles on another level are not seen.
+        range_m: sensing range.
+        most: largest number of vehicles.
+        walls: walls of buildings.
+        over_bodies: whether the station sees over bodies, from a mast.
 
     Returns:
-        how many.
+        the number of vehicles.
     """
     bodies = scratch.bodies.bodies
     near = nearest_bodies(

@@ -1,4 +1,4 @@
-"""What stations send: identities, due times and contents."""
+"""Sending of messages: identities, schedule and contents."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from cavmarl.v2x.kernels.v2x_records import (
     V2xScratch,
 )
 
-# When a CAM that is due is sent (ETSI EN 302 637-2, 6.1.3).
+# Conditions for sending a CAM that is due (ETSI EN 302 637-2, 6.1.3).
 CAM_DISTANCE_M = 4.0
 CAM_HEADING_RAD = math.radians(4.0)
 CAM_SPEED_MPS = 0.5
@@ -45,10 +45,10 @@ STANDS_MPS = 0.1
 def gather(
     zoned: ZoneState, side: int, w: int, stations: NDArray[np.void], spare: NDArray[np.void]
 ) -> int:
-    """List the vehicles of all zones of a world by id; returns how many.
+    """List the vehicles of all zones of a world by id, and return their number.
 
-    `side`: on which of their sides they are. `stations`: STATION (C,), overwritten. `spare`: as
-    large, overwritten.
+    `side`: side of the zones' rows to read. `stations`: STATION (C,), overwritten. `spare`: of the
+    same size, overwritten.
     """
     num = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -72,7 +72,7 @@ def gather(
 def _merge(
     stations: NDArray[np.void], begin: int, middle: int, end: int, spare: NDArray[np.void]
 ) -> None:
-    """Put two runs that are in order, one after the other, together in `spare`."""
+    """Merge two adjacent sorted runs into `spare`."""
     a = begin
     b = middle
     for k in range(begin, end):
@@ -93,7 +93,7 @@ def phase_left_s(
     time: float,
     dt: float,
 ) -> float:
-    """Seconds until the phase that is on ends; of an actuated program, at the soonest."""
+    """Return the remaining time of the present phase in s; of an actuated program, the earliest."""
     program = roads.programs[program_at(roads, signal, time, dt)]
     row = phase[signal]
     if program["controller"] >= 0:
@@ -109,7 +109,7 @@ def phase_left_s(
 def _open(
     mail: Mail, w: int, slot: int, sender: int, tick: int, x: float, y: float, kind: int, count: int
 ) -> int:
-    """Begin a packet of `count` reports; the place of the first, or -1: there is no room."""
+    """Begin a packet of `count` reports; return the index of its first report, or -1 if full."""
     number = mail.num_packets[w, slot]
     first = mail.num_reports[w, slot]
     if number == mail.packets.shape[2] or first + count > mail.reports.shape[2]:
@@ -131,7 +131,7 @@ def _open(
 
 
 @kernel
-def _tell(
+def _write_vehicle(
     report: np.void, row: np.void, sender: int, kind: int, code: int, tick: int, expires: int
 ) -> None:
     report["subject"] = row["id"]
@@ -154,7 +154,7 @@ def _tell(
 
 @kernel
 def _cause(row: np.void, sending: Sending) -> int:
-    """What has happened to a vehicle that others should know; the worst."""
+    """Return the most severe event of a vehicle that others should know."""
     if row["hit"] >= 0:
         return CAUSE_COLLISION
     if row["accel"] <= -sending.hard_braking_mps2:
@@ -166,7 +166,7 @@ def _cause(row: np.void, sending: Sending) -> int:
 
 @kernel
 def _is_due(tick: int, station: int, period: int) -> bool:
-    """Stations take turns by their number."""
+    """Return whether a station sends in this tick; stations take turns by number."""
     return period > 0 and (tick + station) % period == 0
 
 
@@ -183,7 +183,7 @@ def _has_changed(row: np.void, last: np.void, tick: int, dt: float) -> bool:
 
 
 @kernel
-def _note_cam(last: np.void, row: np.void, tick: int) -> None:
+def _store_cam(last: np.void, row: np.void, tick: int) -> None:
     last["id"] = row["id"]
     last["tick"] = tick
     last["x"] = row["x"]
@@ -200,7 +200,7 @@ def _send_cam(
     if first >= 0:
         expires = tick + sending.memory_ticks
         report = mail.reports[w, slot, first]
-        _tell(report, row, row["id"], KIND_CAM, vclass, tick, expires)
+        _write_vehicle(report, row, row["id"], KIND_CAM, vclass, tick, expires)
 
 
 @kernel
@@ -210,7 +210,9 @@ def _send_event(
     first = _open(mail, w, slot, row["id"], tick, row["x"], row["y"], KIND_DENM, 1)
     if first >= 0:
         expires = tick + sending.denm_ticks
-        _tell(mail.reports[w, slot, first], row, row["id"], KIND_DENM, cause, tick, expires)
+        _write_vehicle(
+            mail.reports[w, slot, first], row, row["id"], KIND_DENM, cause, tick, expires
+        )
 
 
 @kernel
@@ -236,7 +238,7 @@ def _send_seen(
         row = scratch.everybody[scratch.seen[k]]
         report = mail.reports[w, slot, first + k]
         vclass = types[row["vtype"]]["vclass"]
-        _tell(report, row, sender, KIND_CPM, vclass, tick, tick + sending.memory_ticks)
+        _write_vehicle(report, row, sender, KIND_CPM, vclass, tick, tick + sending.memory_ticks)
 
 
 @kernel
@@ -254,7 +256,7 @@ def send_from_vehicles(
     walls: Walls,
     scratch: V2xScratch,
 ) -> None:
-    """What is due of all vehicles, by id."""
+    """Send all due packets of vehicles, by id."""
     known = 0
     num_next = 0
     for k in range(num):
@@ -275,7 +277,7 @@ def send_from_vehicles(
                     scratch.next_cams[num_next] = last
                     num_next += 1
             if is_due:
-                _note_cam(scratch.next_cams[num_next], row, tick)
+                _store_cam(scratch.next_cams[num_next], row, tick)
                 num_next += 1
         if is_due:
             _send_cam(sending, mail, w, slot, row, types[row["vtype"]]["vclass"], tick)
@@ -312,7 +314,7 @@ def send_from_units(
     walls: Walls,
     scratch: V2xScratch,
 ) -> None:
-    """What is due of the roadside units."""
+    """Send all due packets of roadside units."""
     tick = common.ticks[w]
     phase = common.signal_phase[w]
     num_agents = mail.declared.shape[1] - units.size
@@ -325,7 +327,7 @@ def send_from_units(
             first = _open(mail, w, slot, sender, tick, unit["x"], unit["y"], KIND_DENM, 1)
             if first >= 0:
                 report = mail.reports[w, slot, first]
-                _tell_of_unit(report, unit, sender, KIND_DENM, cause, tick)
+                _write_unit(report, unit, sender, KIND_DENM, cause, tick)
                 report["subject"] = sender
                 report["expires"] = tick + sending.denm_ticks
         if _is_due(tick, k, sending.unit_cpm_period):
@@ -341,7 +343,7 @@ def send_from_units(
             if first >= 0:
                 report = mail.reports[w, slot, first]
                 signal = unit["signal"]
-                _tell_of_unit(report, unit, sender, KIND_SPAT, phase[signal], tick)
+                _write_unit(report, unit, sender, KIND_SPAT, phase[signal], tick)
                 report["subject"] = signal
                 report["expires"] = expires
                 report["left_s"] = phase_left_s(
@@ -350,10 +352,10 @@ def send_from_units(
 
 
 @kernel
-def _tell_of_unit(
+def _write_unit(
     report: np.void, unit: np.void, sender: int, kind: int, code: int, tick: int
 ) -> None:
-    """Write what a roadside unit says of its own place."""
+    """Write a report of a roadside unit's own position."""
     report["sender"] = sender
     report["tick"] = tick
     report["kind"] = kind

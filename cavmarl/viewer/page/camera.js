@@ -1,6 +1,6 @@
-// Where the picture looks: a middle in metres and pixels a metre; and pointers that move it.
+// The view: a centre in metres and a scale; and the pointers that move it.
 
-const NEAREST = 60; // pixels a metre
+const NEAREST = 60; // pixels per metre
 const CLICK_PX = 6;
 
 export class Camera {
@@ -10,7 +10,7 @@ export class Camera {
     this.x = 0;
     this.y = 0;
     this.scale = 1;
-    this.covered = 0; // pixels at the right that panels cover
+    this.covered = 0; // pixels at the right covered by panels
     this.home();
   }
 
@@ -61,7 +61,7 @@ export class Camera {
   }
 }
 
-// Drags, wheels and pinches; `on.click(px, py)`, `on.moved(byHand)`.
+// Handles drags, wheels and pinches; calls `on.click(px, py)` and `on.moved(byHand)`.
 export function listenToPointers(canvas, camera, on) {
   const down = new Map();
   let travelled = 0;

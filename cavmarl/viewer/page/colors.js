@@ -1,8 +1,8 @@
-// Colours of the map by theme, and of vehicles by what is to be seen of them.
+// Colours of the map by theme, and of vehicles by the chosen property.
 
 const rgb = (...bytes) => bytes.map((c) => c / 255);
 
-// Of the surfaces in the order of map_geometry.py: road, path, kerb, mark, middle line, building.
+// Surface colours in the order of map_geometry.py: road, path, kerb, mark, centre line, building.
 export const THEMES = {
   light: {
     land: rgb(235, 237, 230),
@@ -42,7 +42,7 @@ const CLASSES = [
 const packed = ([r, g, b]) => ((255 << 24) | (b << 16) | (g << 8) | r) >>> 0;
 const packAll = (inks) => Uint32Array.from(inks, packed);
 
-// What gives a row's colour, as 0xAABBGGRR; `zones`: their colours.
+// Returns a function of a row that gives its colour as 0xAABBGGRR; `zones`: their colours.
 export function inks(coloring, zones) {
   const classes = packAll(CLASSES);
   const owners = packAll(zones);
@@ -58,7 +58,7 @@ export function inks(coloring, zones) {
   };
 }
 
-// Names and colours for the legend of what there is.
+// Names and colours of the legend.
 export function legend(coloring, hello, map, roster) {
   if (coloring === "type") {
     const there = [...new Set(roster.classes)].sort((a, b) => a - b);

@@ -1,4 +1,4 @@
-// Programs and buffers of WebGL2, and the layers of the map: one draw call each.
+// WebGL2 programs and buffers, and the layers of the map, with one draw call each.
 
 import { CORNER_BYTES, PIECE_BYTES, STOP_LINE_BYTES } from "./protocol.js";
 
@@ -7,9 +7,9 @@ precision highp float;
 precision highp int;
 `;
 
-// Places to clip space. Depth: the higher level covers, and on one level the later layer.
+// Positions to clip space. Depth: higher levels cover lower ones, and later layers earlier ones.
 export const VIEW = `
-uniform vec4 u_view; // the middle, m; and clip units a metre
+uniform vec4 u_view; // centre, m; clip units per metre
 vec4 onScreen(vec2 place, float level, float layer) {
   return vec4((place - u_view.xy) * u_view.zw, -(level * 8.0 + layer) / 256.0, 1.0);
 }
@@ -23,7 +23,7 @@ layout(location = 3) in uint a_style;
 layout(location = 4) in int a_level;
 layout(location = 5) in uint a_joined;
 uniform float u_grown; // m on each side
-uniform float u_least; // m, the least half width
+uniform float u_least; // m, smallest half width
 uniform float u_layer;
 uniform vec3 u_colors[6];
 uniform bool u_kerb;
@@ -79,7 +79,7 @@ layout(location = 1) in vec2 a_far;
 layout(location = 2) in vec2 a_back;
 layout(location = 3) in int a_level;
 layout(location = 4) in vec4 a_color;
-uniform float u_least; // m, the least depth
+uniform float u_least; // m, smallest depth
 uniform float u_layer;
 flat out vec3 v_color;
 void main() {
@@ -148,7 +148,7 @@ export class Program {
   }
 }
 
-// One attribute of a buffer that is bound; `whole` ones stay integers.
+// Sets one attribute of the bound buffer; with `whole` it stays an integer.
 export function attribute(gl, place, size, type, stride, offset, options = {}) {
   gl.enableVertexAttribArray(place);
   if (options.whole) gl.vertexAttribIPointer(place, size, type, stride, offset);
@@ -233,7 +233,7 @@ export class MapLayers {
     this.zones = { layout, count: rects.length };
   }
 
-  // What each signal shows; only a change costs anything.
+  // Updates the signals, if their states have changed.
   setPhases(phases) {
     const before = this.shownPhases;
     if (before && before.length === phases.length && phases.every((p, k) => p === before[k])) return;

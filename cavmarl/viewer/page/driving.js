@@ -1,4 +1,4 @@
-// A seat: arrow keys, buttons held on a touch screen or a gamepad become throttle and steering.
+// A seat: throttle and steering from arrow keys, touch buttons or a gamepad.
 
 const KEYS = {
   ArrowUp: ["throttle", 1], ArrowDown: ["throttle", -1],
@@ -8,7 +8,7 @@ const KEYS = {
 const EVERY_MS = 50;
 const STEERING_PER_S = 1.6;
 const BACK_PER_S = 3;
-const DEAD = 0.12; // of a gamepad's sticks
+const DEAD = 0.12; // dead zone of a gamepad's sticks
 
 export class Seat {
   constructor(ask) {
@@ -42,7 +42,7 @@ export class Seat {
     return true;
   }
 
-  // Throttle and steering now; keys turn the wheel little by little.
+  // Returns throttle and steering; keys turn the wheel gradually.
   control(seconds) {
     const pressed = { throttle: 0, steering: 0 };
     for (const key of this.held) pressed[KEYS[key][0]] += KEYS[key][1];

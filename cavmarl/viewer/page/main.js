@@ -1,4 +1,4 @@
-// The page: takes messages, keeps what it has seen, draws, and asks.
+// The page: receives messages, stores frames, draws, and sends requests.
 
 import { Camera, listenToPointers } from "./camera.js";
 import { inks, legend, SELECTION, THEMES } from "./colors.js";
@@ -15,7 +15,7 @@ import { VehicleLayer } from "./vehicles.js";
 import { small, toggleAll } from "./worlds.js";
 
 const COUNTED = 240;
-const SMOOTH_S = 1.5; // of the world, from frame to frame; beyond that vehicles jump
+const SMOOTH_S = 1.5; // simulated time between frames above which vehicles jump
 
 const page = {
   hello: null, map: null, camera: null, gl: undefined, layers: null, vehicles: null,
@@ -70,7 +70,7 @@ function closed(code, reason, token) {
   setTimeout(() => connect(token), 2000);
 }
 
-// Another world of the same server.
+// Switches to another world of the same server.
 function goTo(world) {
   watch(null);
   page.world = world;
@@ -203,7 +203,7 @@ function takeEvents(events) {
   showTimeLine();
 }
 
-// ---- what is shown
+// ---- display
 
 const secondsOf = (tick) => {
   const frame = page.live;
@@ -265,7 +265,7 @@ function lookBack(tick) {
   else lookAt(page.line.placeOf(tick));
 }
 
-// Where the time line was set: of a recording a tick, else one of the frames that were kept.
+// Handles the time line: seeks a tick of a recording, or shows a stored frame.
 function lookAt(at) {
   if (page.line.span) {
     ask({ kind: "seek", number: at });
@@ -341,7 +341,7 @@ function resize() {
   for (const canvas of page.gl === null ? [$("labels")] : [scene, $("labels")]) {
     const width = Math.max(1, Math.round(canvas.clientWidth * density));
     const height = Math.max(1, Math.round(canvas.clientHeight * density));
-    if (canvas.width !== width) canvas.width = width; // each makes its memory anew
+    if (canvas.width !== width) canvas.width = width; // setting it reallocates the canvas
     if (canvas.height !== height) canvas.height = height;
   }
   if (page.camera) page.camera.covered = innerWidth > 700 && !small ? 310 : 0;
@@ -402,7 +402,7 @@ function followChosen(part) {
   page.camera.y = y;
 }
 
-// An agent whose seat is held gets another vehicle after its trip.
+// An agent with a seat gets another vehicle after its trip.
 function seatFollows() {
   if (seat.agent === null) return;
   const row = page.frame.roster.agents.indexOf(seat.agent);
@@ -532,7 +532,7 @@ function wire() {
   }, 5000);
 }
 
-// What takes long comes while the world is on its way: it is asked for first.
+// Connect first: the world loads while the page sets up.
 function begin() {
   const named = /^#world=(\d+)$/.exec(location.hash);
   if (named) page.world = Number(named[1]);
@@ -547,7 +547,7 @@ function begin() {
     page.gl.blendFunc(page.gl.ONE, page.gl.ONE_MINUS_SRC_ALPHA);
     $("scene").addEventListener("webglcontextlost", () => location.reload());
   } else {
-    notice("This browser has no WebGL2: a still picture is shown, anew every second.", true);
+    notice("This browser has no WebGL2: a still picture is shown, updated every second.", true);
   }
   setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
   wire();

@@ -1,6 +1,6 @@
-// What is drawn above the vehicles with a 2D canvas: names of agents, and what a vehicle sees.
+// The 2D overlay above the vehicles: names of agents, and sensor data of a vehicle.
 
-const LABEL_SCALE = 1.6; // pixels a metre from where agents have their names
+const LABEL_SCALE = 1.6; // pixels per metre from which agents have labels
 const MOST_LABELS = 80;
 const WAY = "rgb(255 80 200 / 85%)";
 const RAY = "rgb(20 140 255 / 35%)";
@@ -36,7 +36,7 @@ export function drawLabels(pen, page, part, theme) {
   }
 }
 
-// `pose`: x, y, heading of the vehicle; `sensors`: whether more than its way is drawn.
+// `pose`: x, y, heading of the vehicle; `sensors`: whether to draw more than its path.
 export function drawSensed(pen, camera, shapes, pose, sensors) {
   pen.save();
   drawWay(pen, camera, shapes.way, pose);
@@ -53,7 +53,7 @@ export function drawSensed(pen, camera, shapes, pose, sensors) {
   pen.restore();
 }
 
-// Pixels of places in the vehicle's frame, or, `onMap`, beside it with the map's directions.
+// Converts positions in the vehicle's frame, or with `onMap` in the map's axes, to pixels.
 function placer(camera, [x, y, heading], onMap) {
   const [cos, sin] = onMap ? [1, 0] : [Math.cos(heading), Math.sin(heading)];
   return (px, py) => camera.toPixels(x + px * cos - py * sin, y + px * sin + py * cos);
@@ -122,7 +122,7 @@ function drawCone(pen, [x, y, yaw, opening, range], at) {
   pen.fill();
 }
 
-// A picture that lies on the ground: `corners` of its top left, top right and bottom left.
+// Draws a picture on the ground: `corners` of its top left, top right and bottom left.
 function drawGrid(pen, { image, width, height, corners }, at) {
   const [a, b, c] = [0, 2, 4].map((k) => at(corners[k], corners[k + 1]));
   pen.save();

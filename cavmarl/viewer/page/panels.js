@@ -1,4 +1,4 @@
-// The parts of the page that are text. Names come from maps and files: they are only ever set as
+// The text panels of the page. Names come from maps and files, so they are only set as
 // text, never as HTML.
 
 export const $ = (id) => document.getElementById(id);
@@ -50,7 +50,7 @@ export function showVehicle(told, name) {
   fillTable($("observation"), rows);
 }
 
-// What runs the world: each node, what it runs, and its LoadScore.
+// The nodes that run the world, with their zones and LoadScores.
 export function showLoads(rows) {
   $("loads-box").hidden = !rows.length;
   const body = $("loads");
@@ -99,7 +99,7 @@ export function addEvents(events, stepTime, choose) {
 
 let lasting = "";
 
-// A message at the top; an empty one leaves what lasts.
+// Shows a message at the top; an empty one restores the permanent message.
 export function notice(text, lasts = false) {
   if (lasts) lasting = text;
   $("notice").textContent = text || lasting;

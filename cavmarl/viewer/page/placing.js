@@ -1,4 +1,4 @@
-// What pages put into a world: a button says what, the next click on the map, or Enter, says where.
+// Insertions: a button chooses the kind; the next click on the map, or Enter, chooses the place.
 
 import { $, notice } from "./panels.js";
 
@@ -7,14 +7,14 @@ const KINDS = ["insert", "close", "open"];
 export class Placing {
   constructor(ask) {
     this.ask = ask;
-    this.kind = null; // of KINDS; null: nothing is to be placed
+    this.kind = null; // one of KINDS; null: no insertion is pending
   }
 
   set(kind) {
     this.kind = kind;
     for (const id of KINDS) $(id).setAttribute("aria-pressed", String(id === kind));
     $("scene").classList.toggle("placing", kind !== null);
-    const how = "Click on a road, or press Enter for the one in the middle. Escape leaves it.";
+    const how = "Click on a road, or press Enter for the one in the middle. Escape cancels.";
     notice(kind ? how : "");
     if (kind) $("scene").focus();
   }

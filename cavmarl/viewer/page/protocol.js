@@ -45,7 +45,7 @@ export function decodeMap(buffer) {
   };
 }
 
-// What seldom changes of each vehicle, in the order of ids; never written after it is made.
+// Rarely changing fields of each vehicle, in the order of ids; immutable.
 export class Roster {
   constructor(count, version) {
     this.version = version;
@@ -60,7 +60,7 @@ export class Roster {
     this.levels = new Int8Array(count);
   }
 
-  // The row of a vehicle; -1 if it is not here.
+  // Returns the row of a vehicle; -1 if it is missing.
   find(id) {
     let low = 0;
     let high = this.count - 1;
@@ -85,7 +85,7 @@ export class Roster {
     this.levels[to] = from.levels[at];
   }
 
-  // The roster after a message of changes.
+  // Returns the roster after a message of changes.
   after(buffer) {
     const view = new DataView(buffer);
     const whole = view.getUint8(1) === 1;
@@ -141,7 +141,7 @@ function merge(old, left, fresh, version) {
   return merged;
 }
 
-// A frame; `places` are x, y in metres, heading and speed of each vehicle, `flags` its lamps.
+// A frame; `places`: x, y in metres, heading and speed of each vehicle; `flags`: its lamps.
 export function decodeFrame(buffer, roster) {
   const view = new DataView(buffer);
   const count = view.getUint32(24, true);
@@ -171,7 +171,7 @@ export function decodeFrame(buffer, roster) {
   };
 }
 
-// Fills `places` (4 a vehicle) and `flags` of a frame.
+// Fills `places` (4 per vehicle) and `flags` of a frame.
 export function decodePlaces(frame, places, flags) {
   const rows = frame.rows;
   const turn = (2 * Math.PI) / 2048;

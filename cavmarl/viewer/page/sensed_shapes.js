@@ -1,4 +1,4 @@
-// What the sensors of a vehicle see; cavmarl/sensors/sensed_shapes.py says what shapes there are.
+// Sensor data of a vehicle; cavmarl/sensors/sensed_shapes.py defines the shapes.
 
 import { $, element } from "./panels.js";
 
@@ -22,7 +22,7 @@ function imageOf({ width, height, rgba }) {
   return canvas;
 }
 
-// Pictures and numbers of sensors beside the map, each under its sensor's name.
+// Shows pictures and numbers of sensors beside the map, under each sensor's name.
 export function showPictures(shapes) {
   const list = $("pictures");
   const old = new Map([...list.children].map((item) => [item.dataset.name, item]));

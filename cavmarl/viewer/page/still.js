@@ -1,4 +1,4 @@
-// A still picture for browsers without WebGL2, with what a 2D canvas can do.
+// A still picture on a 2D canvas, for browsers without WebGL2.
 
 import { decodePlaces, PIECE_BYTES } from "./protocol.js";
 

@@ -1,9 +1,9 @@
-// The time line: frames that were kept to look back, or the span of a recording; and events.
+// The time line: stored frames, or the span of a recording; and events.
 
 const MOST_FRAMES = 1200;
 const MOST_BYTES = 64e6;
 const MOST_EVENTS = 500;
-const EVERY_MS = 250; // between two drawings of the marks
+const EVERY_MS = 250; // between two updates of the marks
 const INSET = 8; // px, half of the slider's thumb
 const BAD = new Set(["collision", "off_road", "wrong_way", "red_light"]);
 
@@ -39,7 +39,7 @@ export class TimeLine {
     this.markedAt = 0;
   }
 
-  // The first frame that is not before a tick.
+  // Returns the first frame at or after a tick.
   placeOf(tick) {
     return this.frames.findIndex((frame) => frame.tick >= tick);
   }

@@ -13,9 +13,9 @@ layout(location = 0) in vec4 a_before; // x, y, heading, speed
 layout(location = 1) in vec4 a_now;
 layout(location = 2) in vec2 a_size;
 layout(location = 3) in vec4 a_color;
-layout(location = 4) in uint a_bits; // lamps and marks; the level from bit 8, a colour from bit 16
-uniform float u_share; // of the way from the frame before to this one
-uniform float u_scale; // pixels a metre
+layout(location = 4) in uint a_bits; // lamps and marks; level from bit 8, colour from bit 16
+uniform float u_share; // interpolation from the previous frame to this one
+uniform float u_scale; // pixels per metre
 uniform vec3 u_inks[8]; // of rings
 vec2 placeNow() { return mix(a_before.xy, a_now.xy, u_share); }
 float headingNow() {
@@ -158,7 +158,7 @@ export class VehicleLayer {
     attribute(gl, 4, 1, gl.UNSIGNED_INT, 16, 12, { each: 1, whole: true });
   }
 
-  // Take a frame; without `smooth` the vehicles jump to their places.
+  // Takes a frame; without `smooth`, the vehicles jump to their positions.
   take(frame, smooth) {
     const old = this.shown?.roster;
     this.reserve(frame.count);
@@ -177,7 +177,7 @@ export class VehicleLayer {
     this.shown = frame;
   }
 
-  // Where the vehicles of a roster were, that another roster's places are known of.
+  // Maps the previous positions of another roster to the vehicles of a roster.
   match(old, roster, places) {
     for (let k = 0, a = 0; k < roster.count; k++) {
       while (a < old.count && old.ids[a] < roster.ids[k]) a += 1;
@@ -188,7 +188,7 @@ export class VehicleLayer {
     }
   }
 
-  // Colours and marks; `inkOf(row)` gives 0xAABBGGRR.
+  // Sets colours and marks; `inkOf(row)` returns 0xAABBGGRR.
   paint(inkOf, selected, ghosts, ghostInk) {
     const { roster } = this.shown;
     const { sizes, colors, flags } = this;
@@ -220,7 +220,7 @@ export class VehicleLayer {
     });
   }
 
-  // The place of a row between the last two frames: x, y, heading, speed.
+  // Interpolates a row between the last two frames: x, y, heading, speed.
   placeOf(row, share) {
     const [a, b] = [this.before, this.now];
     const at = 4 * row;
@@ -228,7 +228,7 @@ export class VehicleLayer {
       .concat([b[at + 2], b[at + 3]]);
   }
 
-  // The same with the heading between the two.
+  // The same, with an interpolated heading.
   poseOf(row, share) {
     const [x, y] = this.placeOf(row, share);
     const [from, to] = [this.before[4 * row + 2], this.now[4 * row + 2]];
@@ -236,7 +236,7 @@ export class VehicleLayer {
     return [x, y, from + turn * share];
   }
 
-  // The row nearest to a place, within a distance in metres; -1 if there is none.
+  // Returns the row nearest to a position, within a distance in metres; -1 if there is none.
   nearest(x, y, within, share) {
     let best = within * within;
     let found = -1;

@@ -1,8 +1,8 @@
-// All worlds of a server side by side, each in a small page of its own.
+// All worlds of a server side by side, each in its own small page.
 
 import { $, element } from "./panels.js";
 
-// Whether this page is one of them.
+// Whether this page is one of these small pages.
 export const small = parent !== window && Boolean(parent.viewer);
 
 let shown = false;

@@ -38,7 +38,6 @@ def town(tmp_path: Path) -> Path:
 def test_opendrive_comes_back(town: Path, tmp_path: Path) -> None:
     target = tmp_path / "town.xodr"
     trip = write_opendrive(town, target)
-
     assert trip.same
     assert trip.off < 0.02
     text = target.read_text()
@@ -79,7 +78,6 @@ def test_geojson_has_each_lane_where_it_is(town: Path, tmp_path: Path) -> None:
     network = read_network(town)
     target = tmp_path / "town.geojson"
     count = write_geojson(network, target, town)
-
     document = json.loads(target.read_text())
     assert len(document["features"]) == count == int((~network.lanes["internal"]).sum())
     assert "ODbL" in document["provenance"]["licence"]
@@ -96,7 +94,6 @@ def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
     network = read_network(town)
     target = tmp_path / "town_lanelets.osm"
     counts = write_lanelet2(network, target)
-
     assert counts == {"lanelets": len(network.lanes), "read back": len(network.lanes)}
     longitude, latitude = 11.0, 48.0
     projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(latitude, longitude))
@@ -123,7 +120,7 @@ def test_maps_without_a_projection_go_to_no_degrees(tmp_path: Path) -> None:
     from cavmarl.config.registry import find_entry
 
     path = find_entry("ring") / "map" / "map.net.xml"
-    with pytest.raises(MapError, match="where it lies"):
+    with pytest.raises(MapError, match="no georeference"):
         write_geojson(read_network(path), tmp_path / "r.geojson", path)
-    with pytest.raises(MapError, match="where it lies"):
+    with pytest.raises(MapError, match="no georeference"):
         write_lanelet2(read_network(path), tmp_path / "r.osm")

@@ -75,7 +75,6 @@ def test_heights_are_the_models_and_nothing_moves(town: Path, tmp_path: Path) ->
     assert not read_network(flat.path).points["z"].any()
     town.write_text(TOWN)
     result = built(town, model)
-
     network = read_network(result.path)
     assert plane_of(result.path) == plane_of(flat.path)
     level = read_network(flat.path)
@@ -104,14 +103,12 @@ def test_the_model_need_not_be_in_degrees(town: Path, tmp_path: Path) -> None:
         keys=(1024, 0, 1, 1, 1025, 0, 1, 2, 3072, 0, 1, 32632),
     )
     high = read_network(built(town, model).path)
-
     assert high.points["z"].min() == pytest.approx(500.0, abs=0.2)
     assert high.points["z"].max() == pytest.approx(500.0 + 0.05 * 1000.8, abs=0.3)
 
 
 def test_a_bridge_clears_the_road_below_and_is_continuous(town: Path, tmp_path: Path) -> None:
     result = built(town, write_geotiff(tmp_path / "flat.tif", plane(0.0, 0.0)))
-
     network, report = read_network(result.path), told(result)
     assert report.crossings > 0
     assert report.ramp_places > 0
@@ -151,14 +148,12 @@ def test_voids_are_filled_and_counted(town: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("grade", "steep"), [(0.1, False), (0.2, True)])
 def test_steep_roads_are_named(town: Path, tmp_path: Path, grade: float, steep: bool) -> None:
     result = built(town, write_geotiff(tmp_path / "steep.tif", plane(0.0, grade)))
-
     assert any("(Hill Road): 20.0%" in line for line in told(result).steep) is steep
     assert bool(check_map(result.path).steep_lanes) is steep
 
 
 def test_steeper_roads_are_refused_unless_told(town: Path, tmp_path: Path) -> None:
     model = write_geotiff(tmp_path / "steep.tif", plane(0.0, 0.3))
-
     with pytest.raises(MapError, match=r"(?s)30%, more than 25%.*Hill Road.*--limit-grade"):
         built(town, model)
     assert not (tmp_path / "high.net.xml").exists()
@@ -171,7 +166,6 @@ def test_steeper_roads_are_refused_unless_told(town: Path, tmp_path: Path) -> No
 
 def test_an_origin_is_kept_and_read_back(town: Path, tmp_path: Path) -> None:
     result = build_network(town, tmp_path / "o.net.xml", origin=(48.004, 11.0))
-
     geo = read_network(result.path).geo
     assert geo is not None
     assert (geo.offset_x_m, geo.offset_y_m) == (0.0, 0.0)
@@ -191,7 +185,6 @@ def test_heights_go_under_a_network_too(town: Path, tmp_path: Path) -> None:
     flat = build_network(town, tmp_path / "flat.net.xml").path
     model = write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05))
     result = built(flat, model)
-
     assert told(result).raised_edges == ()
     assert "ODbL" in result.provenance["licence"]
     with pytest.raises(MapError, match="has heights already"):
@@ -205,7 +198,6 @@ def test_without_a_model_bridges_and_tunnels_leave_flat_ground_where_they_cross_
     over = build_network(town, tmp_path / "over.net.xml")
     town.write_text(TOWN.replace('"bridge" v="yes"', '"tunnel" v="yes"').replace('v="1"', 'v="-1"'))
     under = build_network(town, tmp_path / "under.net.xml")
-
     assert over.levels > 0
     assert over.levels == under.levels
     assert over.provenance["levels"].startswith(f"{over.levels} crossings")
@@ -228,7 +220,6 @@ def test_a_bridge_that_crosses_no_road_stays_on_flat_ground(town: Path, tmp_path
     assert way in TOWN
     town.write_text(TOWN.replace(way, '<way id="14"><nd ref="7"/><nd ref="1"/>'))
     result = build_network(town, tmp_path / "flat.net.xml")
-
     assert result.levels == 0
     assert "levels" not in result.provenance
     assert not read_network(result.path).points["z"].any()
@@ -275,7 +266,6 @@ def test_real_maps(
 ) -> None:
     heights = HeightOptions((shared_maps / "dem" / model,), limit_grade=0.15)
     result = build_network(shared_maps / "osm" / name, tmp_path / "m.net.xml", heights=heights)
-
     report, found = told(result), check_map(result.path)
     assert low <= found.elevation_m[0] < found.elevation_m[1] <= high
     assert report.max_grade <= 0.151

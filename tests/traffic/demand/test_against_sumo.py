@@ -102,22 +102,15 @@ def test_types_have_sumos_values(tmp_path: Path, town_file: Path) -> None:
 @pytest.mark.parametrize(
     "timing",
     [
-        'begin="0" end="20" number="6"',
-        'begin="1.5" end="21.7" number="7"',
-        'begin="0" end="30" period="7"',
-        'begin="0" end="28" period="7"',
-        'begin="0" end="50" vehsPerHour="700"',
-        'begin="3" number="4" period="5"',
-        'begin="0" end="30" perHour="360"',
-        'begin="0:00:10" end="0:0:20" period="4"',
-        'begin="10" end="10" number="3"',
-        'begin="10" end="10" period="3"',
-        'begin="0" end="10" number="0"',
-        'begin="0.2" end="9.7" probability="1"',
-        'begin="5" number="3" probability="1"',
-        'end="9" period="0.4"',
+        'begin="0" end="20" number="6"', 'begin="1.5" end="21.7" number="7"',
+        'begin="0" end="30" period="7"', 'begin="0" end="28" period="7"',
+        'begin="0" end="50" vehsPerHour="700"', 'begin="3" number="4" period="5"',
+        'begin="0" end="30" perHour="360"', 'begin="0:00:10" end="0:0:20" period="4"',
+        'begin="10" end="10" number="3"', 'begin="10" end="10" period="3"',
+        'begin="0" end="10" number="0"', 'begin="0.2" end="9.7" probability="1"',
+        'begin="5" number="3" probability="1"', 'end="9" period="0.4"',
     ],
-)
+)  # fmt: skip
 def test_flows_depart_at_sumos_times(
     demand: Reader, tmp_path: Path, town_file: Path, timing: str
 ) -> None:
@@ -170,5 +163,5 @@ def test_mcity_is_read_without_its_cycle_lanes(shared_maps: Path) -> None:
     assert len(file.elements) == 23
     assert len(file.draw(0, until_s=3600.0)) > 2000
     assert file.report.tolerated["<personFlow> is not read"].count == 7
-    left_out = "type 'bike' without a way: maps leave out its own lanes"
+    left_out = "type 'bike' without a way: maps lack its own lanes"
     assert file.report.tolerated[left_out].count == 1

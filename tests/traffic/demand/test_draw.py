@@ -41,9 +41,7 @@ def test_draws_depend_on_the_key_and_on_nothing_else(demand: Reader) -> None:
     assert len(early) == np.count_nonzero(orders["depart"] < 300.0)
 
 
-def test_the_hash_is_of_what_stands_in_records_and_not_of_what_lies_between(
-    demand: Reader,
-) -> None:
+def test_the_hash_is_of_what_stands_in_records_and_not_of_what_lies_between(demand: Reader) -> None:
     file = demand('<flow id="f" end="900" period="9"><route edges="AB BC"/></flow>')
     assert file.routes.dtype.itemsize > sum(file.routes.dtype[k].itemsize for k in range(5))
     routes = np.full(len(file.routes), 0xA5, dtype=np.uint8).repeat(file.routes.dtype.itemsize)

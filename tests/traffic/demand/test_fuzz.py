@@ -31,20 +31,8 @@ WHOLE = """<?xml version="1.0" encoding="UTF-8"?>
 """
 PIECES = WHOLE.replace("<", "\0<").replace('"', '\0"').replace(" ", "\0 ").split("\0")
 VALUES = [
-    "",
-    "-1",
-    "0",
-    "nan",
-    "1e308",
-    "99999999999999999999",
-    "AB",
-    "BX",
-    "r",
-    "m",
-    "d",
-    "é",
-    ":",
-]
+    "", "-1", "0", "nan", "1e308", "99999999999999999999", "AB", "BX", "r", "m", "d", "é", ":",
+]  # fmt: skip
 
 
 def check(town: RoadNetwork, folder: Path, content: bytes) -> None:

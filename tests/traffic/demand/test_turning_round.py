@@ -72,4 +72,7 @@ def test_a_trip_without_a_way_can_be_skipped(net: Path, caplog: pytest.LogCaptur
         env = world(net, ROUND + LOST, on_bad_route="skip")
     assert env.simulation.demand is not None
     assert env.simulation.demand.element_ids == ("round",)
-    assert "x.rou.xml: 1 cannot drive their routes, left out: lost" in caplog.text
+    assert (
+        "x.rou.xml: left out 1 vehicles and flows that cannot drive their routes: lost"
+        in caplog.text
+    )

@@ -132,7 +132,7 @@ def _hold_for_foes(
 
 
 @kernel
-def _exit_blocked(
+def exit_blocked(
     roads: RoadArrays, travel: TripTables, row: np.void, link: int, way: int, scratch: Scratch
 ) -> bool:
     """Return whether a row could not clear the junction behind the next standing vehicle ahead.
@@ -212,7 +212,7 @@ def hold_at_line(
     )
     if hold != HOLD_NONE:
         return hold
-    if _exit_blocked(roads, travel, row, link, way, scratch):
+    if exit_blocked(roads, travel, row, link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
@@ -328,7 +328,7 @@ def hold_inside(
     )
     if hold != HOLD_NONE:
         return hold
-    if _exit_blocked(roads, travel, rows[i], link, way, scratch):
+    if exit_blocked(roads, travel, rows[i], link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 

@@ -156,7 +156,7 @@ def _next_beyond(
 
 
 @kernel
-def _imposed_on_followers(
+def imposed_on_followers(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -192,7 +192,7 @@ def _imposed_on_followers(
 
 
 @kernel
-def _change_is_safe(
+def change_is_safe(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],
@@ -236,14 +236,14 @@ def _change_is_safe(
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
         return False
-    followers = _imposed_on_followers(roads, travel, rows, row, target, s, scratch)
+    followers = imposed_on_followers(roads, travel, rows, row, target, s, scratch)
     most = MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED
     # With POLITENESS = 0 the present accelerations of the followers do not count.
     return mobil_accepts(own_wish, after, 0.0, followers, 0.0, 0.0, mandatory, most)
 
 
 @inlined_kernel
-def _rear_is_inside(lane: np.void, row: np.void) -> bool:
+def rear_is_inside(lane: np.void, row: np.void) -> bool:
     """Return whether a vehicle's rear is in or near the junction, where others turn in beside it.
 
     The rule does not hold on lanes too short for two vehicles and room to swap: there, a vehicle
@@ -277,7 +277,7 @@ def _may_change(
     target = lane["left"] if side > 0 else lane["right"]
     if lane["internal"] or target < 0 or (needed != 0 and needed != side):
         return False
-    if _rear_is_inside(lane, row):
+    if rear_is_inside(lane, row):
         return False
     rest = lane["length_m"] - row["s"] - SIDEWAYS_S * row["speed"]
     if rest < (0.5 * row["length"] if needed == 0 or row["speed"] > CREEP_MPS else 0.0):
@@ -303,7 +303,7 @@ def _may_change(
             queue_m = QUEUED_M * num_ahead(scratch, row["lane"], row["s"], row["id"], travel.view_m)
             if beyond["room"] - row["s"] - queue_m < 2.0 * early:
                 return False
-    if not _change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch):
+    if not change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch):
         return False
     # A slow vehicle moves sideways almost in place.
     place = beside_s(roads, row["lane"], target, row["s"])

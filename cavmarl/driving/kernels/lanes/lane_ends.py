@@ -52,7 +52,7 @@ def lane_end(
 
 
 @kernel
-def _behind_turning(
+def behind_turning(
     roads: RoadArrays, kind: np.void, row: np.void, lane: int, distance: float, scratch: Scratch
 ) -> float:
     """Return the constraint of long vehicles that turn from a lane adjacent to a dead end.
@@ -145,7 +145,7 @@ def constraint_over_lane_end(
     if not is_near or row["driver"] == DRIVER_AGENT:
         return constraint
     if roads.lanes[lane]["num_links"] == 0:
-        return max(constraint, _behind_turning(roads, kind, row, lane, distance, scratch))
+        return max(constraint, behind_turning(roads, kind, row, lane, distance, scratch))
     first, front = roads.lanes[lane]["first_link"], distance - 0.5 * row["length"]
     swept = before_foe_sweep(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
     return max(constraint, swept)

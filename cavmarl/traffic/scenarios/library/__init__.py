@@ -1,10 +1,10 @@
-"""Scenarios: one file each, in this folder or anywhere.
+"""Scenarios: one file each, in this folder or anywhere else.
 
-A file's docstring says what happens. It defines
+The docstring of a file describes the scenario. The file defines
 
-- `NEEDS`, what a map must have for it, in words;
+- `NEEDS`, a description of the map that the scenario needs;
 - `Parameters`, a frozen dataclass of `scene.setting`s and `scene.switch`es;
-- `places(streets, parameters)`, by name where on a map it can be played;
+- `places(streets, parameters)`, the possible places on a map by name;
 - `stage(streets, place, parameters)`, the `Scene` at one of these places.
 """
 
@@ -34,19 +34,19 @@ PARTS = ("NEEDS", "Parameters", "places", "stage")
 
 
 def scenario_names() -> list[str]:
-    """Those that come with cavmarl, by name."""
+    """Return the names of the scenarios that come with cavmarl, sorted."""
     return sorted(module.name for module in iter_modules(__path__))
 
 
 @cache
 def load_scenario(name: str) -> Any:
-    """The module of a scenario.
+    """Load the module of a scenario.
 
     Args:
         name: one of `scenario_names`, or the path of a `.py` file.
 
     Raises:
-        ConfigError: nothing of that name, or a file that is no scenario.
+        ConfigError: the name is unknown, or the file does not define a scenario.
     """
     if name in scenario_names():
         return importlib.import_module(f"{__name__}.{name}")
@@ -55,11 +55,11 @@ def load_scenario(name: str) -> Any:
         close = get_close_matches(name, scenario_names(), n=1)
         hint = f"did you mean {close[0]}? " if close else ""
         raise ConfigError(
-            f"no scenario or file '{name}'; {hint}There are: {', '.join(scenario_names())}"
+            f"no scenario or file '{name}'; {hint}Choose one of: {', '.join(scenario_names())}"
         )
     module = _run(path)
     if missing := [part for part in PARTS if not hasattr(module, part)]:
-        raise ConfigError(f"{path}: no scenario, it does not define {', '.join(missing)}")
+        raise ConfigError(f"{path}: not a scenario; define {', '.join(missing)}")
     return module
 
 
@@ -68,26 +68,26 @@ def _run(path: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ConfigError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where its dataclass looks for what its annotations name
+    sys.modules[spec.name] = module  # dataclasses resolve their annotations in this module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # the file is the user's: it may raise anything
+    except Exception as error:  # the user's file may raise any exception
         del sys.modules[spec.name]
         raise ConfigError(fault_in(path, error)) from error
     return module
 
 
 def summary_of(name: str) -> str:
-    """The first sentence about a scenario."""
+    """Return the first paragraph of a scenario's docstring."""
     text = load_scenario(name).__doc__ or ""
     return " ".join(text.strip().split("\n\n")[0].split())
 
 
 def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
-    """What is played on a map; None without a scenario.
+    """Return the scene for a map; None without a scenario.
 
-    Raises ConfigError: no such scenario, or no such place on the map; a parameter that it does not
-    have, or a value out of range; ScenarioError: the map has none at all.
+    Raises ConfigError: the scenario or the place does not exist, or a parameter is unknown or out
+    of range; ScenarioError: the map has no place for the scenario.
     """
     if not config.name:
         return None
@@ -114,7 +114,7 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
     return scene
 
 
-@lru_cache(maxsize=16)  # several worlds of an environment ask one after the other
+@lru_cache(maxsize=16)  # the worlds of an environment ask one after the other
 def _places(name: str, network: RoadNetwork, parameters: Any) -> dict[str, Any]:
     found: dict[str, Any] = load_scenario(name).places(Streets(network), parameters)
     return found

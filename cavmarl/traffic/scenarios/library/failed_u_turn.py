@@ -1,6 +1,6 @@
-"""An oncoming car turns round, fails at the first attempt and stands across the agent's lane.
+"""An oncoming car attempts a U-turn, fails and stands across the agent's lane.
 
-It reverses, turns further and drives off in front of the agent: a turn in three parts.
+It reverses, turns further and drives off in front of the agent: a three-point turn.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
 from cavmarl.traffic.scenarios.scene import Scene, Seat, setting
 from cavmarl.traffic.scenarios.streets import Opposite, Streets
 
-NEEDS = "a straight road of 85 m or more with one lane for the other direction right beside it"
+NEEDS = "a straight road of 85 m or more with an adjacent lane in the opposite direction"
 
 ROAD_M = 85.0
-BEHIND_M = 30.0  # of road beyond the place where the turn begins
+BEHIND_M = 30.0  # length of road beyond the start of the turn
 RADIUS_M = 5.0  # of the turning circle
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """What can be said about the turn."""
+    """Parameters of the turn."""
 
     speed_mps: float = setting(8.0, 3.0, 12.0, "m/s", "speed of the agent when it starts")
-    turn_mps: float = setting(3.0, 1.0, 4.0, "m/s", "speed of the car that turns")
-    pause_s: float = setting(3.0, 1.0, 20.0, "s", "how long it stands between two parts")
+    turn_mps: float = setting(3.0, 1.0, 4.0, "m/s", "speed of the turning car")
+    pause_s: float = setting(3.0, 1.0, 20.0, "s", "pause between two parts of the turn")
     lead_s: float = setting(
-        0.5, 0.0, 2.0, "s", "how long before an agent that does not brake it stands in its lane"
+        0.5, 0.0, 2.0, "s", "lead of the car in the lane over an agent that does not brake"
     )
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
-    """Straight lanes beside an oncoming one."""
+    """Return straight lanes beside an oncoming lane."""
     found = {}
     for lane in streets.straights(ROAD_M):
         other = streets.opposite(lane, streets.length_m(lane) - BEHIND_M)
@@ -47,7 +47,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """The car stands across when an agent that keeps its speed comes to it."""
+    """Stage the car so that it blocks the lane just before an agent that keeps its speed."""
     begin_s = streets.length_m(place) - BEHIND_M
     other = streets.opposite(place, begin_s)
     assert other is not None, "a place that `places` has not found"
@@ -74,10 +74,10 @@ def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
 
 
 def _first_turn(other: Opposite) -> float:
-    """How far the heading turns in the first part, in rad.
+    """Return how far the heading turns in the first part, in rad.
 
-    Three arcs of one radius r through α, π - 2 α and α carry a car 2 r (1 - 2 cos α) aside, which
-    has to be the distance of the lanes.
+    Three arcs of one radius r through α, π - 2 α and α move a car sideways by 2 r (1 - 2 cos α),
+    which has to be the distance between the lanes.
     """
     return acos(0.25 * (2.0 - other.apart_m / RADIUS_M))
 

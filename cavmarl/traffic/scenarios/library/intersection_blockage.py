@@ -1,4 +1,4 @@
-"""A car stops in the middle of a junction, across the agent's way, and goes on after a while."""
+"""A car stops in the middle of a junction, across the agent's way, and later drives on."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
 from cavmarl.traffic.scenarios.scene import FREE_M, Scene, approach, setting
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
 
-NEEDS = "a junction where a way straight on crosses another one, with 65 m of road before it"
+NEEDS = "a junction where a straight movement crosses another movement, with 65 m of road before it"
 
-FAR_M = 60.0  # from the agent to the junction in the beginning
-ROLL_M = 12.0  # from the other car to its stop line
-NEAR_M = 30.0  # from the agent to the junction, when the time of the blockage begins
+FAR_M = 60.0  # initial distance from the agent to the junction
+ROLL_M = 12.0  # initial distance from the other car to its stop line
+NEAR_M = 30.0  # distance from the agent to the junction at which the blockage's time starts
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """What can be said about the blockage."""
+    """Parameters of the blockage."""
 
     speed_mps: float = setting(8.0, 3.0, 10.0, "m/s", "speed of the agent when it starts")
     blocked_s: float = setting(
-        8.0, 6.0, 60.0, "s", "how long the car stands once the agent is near"
+        8.0, 6.0, 60.0, "s", "time for which the car stands once the agent is near"
     )
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
-    """Ways straight on over a junction that another way crosses at about a right angle."""
+    """Return straight movements that another movement crosses at about a right angle."""
     found: dict[str, Crossing] = {}
     for yields in (False, True):
         for crossing in streets.crossings("s", yields=yields, merges=False):
@@ -42,7 +42,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
 
 
 def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
-    """The car is there before any agent can be, and stays until the agent has had to wait."""
+    """Stage a car that blocks the junction before an agent arrives, until it had to wait."""
     seat = approach(streets, place.link, FAR_M, parameters.speed_mps)
     assert seat is not None, "a place that `places` has not found"
     path = path_of(streets.network, place.foe)

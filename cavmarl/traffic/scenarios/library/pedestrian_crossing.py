@@ -1,7 +1,6 @@
-"""A pedestrian steps onto the road off any crosswalk, just as the agent comes.
+"""A pedestrian steps onto the road away from crosswalks, just as the agent comes.
 
-Where it is occluded, a van that is parked beside the road hides the pedestrian until the last
-moment.
+If `occluded` is set, a van parked beside the road hides the pedestrian until the last moment.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from cavmarl.traffic.scenarios.streets import Streets
 NEEDS = "a straight road for cars of 85 m or more"
 
 ROAD_M = 85.0
-BEHIND_M = 25.0  # of road beyond the pedestrian
-KERB_M = 1.4  # where the pedestrian stands, and ends, beside the road
+BEHIND_M = 25.0  # length of road beyond the pedestrian
+KERB_M = 1.4  # distance of the pedestrian's start and end from the road
 VAN_GAP_M = 0.3  # between road and van
 VAN_M = (6.5, 2.16)
 STEP_M = 1.0  # between van and pedestrian
@@ -27,25 +26,25 @@ STEP_M = 1.0  # between van and pedestrian
 
 @dataclass(frozen=True)
 class Parameters:
-    """What can be said about the crossing."""
+    """Parameters of the crossing."""
 
     speed_mps: float = setting(8.0, 3.0, 14.0, "m/s", "speed of the agent when it starts")
     walk_mps: float = setting(1.4, 0.5, 3.0, "m/s", "speed of the pedestrian")
     lead_s: float = setting(
-        0.0, -0.5, 2.0, "s", "how long before an agent that does not brake it is in its lane"
+        0.0, -0.5, 2.0, "s", "lead of the pedestrian in the lane over an agent that does not brake"
     )
     occluded: bool = switch(False, "a parked van hides the pedestrian")
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
-    """The lanes at the kerb of straight roads."""
+    """Return the lanes at the kerb of straight roads."""
     return {
         streets.name(lane): lane for lane in streets.straights(ROAD_M) if streets.is_at_kerb(lane)
     }
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """The pedestrian sets off so that a vehicle that keeps its speed runs into it."""
+    """Stage a pedestrian to start so that a vehicle that keeps its speed would collide."""
     lane, s = place, streets.length_m(place) - BEHIND_M
     near, far = streets.kerbs_m(lane, s)
     side = near + KERB_M

@@ -1,6 +1,6 @@
-"""The road behind the next junction is closed: a works van stands on each of its lanes.
+"""The road behind the next junction is closed: a van stands on each of its lanes.
 
-The agent stops before them until the road is opened again, or reaches its goal another way.
+The agent stops before them until the road is opened, or reaches its goal on another way.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from cavmarl.traffic.scenarios.scene import FREE_M, Scene, approach, setting
 from cavmarl.traffic.scenarios.streets import Streets
 
 NEEDS = (
-    "a way straight on into a road of 80 m or more that leads on to another one, with 45 m of "
+    "a straight movement into a road of 80 m or more that leads on to another road, with 45 m of "
     "road before the junction"
 )
 
-FAR_M = 40.0  # from the agent to the junction in the beginning
+FAR_M = 40.0  # initial distance from the agent to the junction
 INTO_M = 50.0  # from the start of the closed road to the vans
 ROAD_M = INTO_M + FREE_M + 10.0
-NEAR_M = 35.0  # from the agent to the vans, when the time until they leave begins
-MARGIN_M = 30.0  # around all of it no other vehicle is in the beginning
+NEAR_M = 35.0  # distance from the agent to the vans at which the time until they leave starts
+MARGIN_M = 30.0  # margin around the scene without other vehicles at the start
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """What can be said about the closure."""
+    """Parameters of the closure."""
 
     speed_mps: float = setting(8.0, 3.0, 12.0, "m/s", "speed of the agent when it starts")
     closed_s: float = setting(
-        10.0, 8.0, 90.0, "s", "how long the road stays closed once the agent is near"
+        10.0, 8.0, 90.0, "s", "time for which the road stays closed once the agent is near"
     )
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
-    """Ways straight on into a long road, from which another road goes on."""
+    """Return straight movements into a long road that leads on to another road."""
     found: dict[str, int] = {}
     for link in streets.movements("s"):
         row = streets.network.links[link]
@@ -51,7 +51,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """The vans are there from the beginning, and leave when the agent has had to wait."""
+    """Stage vans that stand on the road from the start and leave after the agent had to wait."""
     seat = approach(streets, place, FAR_M, parameters.speed_mps)
     closed = int(streets.network.links["to_lane"][place])
     goal = streets.onward(closed)

@@ -1,6 +1,6 @@
-"""The signals of a junction go dark as the agent comes, on the road that then has to give way.
+"""The signals of a junction go dark as the agent comes on the road that then has to yield.
 
-Cars on the other road do not slow down for it.
+Cars on the other road do not slow down for the agent.
 """
 
 from __future__ import annotations
@@ -11,29 +11,29 @@ from cavmarl.traffic.scenarios.scene import Meeting, Outage, Scene, meetings, se
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
 
 NEEDS = (
-    "a signal, and a way straight on that gives way to another one where it is off, with 55 m of "
+    "a signal, and a straight movement that yields to another one when it is off, with 55 m of "
     "road before it"
 )
 
-FAR_M = 50.0  # from the agent to the junction in the beginning
+FAR_M = 50.0  # initial distance from the agent to the junction
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """What can be said about the outage and both sides."""
+    """Parameters of the outage, the agent and the crossing cars."""
 
     speed_mps: float = setting(8.0, 3.0, 10.0, "m/s", "speed of the agent when it starts")
-    passing_mps: float = setting(8.0, 3.0, 14.0, "m/s", "speed of the cars that cross")
-    gap_s: float = setting(1.5, 1.0, 3.0, "s", "between them, from centre to centre")
-    cars: float = setting(3, 1, 6, "", "how many cross")
+    passing_mps: float = setting(8.0, 3.0, 14.0, "m/s", "speed of the crossing cars")
+    gap_s: float = setting(1.5, 1.0, 3.0, "s", "time between the centres of crossing cars")
+    cars: float = setting(3, 1, 6, "", "number of crossing cars")
     lead_s: float = setting(
-        0.0, -0.4, 0.4, "s", "how long the first is there before an agent that keeps its speed"
+        0.0, -0.4, 0.4, "s", "lead of the first car over an agent that keeps its speed"
     )
-    dark_s: float = setting(1.0, 0.0, 10.0, "s", "when the signals go dark")
+    dark_s: float = setting(1.0, 0.0, 10.0, "s", "time at which the signals go dark")
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, Meeting]:
-    """Ways straight on that another one crosses, which goes first where the signal is off."""
+    """Return straight movements crossed by another one that has priority when the signal is off."""
     crossings = (
         crossing
         for crossing in streets.crossings("s", yields=True, merges=False)
@@ -50,7 +50,7 @@ def _loses_its_signal(streets: Streets, crossing: Crossing) -> bool:
 
 
 def stage(streets: Streets, place: Meeting, parameters: Parameters) -> Scene:
-    """The first car meets an agent that keeps its speed in the dark junction."""
+    """Stage the first car to meet an agent that keeps its speed in the dark junction."""
     crossing, scene = place
     signal = int(streets.network.links["signal"][crossing.link])
     outage = Outage(streets.network.signal_ids[signal], parameters.dark_s)

@@ -1,1 +1,0 @@
-"""What survives a worker: checkpoints of worlds and logs of actions since."""

@@ -1,0 +1,200 @@
+"""`StateReplicas`: kept states of the zones of a node, and of the previous node of the ring.
+
+Now and then, between two steps, each node keeps its state, and sends a replica to the next living
+node. When a node is lost, the next one takes over its zones, and all nodes go back to the newest
+state that all of them have. They repeat the commands since then, which gives the same bytes. Zones
+that move to another node, such as a new one, do it in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import WorkerError
+from cavmarl.ownership.messages import COORDINATOR
+from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
+from cavmarl.parallel.nodes.links import Links
+from cavmarl.parallel.nodes.peer_faults import FAULTS, reading
+from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.traffic.sumo.sumo_history import ToldLog
+
+Array = NDArray[Any]
+KEPT = 2  # states, since the newest one may not have arrived everywhere
+
+
+class StateReplicas:
+    """The states that one node keeps.
+
+    Attributes:
+        own: states of this node, by their numbers.
+        others: node → states that it has sent, by their numbers.
+    """
+
+    def __init__(
+        self, worlds: LocalWorlds, logs: Sequence[ToldLog], links: Links, number: int
+    ) -> None:
+        self._worlds = worlds
+        self._logs = logs  # of commands to SUMO
+        self._links = links
+        self._number = number
+        self.own: dict[int, Bytes] = {}
+        self.others: dict[int, dict[int, Bytes]] = {}
+        self._given: dict[int, NodeFrame] = {}  # by nodes that give zones away
+        self._is_settled = True  # no state was kept since `settle`
+
+    def begin_anew(self, worlds: LocalWorlds, logs: Sequence[ToldLog]) -> None:
+        """Keep states of other worlds; replicas of other nodes stay, as they may be of these."""
+        self._worlds, self._logs = worlds, logs
+        self.own.clear()
+        self._given.clear()
+
+    def settle(self) -> None:
+        """Drop older states, since the newest one has arrived everywhere."""
+        if self._is_settled:
+            return
+        self._is_settled = True
+        newest = max(self.own, default=0)
+        for states in (self.own, *self.others.values()):
+            for old in [number for number in states if number < newest]:
+                del states[old]
+
+    def keep(self, state: int, living: Sequence[int]) -> None:
+        """Keep the present state here, and send a replica to the next living node."""
+        data = to_bytes(self._worlds.save())
+        _add(self.own, state, data)
+        self._is_settled = False
+        if len(living) > 1:
+            to = living[(living.index(self._number) + 1) % len(living)]
+            self._links.send(to, FrameKind.KEEP, state, [data])
+        else:
+            logs = to_bytes([log.words for log in self._logs])
+            self._links.send(COORDINATOR, FrameKind.KEEP, state, [logs, data])
+
+    def resume_from(self, state: int, data: Bytes) -> None:
+        """Take over a state that the coordinator has kept for the only node, which is lost.
+
+        Raises:
+            ConfigError: the state is one of other worlds.
+        """
+        _drop_later(self.own, -1)
+        like = [*(log.words for log in self._logs), *self._worlds.save()]
+        found = from_bytes(data, like)
+        saved = found[len(self._logs) :]
+        self._worlds.check(saved)
+        for log, words in zip(self._logs, found, strict=False):
+            log.take_up(words)
+        self.own[state] = to_bytes(saved)
+
+    def receive(self, number: int, frame: NodeFrame) -> None:
+        """Keep the replica of another node."""
+        _add(self.others.setdefault(number, {}), frame.number, frame.data)
+        self._is_settled = False
+
+    def receive_given(self, number: int, frame: NodeFrame) -> None:
+        """Take the state of another node, some of whose zones this node will host."""
+        self._given[number] = frame
+
+    def load(
+        self,
+        state: int,
+        lost: Sequence[int],  # nodes whose zones this node takes over
+        donors: Sequence[int],  # nodes that give zones to this node
+        takers: Sequence[int],  # nodes that get zones of this node
+        zones: Sequence[int],  # of this node from now on
+        generation: int,  # number of changes of nodes
+        check: Callable[[], None],  # raises if the awaited frames will never come
+    ) -> None:
+        """Resume from a kept state.
+
+        Later states are dropped: otherwise they would count as the newest ones.
+
+        Raises:
+            WorkerError: the state of a lost node is not here.
+        """
+        for states in (self.own, *self.others.values()):
+            _drop_later(states, state)
+        like = self._worlds.save()
+        own = self.own.get(state)
+        saved = None if own is None else self._read(own, like)
+        for number in lost:
+            found = self.others.get(number, {}).get(state)
+            if saved is None or found is None:
+                raise WorkerError(f"there is no replica of the state of node {number}")
+            try:
+                theirs = self._read(found, like)
+            except FAULTS as error:
+                raise WorkerError(f"the state of node {number} is damaged: {error}") from error
+            saved[self._first - 1] += self._join(saved, theirs, like)
+        if takers and saved is not None:
+            data = to_bytes(saved)
+            for taker in takers:
+                self._links.send(taker, FrameKind.GIVE, generation, [data])
+        for donor in donors:
+            check()
+            self._links.wanted = (donor,)
+            while donor not in self._given or self._given[donor].number != generation:
+                self._links.pump(None)
+                check()  # it may receive the awaited frame
+            self._links.wanted = ()
+            with reading(donor):
+                given = self._read(self._given.pop(donor).data, like)
+            if saved is None:
+                saved = given
+                saved[self._first - 1][...] = 0  # contacts stay with the node that counted them
+            else:
+                self._join(saved, given, like)
+        if saved is None:
+            raise WorkerError(f"there is no replica of state {state}")
+        count = self._worlds.world.partition.count
+        for n in range(self._first, len(saved)):
+            if (n - self._first) % count not in zones:
+                saved[n] = saved[n][:0]
+        self._worlds.load_own(saved, zones[0])
+
+    def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
+        """Read a kept state. Raises ConfigError: the worlds cannot resume from it."""
+        saved = from_bytes(data, like)
+        self._worlds.check(saved)
+        return saved
+
+    @property
+    def _first(self) -> int:
+        """Index of the vehicles of the first zone among the saved arrays."""
+        simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
+        return len(self._worlds.save()) - simulation.num_worlds * zones
+
+    def _join(self, saved: list[Array], other: Sequence[Array], like: Sequence[Array]) -> Array:
+        """Add the vehicles of another node, and the state of its agents, to a saved state.
+
+        Returns:
+            (W,) contacts that the other node has counted.
+        """
+        simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
+        first = self._first
+        kept = {id(array) for array in simulation.agent_arrays()}
+        agent_arrays = [n for n, array in enumerate(like) if id(array) in kept]
+        for n in range(first, len(saved)):
+            if not len(other[n]):
+                continue
+            saved[n] = other[n]
+            w = (n - first) // zones
+            agents = other[n]["agent"][other[n]["agent"] >= 0]
+            for k in agent_arrays:
+                saved[k][w, agents] = other[k][w, agents]
+        return other[first - 1]
+
+
+def _add(states: dict[int, Bytes], state: int, data: Bytes) -> None:
+    states[state] = data
+    for old in sorted(states)[:-KEPT]:
+        del states[old]
+
+
+def _drop_later(states: dict[int, Bytes], state: int) -> None:
+    for later in [number for number in states if number > state]:
+        del states[later]

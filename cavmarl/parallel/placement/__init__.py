@@ -1,0 +1,1 @@
+"""Which worker or node runs what, how that changes, and the commands that go there."""

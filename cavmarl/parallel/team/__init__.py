@@ -1,1 +1,0 @@
-"""Worker processes that run the phases of one world together."""

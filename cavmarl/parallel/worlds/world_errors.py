@@ -1,0 +1,42 @@
+"""Errors of worlds in other processes: what they do not support, and what they raise there."""
+
+from __future__ import annotations
+
+import cavmarl.core.errors
+from cavmarl.config.v2x import V2xConfig
+from cavmarl.core.errors import CavmarlError, ConfigError, WorkerFailureError
+
+
+def copy_error() -> ConfigError:
+    """Return the error for a copy or a pickle of worlds in other processes."""
+    return ConfigError(
+        "workers: worlds in worker processes cannot be copied; use backend='local', or make "
+        "another environment with the same seed"
+    )
+
+
+def network_error() -> ConfigError:
+    """Return the error for a network simulator with worlds in worker processes."""
+    return ConfigError(
+        "v2x.channel.external: the network simulator is in the process of the caller, which "
+        "worlds in worker processes do not ask; use backend='local', or nodes"
+    )
+
+
+def refuse_external(v2x: V2xConfig) -> None:
+    """Refuse an external channel, which needs the process of the caller in each tick.
+
+    Raises:
+        ConfigError: the channel is external.
+    """
+    if v2x.enabled and v2x.channel.external:
+        raise network_error()
+
+
+def original_error(failure: WorkerFailureError) -> CavmarlError:
+    """Return the error of cavmarl that a worker has raised; else the failure itself."""
+    kind = getattr(cavmarl.core.errors, failure.kind, None)
+    if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
+        return failure
+    takes_text = "__init__" not in vars(kind)
+    return kind(failure.text) if takes_text else failure
