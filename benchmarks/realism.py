@@ -1,4 +1,4 @@
-"""The table of docs/explanation/realism.md: traffic compared with SUMO, over maps and seeds.
+"""The table of docs/figures/realism.md: traffic compared with SUMO, over maps and seeds.
 
 Maps outside the eclipse-sumo wheel come from a folder. Demands with missing files are left out and
 listed.

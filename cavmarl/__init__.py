@@ -6,8 +6,8 @@
     vec = cavmarl.make_vec("merge", num_envs=16)                            # batched arrays
     policy = cavmarl.load_policy("idm", env)
 
-Importing it registers the entries of `envs/` with Gymnasium and PettingZoo; the simulator is loaded
-when one of its names is used.
+The import registers the entries of `envs/` with Gymnasium and PettingZoo. The simulator is loaded
+at the first use of one of its names.
 """
 
 import sys
@@ -160,7 +160,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """`cavmarl.env` is the function, though a folder of that name is imported, too."""
+    """Keeps `cavmarl.env` the function, although the folder of that name is also imported."""
 
     @property
     def env(self) -> Any:
@@ -168,7 +168,7 @@ class _Package(ModuleType):
 
     @env.setter
     def env(self, folder: ModuleType) -> None:
-        """Importing the folder does not hide the function."""
+        """Ignore the assignment of the folder, so that it does not hide the function."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return import_module, (self.__name__,)

@@ -1,4 +1,4 @@
-"""Views of a world for libraries that do not read PettingZoo: Gymnasium, SB3, TorchRL, RLlib.
+"""Views of worlds for libraries other than PettingZoo: Gymnasium, SB3, TorchRL, RLlib.
 
-They stand on `env` and know nothing of how worlds are run.
+They build on `env` and do not depend on how worlds are run.
 """

@@ -1,6 +1,6 @@
-"""BenchMARL's tasks: every entry of `envs/`, through `cavmarl.adapters.torchrl_env`.
+"""BenchMARL's tasks: every entry of `envs/`, via `cavmarl.adapters.torchrl_env`.
 
-Importing this module loads BenchMARL and torch; nothing that `import cavmarl` loads imports it.
+Importing this module loads BenchMARL and torch; `import cavmarl` does not import it.
 """
 
 from __future__ import annotations
@@ -22,19 +22,22 @@ except ModuleNotFoundError as error:
 DECIDED = ("num_envs", "device", "action.kind")
 
 
-class CavTaskClass(TaskClass):  # type: ignore[misc] # found in an environment of its own only
-    """One environment; BenchMARL says how many worlds, where, and which kind of action.
+class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separate environment
+    """One environment; BenchMARL chooses the number of worlds, the device and the kind of action.
 
-    In `respawn` worlds, the default, a seat whose vehicle ended gets a new one. BenchMARL's losses
-    know no mask: they also count the steps in which an agent has no vehicle, whose observation and
-    reward are 0. These are few in `respawn`, and many in `closed` and `open` worlds.
+    In `respawn` worlds, the default, an agent whose vehicle ended gets a new one. BenchMARL's
+    losses have no mask: they also count steps in which an agent has no vehicle, with an observation
+        and a
+    reward of 0. Such steps are rare in `respawn` worlds, and frequent in `closed` and `open`
+    worlds.
 
     Args:
-        name: of the task; in lower case it is that of the environment, unless `config` has `env`.
-        config: keywords of `CavTorchRLEnv`.
+        name: name of the task; in lower case, the name of the environment, unless `config` has
+            `env`.
+        config: keyword arguments of `CavTorchRLEnv`.
 
     Raises:
-        ConfigError: a keyword that BenchMARL decides.
+        ConfigError: BenchMARL sets one of the keyword arguments.
     """
 
     def __init__(self, name: str, config: Mapping[str, Any] | None = None) -> None:
@@ -44,7 +47,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # found in an environment o
     def get_env_fun(
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
     ) -> Callable[[], CavTorchRLEnv]:
-        """What makes `num_envs` worlds."""
+        """Return a function that makes `num_envs` worlds."""
         overrides = {
             "population.mode": "respawn",
             **self.config.get("overrides", {}),
@@ -61,64 +64,64 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # found in an environment o
 
     @property
     def _choices(self) -> str:
-        """The kind of action with choices that the environment has; without one: meta-actions."""
+        """The environment's kind of action if it is a choice, otherwise meta-actions."""
         kind = load_config(self.config["env"])[0].action.kind
         return "discrete" if kind == "continuous" else kind
 
     def supports_continuous_actions(self) -> bool:
-        """Throttle and steering."""
+        """Return True: throttle and steering."""
         return True
 
     def supports_discrete_actions(self) -> bool:
-        """Meta-actions, or the grid of an environment that has one."""
+        """Return True: meta-actions, or the grid of an environment that has one."""
         return True
 
     def max_steps(self, env: CavTorchRLEnv) -> int:
-        """Steps to the horizon."""
+        """Return the number of steps to the horizon."""
         return int(env.max_cycles)
 
     def has_render(self, env: CavTorchRLEnv) -> bool:
-        """Batches of worlds are not drawn."""
+        """Return False: batches of worlds are not drawn."""
         return False
 
     def group_map(self, env: CavTorchRLEnv) -> dict[str, list[str]]:
-        """All agents are of one group."""
+        """Return one group with all agents."""
         return dict(env.group_map)
 
     def observation_spec(self, env: CavTorchRLEnv) -> Composite:
-        """Of one world: what its agents observe."""
+        """Return the spec of the observations of one world's agents."""
         return self._of_agents(env, "observation")
 
     def info_spec(self, env: CavTorchRLEnv) -> Composite:
-        """Of one world: its agents' terms, by name."""
+        """Return the spec of the terms of one world's agents, by name."""
         return self._of_agents(env, "info")
 
     def state_spec(self, env: CavTorchRLEnv) -> None:
-        """None: central critics read the observations of all agents."""
+        """Return None: central critics read the observations of all agents."""
 
     def action_spec(self, env: CavTorchRLEnv) -> Composite:
-        """Of one world."""
+        """Return the action spec of one world."""
         return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: CavTorchRLEnv) -> None:
-        """None: every agent can do everything."""
+        """Return None: every agent can take every action."""
 
     @staticmethod
     def env_name() -> str:
-        """What BenchMARL calls the environments together."""
+        """Return BenchMARL's name for all environments."""
         return "cavmarl"
 
     @staticmethod
     def _of_agents(env: CavTorchRLEnv, part: str) -> Composite:
-        """The spec of one world that has only this part of what the agents are told."""
+        """Return the spec of one world with only this part of the agents' entries."""
         spec = env.full_observation_spec_unbatched.clone()
         for other in set(spec[GROUP].keys()) - {part}:
             del spec[GROUP, other]
         return spec
 
 
-class CavTask(Task):  # type: ignore[misc] # found in an environment of its own only
-    """The entries of `envs/`; `CavTaskClass` takes other folders and maps."""
+class CavTask(Task):  # type: ignore[misc] # only installed in a separate environment
+    """The entries of `envs/`; `CavTaskClass` accepts other folders and maps."""
 
     GRID4X4 = None
     MERGE = None
@@ -128,11 +131,11 @@ class CavTask(Task):  # type: ignore[misc] # found in an environment of its own 
 
     @staticmethod
     def associated_class() -> type[CavTaskClass]:
-        """What `get_task` makes."""
+        """Return the class of `get_task`'s results."""
         return CavTaskClass
 
     def get_from_yaml(self, path: str | None = None) -> CavTaskClass:
-        """The task as its entry describes it, or with the keywords of a YAML file."""
+        """Return the task of the entry, or with the keyword arguments in a YAML file."""
         if path is None:
             return CavTaskClass(self.name)
         found: CavTaskClass = super().get_from_yaml(path)

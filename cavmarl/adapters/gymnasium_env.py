@@ -19,26 +19,26 @@ DECIDED = ("agents", "population.agents", "population.budget")
 
 
 class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
-    """One vehicle of a world; the built-in drivers drive all others.
+    """One vehicle of a world; the built-in drivers drive all other vehicles.
 
-    The entry's other agents become background vehicles, so that the traffic is as dense as there.
-    The infos also have highway-env's `speed` in m/s and `crashed`, and `is_success`, whether it has
-    arrived; `speed` of a vehicle that has left is the last one that was seen.
+    The entry's other agents become background vehicles, so that the traffic has the same density.
+    Infos also have highway-env's `speed` in m/s and `crashed`, and `is_success` (the vehicle has
+    arrived). For a vehicle that has left, `speed` is its last speed.
 
-    An episode is the trip of one vehicle. In `closed` worlds, the default, the others leave one by
-    one; in `open` and `respawn` worlds new ones come for those that leave.
+    An episode is the trip of one vehicle. In `closed` worlds, the default, the other vehicles leave
+    one by one; in `open` and `respawn` worlds, new ones replace them.
 
     Args:
-        env: as for `parallel_env`.
+        env: see `parallel_env`.
         render_mode: `human`, `rgb_array` or None.
-        background: other vehicles; None: all of the entry but one.
-        overrides: as for `parallel_env`.
+        background: number of other vehicles; None: all of the entry but one.
+        overrides: see `parallel_env`.
         config: the same, nested as in an env.yaml: `{"sensors": {"lidar": {"rays": 8}}}`.
-        action_kind: shadows action.kind, `continuous`, `discrete` or `grid`.
-        arguments: other keywords of `parallel_env`.
+        action_kind: sets action.kind: `continuous`, `discrete` or `grid`.
+        arguments: other keyword arguments of `parallel_env`.
 
     Raises:
-        ConfigError: a key that this view decides, or that cannot work.
+        ConfigError: this view sets one of the keys, or a value is not allowed.
     """
 
     metadata: dict[str, Any] = CavEnv.metadata
@@ -89,24 +89,24 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
         """Begin an episode."""
         super().reset(seed=seed)
         observations, infos = self._env.reset(seed=seed, options=options)
-        return observations[EGO], self._told(infos[EGO])
+        return observations[EGO], self._info(infos[EGO])
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Let the vehicle act."""
         observations, rewards, _, truncations, infos = self._env.step({EGO: action})
         ended = bool(infos[EGO]["vehicle_done"])  # a seat itself does not end
         cut = truncations[EGO] and not ended
-        return observations[EGO], rewards[EGO], ended, cut, self._told(infos[EGO])
+        return observations[EGO], rewards[EGO], ended, cut, self._info(infos[EGO])
 
     def render(self) -> Any:
-        """As `CavEnv.render`."""
+        """Draw the world; see `CavEnv.render`."""
         return self._env.render()
 
     def close(self) -> None:
-        """As `CavEnv.close`."""
+        """Close the environment; see `CavEnv.close`."""
         self._env.close()
 
-    def _told(self, info: Mapping[str, float]) -> dict[str, Any]:
+    def _info(self, info: Mapping[str, float]) -> dict[str, Any]:
         for vehicle in self._env.worlds.driven(0, [0]):
             self._speed_mps = vehicle.speed_mps
         return {
@@ -118,13 +118,15 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
 
 
 def _dotted(keys: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested keys as dotted ones.
+    """Yield nested keys as dotted keys.
 
     Raises:
-        ConfigError: no mapping.
+        ConfigError: `keys` is not a mapping.
     """
     if not isinstance(keys, Mapping):
-        raise ConfigError(f"config = {keys!r}: must be a mapping of keys, as in an env.yaml")
+        raise ConfigError(
+            f"config = {keys!r}: must be a mapping from keys to values, as in an env.yaml"
+        )
     for key, value in keys.items():
         if isinstance(value, Mapping):
             yield from _dotted(value, f"{above}{key}.")

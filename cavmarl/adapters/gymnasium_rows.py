@@ -21,40 +21,40 @@ DECIDED = ("agents", "population.budget")
 
 
 class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
-    """The agents of one or more worlds as rows, for programs written for vectors of single agents.
+    """The agents of one or more worlds as rows, for programs written for single-agent vectors.
 
-    A row is an agent id of a world; row `w · A + a` is agent a of world w. In `respawn` worlds, the
+    A row is an agent of a world; row `w · A + a` is agent a of world w. In `respawn` worlds, the
     default, a row whose vehicle ended gets a new one as soon as there is room. In `closed` worlds
-    it waits until the world begins anew, and in `open` worlds each row is used once an episode,
-    from when its agent enters.
+    it waits until the world resets. In `open` worlds each row is used once per episode, from the
+    time when its agent enters.
 
-    Rows end singly (terminations), and all that have a vehicle at the horizon (truncations).
-    `infos["active"]` says which rows act next: the others' observations are 0 and their actions are
-    not read, but for a row that has just ended with `NEXT_STEP` or `DISABLED`: it shows its last
-    observation. With `SAME_STEP` that is in `infos["final_obs"]`, and what the infos said of it in
-    `infos["final_info"]`. The infos also hold every term by its name.
+    Rows end individually (terminations), or at the horizon together (truncations).
+    `infos["active"]` marks the rows that act next. Observations of the other rows are 0, and their
+    actions are not read. With `NEXT_STEP` or `DISABLED`, a row that has just ended shows its last
+    observation. With `SAME_STEP`, that observation is in `infos["final_obs"]`, and its last infos
+    in `infos["final_info"]`. Infos also have every term by its name.
 
-    With `DISABLED`, `reset(options={"reset_mask": …})` takes (num_envs,) rows: a world that is over
-    begins anew with any of its rows, one that goes on with all of them. A row that ended while its
-    world goes on waits as ever, and shows 0 until it has a vehicle. The horizon truncates every row
-    of a world, also those without a vehicle.
+    With `DISABLED`, `reset(options={"reset_mask": …})` takes a mask of rows (num_envs,). A world
+    that is over resets if any of its rows is chosen, another world if all of them are. A row that
+    ended in a world that continues waits as usual, with observations of 0 until it has a vehicle.
+    The horizon truncates every row of a world, including those without a vehicle.
 
-    A frame of a row is that of its world.
+    The frame of a row is that of its world.
 
     Args:
-        env: as for `make_vec`.
-        num_envs: rows of all worlds together.
-        num_worlds: how many worlds they are in.
-        autoreset_mode: when rows and worlds that ended begin anew.
+        env: see `make_vec`.
+        num_envs: number of rows in all worlds.
+        num_worlds: number of worlds.
+        autoreset_mode: when rows and worlds that ended begin again.
         max_episode_steps: Gymnasium's name of `max_cycles`.
         render_mode: `rgb_array` or None.
-        action_kind: shadows action.kind, `continuous`, `discrete` or `grid`.
-        overrides: values for any other key.
-        arguments: other keywords of `make_vec`.
+        action_kind: sets action.kind: `continuous`, `discrete` or `grid`.
+        overrides: values of any other keys.
+        arguments: other keyword arguments of `make_vec`.
 
     Raises:
-        ConfigError: rows that cannot be shared among the worlds, a key that this view decides, or
-            that cannot work.
+        ConfigError: the rows cannot be distributed over the worlds, this view sets one of the keys,
+            or a value is not allowed.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        self.closed = True  # until there is something to close: Gymnasium does so when it is freed
+        self.closed = True  # Gymnasium closes it when it is freed, even if it was not completed
         refuse_decided(DECIDED, overrides, arguments)
         wanted = {"population.mode": "respawn", **(overrides or {})}
         if action_kind is not None:
@@ -82,7 +82,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
             num_envs=num_worlds,
             autoreset_mode=autoreset_mode,
             render_mode=render_mode,
-            overrides=wanted | _rows_a_world(env, wanted, num_envs, num_worlds),
+            overrides=wanted | _rows_per_world(env, wanted, num_envs, num_worlds),
             **arguments,
         )
         self.closed = False
@@ -124,7 +124,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         shown = self._rows(observations)
         if waits.any():
             shown = np.where(waits[:, None], np.float32(0.0), shown)
-        return self._form(shown), self._told({"active": infos["mask"]})
+        return self._form(shown), self._infos({"active": infos["mask"]})
 
     def step(
         self, actions: NDArray[Any]
@@ -137,48 +137,50 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
             actions.reshape(*self._shape, *actions.shape[1:])
         )
         terms = {name: infos["terms"][..., k] for k, name in enumerate(self._term_names)}
-        told = self._told({"active": infos["mask"], "vehicle_done": infos["vehicle_done"], **terms})
+        row_infos = self._infos(
+            {"active": infos["mask"], "vehicle_done": infos["vehicle_done"], **terms}
+        )
         if self.autoreset_mode is AutoresetMode.DISABLED:
-            # Rows without a vehicle have to say so as well: a world may end when none has one.
+            # Rows without a vehicle are truncated, too: a world may end when none has one.
             cut = cut | (infos["episode_over"][:, None] & ~ended)
         over = self._rows(ended | cut)
         self._over = np.stack([over, infos["episode_over"].repeat(self._shape[1])])
         if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():
-            told["final_obs"] = self._last(self._rows(infos["final_observations"]), over)
-            told["final_info"] = {}
+            row_infos["final_obs"] = self._last(self._rows(infos["final_observations"]), over)
+            row_infos["final_info"] = {}
             for name, array in terms.items():
                 rows = self._rows(array)
-                told["final_info"] |= {name: np.where(over, rows, 0.0), f"_{name}": over}
-            told["_final_obs"] = told["_final_info"] = over
+                row_infos["final_info"] |= {name: np.where(over, rows, 0.0), f"_{name}": over}
+            row_infos["_final_obs"] = row_infos["_final_info"] = over
         return (
             self._form(self._rows(observations)),
             self._rows(rewards),
             self._rows(ended),
             self._rows(cut),
-            told,
+            row_infos,
         )
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A frame (height, width, 3) a row, that of its world."""
+        """Return a frame (height, width, 3) for each row, that of its world."""
         frames = self._vec.render()
         if frames is None:
             return None
         return tuple(frame for frame in frames for _ in range(self._shape[1]))
 
     def close_extras(self, **_: Any) -> None:
-        """As `CavVectorEnv.close`."""
+        """Close the environment; see `CavVectorEnv.close`."""
         self._vec.close()
 
     def _worlds_of(self, rows: NDArray[Any]) -> NDArray[np.bool_]:
-        """(W,) the worlds that begin anew for these rows.
+        """Return the worlds (W,) that reset for these rows.
 
         Raises:
-            ConfigError: not a mask of rows, or only a part of a world that goes on.
+            ConfigError: `rows` is not a mask, or has only a part of a world that continues.
         """
         if rows.shape != (self.num_envs,) or rows.dtype != np.bool_:
             raise ConfigError(
                 f"reset_mask has shape {rows.shape} and dtype {rows.dtype}: must be "
-                f"({self.num_envs},) and bool, one a row"
+                f"({self.num_envs},) and bool, one value per row"
             )
         ended, over = self._over.reshape(2, *self._shape)
         chosen = rows.reshape(self._shape)
@@ -186,36 +188,36 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         parts = chosen & ~ended & ~worlds[:, None]
         if parts.any():
             raise ConfigError(
-                f"reset_mask has row {int(parts.argmax())}, which has not ended: its world goes on "
-                f"for the other rows; choose all {self._shape[1]} of the world"
+                f"reset_mask has row {int(parts.argmax())}, which has not ended: its world "
+                f"continues for the other rows; choose all {self._shape[1]} rows of the world"
             )
         return worlds
 
-    def _told(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        """Infos of all rows, each with the mask of its rows, as Gymnasium's wrappers expect."""
-        everybody = np.ones(self.num_envs, dtype=np.bool_)
-        told: dict[str, Any] = {name: self._rows(array) for name, array in arrays.items()}
-        return told | {f"_{name}": everybody for name in arrays}
+    def _infos(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+        """Return infos of all rows with masks, as Gymnasium's wrappers expect them."""
+        all_rows = np.ones(self.num_envs, dtype=np.bool_)
+        infos: dict[str, Any] = {name: self._rows(array) for name, array in arrays.items()}
+        return infos | {f"_{name}": all_rows for name in arrays}
 
     def _last(self, flat: NDArray[np.float32], over: NDArray[np.bool_]) -> NDArray[np.object_]:
-        """(rows,) the last observations of those that are over, None for the others."""
+        """Return the last observations (rows,) of rows that are over, None for other rows."""
         found = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(over):
             found[row] = self._form(flat[row])
         return found
 
     def _rows(self, batch: NDArray[Any]) -> NDArray[Any]:
-        """(W, A, …) as (W · A, …)."""
+        """Reshape (W, A, …) to (W · A, …)."""
         return batch.reshape(-1, *batch.shape[2:])
 
 
-def _rows_a_world(
+def _rows_per_world(
     env: str | Path, overrides: Mapping[str, Any], num_envs: int, num_worlds: int
 ) -> dict[str, int]:
-    """The keys that give each world its share of the rows.
+    """Return the keys that give each world its share of the rows.
 
     Raises:
-        ConfigError: no number of agents does.
+        ConfigError: the rows cannot be divided evenly.
     """
     if min(num_envs, num_worlds) < 1 or num_envs % num_worlds:
         raise ConfigError(

@@ -1,8 +1,8 @@
 """highway-env's tasks under its own names, for scripts in which only the id changes.
 
-`gymnasium.make("cavmarl-highway/merge-v0", config={...})` takes highway-env's `config` with its
-names and units, and gives its observations, actions, rewards and infos; cars drive on maps of
-`envs/` by the models of this package. Leurent: "An environment for autonomous driving
+`gymnasium.make("cavmarl-highway/merge-v0", config={...})` accepts highway-env's `config` with its
+names and units, and returns its observations, actions, rewards and infos. Cars drive on maps of
+`envs/` with the models of this package. Leurent: "An environment for autonomous driving
 decision-making", 2018.
 """
 
@@ -21,7 +21,7 @@ from cavmarl.adapters.highway_tasks import COMMON, DRAWING_KEYS, REWARDS, TASKS,
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import DRIVER_AGENT
 
-# highway-env's type of observation → the sensor, and settings of it that are on by default there.
+# highway-env's type of observation → the sensor, and its settings that are on by default there.
 OBSERVATIONS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "Kinematics": ("kinematics", {"vehicles_count": 5}),
     "OccupancyGrid": (
@@ -52,23 +52,23 @@ _OFF: Mapping[str, Any] = {
 class HighwayEnv(CavEgoEnv):
     """One of highway-env's tasks.
 
-    Rewards are the named ones of highway-env, weighed by its keys; speeds for `high_speed_reward`
-    are scaled by `reward_speed_range` in all tasks. `info["rewards"]` has each. A vehicle that
-    leaves the road ends the episode, whatever `offroad_terminal` says.
+    Rewards are highway-env's named rewards, weighted by its keys. In all tasks,
+    `reward_speed_range` scales the speed for `high_speed_reward`. `info["rewards"]` has each
+    reward. A vehicle that leaves the road ends the episode, independent of `offroad_terminal`.
 
     Args:
         task: a key of `TASKS`.
-        config: highway-env's keys, over the task's own.
-        render_mode: as for `CavEgoEnv`.
-        arguments: other keywords of `parallel_env`; `overrides` holds keys of env.yaml.
+        config: highway-env's keys, which replace those of the task.
+        render_mode: see `CavEgoEnv`.
+        arguments: other keyword arguments of `parallel_env`; `overrides` has keys of env.yaml.
 
     Attributes:
-        config: all of highway-env's keys, with their values.
+        config: all keys of highway-env with their values.
         action_type: has `actions_indexes`, the number of each named action.
 
     Raises:
-        ConfigError: a key that the task does not have, or a type that there is not; which there
-            are is said.
+        ConfigError: the task does not have a key, or a type does not exist; the message lists
+            those that exist.
     """
 
     def __init__(
@@ -120,11 +120,11 @@ class HighwayEnv(CavEgoEnv):
         observation, _, ended, cut, info = super().step(taken)
         named = self._named_rewards(info, changes)
         on_road = info["off_road"] == 0.0
-        told = {**info, "action": action, "rewards": {**named, "on_road_reward": float(on_road)}}
-        return observation[self._seen], self._reward(named) * on_road, ended, cut, told
+        infos = {**info, "action": action, "rewards": {**named, "on_road_reward": float(on_road)}}
+        return observation[self._seen], self._reward(named) * on_road, ended, cut, infos
 
     def _named_rewards(self, info: Mapping[str, Any], changes_lane: bool) -> dict[str, float]:
-        """The named rewards of this step, each about from 0 to 1."""
+        """Return the named rewards of this step, each about from 0 to 1."""
         low, high = self.config["reward_speed_range"]
         fast = float(np.clip((info["speed"] - low) / (high - low), 0.0, 1.0))
         right, merging_mps = self._lane_and_merging()
@@ -150,7 +150,7 @@ class HighwayEnv(CavEgoEnv):
         return float((total - worst) / (best - worst)) if best > worst else float(total)
 
     def _lane_and_merging(self) -> tuple[float, float]:
-        """How far right the own lane is, 0 to 1; and how much slower than they may others merge."""
+        """Return how far right the lane is, 0 to 1, and by how much merging cars are too slow."""
         network = self._env.network
         rows = self._env.worlds.simulation.vehicles(0)
         own = rows[rows["driver"] == DRIVER_AGENT]
@@ -169,17 +169,17 @@ class HighwayEnv(CavEgoEnv):
 
 
 class _Actions:
-    """highway-env's actions in terms of this package's.
+    """highway-env's actions, translated to this package's.
 
     Args:
-        settings: highway-env's, `type` among them.
+        settings: highway-env's settings, including `type`.
 
     Attributes:
-        keys: of env.yaml.
-        space: of the actions.
+        keys: keys of env.yaml.
+        space: the action space.
         numbers: named action → its number.
 
-    Raises ConfigError: a type or a setting that there is not.
+    Raises ConfigError: a type or a setting does not exist.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -192,7 +192,7 @@ class _Actions:
                                "actions_per_axis"),
         }  # fmt: skip
         if kind not in known:
-            raise ConfigError(f"action.type = {kind!r}: there are {', '.join(known)}")
+            raise ConfigError(f"action.type = {kind!r}: must be one of {', '.join(known)}")
         _refuse_unknown("action", settings, ("type", *known[kind]))
         self._pedals = bool(settings.get("longitudinal", True))
         self._wheel = bool(settings.get("lateral", True))
@@ -221,7 +221,7 @@ class _Actions:
         self.space = gymnasium.spaces.Discrete(len(self._choices))
 
     def translate(self, action: Any) -> Any:
-        """The action of this package that is meant."""
+        """Return this package's action for an action of highway-env."""
         if isinstance(self.space, gymnasium.spaces.Discrete) and not self.space.contains(action):
             raise ConfigError(f"action = {action!r}: must be one of 0 to {self.space.n - 1}")
         if self._meta:
@@ -230,7 +230,7 @@ class _Actions:
         return np.array(pair, dtype=np.float32)
 
     def changes_lane(self, action: Any) -> bool:
-        """Whether a meta-action asks for another lane."""
+        """Return whether a meta-action asks for another lane."""
         return bool(self._meta) and self._meta[int(action)] in (0, 2)
 
     def _make_meta(self, settings: Mapping[str, Any]) -> None:
@@ -249,7 +249,7 @@ class _Actions:
         }
 
     def _pair(self, action: Any) -> tuple[float, float]:
-        """Throttle and steering; the wheel turns to the right there, to the left here."""
+        """Return throttle and steering; highway-env's steering is positive to the right."""
         values = [float(value) for value in action]
         throttle = values.pop(0) if self._pedals else 0.0
         return throttle, -values.pop(0) if self._wheel else 0.0
@@ -258,9 +258,9 @@ class _Actions:
 def _whole_config(
     task: str, found: HighwayTask, config: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """All keys of a task; those of a caller last."""
+    """Return all keys of a task, with those of the caller."""
     if config is not None and not isinstance(config, Mapping):
-        raise ConfigError(f"config = {config!r}: must be a mapping, as of highway-env")
+        raise ConfigError(f"config = {config!r}: must be a mapping of highway-env's keys")
     whole = {**COMMON, **found.config}
     for key, value in (config or {}).items():
         if key in ("other_vehicles_type", "offroad_terminal", *DRAWING_KEYS):
@@ -270,17 +270,17 @@ def _whole_config(
         whole[key] = {**whole[key], **value} if is_same else value
     if whole["controlled_vehicles"] != 1:
         raise ConfigError(
-            f"controlled_vehicles = {whole['controlled_vehicles']!r}: this view drives one; "
+            f"controlled_vehicles = {whole['controlled_vehicles']!r}: must be 1 in this view; "
             f"cavmarl.parallel_env({found.entry!r}) drives many"
         )
     return whole
 
 
 def _observation(settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The sensor that is meant, and its keys of env.yaml."""
+    """Return the sensor of an observation type, and its keys of env.yaml."""
     kind = str(settings.get("type"))
     if kind not in OBSERVATIONS:
-        raise ConfigError(f"observation.type = {kind!r}: there are {', '.join(OBSERVATIONS)}")
+        raise ConfigError(f"observation.type = {kind!r}: must be one of {', '.join(OBSERVATIONS)}")
     sensor, usual = OBSERVATIONS[kind]
     keys = {**usual, **settings}
     for name in ("type", "include_obstacles", "flatten"):
@@ -289,12 +289,12 @@ def _observation(settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
 
 
 def _clock(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The keys that say how long ticks, steps and episodes are."""
+    """Return the keys for the durations of ticks, steps and episodes."""
     policy, ticks = float(config["policy_frequency"]), float(config["simulation_frequency"])
     if policy <= 0.0 or ticks < policy:
         raise ConfigError(
             f"policy_frequency = {policy:g}, simulation_frequency = {ticks:g}: must be above 0, "
-            "and the second one not below the first"
+            "and the second must not be below the first"
         )
     duration = float(config["duration"])
     if not 0.0 < duration < math.inf:
@@ -314,14 +314,14 @@ def _map(task: HighwayTask, config: Mapping[str, Any]) -> dict[str, Any]:
     lanes = config["lanes_count"]
     if lanes not in task.maps:
         raise ConfigError(
-            f"lanes_count = {lanes!r}: there are maps of {', '.join(map(str, task.maps))} lanes; "
-            "for another number, name a map of your own: overrides={'map.source': FILE}"
+            f"lanes_count = {lanes!r}: must be one of {', '.join(map(str, task.maps))}; "
+            "for another number, use your own map: overrides={'map.source': FILE}"
         )
     return {"map.source": task.maps[lanes]}
 
 
 def _half(name: str, settings: Mapping[str, Any], usual: float) -> float:
-    """What ±1 means."""
+    """Return the value of ±1."""
     low, high = settings.get(name, (-usual, usual))
     if low != -high or high <= 0.0:
         raise ConfigError(f"action.{name} = [{low}, {high}]: must be symmetric, as [-5, 5]")
@@ -332,5 +332,5 @@ def _refuse_unknown(where: str, given: Mapping[str, Any], known: Iterable[str]) 
     for key in given:
         if key not in known:
             raise ConfigError(
-                f"{where}.{key}: no such key; there are {', '.join(sorted(set(known)))}"
+                f"{where}.{key}: no such key; must be one of {', '.join(sorted(set(known)))}"
             )

@@ -1,7 +1,7 @@
-"""highway-env's tasks: which entry each is driven in, and what its `config` holds by default.
+"""highway-env's tasks: the entry of each task, and the default values of its `config`.
 
-The values are those of highway-env 1.10, but for observations that this package does not have:
-`two-way` and `u-turn` are observed there as times to collision, here as `Kinematics`.
+The values are those of highway-env 1.10, except for observations that this package does not have:
+`two-way` and `u-turn` have times to collision there, and `Kinematics` here.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-# Of every task.
+# Common to all tasks.
 COMMON: Mapping[str, Any] = {
     "observation": {"type": "Kinematics"},
     "action": {"type": "DiscreteMetaAction"},
@@ -22,7 +22,7 @@ COMMON: Mapping[str, Any] = {
     "collision_reward": -1,
 }
 
-# Settings of how highway-env draws: they change nothing of the task, and nothing here.
+# Settings of highway-env's rendering; they are accepted and ignored.
 DRAWING_KEYS = frozenset(
     (
         "screen_width", "screen_height", "centering_position", "scaling", "show_trajectories",
@@ -30,7 +30,7 @@ DRAWING_KEYS = frozenset(
     )
 )  # fmt: skip
 
-# Named terms of a task's reward, which its config weighs.
+# Named rewards of a task; its config has their weights.
 REWARDS = (
     "collision_reward",
     "right_lane_reward",
@@ -48,13 +48,13 @@ class HighwayTask:
     """One task.
 
     Attributes:
-        entry: the environment of `envs/` that it is driven in.
-        config: highway-env's keys, over `COMMON`.
-        keys: keys of `env.yaml` that make the entry the task.
-        worst: rewards of the smallest sum, which `normalize_reward` makes 0.
-        best: rewards of the largest sum, which it makes 1.
-        maps: number of lanes → map of the entry, where `lanes_count` chooses one.
-        merging: edge whose vehicles merge.
+        entry: the environment in `envs/` of the task.
+        config: highway-env's keys, in addition to `COMMON`.
+        keys: keys of `env.yaml` that change the entry for the task.
+        worst: rewards of the smallest sum, which `normalize_reward` maps to 0.
+        best: rewards of the largest sum, which it maps to 1.
+        maps: number of lanes → map of the entry, if `lanes_count` selects one.
+        merging: edge from which vehicles merge.
     """
 
     entry: str

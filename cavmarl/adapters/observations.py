@@ -1,4 +1,4 @@
-"""What the views share: the form of observations, keys that views decide, specs with a horizon."""
+"""Common parts of the views: the form of observations, fixed keys, and specs with a horizon."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Observations = NDArray[np.float32] | dict[str, NDArray[Any]]
 
 
 def refuse_decided(keys: Iterable[str], *given: Mapping[str, Any] | None) -> None:
-    """Refuse keywords and overrides of a caller that hold keys which the view decides."""
+    """Raise an error if arguments or overrides have keys that the view sets itself."""
     for key in keys:
         if any(key in mapping for mapping in given if mapping is not None):
             raise ConfigError(
-                f"{key}: this view decides it; cavmarl.parallel_env and make_vec leave it to you"
+                f"{key}: this view sets it; use cavmarl.parallel_env or make_vec to choose it"
             )
 
 
 class WithSpec:
-    """Base of a view whose spec, which Gymnasium sets, tells the horizon of this very one.
+    """Base of a view whose Gymnasium spec has the horizon of this environment.
 
-    The ids have none: Gymnasium would cut at it what `max_cycles` or `horizon_s` makes longer.
+    The registered ids have no horizon, as Gymnasium would also cut longer episodes at it.
     """
 
     _spec: EnvSpec | None = None
@@ -37,7 +37,7 @@ class WithSpec:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How it was made; None if not by Gymnasium."""
+        """Gymnasium's spec; None if Gymnasium did not make this object."""
         return self._spec
 
     @spec.setter
@@ -46,16 +46,16 @@ class WithSpec:
 
 
 class ObservationForm:
-    """Leads from flat observations, which `CavVectorEnv` gives, to those of `observation.kind`.
+    """Converts flat observations of `CavVectorEnv` to the form of `observation.kind`.
 
     Args:
-        config: the environment.
+        config: configuration of the environment.
 
     Attributes:
-        space: of one agent: a flat Box, or a Dict with one Box a sensor.
+        space: space of one agent: a flat Box, or a Dict with one Box per sensor.
 
     Raises:
-        ConfigError: samples of sensors in a form that this cannot give.
+        ConfigError: the observations are sensor samples in a form that is not supported.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -63,14 +63,14 @@ class ObservationForm:
         if form.mode != "ground_truth" and form.kind != "flat":
             raise ConfigError(
                 f"observation.mode = {form.mode!r}, observation.kind = {form.kind!r}: this adapter "
-                "gives flat numbers; use observation.kind = flat, or make_vec or parallel_env"
+                "supports flat numbers; use observation.kind = flat, or make_vec or parallel_env"
             )
         self.space = observation_space(config)
         self._stack = config.sensors.stack
         self._parts = observation_parts(config.sensors) if form.kind == "dict" else None
 
     def __call__(self, flat: NDArray[np.float32]) -> Observations:
-        """Observations of any number of agents: (…, D) as they are, or (…, *shape) a sensor."""
+        """Return observations of any number of agents: (…, D), or (…, *shape) for each sensor."""
         if self._parts is None:
             return flat
         frames = flat.reshape(*flat.shape[:-1], self._stack, -1)

@@ -1,6 +1,6 @@
 """RLlib's `MultiAgentEnv`, for its new API stack.
 
-Importing this module loads Ray and RLlib; nothing that `import cavmarl` loads imports it.
+Importing this module loads Ray and RLlib; `import cavmarl` does not import it.
 """
 
 from __future__ import annotations
@@ -23,26 +23,27 @@ Step = tuple[
 
 
 class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an environment of its own only
-    """One world; what `config` holds are the arguments of `parallel_env`.
+    """One world; `config` has the keyword arguments of `parallel_env`.
 
         PPOConfig().environment(CavRllibEnv, env_config={"env": "town", "agents": 25})
 
-    Agents enter and leave in every population: all ids that an episode can use are declared
-    beforehand, and an id that has ended does not come back. The end of all (`__all__`) is a
-    truncation where the horizon cut an agent. RLlib ends an episode as soon as all agents that it
-    knows have ended, also where others enter in that very step: these are then the agents of its
-    next episode, for which the same world goes on.
+    Agents enter and leave in every population. All ids of an episode are declared in advance, and
+    an id that has ended does not return. The end of the episode (`__all__`) is a truncation if the
+    horizon cut an agent. RLlib ends an episode as soon as all agents known to it have ended, even
+    if other agents enter in the same step. They are the agents of its next episode, in which the
+    same world continues.
 
-    In `respawn` worlds an id is a seat: its vehicle ends with `infos[agent]["vehicle_done"]`, and
-    RLlib's values go on across it, so that `closed` and `open` worlds are learnt more exactly.
+    In `respawn` worlds an id is a seat: its vehicle ends with `infos[agent]["vehicle_done"]`, but
+    RLlib's value estimates continue across it. Learning is therefore more exact in `closed` and
+    `open` worlds.
 
-    Each environment of an env runner is a world of its own, seeded by RLlib.
+    Each environment of an env runner has its own world, seeded by RLlib.
 
     Args:
-        config: keywords of `parallel_env`, as RLlib's `env_config` gives them.
+        config: keyword arguments of `parallel_env`, from RLlib's `env_config`.
 
     Raises:
-        ConfigError: a key, value or combination that cannot work.
+        ConfigError: a key, a value or a combination is not possible.
     """
 
     def __init__(self, config: Mapping[str, Any] | None = None) -> None:
@@ -58,7 +59,7 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode; without a seed it is that of the agents that entered last, if any."""
+        """Begin an episode; without a seed, that of the agents that entered last, if any."""
         if self._entered is None or seed is not None:
             self._entered = self._env.reset(seed=seed, options=options)
         (observations, infos), self._entered = self._entered, None
@@ -82,14 +83,14 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an
         return observations, rewards, ends, {**cut, "__all__": at_horizon}, infos
 
     def render(self) -> Any:
-        """As `CavEnv.render`."""
+        """Draw the world; see `CavEnv.render`."""
         return self._env.render()
 
     def close(self) -> None:
-        """As `CavEnv.close`."""
+        """Close the environment; see `CavEnv.close`."""
         self._env.close()
 
 
 def _only(agents: Collection[str], part: Mapping[str, Any]) -> dict[str, Any]:
-    """What a part of a step's results says of these agents."""
+    """Return the entries of these agents."""
     return {agent: value for agent, value in part.items() if agent in agents}

@@ -1,7 +1,6 @@
-"""stable-baselines3's `VecEnv`: every agent seat of every world is one of its environments.
+"""stable-baselines3's `VecEnv`: every agent of every world is one of its environments.
 
-Importing this module loads stable-baselines3 and torch; nothing that `import cavmarl` loads imports
-it.
+Importing this module loads stable-baselines3 and torch; `import cavmarl` does not import it.
 """
 
 from __future__ import annotations
@@ -35,25 +34,25 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
     """W worlds with A agents each as W · A environments that share one policy; row w · A + a.
 
     In `respawn` worlds, the default, a row whose vehicle ended gets a new one as soon as there is
-    room. In `closed` worlds it waits until the world begins anew, and in `open` worlds each row
-    is used once an episode, from when its agent enters.
+    room. In `closed` worlds it waits until the world resets. In `open` worlds each row is used once
+    per episode, from the time when its agent enters.
 
-    A row that ended is `done` and carries its last observation as `terminal_observation`, whether
+    A row that ended is `done`. Its info has its last observation as `terminal_observation`, whether
     the horizon cut it as `TimeLimit.truncated`, and whether it arrived as `is_success`. While a row
-    waits for a vehicle its observation and reward are 0, its actions are not read and its info says
-    `inactive`. With `render_mode="rgb_array"`, a picture has one tile a world.
+    waits for a vehicle, its observation and reward are 0, its actions are not read, and its info
+    has `inactive`. With `render_mode="rgb_array"`, a picture has one tile per world.
 
     Args:
-        env: as for `make_vec`.
+        env: see `make_vec`.
         num_worlds: W.
-        overrides: values for any other key.
-        arguments: other keywords of `make_vec`.
+        overrides: values of any other keys.
+        arguments: other keyword arguments of `make_vec`.
 
     Attributes:
-        spec: Gymnasium's of the entry's rows; None where there is no such id.
+        spec: Gymnasium's spec of the entry's rows; None if there is no such id.
 
     Raises:
-        ConfigError: a key, value or combination that cannot work.
+        ConfigError: a key, a value or a combination is not possible.
     """
 
     def __init__(
@@ -82,7 +81,7 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
         self.spec = gymnasium.registry.get(f"cavmarl/{env}Agents-v{self._vec.config.version}")
 
     def reset(self) -> Observations:
-        """Begin an episode in every world; the first row's seed is the root of all."""
+        """Begin an episode in every world; the first row's seed is the root of all seeds."""
         observations, infos = self._vec.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
@@ -90,7 +89,7 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
         return self._form(self._rows(observations))
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take the actions of all rows."""
+        """Store the actions of all rows."""
         self._actions = actions.reshape(*self._shape, *actions.shape[1:])
 
     def step_wait(
@@ -114,37 +113,37 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
         return self._form(self._rows(observations)), self._rows(rewards), done, shown
 
     def close(self) -> None:
-        """As `CavVectorEnv.close`."""
+        """Close the environment; see `CavVectorEnv.close`."""
         self._vec.close()
 
     def get_images(self) -> tuple[NDArray[np.uint8], ...]:
-        """A frame (height, width, 3) a world, which `render` makes one picture of."""
+        """Return a frame (height, width, 3) per world, from which `render` makes one picture."""
         return self._vec.render() or ()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of the worlds, the same for every row."""
+        """Return an attribute of the worlds, the same for every row."""
         value = self.spec if attr_name == "spec" else getattr(self._vec, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Refused: rows share their worlds.
+        """Raise an error: rows share their worlds.
 
         Raises:
             NotImplementedError: always.
         """
-        raise NotImplementedError(f"{attr_name}: rows share their worlds, no row has its own")
+        raise NotImplementedError(f"{attr_name}: cannot be set, because rows share their worlds")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the worlds once; every row gets what it returns."""
+        """Call a method of the worlds once; every row gets its result."""
         found = getattr(self._vec, method_name)(*method_args, **method_kwargs)
         return [found for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
-        """No row is wrapped by itself."""
+        """Return False for each row: no row is wrapped individually."""
         return [False for _ in self._get_indices(indices)]
 
     def _rows(self, batch: NDArray[Any]) -> NDArray[Any]:
-        """(W, A, …) as (W · A, …)."""
+        """Reshape (W, A, …) to (W · A, …)."""
         return batch.reshape(-1, *batch.shape[2:])

@@ -1,7 +1,7 @@
 """TorchRL's `EnvBase`: W worlds with A agents each as one batch of tensors.
 
-No Python loop runs over agents in a step. Importing this module loads TorchRL and torch; nothing
-that `import cavmarl` loads imports it.
+No Python loop runs over agents in a step. Importing this module loads TorchRL and torch;
+`import cavmarl` does not import it.
 """
 
 from __future__ import annotations
@@ -31,38 +31,37 @@ except ModuleNotFoundError as error:
     raise missing(error.name, "torchrl") from error
 
 GROUP = "car"
-DECIDED = ("autoreset_mode", "copy")  # TorchRL resets worlds itself and keeps what it is given
+DECIDED = ("autoreset_mode", "copy")  # TorchRL resets worlds itself and keeps its inputs
 
 
 class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not typed
-    """W worlds with A agents each, of the batch size (W,); all agents are of the group `car`.
+    """W worlds with A agents each, of the batch size (W,); all agents are in the group `car`.
 
-    Entries of a tensordict, with one axis more than the batch for the agents:
+    Entries of a tensordict; the agents' entries have one axis more than the batch:
 
-    - `("car", "observation")`: (W, A, D), or one entry a sensor (`observation.kind: dict`);
-    - `("car", "mask")`: (W, A) agents that have a vehicle and act next. The others' actions are not
-    read
-      and their observations are 0, but for the last one of an agent that has just ended. Losses
-      and means are to be taken where it is True;
+    - `("car", "observation")`: (W, A, D), or one entry per sensor (`observation.kind: dict`);
+    - `("car", "mask")`: (W, A) agents that have a vehicle and act next. Actions of other agents are
+      not read. Their observations are 0, except for the last one of an agent that has just ended.
+      Use only entries where the mask is True for losses and means;
     - `("car", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;
     - `("next", "car", "reward")`: (W, A, 1);
-    - `("next", "car", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) of each agent: its vehicle
-      ended, or the horizon cut its trip. They are those of a value estimator;
-    - `("next", "terminated")`, `"truncated"`, `"done"`: (W, 1) of each world, which TorchRL resets
-      by; `("next", "car", "observation")` still has the last observations of the old episode;
+    - `("next", "car", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) for each agent: its
+      vehicle ended, or the horizon cut its trip. Use these for value estimators;
+    - `("next", "terminated")`, `"truncated"`, `"done"`: (W, 1) of each world; TorchRL resets by it.
+      `("next", "car", "observation")` still has the last observations of the old episode;
     - `("next", "car", "info", term)`: (W, A, 1) each term by its name.
 
-    Every population can be used; agents enter and leave where the mask changes. In `respawn` worlds
-    an agent that is done gets another vehicle while its world goes on.
+    Every population can be used; the mask changes when agents enter and leave. In `respawn` worlds,
+    an agent that is done gets another vehicle while its world continues.
 
     Args:
-        env: as for `make_vec`.
+        env: see `make_vec`.
         num_envs: W.
-        device: where the tensors are; the worlds stay on the CPU.
-        arguments: other keywords of `make_vec`.
+        device: device of the tensors; the worlds stay on the CPU.
+        arguments: other keyword arguments of `make_vec`.
 
     Raises:
-        ConfigError: a key, value or combination that cannot work.
+        ConfigError: a key, a value or a combination is not possible.
     """
 
     batch_locked = True
@@ -109,7 +108,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         return self._vec
 
     def _of_agents(self, **specs: TensorSpec) -> Composite:
-        """A spec of the group's entries."""
+        """Return a spec of the group's entries."""
         agents = (*self.batch_size, len(self.group_map[GROUP]))
         return Composite({GROUP: Composite(specs, shape=agents)}, shape=self.batch_size)
 
@@ -143,7 +142,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     def _agents(
         self, flat: NDArray[np.float32], mask: NDArray[np.bool_], terms: NDArray[np.float32]
     ) -> dict[str, Any]:
-        """What the agents are told; arrays are not copied."""
+        """Return the entries of the agents; arrays are not copied."""
         shown = self._form(flat)
         columns = torch.from_numpy(terms)
         return {
@@ -159,13 +158,13 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         return TensorDict({GROUP: agent_arrays, **worlds}, self.batch_size, device=self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """As `CavVectorEnv.close`."""
+        """Close the environment; see `CavVectorEnv.close`."""
         self._vec.close()
         super().close(raise_if_closed=raise_if_closed)
 
 
 def _ends(terminated: NDArray[np.bool_], truncated: NDArray[np.bool_]) -> dict[str, Tensor]:
-    """TorchRL's three entries, each with a last axis of 1."""
+    """Return TorchRL's three entries, each with a last axis of 1."""
     ended, cut = (torch.from_numpy(flags).unsqueeze(-1) for flags in (terminated, truncated))
     return {"done": ended | cut, "terminated": ended, "truncated": cut}
 
@@ -175,7 +174,7 @@ def _flags(shape: tuple[int, ...]) -> Categorical:
 
 
 def _observation_spec(space: spaces.Space[Any], agents: tuple[int, int]) -> TensorSpec:
-    """The spec of a Box, or of a Dict of them."""
+    """Return the spec of a Box, or of a Dict of Boxes."""
     if isinstance(space, spaces.Dict):
         return Composite(
             {name: _observation_spec(part, agents) for name, part in space.items()}, shape=agents
@@ -189,7 +188,7 @@ def _observation_spec(space: spaces.Space[Any], agents: tuple[int, int]) -> Tens
 
 
 def _action_spec(space: spaces.Space[Any], agents: tuple[int, int]) -> TensorSpec:
-    """The spec of continuous or of meta-actions."""
+    """Return the spec of continuous actions or of choices."""
     if isinstance(space, spaces.Discrete):
         return Categorical(int(space.n), agents, dtype=torch.int64)
     return Bounded(-1.0, 1.0, (*agents, 2), dtype=torch.float32)

@@ -43,7 +43,7 @@ add_command(
     app,
     "fidelity",
     map_fidelity.fidelity,
-    "cavmarl map fidelity city.net.xml scan.laz --frame utm --page fidelity.html",
+    "cavmarl map fidelity city.net.xml scan.laz --frame projected --page fidelity.html",
 )
 add_command(
     app,

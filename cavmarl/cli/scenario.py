@@ -227,11 +227,11 @@ add_command(
     app,
     "run",
     run,
-    "cavmarl scenario run cut_in --map grid4x4 --driver idm --video cut_in.mp4",
+    "cavmarl scenario run merge_conflict --map grid4x4 --driver idm --video merge_conflict.mp4",
 )
 add_command(
     app,
     "sweep",
     sweep,
-    "cavmarl scenario sweep cut_in --map grid4x4 --seeds 5",
+    "cavmarl scenario sweep merge_conflict --map grid4x4 --seeds 5",
 )

@@ -1,4 +1,4 @@
-"""What a world is: the keys of `env.yaml`, their checks, and the entries of `envs/`.
+"""Configuration of a world: the keys of `env.yaml`, their checks, and the entries of `envs/`.
 
-Stands on `core` alone; all other folders read it.
+Builds on `core` alone; all other folders read it.
 """

@@ -1,4 +1,4 @@
-"""`ActionConfig`: what an agent can do."""
+"""`ActionConfig`: the actions of an agent."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ MAX_GRID = 1024  # choices
 
 @dataclass(frozen=True)
 class ActionConfig(Section, key="action"):
-    """What an agent can do.
+    """The actions of an agent.
 
     Attributes:
         kind: `continuous`: (throttle, steering) in [-1, 1]; `discrete`: highway-env's five
-            meta-actions LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER; `grid`: one of all pairs of
-            `grid_throttle` and `grid_steering`.
-        acceleration_mps2: what throttle ±1 means.
-        steering_rad: what steering ±1 means (front wheels, left positive).
+            meta-actions LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER; `grid`: an index into all
+            pairs of `grid_throttle` and `grid_steering`.
+        acceleration_mps2: acceleration at throttle ±1.
+        steering_rad: steering angle of the front wheels at steering ±1, left positive.
         target_speeds_mps: `discrete`: the speeds that FASTER and SLOWER step through.
-        grid_throttle: `grid`: rising throttles in [-1, 1], 0 among them.
-        grid_steering: `grid`: rising steerings in [-1, 1], 0 among them. Choice k is throttle
-            k // n with steering k % n, of n steerings.
+        grid_throttle: `grid`: increasing throttles in [-1, 1], including 0.
+        grid_steering: `grid`: increasing steerings in [-1, 1], including 0. With n steerings,
+            choice k is throttle k // n and steering k % n.
         out_of_range: continuous values beyond ±1: `error`, or `clip` (see `traffic_stats`).
-        missing_action: a live agent without an action: `error`, or `hold` its last one (counted).
+        missing_action: no action for a live agent: `error`, or `hold` its last action (counted).
         late_actions: an action for an agent that has left: `error`, or `ignore` (counted).
     """
 
@@ -48,28 +48,30 @@ class ActionConfig(Section, key="action"):
         self.need(
             "target_speeds_mps",
             len(speeds) >= 2 and _rises(speeds, 0.0, 60.0),
-            "must be at least two rising speeds from 0 to 60",
+            "must be at least two increasing speeds from 0 to 60",
         )
         for key in ("grid_throttle", "grid_steering"):
             shares = getattr(self, key)
             self.need(
                 key,
                 _rises(shares, -1.0, 1.0) and 0.0 in shares,
-                "must be rising numbers from -1 to 1, 0 among them",
+                "must be increasing numbers from -1 to 1, including 0",
             )
         size = len(self.grid_throttle) * len(self.grid_steering)
-        self.need("grid_steering", size <= MAX_GRID, f"makes {size} pairs, over {MAX_GRID}")
+        self.need(
+            "grid_steering", size <= MAX_GRID, f"makes {size} pairs; at most {MAX_GRID} are allowed"
+        )
 
     @property
     def choices(self) -> int:
-        """How many actions there are to choose from; 0: they are continuous."""
+        """Number of actions to choose from; 0: actions are continuous."""
         if self.kind == "grid":
             return len(self.grid_throttle) * len(self.grid_steering)
         return ACTION_SLOWER + 1 if self.kind == "discrete" else 0
 
     @property
     def idle_choice(self) -> int:
-        """The choice that changes nothing."""
+        """The action that changes nothing."""
         if self.kind != "grid":
             return ACTION_IDLE
         steering = self.grid_steering
@@ -77,12 +79,12 @@ class ActionConfig(Section, key="action"):
 
     @property
     def pairs(self) -> list[tuple[float, float]]:
-        """(throttle, steering) in [-1, 1] of each choice of a grid."""
+        """The pair (throttle, steering) in [-1, 1] of each choice of a grid."""
         return list(product(self.grid_throttle, self.grid_steering))
 
 
 def _rises(values: tuple[float, ...], low: float, high: float) -> bool:
-    """Whether there are some, each above the one before, all within the bounds."""
+    """Return whether there are values, all within the bounds and strictly increasing."""
     return (
         bool(values)
         and all(math.isfinite(v) and low <= v <= high for v in values)

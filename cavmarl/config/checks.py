@@ -1,7 +1,7 @@
-"""How the classes of a configuration refuse values.
+"""Checks of configuration values.
 
-A field's range stands in its type: `Annotated[float, Within(0.0, 1.0)]`. `check_ranges` reads it
-there; what depends on several fields is checked by the class itself, in `__post_init__`.
+The type of a field contains its range: `Annotated[float, Within(0.0, 1.0)]`. `check_ranges` reads
+it there. A class checks conditions on several fields itself, in `__post_init__`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Within:
 
     @property
     def expected(self) -> str:
-        """What a message says a value must be."""
+        """The part of an error message that describes allowed values."""
         return f"must be a number from {self.low:g} to {self.high:g}"
 
 
@@ -33,7 +33,7 @@ class Whole(Within):
     """The range of a whole number.
 
     Attributes:
-        note: ends the message.
+        note: text that ends the error message.
     """
 
     low: int
@@ -42,14 +42,14 @@ class Whole(Within):
 
     @property
     def expected(self) -> str:
-        """What a message says a value must be."""
+        """The part of an error message that describes allowed values."""
         return f"must be a whole number from {self.low} to {self.high}{self.note}"
 
 
 class Section:
-    """A class of the configuration: `key` is where it stands in the file.
+    """Base of configuration classes; `key` is their place in env.yaml.
 
-    Fields are checked against their ranges when an object is made.
+    Fields are checked against their ranges when an object is created.
     """
 
     section: ClassVar[str]
@@ -62,18 +62,18 @@ class Section:
         check_ranges(self.section, self)
 
     def need(self, name: str, holds: bool, expected: str) -> None:
-        """Refuse the value at a dotted name of this section unless `holds`."""
+        """Raise a ConfigError for the value at a dotted name of this section unless `holds`."""
         key = f"{self.section}.{name}" if self.section else name
         check(holds, key, attrgetter(name)(self), expected)
 
 
 def check_ranges(section: str, holder: object) -> None:
-    """Refuse values outside the ranges in the types of a dataclass's fields; None passes."""
+    """Raise a ConfigError for a field outside the range in its type; None is allowed."""
     kind: Any = type(holder)
     for name, bounds in _ranges(kind):
         value = getattr(holder, name)
         if value is not None:
-            # NaN is in no range, and infinity is beyond every one.
+            # NaN and infinity are outside of every range.
             fits = bounds.low <= value <= bounds.high
             check(fits, f"{section}.{name}", value, bounds.expected)
 

@@ -1,6 +1,6 @@
-"""The form of a trained driver: the keys of `env.yaml` that say what it observes and does.
+"""The form of a trained driver: the keys of `env.yaml` for its observations and actions.
 
-A driver's `config.json` holds its form. Reading it needs neither the weights nor torch.
+A driver's `config.json` contains its form. Reading it needs neither the weights nor torch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from cavmarl.core.errors import ConfigError, PolicyError
 
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
-# Keys of `action` that give the actions of each kind their meaning.
+# Keys of `action` that define the meaning of the actions, by kind.
 SCALES = {
     "continuous": ("acceleration_mps2", "steering_rad"),
     "discrete": ("target_speeds_mps",),
@@ -31,19 +31,19 @@ SCALES = {
 _ABSENT = object()
 
 Form = dict[str, Any]
-"""Values of `sensors` and `action` by dotted key, as overrides."""
+"""Values of keys of `sensors` and `action`, by dotted key, usable as overrides."""
 
 
 @dataclass(frozen=True)
 class _FormFile:
-    """The two parts of `config.json` that make the form."""
+    """The two parts of `config.json` that contain the form."""
 
     sensors: SensorsConfig
     action: ActionConfig
 
 
 def form_of(sensors: SensorsConfig, action: ActionConfig) -> Form:
-    """Return all keys that say what observations and actions mean, with these values."""
+    """Return all keys that define the meaning of observations and actions, with their values."""
     from cavmarl.config.io import dotted_keys  # pydantic is slow to import
 
     names = ("kind", *SCALES[action.kind])
@@ -56,7 +56,7 @@ def read_form(folder: Path) -> Form:
     """Read the form of a trained driver from its folder.
 
     Raises:
-        PolicyError: a file of the driver is missing, or `config.json` is broken.
+        PolicyError: a file of the driver is missing, or `config.json` is invalid.
     """
     from cavmarl.config.io import validate
 
@@ -66,7 +66,7 @@ def read_form(folder: Path) -> Form:
     path = folder / CONFIG_FILE
     try:
         raw: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:  # not all of JSON's are its own
+    except (OSError, ValueError, RecursionError) as error:  # json raises RecursionError, too
         reason = error.strerror if isinstance(error, OSError) else None
         raise PolicyError(f"{path}: cannot be read ({reason or error})") from error
     if isinstance(raw, Mapping):
@@ -79,20 +79,20 @@ def read_form(folder: Path) -> Form:
 
 
 def forms_in(policies: Iterable[str | Path]) -> dict[str, Form]:
-    """Return the form of each trained driver in `policies`, by its name; scripts have none.
+    """Return the form of each trained driver in `policies`, by name; scripts have no form.
 
     Raises:
-        PolicyError: there is nothing of that name, or its `config.json` is broken.
+        PolicyError: there is no driver of that name, or its `config.json` is invalid.
     """
     paths = [find_driver(one) for policy in policies for one in drivers_in(policy)]
     return {name_of_driver(path): read_form(path) for path in paths if path.is_dir()}
 
 
 def common_form(forms: Mapping[str, Form]) -> Form:
-    """Return the one form that all these drivers have.
+    """Return the form that all these drivers share.
 
     Raises:
-        PolicyError: two of them have different forms; the message names each key and value.
+        PolicyError: two of the drivers have different forms; the message lists keys and values.
     """
     (first, form), *others = forms.items()
     lines = [
@@ -104,27 +104,27 @@ def common_form(forms: Mapping[str, Form]) -> Form:
     if lines:
         raise PolicyError(
             f"The drivers {', '.join(forms)} need different sensors or actions: "
-            f"{'; '.join(lines)}. All drivers of one run have the same sensors and actions. Run "
-            "each of these drivers by itself"
+            f"{'; '.join(lines)}. All drivers of a run must have the same sensors and actions. Run "
+            "each of these drivers in a run of its own"
         )
     return form
 
 
 def form_of_driver(policy: str | Path) -> Form:
-    """Return the form of a trained driver: overrides that make any environment fit for it.
+    """Return the form of a trained driver, as overrides that make any environment fit the driver.
 
     Args:
-        policy: as in `load_policy`.
+        policy: see `load_policy`.
 
     Raises:
-        PolicyError: there is nothing of that name, no trained driver in it, or there are two that
-            need different forms.
+        PolicyError: there is no driver of that name, none of them is trained, or two of them have
+            different forms.
     """
     forms = forms_in([policy])
     if not forms:
         trained = ", ".join(name for name, path in agent_entries().items() if path.is_dir())
         raise PolicyError(
-            f"The driver '{policy}' is a script. A script brings no sensors of its own: it fits "
+            f"The driver '{policy}' is a script. A script has no sensors of its own: it accepts "
             f"those of the environment, or says what it needs. Name a trained driver ({trained}), "
             "or leave sensors_of (--sensors-of) out"
         )
@@ -137,8 +137,8 @@ def with_sensors_of(
     """Return the overrides with the form of a trained driver; without a driver, unchanged.
 
     Raises:
-        ConfigError: an override gives a key of the form another value.
-        PolicyError: as `form_of_driver`.
+        ConfigError: an override sets a key of the form to another value.
+        PolicyError: see `form_of_driver`.
     """
     if driver is None:
         return overrides
@@ -149,10 +149,10 @@ def with_form(overrides: Mapping[str, Any] | None, form: Form, driver: str) -> d
     """Return the overrides with the keys of a form.
 
     Raises:
-        ConfigError: an override gives a key of the form another value.
+        ConfigError: an override sets a key of the form to another value.
     """
     if not isinstance(overrides, Mapping | None):
-        raise ConfigError(f"overrides = {overrides!r}: must be a mapping of dotted keys")
+        raise ConfigError(f"overrides = {overrides!r}: must map dotted keys to values")
     given = deepcopy(dict(overrides or {}))
     lines = [
         f"{key} is {value!r} in the overrides, {needed!r} for {driver}"
@@ -163,23 +163,23 @@ def with_form(overrides: Mapping[str, Any] | None, form: Form, driver: str) -> d
     if lines:
         raise ConfigError(
             f"The overrides and the sensors of {driver} contradict each other: {'; '.join(lines)}. "
-            "A key has one value. Leave out the overrides of these keys (overrides, --set, "
-            "--sensors-of), or name another driver"
+            "Leave out the overrides of these keys (overrides, --set, --sensors-of), or name "
+            "another driver"
         )
     return given | form
 
 
 def differing_keys(form: Form, config: EnvConfig) -> dict[str, tuple[Any, Any]]:
-    """Return the keys whose values differ: (in the form, in the environment)."""
+    """Return the keys with different values: (value in the form, value in the environment)."""
     pairs = {key: (needed, attrgetter(key)(config)) for key, needed in form.items()}
     return {key: (needed, here) for key, (needed, here) in pairs.items() if needed != here}
 
 
 def _values_at(overrides: Mapping[str, Any], key: str) -> Iterable[Any]:
-    """Yield each value that overrides give for a key, for a section around it, or inside it."""
+    """Yield each value that overrides set for a key, for a section around it, or inside it."""
     for name, value in overrides.items():
         if not isinstance(name, str):
-            continue  # `load_config` refuses it
+            continue  # `load_config` raises an error for it
         if key == name:
             yield value
         elif key.startswith(f"{name}."):
@@ -191,5 +191,5 @@ def _values_at(overrides: Mapping[str, Any], key: str) -> Iterable[Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return the value as JSON has it, in which a list and a tuple are the same."""
+    """Return the value in its JSON form, in which lists and tuples are equal."""
     return json.loads(json.dumps(value, default=str))

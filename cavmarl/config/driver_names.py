@@ -1,4 +1,4 @@
-"""Names of drivers: which files the text of a policy means, without running or reading them."""
+"""Names of drivers: find the files of a policy without running or reading them."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 from cavmarl.config.registry import agent_entries, agent_here
 from cavmarl.core.errors import PolicyError
 
-TOGETHER = "+"  # between drivers that share the agents of a world
-SHIELDED = "shielded:"  # before a driver that the built-in one relieves
+TOGETHER = "+"  # separates drivers that share the agents of a world
+SHIELDED = "shielded:"  # before a driver; the built-in driver acts where it would brake harder
 
 
 def find_driver(policy: str | Path) -> Path:
     """Return the `.py` file or the folder of one driver.
 
     Args:
-        policy: a name of `agents/`, or the path of a folder or of a `.py` file.
+        policy: the name of an entry of `agents/`, or the path of a folder or of a `.py` file.
 
     Raises:
-        PolicyError: there is nothing of that name, or no driver.
+        PolicyError: nothing has that name, or it is not a driver.
     """
     if not isinstance(policy, str | Path):
         raise PolicyError(f"policy = {policy!r}: must be the name of a driver, or a path")
@@ -29,42 +29,42 @@ def find_driver(policy: str | Path) -> Path:
     if isinstance(policy, str) and policy in known:
         if here is not None:
             raise PolicyError(
-                f"policy '{policy}': is a driver of cavmarl, and {here} is there, too; give a path"
+                f"policy '{policy}': both a driver of cavmarl and {here}; give the path of one"
             )
         return known[policy]
     path = Path(policy)
-    if isdir(path):  # unlike Path's, it takes names that no folder can have
+    if isdir(path):  # unlike Path.is_dir, isdir accepts names that no folder can have
         return path
     if isfile(path) and path.suffix == ".py":
         return path
     if isfile(path):
         raise PolicyError(
-            f"{path}: no policy; give a folder with model.safetensors, or a .py with make_policy"
+            f"{path}: not a policy; give a folder with model.safetensors, or a .py with make_policy"
         )
     if here is not None:
-        raise PolicyError(f"policy '{policy}': {here} is code of this folder; give its path")
+        raise PolicyError(f"policy '{policy}': {here} is code in this folder; give its path")
     close = difflib.get_close_matches(str(policy), known, n=3)
     meant = f"did you mean {' or '.join(close)}? " if close else ""
     raise PolicyError(
-        f"no policy, folder or file '{policy}'; {meant}There are: {', '.join(known) or 'none'}"
+        f"no policy, folder or file '{policy}'; {meant}Drivers: {', '.join(known) or 'none'}"
     )
 
 
 def name_of_driver(path: Path) -> str:
-    """Return the shortest text by which `find_driver` finds a driver: its name, else its path."""
+    """Return the shortest text from which `find_driver` finds a driver: its name, or its path."""
     name = path.name.removesuffix(".py")
     return name if agent_entries().get(name) == path else str(path)
 
 
 def shared_drivers(policy: str | Path) -> list[str]:
-    """Return the drivers that share the agents; none if `policy` is one driver."""
+    """Return the drivers that share the agents; an empty list if `policy` is one driver."""
     if not isinstance(policy, str) or TOGETHER not in policy or Path(policy).exists():
         return []
     return policy.split(TOGETHER)
 
 
 def drivers_in(policy: str | Path) -> list[str | Path]:
-    """Return every single driver in `policy`: `a+shielded:b` has the drivers a and b."""
+    """Return all single drivers in `policy`: `a+shielded:b` contains the drivers a and b."""
     if parts := shared_drivers(policy):
         return [driver for part in parts for driver in drivers_in(part)]
     if isinstance(policy, str) and policy.startswith(SHIELDED):

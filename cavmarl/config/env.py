@@ -1,8 +1,8 @@
-"""What a world is: `EnvConfig`, frozen dataclasses whose fields are the keys of `env.yaml`.
+"""`EnvConfig`: frozen dataclasses whose fields are the keys of `env.yaml`.
 
-A unit ends the name of every bare number. Each class refuses, in `__post_init__`, the values and
-the combinations that cannot work, and says what to change. Types and unknown keys are checked at
-the border by `registry.load_config`.
+The name of each number that has a unit ends with it. Each class checks values and combinations
+in `__post_init__`; its messages say what to change. `registry.load_config` checks types and
+unknown keys when it reads a file.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from cavmarl.config.v2x import V2xConfig
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.config.zones import ZonesConfig
 
-BY_MAP = 0.0  # a horizon in s that the map says
+BY_MAP = 0.0  # horizon in s that is derived from the map
 
 
 @dataclass(frozen=True)
 class MapConfig(Section, key="map"):
-    """Where the roads come from.
+    """The source of the roads.
 
     Attributes:
         source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
-            the eclipse-sumo wheel. A list of them, or a folder of map files: each episode of each
-            world is on one that is drawn by the seed.
-        programs: additional files with more signal programs, named as the source is; of several
-            programs of a signal the last is on.
-        program: the program of each signal named here, whatever was loaded; `off` is one, too.
-        buildings: `osm`: those of the OpenStreetMap file that `source` is; or a file of buildings
-            (OpenStreetMap or SUMO's polygons), named as the source is; empty: none.
+            the eclipse-sumo wheel. Or a list of map files, or a folder of them; the seed then draws
+            a map for each episode of each world.
+        programs: additional files with signal programs, named like `source`. If a signal has
+            several programs, the last one runs.
+        program: the program of each signal named here, whatever was loaded; may be `off`.
+        buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of buildings
+            (OpenStreetMap or SUMO's polygons), named like `source`; empty: none.
     """
 
     source: str | tuple[str, ...]
@@ -52,18 +52,18 @@ class MapConfig(Section, key="map"):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """What `source` names, one or several."""
+        """The names in `source`, as a tuple."""
         return (self.source,) if isinstance(self.source, str) else self.source
 
 
 @dataclass(frozen=True)
 class ClockConfig(Section, key="clock"):
-    """Time: the integer tick is the truth, seconds = tick · sim_dt_s.
+    """Time is counted in integer ticks; seconds = tick · sim_dt_s.
 
     Attributes:
-        sim_dt_s: seconds a tick.
-        ctrl_dt_s: seconds an agent's decision (step); a whole number of ticks.
-        control_latency_ticks: ticks between an action and its effect.
+        sim_dt_s: duration of a tick.
+        ctrl_dt_s: duration of a step, in which an agent decides once; a whole number of ticks.
+        control_latency_ticks: delay between an action and its effect.
     """
 
     sim_dt_s: Annotated[float, Within(0.001, 0.2)] = 0.05
@@ -82,19 +82,19 @@ class ClockConfig(Section, key="clock"):
 
     @property
     def ticks_per_step(self) -> int:
-        """Ticks in one agent step."""
+        """Number of ticks in a step."""
         return round(self.ctrl_dt_s / self.sim_dt_s)
 
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """What an observation is made of, and its form.
+    """The content and the form of observations.
 
     Attributes:
-        mode: `ground_truth`: what `sensors` says, taken from the world itself. `sensors`: the
-            latest samples of the `rig`. `messages`: of `sensors` only what the vehicle knows of
-            itself and its route, and what it is told over the air.
-        kind: `flat`: one Box of float32. `dict`: one Box a sensor.
+        mode: `ground_truth`: the features configured under `sensors`, without errors. `sensors`:
+            the latest samples of the `rig`. `messages`: of `sensors`, only the features of the own
+            vehicle and its route, and those received over the air.
+        kind: `flat`: one float32 Box. `dict`: one Box per sensor.
     """
 
     mode: Literal["ground_truth", "sensors", "messages"] = "ground_truth"
@@ -103,14 +103,14 @@ class ObservationConfig:
 
 @dataclass(frozen=True)
 class EnvConfig(Section, key=""):
-    """The whole decision process of one environment: the keys of `env.yaml`.
+    """The decision process of one environment: all keys of `env.yaml`.
 
     Attributes:
-        name: of the entry, as its folder.
-        version: goes up whenever results change that others may have reported.
+        name: name of the entry, equal to its folder's.
+        version: increases whenever published results change.
         rig: sensors that are mounted on every agent's vehicle, by name; see
             docs/reference/sensors.md.
-        horizon_s: when an episode is truncated; 0: after a time by the size of the map.
+        horizon_s: time after which an episode is truncated; 0: depends on the size of the map.
     """
 
     name: str
@@ -139,28 +139,28 @@ class EnvConfig(Section, key=""):
         self.need(
             "workers.sensors",
             not self.workers.sensors or bool(self.rig),
-            "there is no rig whose sensors they could share; name some under rig, or leave it 0",
+            "needs sensors under rig; mount some, or set it to 0",
         )
         self.need(
             "observation.mode",
             self.observation.mode != "sensors" or bool(self.rig),
-            "there is no sensor under rig; mount one",
+            "needs a sensor under rig; mount one",
         )
         self.need(
             "population.agents",
             not self.scenario.name or self.population.agents >= 1,
-            "must be 1 or more where there is a scenario: it is played to agents",
+            "must be 1 or more: the scenario needs agents",
         )
         if self.v2x.enabled:
             self.v2x.check_clock(self.clock.sim_dt_s)
         self._check_messages()
         if self.observation.mode == "messages":
-            self._keep_what_is_told()
+            self._drop_sight()
         if self.traffic.source != "native":
             self._check_sumo()
 
     def _check_horizon(self) -> None:
-        """Refuse a horizon that is no number of steps."""
+        """Raise an error for a horizon that is not a whole number of steps."""
         check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
         steps = self.horizon_s / self.clock.ctrl_dt_s
         self.need(
@@ -170,18 +170,18 @@ class EnvConfig(Section, key=""):
             f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
         )
 
-    def _keep_what_is_told(self) -> None:
-        """Switch the sensors off that look at others."""
-        told = self.sensors.messages
+    def _drop_sight(self) -> None:
+        """Switch off all sensors that see other vehicles or signals."""
+        messages = self.sensors.messages
         self.need(
             "observation.mode",
-            bool(told.objects or told.events or told.signal),
+            bool(messages.objects or messages.events or messages.signal),
             "no messages are observed: set sensors.messages.objects",
         )
         object.__setattr__(self, "sensors", self.sensors.without_sight())
 
     def _check_messages(self) -> None:
-        """Refuse to observe messages that are not kept."""
+        """Raise an error if observed messages are not sent, or not kept by receivers."""
         kept = {"objects": self.v2x.inbox.objects, "events": self.v2x.inbox.events}
         for name, most in kept.items():
             key, count = f"sensors.messages.{name}", getattr(self.sensors.messages, name)
@@ -191,7 +191,7 @@ class EnvConfig(Section, key=""):
                 count,
                 "there are no messages: set v2x.enabled to true, or this to 0",
             )
-            check(count <= most, key, count, f"v2x.inbox.{name} = {most} keeps fewer")
+            check(count <= most, key, count, f"must be at most v2x.inbox.{name} = {most}")
         for key, reads in (
             ("messages.signal", self.sensors.messages.signal),
             ("conflicts.heard", self.sensors.conflicts.heard),
@@ -204,24 +204,24 @@ class EnvConfig(Section, key=""):
             )
 
     def _check_sumo(self) -> None:
-        """Refuse what cannot be together with SUMO as global traffic."""
+        """Raise an error for settings that SUMO as global traffic does not support."""
         source, tick_ms = self.traffic.source, self.clock.sim_dt_s * 1000.0
         self.need(
             "clock.sim_dt_s",
             abs(tick_ms - round(tick_ms)) < 1e-9,
-            f"must be whole milliseconds with traffic.source = {source}: SUMO counts in them",
+            f"must be whole milliseconds with traffic.source = {source}, SUMO's unit of time",
         )
         check(
             not self.map.programs and not self.map.program,
             "map.programs",
             self.map.programs or self.map.program,
-            f"traffic.source = {source}: SUMO has the signals; name such files in its .sumocfg",
+            f"traffic.source = {source}: SUMO runs the signals; name such files in its .sumocfg",
         )
         self.need(
             "workers.balance_steps",
             source == "sumo-demand" or self.workers.balance_steps == 0,
-            f"traffic.source = {source}: a process that takes up a SUMO has to run it again from "
-            "the beginning of the episode; leave it 0",
+            f"must be 0 with traffic.source = {source}: to move a world, SUMO would have to run "
+            "again from the start of the episode",
         )
         way = self.sensors.way
         for key, timed in (
@@ -232,30 +232,30 @@ class EnvConfig(Section, key=""):
                 not timed,
                 key,
                 True,
-                f"traffic.source = {source}: when SUMO's signals change is not known; set it false",
+                f"traffic.source = {source}: SUMO's signal changes are not known; set it to false",
             )
         self.need(
             "population.types",
             set(self.population.types) == {"car"},
-            f"traffic.source = {source}: SUMO knows our car alone; leave it out",
+            f"traffic.source = {source}: SUMO only knows cavmarl's car; leave the key out",
         )
         self.need(
             "population.insertions",
             self.population.insertions == 0,
-            f"traffic.source = {source}: SUMO knows only vehicles of its demand; leave it out",
+            f"traffic.source = {source}: SUMO only runs vehicles of its demand; leave the key out",
         )
         self.need(
             "scenario.name",
             not self.scenario.name,
-            f"traffic.source = {source}: scenes are for native traffic; leave one out",
+            f"traffic.source = {source}: scenarios need native traffic; leave the key out",
         )
 
     @property
     def registered(self) -> tuple[str, ...]:
-        """What it may name from outside of the package."""
+        """The registered terms, sensors and models that the environment may use."""
         return (*self.terms.registered, *self.sensors.registered, self.traffic.model)
 
     @property
     def max_steps(self) -> int:
-        """Steps until truncation, of a configuration whose horizon is known."""
+        """Steps until truncation; valid if the horizon is known."""
         return max(1, round(self.horizon_s / self.clock.ctrl_dt_s))

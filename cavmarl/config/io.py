@@ -1,8 +1,8 @@
-"""The border where text becomes configuration: YAML in, checked frozen dataclasses out.
+"""Reads YAML into checked, frozen dataclasses.
 
-YAML is read by the core schema of YAML 1.2 (`1e-3` is a number, `on` and `1:30` are text). Tags,
-aliases, duplicate keys, deep nesting and large files are refused: a configuration needs none.
-Types are strict: a bool is not an int, a quoted number is not a number.
+YAML is read with the core schema of YAML 1.2 (`1e-3` is a number, `on` and `1:30` are text). A
+configuration needs no tags, aliases, duplicate keys, deep nesting or large files: they raise
+errors. Types are strict: a bool is not an int, a quoted number is not a number.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ T = TypeVar("T")
 MAX_BYTES = 1 << 16
 MAX_DEPTH = 16
 
-# The units that end a key's name, for `range_km` where `range_m` is meant.
+# Units at the end of key names, to suggest `range_m` for `range_km`.
 UNITS = frozenset("m km cm mm s ms min h hz mps kmh mph mps2 mps3 rad deg ticks steps".split())
 
 
 class _CoreLoader(yaml.SafeLoader):
     """YAML 1.2's core schema, without the features that a configuration does not need."""
 
-    yaml_implicit_resolvers = {}  # noqa: RUF012 - PyYAML's own way; the resolvers follow below
+    yaml_implicit_resolvers = {}  # noqa: RUF012 - PyYAML's API; the resolvers follow below
     depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
@@ -59,7 +59,7 @@ class _CoreLoader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 raise _refusal("a key must be a name", key.start_mark)
             if key.value in seen:
-                raise _refusal(f"key '{key.value}' stands twice", key.start_mark)
+                raise _refusal(f"key '{key.value}' is given twice; keep one", key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -85,11 +85,11 @@ for _tag, _pattern, _first in (
 
 
 def read_yaml(path: Path) -> object:
-    """The content of a YAML file as plain Python values.
+    """Return the content of a YAML file as plain Python values.
 
     Raises:
-        ConfigError: unreadable, too large, not UTF-8, not YAML, or YAML with an alias, a tag or a
-            duplicate key; with the line.
+        ConfigError: the file is unreadable, too large, not UTF-8 or not YAML, or has an alias, a
+            tag or a duplicate key; the message names the line.
     """
     try:
         with path.open("rb") as file:
@@ -97,7 +97,7 @@ def read_yaml(path: Path) -> object:
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
     if len(data) > MAX_BYTES:
-        raise ConfigError(f"{path}: more than {MAX_BYTES // 1024} KiB; is this a configuration?")
+        raise ConfigError(f"{path}: larger than {MAX_BYTES // 1024} KiB; is this a configuration?")
     try:
         return deepcopy(_parsed(data.decode()))
     except UnicodeDecodeError as error:
@@ -109,34 +109,34 @@ def read_yaml(path: Path) -> object:
         raise ConfigError(f"{path}: {error}") from error
 
 
-@lru_cache(maxsize=32)  # a world that is made again has the same settings
+@lru_cache(maxsize=32)  # many worlds are made from the same files
 def _parsed(text: str) -> object:
     loaded: object = yaml.load(text, Loader=_CoreLoader)
     return loaded
 
 
 def validate(kind: type[T], raw: object, where: str) -> T:
-    """Build the dataclass `kind` from plain values, with its nested dataclasses.
+    """Build the dataclass `kind` and its nested dataclasses from plain values.
 
     Args:
-        kind: a frozen dataclass, which may hold others.
+        kind: a frozen dataclass.
         raw: mappings, sequences, strings, numbers, bools, None.
-        where: begins every message: the file that `raw` comes from.
+        where: start of every message, such as the file of `raw`.
 
     Raises:
-        ConfigError: an unknown key, a missing key, a wrong type or a value that `kind` refuses; the
-            message names the key, the value and the cure, one line each.
+        ConfigError: a key is unknown or missing, a type is wrong, or `kind` refuses a value. Each
+            line of the message names a key, its value and a remedy.
     """
-    hashable: Any = kind  # as mypy takes no class of a type variable to be
+    hashable: Any = kind  # mypy does not accept a type variable here
     if not isinstance(raw, Mapping):
-        raise ConfigError(f"{where}: must be a mapping of keys, not {raw!r}")
+        raise ConfigError(f"{where}: must be a mapping from keys to values, not {raw!r}")
     try:
-        # By way of JSON: its strict mode knows no difference between list and tuple, or mapping and
-        # dataclass. NumPy's numbers count as Python's; what else JSON cannot carry becomes text,
-        # which no number accepts.
+        # Via JSON, whose strict mode does not distinguish lists from tuples, or mappings from
+        # dataclasses. NumPy's numbers count as Python's. Other types become text, which is
+        # accepted for no number.
         text = json.dumps(raw, default=_plain)
     except (TypeError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{where}: holds what no configuration can hold ({error})") from error
+        raise ConfigError(f"{where}: has a value that is not allowed ({error})") from error
     try:
         checked: T = _adapter(hashable).validate_json(text)
     except ValidationError as error:
@@ -148,12 +148,12 @@ def validate(kind: type[T], raw: object, where: str) -> T:
 
 
 def _plain(value: object) -> object:
-    """What JSON takes in place of `value`."""
+    """Return a replacement of `value` that JSON can represent."""
     return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def dotted_keys(kind: type[Any], prefix: str = "") -> list[str]:
-    """Every key of the dataclass `kind` and of those inside it, as `sensors.lidar.rays`."""
+    """Return every key of the dataclass `kind` and its sections, such as `sensors.lidar.rays`."""
     keys = []
     for name, hint in _fields(kind).items():
         if isinstance(hint, type) and is_dataclass(hint):
@@ -163,24 +163,24 @@ def dotted_keys(kind: type[Any], prefix: str = "") -> list[str]:
     return keys
 
 
-@cache  # it takes longer to make than a small world
+@cache  # building it takes longer than making a small world
 def _adapter(kind: type[Any]) -> TypeAdapter[Any]:
-    """Pydantic's view of `kind`, strict and closed.
+    """Return pydantic's strict adapter of `kind`, without additional keys.
 
-    In a union, because a dataclass by itself takes no configuration from outside.
+    It adapts a union, because a dataclass by itself ignores a configuration from outside.
     """
     union: Any = kind | None
     return TypeAdapter(union, config=ConfigDict(extra="forbid", strict=True))
 
 
 def _fields(kind: type[Any]) -> dict[str, Any]:
-    """Field names of a dataclass with their resolved types."""
+    """Return the field names of a dataclass with their resolved types."""
     hints = get_type_hints(kind)
     return {field.name: hints[field.name] for field in fields(kind)}
 
 
 def _explain(kind: type[Any], details: ErrorDetails) -> str:
-    """One line about one of pydantic's findings, in the words of the configuration."""
+    """Return one line about an error of pydantic, in the terms of the configuration."""
     location = [str(part) for part in details["loc"]]
     keys, _ = _walk(kind, location)
     path = ".".join(keys)
@@ -188,25 +188,25 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
         case "unexpected_keyword_argument":
             return removed_key(path) or f"{path}: unknown key; {_nearest(kind, location)}"
         case "missing":
-            return f"{path}: missing; it has no default"
+            return f"{path}: missing; this key has no default, add it"
         case "dataclass_type" | "dict_type":
-            return f"{path} = {details['input']!r}: must be a mapping of keys"
+            return f"{path} = {details['input']!r}: must be a mapping from keys to values"
         case "union_tag_not_found":
-            return f"{path}: must be a mapping of keys with a type, one of {_types(kind, location)}"
+            return f"{path}: must be a mapping with the key type: one of {_types(kind, location)}"
         case "union_tag_invalid":
             tag = details["ctx"]["tag"]
-            return f"{path}.type = {tag!r}: no such type; there are {_types(kind, location)}"
+            return f"{path}.type = {tag!r}: must be one of {_types(kind, location)}"
         case "json_invalid":
-            return f"holds what no configuration can hold ({details['msg']})"
+            return f"has a value that is not allowed ({details['msg']})"
         case "tuple_type":
             return f"{path} = {details['input']!r}: must be a list"
     return f"{path} = {details['input']!r}: {details['msg'].replace('Input should', 'must')}"
 
 
 def _walk(kind: type[Any], location: list[str]) -> tuple[list[str], Any]:
-    """The keys of a location, and the type of what stands there.
+    """Return the keys of a location, and the type at that location.
 
-    Pydantic names the member of a union between two keys; those are left out.
+    Pydantic puts the member of a union between two keys; those members are left out.
     """
     keys: list[str] = []
     inner: Any = kind
@@ -228,27 +228,27 @@ def _walk(kind: type[Any], location: list[str]) -> tuple[list[str], Any]:
 
 
 def _types(kind: type[Any], location: list[str]) -> str:
-    """The types of the members of a union."""
+    """Return the names of the types in a union."""
     return ", ".join(one.type for one in get_args(_walk(kind, location)[1]))
 
 
 def _nearest(kind: type[Any], location: list[str]) -> str:
-    """The advice for an unknown key: what was probably meant, else what there is."""
+    """Return advice for an unknown key: a similar key, or all keys of the section."""
     parents, inner = _walk(kind, location[:-1])
     key = location[-1]
     known = list(_fields(inner))
     for name in known:
         if name != key and _stem(name) == _stem(key):
-            return f"use {name} (the end of a name is its unit: convert the value)"
+            return f"use {name} (a name ends with its unit: convert the value)"
     if close := difflib.get_close_matches(key, known, n=1):
         return f"did you mean {'.'.join([*parents, *close])}?"
     elsewhere = [other for other in dotted_keys(kind) if other.split(".")[-1] == key]
     if elsewhere:
         return f"did you mean {elsewhere[0]}?"
-    return f"known here: {', '.join(known)}"
+    return f"the keys here are: {', '.join(known)}"
 
 
 def _stem(key: str) -> str:
-    """A key without its unit: `range_m`, `range_km` and `range` have the same stem."""
+    """Return a key without its unit: `range_m`, `range_km` and `range` have the same stem."""
     head, _, tail = key.rpartition("_")
     return head if head and tail.lower() in UNITS else key

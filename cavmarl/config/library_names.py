@@ -1,10 +1,11 @@
-"""The names under which other libraries find the environments.
+"""Registers the environments in other libraries.
 
-PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from 1.27 on, ids such
-as `cavmarl/merge-v6` in both its registries. Gymnasium: `cavmarl/merge-v6`, one vehicle of the
-world as a single-agent environment, and `cavmarl/mergeAgents-v6` for `gymnasium.make_vec`, all
-agents as rows; `cavmarl/mergeDiscrete-v2` and `cavmarl/mergeDiscreteAgents-v2` are the same with
-meta-actions. highway-env's tasks have its names: `cavmarl-highway/merge-v0` for `merge-v0`.
+PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from version 1.27 on,
+ids such as `cavmarl/merge-v6` in its two registries. Gymnasium: `cavmarl/merge-v6` is one vehicle
+of the world as a single-agent environment, and `cavmarl/mergeAgents-v6`, for
+`gymnasium.make_vec`, has all agents as rows. `cavmarl/mergeDiscrete-v2` and
+`cavmarl/mergeDiscreteAgents-v2` use meta-actions. highway-env's tasks keep their names:
+`merge-v0` is `cavmarl-highway/merge-v0`.
 """
 
 from __future__ import annotations
@@ -20,18 +21,17 @@ from cavmarl.config.registry import entries
 _ID = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 
-# The keys of `adapters/highway_tasks.py`, which lies above and takes time to import.
+# Keys of `adapters/highway_tasks.py`, which is in a higher layer and slow to import.
 HIGHWAY_TASKS = (
     "highway", "highway-fast", "merge", "roundabout", "intersection", "exit", "two-way", "u-turn",
 )  # fmt: skip
 
 
 def register_all() -> None:
-    """Register every entry with Gymnasium and, where it has a registry, with PettingZoo.
+    """Register every entry with Gymnasium and, if it has a registry, with PettingZoo.
 
-    highway-env's tasks are registered with Gymnasium.
-
-    Entries whose name cannot be an id (letters, digits, `_`, `-` and `.`) have none.
+    Also register highway-env's tasks with Gymnasium. An entry gets no id if its name is not valid
+    in ids (letters, digits, `_`, `-` and `.`).
     """
     for name, folder in entries().items():
         if not _ID.fullmatch(name):
@@ -67,10 +67,10 @@ def register_all() -> None:
 
 
 def _version(folder: Path) -> int:
-    """The entry's version, read without the parsers that would make the import slow."""
+    """Return the entry's version, without the parsers that would slow down the import."""
     try:
         text = (folder / "env.yaml").read_bytes()
     except OSError:
-        return 0  # what is wrong with it is said when it is used
+        return 0  # loading the entry reports the error
     found = re.search(rb"^version: *(\d{1,9})", text, re.MULTILINE)
     return int(found[1]) if found else 0

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole
 
-MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows in every output
+MAX_IDS = 1_000_000  # agents per episode; each has a space and rows in every output
 
 
 @dataclass(frozen=True)
@@ -15,22 +15,22 @@ class PopulationConfig(Section, key="population"):
     """The vehicles of a world.
 
     Attributes:
-        mode: `closed`: all agents enter at reset. `open`: agents also enter during the episode,
-            each id once, `budget` in all. `respawn`: `agents` fixed ids; when the vehicle of one
-            ends, the id gets a new vehicle.
-        agents: vehicles driven by policies at any one time.
-        background: vehicles driven by the built-in drivers. In `closed` worlds they are placed at
-            reset; else each arrival orders a new departure, so that their number holds.
-        budget: how many agents may enter in one episode of an `open` world (default 4 ·
-            agents); the other modes do not read it.
-        types: vehicles of the agents in turn, of `car`, `truck` and `bus`: agent k has the one
-            at place k, counted round.
-        insertions: how many vehicles may be put into a world in one episode while it runs
-            (`insert_vehicle`, `close_road`); there is room for them.
+        mode: `closed`: all agents enter at the reset. `open`: agents also enter during the episode,
+            each id once, `budget` agents in all. `respawn`: a fixed set of `agents` ids; if an
+            agent's vehicle ends its trip, the agent gets a new one.
+        agents: vehicles that policies drive at the same time.
+        background: vehicles that the built-in driver drives. In `closed` worlds they are placed at
+            the reset; otherwise each arrival causes a departure, so that their number stays.
+        budget: number of agents that may enter in an episode of an `open` world (default: 4 ·
+            agents); not used in the other modes.
+        types: vehicle types of the agents, from `car`, `truck` and `bus`. Agent k has type
+            k modulo the length of the list.
+        insertions: number of vehicles that may be inserted into a world during an episode
+            (`insert_vehicle`, `close_road`); memory is reserved for them.
     """
 
     mode: Literal["closed", "open", "respawn"] = "closed"
-    agents: Annotated[int, Whole(0, 100_000, "; 0: a world to watch")] = 4
+    agents: Annotated[int, Whole(0, 100_000, "; 0: without agents")] = 4
     background: Annotated[int, Whole(0, 1_000_000)] = 20
     budget: int | None = None
     types: tuple[Literal["car", "truck", "bus"], ...] = ("car",)
@@ -48,7 +48,7 @@ class PopulationConfig(Section, key="population"):
 
     @property
     def num_ids(self) -> int:
-        """How many agent ids an episode can use."""
+        """Number of agent ids that an episode can use."""
         if self.mode == "open":
             return self.budget if self.budget is not None else 4 * self.agents
         return self.agents

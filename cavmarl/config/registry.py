@@ -1,7 +1,7 @@
-"""The finder of entries: what stands in `envs/` and `agents/` is what there is.
+"""Finds the entries of `envs/` and `agents/`.
 
-A name is looked up in the working directory first, then in what the wheel carries, else beside the
-package in a checkout. A path to a folder or to a map file works wherever a name does.
+A name is looked up in the working directory, then in the data of the wheel or, in a checkout,
+beside the package. Instead of a name, the path of a folder or of a map file can be given.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ _SUMO_PREFIX = "sumo:"
 
 
 def places(kind: str) -> list[Path]:
-    """The folders that hold entries of `kind` (`envs`, `agents`, `configs`), first wins."""
+    """Return the folders with entries of `kind` (`envs`, `agents`, `configs`); the first wins."""
     return [place for place in (Path.cwd() / kind, _ours(kind)) if place.is_dir()]
 
 
 def _ours(kind: str) -> Path:
-    """Where the wheel has it, else the checkout."""
+    """Return the folder in the wheel or, if there is none, in the checkout."""
     packaged = PACKAGE / "data" / kind
     return packaged if packaged.is_dir() else PACKAGE.parent / kind
 
 
 def entries() -> dict[str, Path]:
-    """Every environment that a name can mean: name → its folder, sorted by name."""
+    """Return every environment that has a name: name → its folder, sorted by name."""
     return _collect("envs", _environment_name)
 
 
 def agent_entries() -> dict[str, Path]:
-    """Every driver that a name can mean: name → `NAME.py`, or the folder of a trained one.
+    """Return every driver that has a name: name → `NAME.py`, or the folder of a trained driver.
 
-    In the working directory's `agents/` these are trained ones with names of their own: a script
-    that lies there is run by its path alone.
+    The working directory's `agents/` adds trained drivers with other names. A script there can only
+    be given by its path, so that no code runs by accident.
     """
     own = {name: path for name, path in _collect("agents", _agent_name).items() if path.is_dir()}
     ours = places("agents")[-1:]
@@ -61,13 +61,13 @@ def agent_entries() -> dict[str, Path]:
 
 
 def programs() -> dict[str, Path]:
-    """The training programs: name → `train/NAME.py`; those of the working directory are not it."""
+    """Return the package's training programs, not the working directory's: name → path."""
     ours = _ours("train")
     return {path.stem: path for path in sorted(ours.glob("*.py"))}
 
 
 def agent_here(name: str) -> Path | None:
-    """What lies under the name of a driver in the working directory, if it is not that driver."""
+    """Return the path in the working directory that has a driver's name but is another driver."""
     for path in (Path.cwd() / "agents" / f"{name}.py", Path.cwd() / "agents" / name):
         is_driver = isfile(path) if path.suffix == ".py" else _agent_name(path) is not None
         if is_driver and agent_entries().get(name) != path:
@@ -76,13 +76,13 @@ def agent_here(name: str) -> Path | None:
 
 
 def find_entry(env: str | Path) -> Path:
-    """The entry folder or the map file that `env` means.
+    """Return the entry folder or the map file that `env` means.
 
     Args:
         env: a name from `entries()`, a folder with an `env.yaml`, or a map file.
 
     Raises:
-        UnknownEnvironmentError: nothing there; the message says what there is.
+        UnknownEnvironmentError: nothing has that name; the message lists all names.
     """
     if not isinstance(env, (str, Path)):
         raise UnknownEnvironmentError(
@@ -92,16 +92,16 @@ def find_entry(env: str | Path) -> Path:
     if isinstance(env, str) and env in known:
         return known[env]
     path = Path(env)
-    if isfile(path / "env.yaml"):  # unlike Path's, it takes names that no file can have
+    if isfile(path / "env.yaml"):  # unlike Path.is_file, isfile accepts names that no file can have
         return path
     if isfile(path):
         if not path.name.endswith(MAP_SUFFIXES):
             raise UnknownEnvironmentError(
-                f"{path}: not a map file; their names end in {', '.join(MAP_SUFFIXES)}"
+                f"{path}: not a map file; the name must end in {' or '.join(MAP_SUFFIXES)}"
             )
         return path
     if isdir(path):
-        raise UnknownEnvironmentError(f"{path}: a folder without an env.yaml")
+        raise UnknownEnvironmentError(f"{path}: a folder without env.yaml; add one, or give a map")
     raise UnknownEnvironmentError(
         f"no environment, folder or map file '{env}'; {_advice(env, known)}"
     )
@@ -117,22 +117,22 @@ def load_config(
     max_cycles: int | None = None,
     overrides: Mapping[str, object] | None = None,
 ) -> tuple[EnvConfig, Path]:
-    """The configuration of an environment, and the folder that its map's source is relative to.
+    """Return the configuration of an environment, and the folder that relative paths start from.
 
     Args:
-        env: what `find_entry` takes; a map file gets a default environment, whose horizon
-            follows the map: see `make_world`.
-        zones: shadows `zones.count`.
-        sensor_workers: shadows `workers.sensors`.
-        agents: shadows `population.agents`.
-        background: shadows `population.background`.
-        max_cycles: shadows `horizon_s`, in steps: exactly that many.
-        overrides: dotted key → value, for every other key: `{"sensors.lidar.rays": 64}`. As in an
+        env: see `find_entry`. A map file gets a default environment, whose horizon depends on the
+            map: see `make_world`.
+        zones: sets `zones.count`.
+        sensor_workers: sets `workers.sensors`.
+        agents: sets `population.agents`.
+        background: sets `population.background`.
+        max_cycles: sets `horizon_s` to this number of steps.
+        overrides: dotted key → value, for all other keys: `{"sensors.lidar.rays": 64}`. As in an
             env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file.
 
     Raises:
-        UnknownEnvironmentError: nothing of that name.
-        ConfigError: a key, a type or a value that cannot work, with the nearest that can.
+        UnknownEnvironmentError: nothing has that name.
+        ConfigError: a key, a type or a value is not allowed; the message suggests the nearest one.
     """
     from cavmarl.config.io import read_yaml, validate
 
@@ -158,16 +158,16 @@ def load_config(
     }
     given = {key: value for key, value in keywords.items() if value is not None}
     if not isinstance(overrides, Mapping | None):
-        raise ConfigError(f"overrides = {overrides!r}: must be a mapping of dotted keys")
-    shadows = dict(overrides or {})
-    if strange := [key for key in shadows if not isinstance(key, str)]:
-        raise ConfigError(f"overrides: {strange[0]!r} is no key; keys are text, dotted")
-    if twice := given.keys() & shadows.keys():
-        raise ConfigError(f"{min(twice)} stands in overrides and is given as a keyword; use one")
-    shadows |= {key: value for key, value in given.items() if key != "horizon_s"}
-    if shadows or max_cycles is not None:
+        raise ConfigError(f"overrides = {overrides!r}: must map dotted keys to values")
+    values = dict(overrides or {})
+    if strange := [key for key in values if not isinstance(key, str)]:
+        raise ConfigError(f"overrides: {strange[0]!r} is not a key; keys are text, dotted")
+    if twice := given.keys() & values.keys():
+        raise ConfigError(f"{min(twice)} is given in overrides and as a keyword; use one of them")
+    values |= {key: value for key, value in given.items() if key != "horizon_s"}
+    if values or max_cycles is not None:
         raw = dataclasses.asdict(config)
-        for key, value in shadows.items():
+        for key, value in values.items():
             is_named = key == "rig" and isinstance(value, str)
             shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
         if max_cycles is not None:
@@ -177,7 +177,7 @@ def load_config(
 
 
 def find_settings(what: str, name: str) -> Path:
-    """The file that `name` means: a path, or a name in `configs/`: a `rig`, `suite` or `train`."""
+    """Return the path of a file, or of a `rig`, `suite` or `train` file of `configs/` by name."""
     if Path(name).is_file():
         return Path(name)
     folder, usual = {
@@ -187,29 +187,29 @@ def find_settings(what: str, name: str) -> Path:
         path = place / folder / f"{name}.yaml"
         if path.is_file():
             return path
-    raise ConfigError(f"no {what} or file '{name}': give '{usual}' or the path of a .yaml")
+    raise ConfigError(f"no {what} or file '{name}': give '{usual}' or the path of a .yaml file")
 
 
 def _refuse_code(keys: object, where: str) -> None:
-    """A folder of data does not run code: only the caller can name a file of it."""
+    """Raise an error if an env.yaml names a file of code, which only the caller may do."""
     scenario = keys.get("scenario") if isinstance(keys, dict) else None
     name = scenario.get("name") if isinstance(scenario, dict) else None
     if isinstance(name, str) and path_of_code(name):
         raise ConfigError(
-            f"{where}: scenario.name = {name!r}: is code, which a folder of data does not run; if "
-            f"you trust it, say so: overrides={{'scenario.name': {name!r}}}, or --set scenario.name"
+            f"{where}: scenario.name = {name!r} is code, which a folder of data must not run; if "
+            f"you trust it, pass overrides={{'scenario.name': {name!r}}} or --set scenario.name"
         )
 
 
 def load_rig(name: str, base_dir: Path | None = None) -> dict[str, Any]:
-    """The sensors of a rig that is named, by name, as they stand in its file.
+    """Return the sensors of a named rig, by name, as given in its file.
 
     Args:
-        name: of `configs/rigs/NAME.yaml`, or a YAML file, relative or absolute.
-        base_dir: the folder that a relative file starts from; None: the working directory.
+        name: NAME of `configs/rigs/NAME.yaml`, or a YAML file, relative or absolute.
+        base_dir: folder that a relative path starts from; None: the working directory.
 
     Raises:
-        ConfigError: there is none of that name, or no mapping in it.
+        ConfigError: no rig has that name, or its file has no mapping.
     """
     from cavmarl.config.io import read_yaml
 
@@ -226,16 +226,16 @@ def _find_rig(name: str, base_dir: Path) -> Path:
     rigs = {path.stem: path for place in places("configs") for path in place.glob("rigs/*.yaml")}
     if name not in rigs:
         raise ConfigError(
-            f"rig = {name!r}: no such rig; there are {', '.join(sorted(rigs)) or 'none'}; or name "
-            "a file that ends in .yaml"
+            f"rig = {name!r}: no such rig; give one of {', '.join(sorted(rigs)) or 'none'}, or the "
+            "path of a file that ends in .yaml"
         )
     return rigs[name]
 
 
 def resolve_maps(config: EnvConfig, base_dir: Path) -> list[Path]:
-    """The files that `map.source` means; those of a folder in the order of their names.
+    """Return the files of `map.source`; those of a folder are sorted by name.
 
-    Raises MapError: what is missing, all of it; a folder without a map file.
+    Raises MapError if files are missing (the message lists all) or a folder has no map file.
     """
     found: list[Path] = []
     refused: list[str] = []
@@ -250,14 +250,14 @@ def resolve_maps(config: EnvConfig, base_dir: Path) -> list[Path]:
 
 
 def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
-    """The file that `map.source` means, where it is to be one.
+    """Return the file of `map.source`, which must be a single file.
 
-    Raises MapError: as of `resolve_maps`, or there are several.
+    Raises MapError as `resolve_maps` does, or if there are several files.
     """
     found = resolve_maps(config, base_dir)
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
-        raise MapError(f"map.source has {len(found)} maps: {names}; name the one that is meant")
+        raise MapError(f"map.source has {len(found)} maps: {names}; name one of them")
     return found[0]
 
 
@@ -267,12 +267,15 @@ def _maps_of(source: str, base_dir: Path) -> list[Path]:
     names = sorted(path.name for path in (base_dir / source).iterdir())
     maps = [base_dir / source / name for name in names if name.endswith(MAP_SUFFIXES)]
     if not maps:
-        raise MapError(f"map.source = {source!r}: no map file in {base_dir / source}")
+        raise MapError(
+            f"map.source = {source!r}: no map file in {base_dir / source}; its name must end in "
+            f"{' or '.join(MAP_SUFFIXES)}"
+        )
     return maps
 
 
 def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
-    """The files that `traffic.demand` means, as `map.source` is resolved."""
+    """Return the files of `traffic.demand`; paths as in `map.source`."""
     return [
         _resolve("traffic.demand", source, base_dir, DemandError)
         for source in config.traffic.demand
@@ -280,12 +283,12 @@ def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
 
 
 def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
-    """The files that `map.programs` means; arguments and errors as for `resolve_map`."""
+    """Return the files of `map.programs`; arguments and errors as for `resolve_map`."""
     return [_resolve("map.programs", source, base_dir, MapError) for source in config.map.programs]
 
 
 def resolve_buildings(config: EnvConfig, base_dir: Path) -> Path | None:
-    """The file that `map.buildings` means; None: no buildings. Else as `resolve_map`."""
+    """Return the file of `map.buildings`, None if empty; otherwise as `resolve_map`."""
     match config.map.buildings:
         case "":
             return None
@@ -296,7 +299,7 @@ def resolve_buildings(config: EnvConfig, base_dir: Path) -> Path | None:
 
 
 def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:
-    """The zone file that `zones.layout` means; None where it is no file. Else as `resolve_map`."""
+    """Return the zone file in `zones.layout`, None for a method; otherwise as `resolve_map`."""
     layout = config.zones.layout
     if layout in ZONE_LAYOUTS:
         return None
@@ -308,16 +311,16 @@ def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError])
         home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
         path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
         if not path.is_relative_to(home):
-            raise failure(f"{key} = {source!r}: leads out of the eclipse-sumo wheel")
+            raise failure(f"{key} = {source!r}: must be inside of the eclipse-sumo wheel")
     else:
         path = base_dir / source
     if not isfile(path):
-        raise failure(f"{key} = {source!r}: no file {path}")
+        raise failure(f"{key} = {source!r}: no file {path}; give the path of a file")
     return path
 
 
 def _collect(kind: str, name_of: Callable[[Path], str | None]) -> dict[str, Path]:
-    """Name → path of all entries of `kind`, sorted by name; of equal names the first place wins."""
+    """Return name → path of all entries of `kind`, sorted by name; the first place wins."""
     return dict(sorted(_named(reversed(places(kind)), name_of).items()))
 
 
@@ -331,7 +334,7 @@ def _named(folders: Iterable[Path], name_of: Callable[[Path], str | None]) -> di
 
 
 def _listed(place: Path) -> list[Path]:
-    """What lies in a folder and can be named; nothing of one that cannot be read."""
+    """Return the files in a folder that have printable names; none if it cannot be read."""
     try:
         return [path for path in place.iterdir() if path.name.isprintable()]
     except OSError:
@@ -349,33 +352,33 @@ def _agent_name(path: Path) -> str | None:
 
 
 def _advice(env: str | Path, known: Mapping[str, Path]) -> str:
-    """What was probably meant by an unknown name, and what there is."""
+    """Return similar names, if any, and all known names."""
     close = difflib.get_close_matches(str(env), known, n=3)
     meant = f"did you mean {' or '.join(close)}? " if close else ""
-    return f"{meant}There are: {', '.join(known) or 'none'}"
+    return f"{meant}Environments: {', '.join(known) or 'none'}"
 
 
 def _map_name(path: Path) -> str:
-    """A map file's name without its ending."""
+    """Return a map file's name without its suffix."""
     ending = max((s for s in MAP_SUFFIXES if path.name.endswith(s)), key=len)
     return path.name.removesuffix(ending)
 
 
 def shadow(raw: dict[str, Any], key: str, value: object) -> None:
-    """Put `value` at a dotted key of nested mappings."""
+    """Set the value at a dotted key of nested mappings."""
     *parents, last = key.split(".")
     inner: Any = raw
     for depth, parent in enumerate(parents):
         inner = inner.setdefault(parent, {})
         if not isinstance(inner, dict):
-            raise ConfigError(f"{key}: {'.'.join(parents[: depth + 1])} has no keys inside")
+            raise ConfigError(f"{key}: {'.'.join(parents[: depth + 1])} has no keys inside it")
     inner[last] = value
 
 
 def _horizon_s(max_cycles: int, raw: Mapping[str, Any]) -> object:
-    """The horizon of `max_cycles` steps; of an impossible step, whatever stands there."""
+    """Return the horizon of `max_cycles` steps; unchanged if the step has no valid duration."""
     whole = isinstance(max_cycles, (int, np.integer)) and not isinstance(max_cycles, bool)
     if not whole or max_cycles < 1:
-        raise ConfigError(f"max_cycles = {max_cycles!r}: must be a whole number from 1")
+        raise ConfigError(f"max_cycles = {max_cycles!r}: must be a whole number, at least 1")
     step_s = raw["clock"].get("ctrl_dt_s") if isinstance(raw["clock"], Mapping) else None
     return int(max_cycles) * step_s if isinstance(step_s, (int, float)) else raw["horizon_s"]

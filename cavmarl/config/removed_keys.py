@@ -1,11 +1,11 @@
-"""Keys, keywords and command-line options that were removed, and what to use in their place.
+"""Keys, keywords and command-line options that were removed, and their replacements.
 
-An entry here only improves the refusal: a removed name is an unknown one, and has no effect.
+An entry here only improves the error message: a removed name is unknown and has no effect.
 """
 
 from __future__ import annotations
 
-# Dotted key of env.yaml → what replaced it. An entry covers the keys inside it, too.
+# Dotted key of env.yaml → advice. An entry also covers the keys inside it.
 REMOVED_KEYS = {
     "sensors.roadgraph": "use sensors.lanes, sensors.route and sensors.way for the roads ahead",
     "terms.weights.comfort": "use terms.weights.jerk",
@@ -25,30 +25,30 @@ REMOVED_KEYS = {
     "of each run that fails",
 }
 
-# Option of the command line → what replaced it.
+# Option of the command line → advice.
 REMOVED_OPTIONS = {
     "--hosts": "use --backend; nodes are killed by cavmarl verify nodes --kill K",
     "--cut-anew": "use --write-zones",
 }
 
-# Keyword of `make_vec` and `parallel_env` → what replaced it.
+# Keyword of `make_vec` and `parallel_env` → advice.
 REMOVED_ARGUMENTS = {"hosts": "use backend='ray:N' or backend='nodes:N@HOST:PORT'"}
 
 
 def removed_key(key: str) -> str | None:
-    """Return the refusal of a dotted key that was removed, or that is inside a removed one."""
+    """Return the error message for a key that was removed, or that is inside a removed key."""
     parts = key.split(".")
     names = (".".join(parts[:depth]) for depth in range(len(parts), 0, -1))
     return next((_refusal(name, REMOVED_KEYS) for name in names if name in REMOVED_KEYS), None)
 
 
 def removed_option(option: str | None) -> str | None:
-    """Return the refusal of an option that was removed."""
+    """Return the error message for an option that was removed."""
     return _refusal(option, REMOVED_OPTIONS) if option in REMOVED_OPTIONS else None
 
 
 def removed_argument(name: str) -> str | None:
-    """Return the refusal of a keyword that was removed."""
+    """Return the error message for a keyword that was removed."""
     return _refusal(name, REMOVED_ARGUMENTS) if name in REMOVED_ARGUMENTS else None
 
 

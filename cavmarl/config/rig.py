@@ -4,9 +4,8 @@
       roof: {type: lidar, rate_hz: 10, z_m: 1.6, rays: 360, range_m: 60}
       gnss: {type: gnss, rate_hz: 5, phase_ticks: 2, noise: [1.0]}
 
-Each class is one type of sensor; its name in `type` tells which. Frames are right-handed: x
-forward, y to the left, z up. The vehicle's has its origin on the ground below the centre of the
-body.
+Each class is one type of sensor, selected by `type`. Frames are right-handed: x forward, y to the
+left, z up. The origin of the vehicle's frame is on the ground, below the centre of the body.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from cavmarl.config.checks import Whole, Within, check, check_finite, check_ranges
 
 MAX_SENSORS = 64
-MAX_RAYS = 8192  # of a layer: one every 0.05 degrees all around, and less than that
-MAX_SAMPLE_NUMBERS = 1 << 22  # of one sensor: a picture of 1920 by 1080 with two bytes
+MAX_RAYS = 8192  # per layer; finer than 0.05° for a full circle
+MAX_SAMPLE_NUMBERS = 1 << 22  # per sensor: an image of 1920 by 1080 pixels with two bytes each
 MAX_RATE_HZ = 10_000.0
 MAX_REACH_M = 300.0
 
@@ -31,7 +30,7 @@ _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
 class ByType:
-    """Tells the classes of a union apart by their `type`, for validation by pydantic."""
+    """Selects the class of a union by its `type`, for validation by pydantic."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic import Field  # slow to import
@@ -41,16 +40,16 @@ class ByType:
 
 @dataclass(frozen=True, kw_only=True)
 class MountedConfig:
-    """What all sensors of a rig have.
+    """The keys of all sensors of a rig.
 
     Attributes:
-        x_m: place in the vehicle's frame.
-        y_m: place, positive to the left.
-        z_m: place, above the ground.
-        yaw_deg: direction, counter-clockwise from forward; turned first.
-        pitch_deg: then up, positive as uphill.
-        roll_deg: then about its own x axis, positive with the left side up.
-        dropout: chance that a sample is lost.
+        x_m: position in the vehicle's frame, forward.
+        y_m: position, to the left.
+        z_m: position, above the ground.
+        yaw_deg: direction, counter-clockwise from forward; rotated first.
+        pitch_deg: rotated second, positive upwards.
+        roll_deg: rotated last, about the sensor's x axis; positive: left side up.
+        dropout: probability that a sample is lost.
     """
 
     x_m: Annotated[float, Within(-100.0, 100.0)] = 0.0
@@ -61,38 +60,38 @@ class MountedConfig:
     roll_deg: Annotated[float, Within(-360.0, 360.0)] = 0.0
     dropout: Annotated[float, Within(0.0, 1.0)] = 0.0
 
-    units: ClassVar[tuple[str, ...]]  # of the channels, which noise and bias are counted by
-    in_batches: ClassVar[bool] = False  # it can tell what has been between two ticks
+    units: ClassVar[tuple[str, ...]]  # units of the channels, also of noise and bias
+    in_batches: ClassVar[bool] = False  # can report several samples per tick
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one sample; by default one number a channel."""
+        """Shape of a sample; by default one number per channel."""
         return (len(self.units),)
 
     def check(self, key: str) -> None:
-        """Refuse values that cannot work.
+        """Check all values.
 
         Args:
-            key: where they stand, as `rig.NAME`.
+            key: place of the sensor, `rig.NAME`.
 
         Raises:
-            ConfigError: which one, and what can work.
+            ConfigError: a value is not allowed; the message says which values are.
         """
         check_ranges(key, self)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SampledConfig(MountedConfig):
-    """A sensor with a rate.
+    """A sensor with a sampling rate.
 
     Attributes:
-        rate_hz: samples a second.
+        rate_hz: samples per second.
         phase_ticks: tick of the first sample; 0: at the reset.
-        schedule: `exact`: one sample every so many ticks, or so many every tick; other rates are
-            refused. `accumulate`: a rate below that of ticks is met on average, by the first tick
-            at or after each sample's time.
-        noise: standard deviation of each channel, or one of all; in the channel's unit.
-        bias: standard deviation of a constant error that is drawn for each vehicle and episode.
+        schedule: `exact`: one sample every n ticks, or n samples every tick; other rates are
+            errors. `accumulate`: a rate below the tick rate is met on average. A sample is taken at
+            the first tick at or after its time.
+        noise: standard deviation of each channel, or of all; in the channel's unit.
+        bias: standard deviation of a constant error, drawn for each vehicle and episode.
     """
 
     rate_hz: Annotated[float, Within(0.001, MAX_RATE_HZ)]
@@ -102,7 +101,7 @@ class SampledConfig(MountedConfig):
     bias: tuple[float, ...] = (0.0,)
 
     def check(self, key: str) -> None:
-        """As `MountedConfig.check`."""
+        """Check all values, as `MountedConfig.check`."""
         super().check(key)
         for name in ("noise", "bias"):
             values = getattr(self, name)
@@ -111,16 +110,16 @@ class SampledConfig(MountedConfig):
                 len(values) in (1, channels),
                 f"{key}.{name}",
                 values,
-                f"must be one number or {channels}, of {', '.join(self.units)}",
+                f"must be one number, or {channels}: {', '.join(self.units)}",
             )
             for value in values:
                 check_finite(f"{key}.{name}", value, 0.0, 1e6)
 
     def check_schedule(self, key: str, sim_dt_s: float) -> None:
-        """Refuse a rate that does not fit the ticks.
+        """Check that the rate and the phase fit the ticks.
 
         Raises:
-            ConfigError: with the nearest rates that fit.
+            ConfigError: they do not fit; the message gives the nearest rates that do.
         """
         rate = cadence(self.rate_hz, sim_dt_s)
         accumulates = self.schedule == "accumulate" and rate < 1
@@ -130,7 +129,7 @@ class SampledConfig(MountedConfig):
             rate <= 1 or self.in_batches,
             f"{key}.rate_hz",
             self.rate_hz,
-            f"it senses once a tick at most, {1.0 / sim_dt_s:g} Hz with clock.sim_dt_s = "
+            f"must be at most once per tick, {1.0 / sim_dt_s:g} Hz with clock.sim_dt_s = "
             f"{sim_dt_s:g}",
         )
         last = max(0, math.ceil(1 / rate) - 1)
@@ -138,17 +137,17 @@ class SampledConfig(MountedConfig):
             0 <= self.phase_ticks <= last,
             f"{key}.phase_ticks",
             self.phase_ticks,
-            f"must be from 0 to {last}, less than the ticks from one sample to the next",
+            f"must be from 0 to {last}, less than the ticks between two samples",
         )
 
 
 def cadence(rate_hz: float, sim_dt_s: float) -> Fraction:
-    """Samples a tick as the fraction that is meant: 100 Hz with 0.05 s are 5, 3 Hz are 3/20."""
+    """Return samples per tick as a fraction: with 0.05 s, 100 Hz is 5 and 3 Hz is 3/20."""
     return Fraction(rate_hz * sim_dt_s).limit_denominator(_LARGEST_CYCLE)
 
 
 def samples_per_step(config: MountedConfig, sim_dt_s: float, ticks_per_step: int) -> int:
-    """The most samples that a sensor can have in one step."""
+    """Return the largest number of samples that a sensor can have in one step."""
     if isinstance(config, SampledConfig):
         return math.ceil(ticks_per_step * cadence(config.rate_hz, sim_dt_s))
     return ticks_per_step
@@ -158,7 +157,7 @@ def _other_rates(rate: Fraction, sim_dt_s: float, in_batches: bool) -> str:
     if rate < 1:
         ticks = math.floor(1 / rate)
         near = [1.0 / (n * sim_dt_s) for n in (ticks + 1, ticks)]
-        way_out = "; or schedule: accumulate, which meets it on average"
+        way_out = "; or set schedule: accumulate, which meets it on average"
     else:
         near = (
             [n / sim_dt_s for n in (math.floor(rate), math.ceil(rate))]
@@ -171,23 +170,23 @@ def _other_rates(rate: Fraction, sim_dt_s: float, in_batches: bool) -> str:
 
 
 def _check_exact(key: str, config: SampledConfig) -> None:
-    """Refuse errors of classes, which are names and no quantities."""
+    """Raise an error for noise of classes, which are labels and not quantities."""
     for name in ("noise", "bias"):
         values = getattr(config, name)
-        check(not any(values), f"{key}.{name}", values, "must be 0: a class has no errors")
+        check(not any(values), f"{key}.{name}", values, "must be 0: classes have no noise or bias")
 
 
 @dataclass(frozen=True, kw_only=True)
 class LidarRigConfig(SampledConfig):
-    """Distances along rays, in m; `range_m` where nothing is.
+    """Distances along rays in m; `range_m` if a ray hits nothing.
 
     Attributes:
-        range_m: how far it sees.
-        rays: of one layer, from the right to the left.
-        layers: 1: a plane lidar.
-        fov_deg: across all rays; 360: all around, beginning forward.
-        lower_deg: elevation of the lowest of several layers.
-        upper_deg: of the highest one.
+        range_m: range of the sensor.
+        rays: rays per layer, from right to left.
+        layers: number of layers; 1: a planar lidar.
+        fov_deg: angle that the rays cover; 360: a full circle that starts forward.
+        lower_deg: elevation of the lowest layer, if there are several.
+        upper_deg: elevation of the highest layer.
     """
 
     type: Literal["lidar"] = "lidar"
@@ -205,7 +204,7 @@ class LidarRigConfig(SampledConfig):
         return (self.layers, self.rays)
 
     def check(self, key: str) -> None:
-        """As `MountedConfig.check`."""
+        """Check all values, as `MountedConfig.check`."""
         super().check(key)
         check_finite(f"{key}.upper_deg", self.upper_deg, self.lower_deg, 89.0)
 
@@ -215,10 +214,10 @@ class RadarConfig(SampledConfig):
     """The nearest targets: range in m, azimuth in rad, radial speed in m/s (positive: away).
 
     Attributes:
-        range_m: how far it sees.
-        fov_deg: opening in the plane.
-        targets: most that are listed; the rest of the list is zeros.
-        rays: directions that are tried.
+        range_m: range of the sensor.
+        fov_deg: horizontal field of view.
+        targets: maximum number of targets; unused entries are zeros.
+        rays: number of directions that are searched.
     """
 
     type: Literal["radar"] = "radar"
@@ -239,10 +238,10 @@ class CameraConfig(SampledConfig):
     """A pinhole camera.
 
     Attributes:
-        width: pixels, from left to right.
-        height: pixels, from top to bottom.
-        fov_deg: horizontal opening.
-        range_m: how far it sees.
+        width: pixels from left to right.
+        height: pixels from top to bottom.
+        fov_deg: horizontal field of view.
+        range_m: range of the camera.
     """
 
     width: Annotated[int, Whole(1, 4096)] = 160
@@ -258,7 +257,7 @@ class CameraConfig(SampledConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class DepthCameraConfig(CameraConfig):
-    """Depth along the axis in m; `range_m` where nothing is."""
+    """Depth along the optical axis in m; `range_m` where nothing is hit."""
 
     type: Literal["depth_camera"] = "depth_camera"
     units: ClassVar[tuple[str, ...]] = ("m",)
@@ -266,20 +265,20 @@ class DepthCameraConfig(CameraConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class SemanticCameraConfig(CameraConfig):
-    """The class of what each pixel shows."""
+    """The semantic class of each pixel."""
 
     type: Literal["semantic_camera"] = "semantic_camera"
     units: ClassVar[tuple[str, ...]] = ("class",)
 
     def check(self, key: str) -> None:
-        """As `MountedConfig.check`."""
+        """Check all values, as `MountedConfig.check`."""
         super().check(key)
         _check_exact(key, self)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RgbCameraConfig(CameraConfig):
-    """A shaded picture, red, green and blue from 0 to 255."""
+    """A shaded colour image: red, green and blue from 0 to 255."""
 
     type: Literal["rgb_camera"] = "rgb_camera"
     units: ClassVar[tuple[str, ...]] = ("red", "green", "blue")
@@ -292,12 +291,12 @@ class RgbCameraConfig(CameraConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class BevGridConfig(SampledConfig):
-    """What lies around the vehicle, seen from above: the class of each cell.
+    """A bird's-eye view: the semantic class of each cell around the vehicle.
 
     Attributes:
-        ahead_m: how far the grid reaches before the sensor.
-        behind_m: and behind.
-        aside_m: to either side.
+        ahead_m: extent of the grid in front of the sensor.
+        behind_m: extent behind the sensor.
+        aside_m: extent to either side.
         cell_m: side of a cell.
     """
 
@@ -310,17 +309,17 @@ class BevGridConfig(SampledConfig):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(cells along, cells across), the first row farthest ahead, the first column left."""
+        """(rows, columns); the first row is farthest ahead, the first column leftmost."""
         along = math.floor((self.ahead_m + self.behind_m) / self.cell_m + 1e-9)
         return (along, math.floor(2.0 * self.aside_m / self.cell_m + 1e-9))
 
     def check(self, key: str) -> None:
-        """As `MountedConfig.check`."""
+        """Check all values, as `MountedConfig.check`."""
         super().check(key)
         _check_exact(key, self)
         for name in ("pitch_deg", "roll_deg"):
             value = getattr(self, name)
-            check(value == 0.0, f"{key}.{name}", value, "must be 0: it looks straight down")
+            check(value == 0.0, f"{key}.{name}", value, "must be 0: the grid is horizontal")
         check(
             min(self.shape) >= 1,
             f"{key}.cell_m",
@@ -334,9 +333,9 @@ class GnssConfig(SampledConfig):
     """Latitude and longitude in degrees, and height in m (WGS 84); noise in m: east, north, up.
 
     Attributes:
-        origin_lat_deg: where the map's (0, 0) is taken to be, if the map does not say.
-        origin_lon_deg: see `origin_lat_deg`.
-        origin_height_m: the height above the ellipsoid of z = 0.
+        origin_lat_deg: latitude of the map's (0, 0), if the map has no georeference.
+        origin_lon_deg: longitude of the map's (0, 0), likewise.
+        origin_height_m: height of z = 0 above the ellipsoid.
     """
 
     type: Literal["gnss"] = "gnss"
@@ -348,7 +347,7 @@ class GnssConfig(SampledConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ImuConfig(SampledConfig):
-    """Specific force in m/s² and angular rate in rad/s, along the sensor's x, y and z."""
+    """Specific force in m/s² and angular rate in rad/s, along the sensor's x, y and z axes."""
 
     type: Literal["imu"] = "imu"
     units: ClassVar[tuple[str, ...]] = ("m/s²", "m/s²", "m/s²", "rad/s", "rad/s", "rad/s")
@@ -357,7 +356,7 @@ class ImuConfig(SampledConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OdometryConfig(SampledConfig):
-    """Speed in m/s, yaw rate in rad/s, and the distance that the wheels have rolled, in m."""
+    """Speed in m/s, yaw rate in rad/s, and the distance that the wheels have rolled in m."""
 
     type: Literal["odometry"] = "odometry"
     units: ClassVar[tuple[str, ...]] = ("m/s", "rad/s", "m")
@@ -366,13 +365,13 @@ class OdometryConfig(SampledConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class LaneBoundaryConfig(SampledConfig):
-    """The lane that the sensor is on.
+    """The lane below the sensor.
 
-    To its left and its right boundary, and its width, in m; the sensor's direction from the lane's
-    in rad; and the curvature of the way in 1/m, positive to the left.
+    Distances to the left and right boundary and the width in m; the sensor's heading relative to
+    the lane in rad; the curvature of the path in 1/m, positive to the left.
 
     Attributes:
-        lookahead_m: length of the way that the curvature is measured over.
+        lookahead_m: length of the path over which the curvature is measured.
     """
 
     type: Literal["lane_boundary"] = "lane_boundary"
@@ -382,7 +381,7 @@ class LaneBoundaryConfig(SampledConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class CollisionConfig(MountedConfig):
-    """What happens to the vehicle, and when: EVENT_* bits, and the vehicle hit (-1: none)."""
+    """Events of the vehicle per tick: EVENT_* bits, and the id of the vehicle hit (-1: none)."""
 
     type: Literal["collision"] = "collision"
     units: ClassVar[tuple[str, ...]] = ("bits", "id")
@@ -406,15 +405,15 @@ Rig = dict[str, Annotated[RigSensor, ByType()]]
 
 
 def check_rig(rig: Mapping[str, MountedConfig], sim_dt_s: float, ticks_per_step: int) -> None:
-    """Refuse a rig that cannot work."""
-    check(len(rig) <= MAX_SENSORS, "rig", len(rig), f"must be {MAX_SENSORS} sensors at most")
+    """Check the number, the names and the values of a rig's sensors."""
+    check(len(rig) <= MAX_SENSORS, "rig", len(rig), f"must have at most {MAX_SENSORS} sensors")
     for name, sensor in rig.items():
         key = f"rig.{name}"
         check(
             _NAME.fullmatch(name) is not None,
             "rig",
             name,
-            "the name of a sensor must be small letters, digits and _, a letter first",
+            "a sensor's name must be lower-case letters, digits and _, starting with a letter",
         )
         sensor.check(key)
         if isinstance(sensor, SampledConfig):
@@ -424,6 +423,6 @@ def check_rig(rig: Mapping[str, MountedConfig], sim_dt_s: float, ticks_per_step:
             numbers <= MAX_SAMPLE_NUMBERS,
             key,
             sensor.shape,
-            f"a step of it is {numbers} numbers, more than {MAX_SAMPLE_NUMBERS}; use fewer pixels, "
+            f"has {numbers} numbers per step, more than {MAX_SAMPLE_NUMBERS}; use fewer pixels, "
             "rays or cells, or a smaller rate_hz",
         )

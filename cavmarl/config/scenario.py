@@ -1,4 +1,4 @@
-"""The key `scenario`: what happens to the agents, and where."""
+"""`ScenarioConfig`: a scripted conflict for the agents of a world."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from cavmarl.config.checks import Section
 
 @dataclass(frozen=True)
 class ScenarioConfig(Section, key="scenario"):
-    """One scripted conflict for the agents of each world; docs/guides/scenarios.md.
+    """A scripted conflict for the agents of each world; see docs/guides/scenarios.md.
 
     Attributes:
-        name: of a scenario, or the path of a `.py` file with one; empty: none.
-        place: where, by a name of the map as `cavmarl scenario run` prints it; empty: one of the
-            places that the map has, drawn by `seed`.
-        seed: draws the place.
-        params: values of the scenario's parameters; the others have their defaults.
+        name: a scenario, or the path of a `.py` file with one; empty: none.
+        place: name of a place on the map, from `cavmarl scenario run`; empty: a place that is drawn
+            with `seed`.
+        seed: seed that draws the place.
+        params: values of the scenario's parameters; the other parameters keep their defaults.
     """
 
     name: str = ""
@@ -30,11 +30,11 @@ class ScenarioConfig(Section, key="scenario"):
         self.need(
             "name",
             bool(self.name) or not (self.place or self.params),
-            "must name a scenario where scenario.place or scenario.params is given",
+            "must name a scenario if scenario.place or scenario.params is given",
         )
 
 
 def path_of_code(name: str) -> Path | None:
-    """The `.py` file that a scenario's name means, however its path is written; None: no path."""
+    """Return the path of the `.py` file in a scenario's name; None if the name is not a path."""
     path = Path(name)
     return path if path.suffix == ".py" else None

@@ -1,9 +1,9 @@
-"""The keys under `sensors` of `env.yaml`: what each sensor of an agent is set to.
+"""The keys under `sensors` of `env.yaml`: the configuration of each sensor of an agent.
 
 Counts of 0 and empty lists switch a sensor off. `kinematics`, `occupancy_grid` and
-`lidar_observation` take the names, the defaults and the meanings of highway-env's observations
-(Leurent: "An environment for autonomous driving decision-making", 2018), so that a policy made for
-those can be used here.
+`lidar_observation` have the names, the defaults and the meanings of highway-env's observations
+(Leurent: "An environment for autonomous driving decision-making", 2018), so that policies for
+highway-env can be used.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ VEHICLE_FEATURES = (
     "lat_off",
     "ang_off",
 )
-# A layer of an occupancy grid shows one of them, or where the road is.
+# A layer of an occupancy grid is one of these features, or a mask of the road.
 GRID_FEATURES = (*VEHICLE_FEATURES, "on_road")
 
-# More numbers than this in one grid are a mistake: 100 agents would observe 26 MB a step.
+# Larger grids are a mistake: 100 agents would observe 26 MB per step.
 MAX_GRID_NUMBERS = 65_536
 
 
@@ -44,8 +44,8 @@ MAX_GRID_NUMBERS = 65_536
 class SensorSection(Section, key=""):
     """The keys of one sensor.
 
-    A class of a sensor names `switches`, the fields that switch it on: it is off if each of them is
-    0, empty or false. `sight` are those switches that let it look at other vehicles or at signals.
+    A subclass names its `switches`: the sensor is off if all of these fields are 0, empty or false.
+    `sight` are the switches for the perception of other vehicles or signals.
     """
 
     switches: ClassVar[tuple[str, ...]] = ()
@@ -63,17 +63,18 @@ class SensorSection(Section, key=""):
         return any(getattr(self, name) for name in self.switches)
 
     def without_sight(self) -> Self:
-        """Return the same sensor with its sight switched off."""
+        """Return the same sensor with its perception of vehicles and signals switched off."""
         return replace(self, **{name: type(getattr(self, name))() for name in self.sight})
 
 
 @dataclass(frozen=True)
 class EgoConfig(SensorSection, key="sensors.ego", switches=("enabled",)):
-    """The vehicle itself, its lane and what the plan asks of it.
+    """The agent's vehicle, its lane, and the next lane change of its plan.
 
     Attributes:
         enabled: false switches the sensor off.
-        size: adds what its type can do: size, wheelbase, steering, acceleration, braking, speed.
+        size: adds the limits of the vehicle type: size, wheelbase, steering, acceleration, braking,
+            speed.
     """
 
     enabled: bool = True
@@ -85,8 +86,8 @@ class RouteAheadConfig(SensorSection, key="sensors.route", switches=("points",))
     """Points of the route ahead, in the ego frame.
 
     Attributes:
-        points: how many; 0 switches the sensor off.
-        spacing_m: way between one and the next.
+        points: number of points; 0 switches the sensor off.
+        spacing_m: distance along the route between two points.
     """
 
     points: Annotated[int, Whole(0, 64)] = 8
@@ -100,9 +101,9 @@ class NeighborsConfig(
     """The nearest vehicles, in the ego frame.
 
     Attributes:
-        count: how many at most; 0 switches the sensor off.
-        range_m: distance up to which a vehicle is seen.
-        through_walls: false hides vehicles whose centre lies behind a wall of `map.buildings`.
+        count: maximum number of vehicles; 0 switches the sensor off.
+        range_m: distance up to which vehicles are seen.
+        through_walls: false hides vehicles whose centre is behind a wall of `map.buildings`.
     """
 
     count: Annotated[int, Whole(0, 64)] = 8
@@ -114,12 +115,12 @@ class NeighborsConfig(
 class SignalAheadConfig(
     SensorSection, key="sensors.signal", switches=("enabled",), sight=("enabled",)
 ):
-    """The next signal or duty to give way on the route.
+    """The next signal or yield line on the route.
 
     Attributes:
         enabled: false switches the sensor off.
-        range_m: how far ahead it is seen.
-        timing: adds the time until the signal changes, as roadside units broadcast it.
+        range_m: distance ahead up to which it is seen.
+        timing: adds the time until the signal changes, which roadside units broadcast.
     """
 
     enabled: bool = True
@@ -129,10 +130,10 @@ class SignalAheadConfig(
 
 @dataclass(frozen=True)
 class LanesConfig(SensorSection, key="sensors.lanes", switches=("range_m",), sight=("range_m",)):
-    """Vehicles by their place along the lanes around, and the one that crosses the own way first.
+    """Vehicles by position along the surrounding lanes, and the next one to cross the path.
 
     Attributes:
-        range_m: how far along lanes a vehicle is seen; 0 switches the sensor off.
+        range_m: distance along lanes up to which vehicles are seen; 0 switches the sensor off.
     """
 
     range_m: Annotated[float, Within(0.0, 300.0)] = 0.0
@@ -143,9 +144,9 @@ class LidarConfig(SensorSection, key="sensors.lidar", switches=("rays",), sight=
     """Distances around the vehicle.
 
     Attributes:
-        rays: how many, equally spaced; 0 switches the sensor off.
-        range_m: how far a ray reaches.
-        speeds: adds the relative speed of what each ray hits.
+        rays: number of equally spaced rays; 0 switches the sensor off.
+        range_m: range of a ray.
+        speeds: adds the relative speed of the object that each ray hits.
     """
 
     rays: Annotated[int, Whole(0, 1024)] = 64
@@ -157,22 +158,23 @@ class LidarConfig(SensorSection, key="sensors.lidar", switches=("rays",), sight=
 class KinematicsConfig(
     SensorSection, key="sensors.kinematics", switches=("vehicles_count",), sight=("vehicles_count",)
 ):
-    """highway-env's `Kinematics`: a table of vehicles by features, the own one first.
+    """highway-env's `Kinematics`: a table with a row per vehicle, starting with the own vehicle.
 
     Attributes:
-        vehicles_count: rows, the own vehicle included (highway-env: 5); 0 switches the sensor off.
-        features: columns, of `presence`, `x`, `y`, `vx`, `vy`, `heading`, `cos_h`, `sin_h`,
+        vehicles_count: rows, own vehicle included (highway-env: 5); 0 switches the sensor off.
+        features: columns, from `presence`, `x`, `y`, `vx`, `vy`, `heading`, `cos_h`, `sin_h`,
             `cos_d`, `sin_d`, `long_off`, `lat_off`, `ang_off`.
-        features_range: feature to [min, max], which are mapped to [-1, 1]; features that are not
-            named stay as they are. Empty: x ±200 m, y ±4 m for each lane of the map's widest road,
-            vx and vy ±80 m/s.
-        absolute: whether x, y, vx and vy of the others are the world's; else relative to the own
-            ones. The own row always has the world's.
-        order: `sorted`: nearest along the lane first. `shuffled`: the first by id, in random order.
+        features_range: feature to [min, max], mapped to [-1, 1]; other features stay unmapped.
+            Empty: x ±200 m, y ±4 m for each lane of the map's widest road, vx and vy ±80 m/s.
+        absolute: whether x, y, vx and vy of other vehicles are in the world's frame; otherwise
+            relative to the own vehicle. The own row is always in the world's frame.
+        order: `sorted`: nearest along the lane first. `shuffled`: those with the smallest ids, in
+            random order.
         normalize: whether ranges are mapped to [-1, 1].
-        clip: whether what was mapped is clipped to [-1, 1].
-        see_behind: whether vehicles more than two lengths behind are seen.
-        observe_intentions: whether `cos_d` and `sin_d` of the others are shown; else they are 0.
+        clip: whether mapped values are clipped to [-1, 1].
+        see_behind: whether vehicles more than two lengths behind are included.
+        observe_intentions: whether `cos_d` and `sin_d` of other vehicles are filled in; otherwise
+            they are 0.
     """
 
     vehicles_count: Annotated[int, Whole(0, 256)] = 0
@@ -188,7 +190,7 @@ class KinematicsConfig(
     def __post_init__(self) -> None:
         super().__post_init__()
         key = "sensors.kinematics"
-        self.need("features", bool(self.features), "must name at least one")
+        self.need("features", bool(self.features), "must name at least one feature")
         _check_features(f"{key}.features", self.features, VEHICLE_FEATURES)
         _check_ranges(f"{key}.features_range", self.features_range)
 
@@ -200,15 +202,14 @@ class OccupancyGridConfig(
     """highway-env's `OccupancyGrid`: layers of cells around the vehicle.
 
     Attributes:
-        features: layers, of `kinematics.features` and `on_road` (highway-env: presence, vx, vy,
+        features: layers, from `kinematics.features` and `on_road` (highway-env: presence, vx, vy,
             on_road); an empty list switches the sensor off.
-        features_range: feature to [min, max], which are mapped to [-1, 1]. Empty: vx and vy
-            ±80 m/s.
+        features_range: feature to [min, max], mapped to [-1, 1]. Empty: vx and vy ±80 m/s.
         grid_size_m: [[min x, max x], [min y, max y]] around the vehicle.
         grid_step_m: [x, y], sides of a cell.
-        align_to_vehicle_axes: whether the cells turn with the vehicle.
-        clip: whether all is clipped to [-1, 1].
-        as_image: whether [-1, 1] is given as whole numbers from 0 to 255.
+        align_to_vehicle_axes: whether the grid rotates with the vehicle.
+        clip: whether all values are clipped to [-1, 1].
+        as_image: whether values are mapped from [-1, 1] to whole numbers from 0 to 255.
     """
 
     features: tuple[str, ...] = ()
@@ -226,7 +227,7 @@ class OccupancyGridConfig(
         self.need(
             "grid_size_m",
             len(self.grid_size_m) == 2 and all(_is_range(axis) for axis in self.grid_size_m),
-            "must be [[min x, max x], [min y, max y]], both rising",
+            "must be [[min x, max x], [min y, max y]], both increasing",
         )
         for axis in self.grid_size_m:
             for bound in axis:
@@ -248,7 +249,7 @@ class OccupancyGridConfig(
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Cells along x and along y."""
+        """Number of cells along x and along y."""
         columns, rows = (
             math.floor((high - low) / step)
             for (low, high), step in zip(self.grid_size_m, self.grid_step_m, strict=True)
@@ -263,8 +264,8 @@ class LidarObservationConfig(
     """highway-env's `LidarObservation`: distance and speed in sectors around the vehicle.
 
     Attributes:
-        cells: sectors (highway-env: 16); 0 switches the sensor off.
-        maximum_range_m: how far it sees.
+        cells: number of sectors (highway-env: 16); 0 switches the sensor off.
+        maximum_range_m: range of the sensor.
         normalize: whether distances and speeds are divided by `maximum_range_m`.
     """
 
@@ -277,13 +278,13 @@ class LidarObservationConfig(
 class MessagesConfig(
     SensorSection, key="sensors.messages", switches=("objects", "events", "signal")
 ):
-    """What the vehicle has been told over the air, see `v2x`.
+    """Information received in messages; see `v2x`.
 
     Attributes:
-        objects: vehicles that it has heard of, the nearest ones; 0: none.
-        events: that it has heard of, the nearest ones; 0: none.
-        signal: adds what the roadside unit of the next signal on the route says.
-        range_m: distance that a place of 1 stands for; what is further away has 1, too.
+        objects: number of vehicles known from messages, the nearest ones; 0: none.
+        events: number of events known from messages, the nearest ones; 0: none.
+        signal: adds the message of the roadside unit at the next signal on the route.
+        range_m: distance that is scaled to 1; greater distances are clipped to 1.
     """
 
     objects: Annotated[int, Whole(0, 64)] = 0
@@ -296,13 +297,13 @@ class MessagesConfig(
 class WayConfig(
     SensorSection, key="sensors.way", switches=("distances_m", "lines"), sight=("lines",)
 ):
-    """The way ahead by its shape, its lanes and the stop lines on it.
+    """The path ahead: its shape, its lanes and its stop lines.
 
     Attributes:
-        distances_m: at which places are told, rising; an empty list: none.
-        lines: next stop lines with a signal or a duty to give way that are told; 0: none.
-        range_m: how far ahead a line is seen.
-        timing: adds the time until a line's signal changes, as roadside units broadcast it.
+        distances_m: increasing distances at which the path is sampled; an empty list: none.
+        lines: number of next stop lines with a signal or a duty to yield; 0: none.
+        range_m: distance ahead up to which a line is seen.
+        timing: adds the time until a line's signal changes, which roadside units broadcast.
     """
 
     distances_m: tuple[float, ...] = ()
@@ -318,7 +319,7 @@ class WayConfig(
             len(distances) <= 64
             and all(0.5 <= distance <= 300.0 for distance in distances)
             and all(a < b for a, b in pairwise(distances)),
-            "must be rising distances from 0.5 to 300, 64 at most",
+            "must be at most 64 increasing distances from 0.5 to 300",
         )
 
 
@@ -326,20 +327,19 @@ class WayConfig(
 class ConflictsConfig(
     SensorSection, key="sensors.conflicts", switches=("count",), sight=("count",)
 ):
-    """The vehicles that come nearest to the own way, the soonest and nearest ones first.
+    """The vehicles that come closest to the own path, the soonest and closest ones first.
 
-    Nothing of their plans is told but what `indicators` show: each is taken to go on as it goes,
-    along its heading.
+    Their plans are unknown except for `indicators`: a vehicle is assumed to keep its motion, along
+    its heading.
 
     Attributes:
-        count: how many at most; 0 switches the sensor off.
-        range_m: distance up to which a vehicle is seen.
-        through_walls: false hides vehicles whose centre lies behind a wall of `map.buildings`.
-        heard: true adds those that are not seen and that a message tells of (`v2x`), where they are
-            if they have gone on as it says; and two numbers a vehicle, see `seen` and `age`.
-        indicators: true takes vehicles that are seen to follow their lanes and the way that they
-            indicate over the junction that they are on or come to next; and one number a vehicle,
-            see `turn`.
+        count: maximum number of vehicles; 0 switches the sensor off.
+        range_m: distance up to which vehicles are seen.
+        through_walls: false hides vehicles whose centre is behind a wall of `map.buildings`.
+        heard: true adds vehicles that are not seen but known from messages (`v2x`), extrapolated
+            from the message; and two numbers per vehicle, see `seen` and `age`.
+        indicators: true assumes that seen vehicles follow their lanes and the direction that they
+            indicate at their present or next junction; and adds one number per vehicle, see `turn`.
     """
 
     count: Annotated[int, Whole(0, 64)] = 0
@@ -351,10 +351,10 @@ class ConflictsConfig(
 
 @dataclass(frozen=True)
 class HistoryConfig(SensorSection, key="sensors.history", switches=("steps",)):
-    """What the vehicle was told to do, and its speeds.
+    """The last controls and speeds of the vehicle.
 
     Attributes:
-        steps: how many of the last ones; 0 switches the sensor off.
+        steps: number of steps; 0 switches the sensor off.
     """
 
     steps: Annotated[int, Whole(0, 64)] = 0
@@ -362,12 +362,13 @@ class HistoryConfig(SensorSection, key="sensors.history", switches=("steps",)):
 
 @dataclass(frozen=True)
 class SensorsConfig(Section, key="sensors"):
-    """The sensors of every agent; counts and ranges of 0 switch one off.
+    """The sensors of every agent; a count or range of 0 switches one off.
 
     Attributes:
-        stack: observations in one: the last ones, oldest first. At first all are the first.
-        registered: sensors from outside of the package that are on, by name
-            (docs/guides/extending.md); their features follow those of all others.
+        stack: number of observations in one, the latest ones, oldest first. After a reset, all are
+            the first observation.
+        registered: names of sensors from outside of the package that are on
+            (docs/guides/extending.md); their features come last.
     """
 
     stack: Annotated[int, Whole(1, 64)] = 1
@@ -397,12 +398,12 @@ class SensorsConfig(Section, key="sensors"):
         check(is_any_on, "sensors", "all off", "an agent must observe something; switch one on")
 
     def _sections(self) -> dict[str, SensorSection]:
-        """Return the keys of each sensor of the package, by its name."""
+        """Return the configuration of each sensor of the package, by name."""
         named = ((entry.name, getattr(self, entry.name)) for entry in fields(self))
         return {name: value for name, value in named if isinstance(value, SensorSection)}
 
     def without_sight(self) -> SensorsConfig:
-        """Return the same sensors, but for those that look at others or at signals."""
+        """Return the same sensors without those that see other vehicles or signals."""
         blind: dict[str, Any] = {
             name: section.without_sight() for name, section in self._sections().items()
         }
@@ -415,7 +416,7 @@ def _is_range(bounds: tuple[float, ...]) -> bool:
 
 def _check_features(key: str, features: tuple[str, ...], known: tuple[str, ...]) -> None:
     for name in features:
-        check(name in known, key, name, f"no such feature; there are {', '.join(known)}")
+        check(name in known, key, name, f"no such feature; must be one of {', '.join(known)}")
     check(len(set(features)) == len(features), key, features, "must name each feature once")
 
 
@@ -425,6 +426,6 @@ def _check_ranges(key: str, ranges: dict[str, tuple[float, ...]]) -> None:
             name in VEHICLE_FEATURES,
             key,
             name,
-            f"no such feature; there are {', '.join(VEHICLE_FEATURES)}",
+            f"no such feature; must be one of {', '.join(VEHICLE_FEATURES)}",
         )
-        check(_is_range(bounds), f"{key}.{name}", bounds, "must be [min, max], rising and finite")
+        check(_is_range(bounds), f"{key}.{name}", bounds, "must be finite and increasing")

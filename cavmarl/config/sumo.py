@@ -1,4 +1,4 @@
-"""How SUMO is run where it is global traffic: the keys under `sumo` of `env.yaml`."""
+"""`SumoConfig`: the keys under `sumo` of `env.yaml`, used if SUMO is global traffic."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from cavmarl.config.checks import Section, Whole
 
 @dataclass(frozen=True)
 class SumoConfig(Section, key="sumo"):
-    """Read where `traffic.source` is `sumo-demand` or `sumo-traffic`; see docs/guides/sumo.md.
+    """Settings of SUMO for `traffic.source` `sumo-demand` or `sumo-traffic`; docs/guides/sumo.md.
 
     Attributes:
-        interface: `libsumo`, `traci` (slower, the same results), or `auto`: the first of them that
-            is installed.
-        max_vehicles: of SUMO's that one world can hold; SUMO keeps others waiting.
-        replay_mib: MiB, by world, for what SUMO was told of our vehicles in an episode, 40 bytes a
-            vehicle and tick: `sumo-traffic` with worker processes keeps it thrice, and where one
-            dies its successor runs SUMO again with it. 0: nothing is kept, a death is an error.
+        interface: `libsumo`, `traci` (slower, same results), or `auto`: the first of these that is
+            installed.
+        max_vehicles: number of SUMO's vehicles that a world can hold; SUMO delays the others.
+        replay_mib: MiB per world for the inputs of SUMO during an episode, 40 bytes per vehicle and
+            tick. With `sumo-traffic` and worker processes, three copies are kept. If a worker dies,
+            its successor uses them to run SUMO again. 0: nothing is kept, and a death is an error.
     """
 
     interface: Literal["auto", "libsumo", "traci"] = "auto"

@@ -10,7 +10,7 @@ from cavmarl.config.removed_keys import removed_key
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_TERMS
 
-# The named terms of one step, in the order of every terms array (`rewards/kernels/terms.py`).
+# The named terms of a step, in the order of every terms array (`rewards/kernels/terms.py`).
 TERMS = (
     "progress",
     "speeding",
@@ -27,13 +27,13 @@ TERMS = (
 
 @dataclass(frozen=True)
 class TermsConfig(Section, key="terms"):
-    """Reward = Σ weight · term; docs/reference/environments.md says what each of `TERMS` is.
+    """Reward = Σ weight · term; docs/reference/environments.md defines each of `TERMS`.
 
     Attributes:
-        weights: weight of each named term; terms that are not named weigh 0.
-        team_share: share of the reward that is the mean over all live agents: 0 individual, 1 team.
-        team_range_m: only agents that are so near count in that mean, as the local coordination of
-            CoPO has it (Peng et al. 2021); 0: all do.
+        weights: weight of each named term; other terms have weight 0.
+        team_share: share of the mean over all live agents in the reward: 0 individual, 1 team.
+        team_range_m: only agents within this distance count in the mean, as in the local
+            coordination of CoPO (Peng et al. 2021); 0: all agents count.
     """
 
     weights: dict[str, float] = field(
@@ -62,14 +62,14 @@ class TermsConfig(Section, key="terms"):
                 name in known,
                 "terms.weights",
                 name,
-                f"no such term; there are {', '.join(known)}, or add one with "
+                f"no such term; must be one of {', '.join(known)}; or add one with "
                 "cavmarl.register_term",
             )
             check_finite(f"terms.weights.{name}", weight, -1e6, 1e6)
 
     @property
     def registered(self) -> tuple[str, ...]:
-        """The weighted terms that are not of the package."""
+        """The weighted terms that are not part of the package."""
         return tuple(name for name in self.weights if name not in TERMS)
 
     @property
@@ -79,5 +79,5 @@ class TermsConfig(Section, key="terms"):
 
     @property
     def weight_of_each(self) -> tuple[float, ...]:
-        """Their weights, in the same order."""
+        """The weights of all terms, in the order of `names`."""
         return tuple(self.weights.get(name, 0.0) for name in self.names)

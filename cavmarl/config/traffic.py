@@ -1,4 +1,4 @@
-"""`TrafficConfig`: where departures come from."""
+"""`TrafficConfig`: the departures of vehicles."""
 
 from __future__ import annotations
 
@@ -10,30 +10,29 @@ from cavmarl.config.checks import Section, Whole, Within
 
 @dataclass(frozen=True)
 class TrafficConfig(Section, key="traffic"):
-    """Where departures come from.
+    """The departures of vehicles.
 
     Attributes:
-        source: what reads the demand files. `native`: cavmarl. `sumo-demand`: SUMO says which
-            vehicle departs when and on which route, and what signals show; our drivers drive.
-            `sumo-traffic`: SUMO moves its vehicles, too. The generator's drive beside them.
-        demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
-            `.sumocfg`): named as `map.source`; their vehicles drive beside the generator's.
-        on_bad_route: what to do with vehicles of the demand that cannot drive their route, and with
-            stops off it: `error`, or `skip` them (counted).
-        goals: how many destination edges the generator uses; lane-level plans are made for each.
-        origins: edges that agents start on, by id; empty: all that lead somewhere.
-        destinations: edges that agents drive to, by id; empty: the generator's goals.
-        min_trip_m: shortest way of an agent between origin and destination.
-        max_trip_m: longest way of an agent; 0: no limit.
-        endless: agents drive on to another goal before they reach theirs, as the background of a
-            `closed` world does: 150 m before it, to one that is farther than that.
-        speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
-        model: how the generator's vehicles follow their leader: `IDM`, `Krauss`, `ACC`, or a model
-            that is registered (docs/guides/extending.md). Those of `demand` drive as their type
-            says.
-        trip_horizon: so many times what its way takes at the limits, and one cycle of each signal
-            on it, an agent's trip may take; then the vehicle leaves, and the trip is truncated.
-            0: only the episode's horizon cuts it.
+        source: `native`: cavmarl reads the demand files. `sumo-demand`: SUMO determines departures,
+            routes and signals; cavmarl's drivers drive. `sumo-traffic`: SUMO also moves its
+            vehicles. The generator's vehicles drive in all cases.
+        demand: SUMO files with vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
+            `.sumocfg`), named like `map.source`. Their vehicles drive beside the generator's.
+        on_bad_route: what happens to vehicles of the demand that cannot drive their route, and to
+            stops off the route: `error`, or `skip` them (counted).
+        goals: number of destination edges of the generator; lane-level plans are made for each.
+        origins: ids of edges that agents start on; empty: all edges from which a goal is reachable.
+        destinations: ids of edges that agents drive to; empty: the generator's goals.
+        min_trip_m: shortest route of an agent between origin and destination.
+        max_trip_m: longest route of an agent; 0: no limit.
+        endless: 150 m before their goal, agents get another goal that is farther than that, like
+            the background vehicles of a `closed` world.
+        speed_factor_spread: half width of the uniform distribution of desired speed over limit.
+        model: car-following model of the generator's vehicles: `IDM`, `Krauss`, `ACC`, or a
+            registered model (docs/guides/extending.md). Vehicles of `demand` follow their type.
+        trip_horizon: limit of an agent's trip: this multiple of the time that its route takes at
+            the speed limits, plus one cycle of each signal on it. Then the vehicle leaves, and the
+            trip is truncated. 0: only the episode's horizon limits it.
     """
 
     source: Literal["native", "sumo-demand", "sumo-traffic"] = "native"
@@ -54,15 +53,15 @@ class TrafficConfig(Section, key="traffic"):
         self.need(
             "trip_horizon",
             self.trip_horizon == 0.0 or self.trip_horizon >= 1.0,
-            "must be 0 (none), or 1 or more: no vehicle is faster than the limits allow",
+            "must be 0 (no limit), or at least 1: no vehicle is faster than the limits allow",
         )
         self.need(
             "source",
             self.source == "native" or bool(self.demand),
-            "needs traffic.demand: a .sumocfg, or files of routes",
+            "needs traffic.demand: a .sumocfg, or route files",
         )
         self.need(
             "max_trip_m",
             self.max_trip_m == 0.0 or self.max_trip_m > self.min_trip_m,
-            f"must be 0 (no limit) or above traffic.min_trip_m = {self.min_trip_m:g}",
+            f"must be 0 (no limit), or above traffic.min_trip_m = {self.min_trip_m:g}",
         )

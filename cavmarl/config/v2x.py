@@ -1,6 +1,6 @@
 """The keys under `v2x` of `env.yaml`: which messages are sent, and how many of them arrive.
 
-Everything is off by default, and the channel is ideal: each of its effects is off at 0.
+Messages are off by default, and the channel is ideal: each of its effects is off at 0.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ EVERY_SIGNAL = "all"
 
 @dataclass(frozen=True)
 class CamConfig(Section, key="v2x.cam"):
-    """Messages of a vehicle about itself, after CAM (ETSI EN 302 637-2).
+    """Messages of a vehicle about itself, modelled on CAM (ETSI EN 302 637-2).
 
     Attributes:
-        rate_hz: how often one is due; vehicles take turns by id. 0: never.
-        triggered: send what is due only if the vehicle has moved 4 m, turned 4° or changed its
-            speed by 0.5 m/s since its last one, and once a second anyway.
+        rate_hz: rate of messages; vehicles take turns by id. 0: never.
+        triggered: send a message only if the vehicle has moved 4 m, turned 4° or changed its
+            speed by 0.5 m/s since its last one, or if that was a second ago.
     """
 
     rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 10.0
@@ -31,13 +31,13 @@ class CamConfig(Section, key="v2x.cam"):
 
 @dataclass(frozen=True)
 class DenmConfig(Section, key="v2x.denm"):
-    """Messages about events, after DENM (ETSI EN 302 637-3).
+    """Messages about events, modelled on DENM (ETSI EN 302 637-3).
 
     Attributes:
-        rate_hz: how often an event that lasts is told again; 0: only what agents declare is sent.
+        rate_hz: repetition rate while an event lasts; 0: only events that agents declare are sent.
         hard_braking_mps2: deceleration from which braking is an event.
-        stationary_s: time from which a vehicle that stands is an event.
-        validity_s: for so long a receiver keeps an event.
+        stationary_s: standing time from which a vehicle is an event.
+        validity_s: time for which a receiver keeps an event.
     """
 
     rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 10.0
@@ -48,12 +48,12 @@ class DenmConfig(Section, key="v2x.denm"):
 
 @dataclass(frozen=True)
 class PerceptionConfig(Section, key="v2x.perception"):
-    """Messages about others that the sender sees, after CPM (ETSI TS 103 324).
+    """Messages about vehicles that the sender perceives, modelled on CPM (ETSI TS 103 324).
 
     Attributes:
-        rate_hz: how often vehicles send one; 0: never.
-        range_m: how far a vehicle sees, where no body and no building is in between.
-        objects: how many a message tells at most, the nearest ones.
+        rate_hz: rate of messages of a vehicle; 0: never.
+        range_m: range of a vehicle's perception, unless a vehicle or building is in between.
+        objects: maximum number of objects in a message, the nearest ones.
     """
 
     rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 0.0
@@ -63,13 +63,13 @@ class PerceptionConfig(Section, key="v2x.perception"):
 
 @dataclass(frozen=True)
 class RoadsideConfig(Section, key="v2x.roadside"):
-    """Units beside the road, which tell what signals show (SPAT and MAP, SAE J2735).
+    """Roadside units, which broadcast the state of signals (SPAT and MAP, SAE J2735).
 
     Attributes:
-        signals: names of the signals that have one; `[all]`: each.
-        rate_hz: how often each tells its phase.
-        perception_hz: how often each tells what vehicles it sees; 0: it sees none.
-        range_m: how far it sees, over vehicles and not through buildings.
+        signals: names of the signals with a unit; `[all]`: every signal.
+        rate_hz: rate of a unit's messages about its signal.
+        perception_hz: rate of a unit's messages about perceived vehicles; 0: none.
+        range_m: range of a unit's perception, over vehicles but not through buildings.
     """
 
     signals: tuple[str, ...] = ()
@@ -85,26 +85,26 @@ class RoadsideConfig(Section, key="v2x.roadside"):
         self.need(
             "signals",
             EVERY_SIGNAL not in self.signals or len(self.signals) == 1,
-            f"'{EVERY_SIGNAL}' stands alone",
+            f"'{EVERY_SIGNAL}' must be the only name",
         )
 
 
 @dataclass(frozen=True)
 class ChannelConfig(Section, key="v2x.channel"):
-    """How much of what is sent arrives, and when; all zero: everything, everywhere, at once.
+    """Which packets arrive, and when; with zeros, all packets arrive everywhere at once.
 
     Attributes:
-        range_m: nothing is received further away; 0: no limit.
-        latency_ticks: from sending to receiving. With `external`, the longest delay.
-        loss: share of packets that is lost, whatever the distance.
-        path_loss_exponent: of the log-distance model (about 2 to 3); 0: distance costs nothing.
+        range_m: maximum distance of reception; 0: no limit.
+        latency_ticks: time from sending to receiving; with `external`, the longest delay.
+        loss: share of packets that is lost at any distance.
+        path_loss_exponent: exponent of the log-distance model (about 2 to 3); 0: no path loss.
         shadowing_db: standard deviation of the received power.
-        tx_power_dbm: sent, antennas included.
-        sensitivity_dbm: received power from which a packet can be read.
-        building_db: lost where a building stands in the line of sight; 0: they do not matter.
-        data_rate_mbps: what the air can carry; 0: any amount.
+        tx_power_dbm: transmitted power, antenna gains included.
+        sensitivity_dbm: received power from which a packet can be decoded.
+        building_db: loss if a building is in the line of sight; 0: none.
+        data_rate_mbps: capacity of the channel; 0: unlimited.
         packet_bytes: length of a packet.
-        external: a network simulator, connected to the bus, says which receiver gets which message.
+        external: a network simulator on the bus decides which receiver gets which message.
     """
 
     range_m: Annotated[float, Within(0.0, 1e6)] = 0.0
@@ -130,19 +130,19 @@ class ChannelConfig(Section, key="v2x.channel"):
         self.need(
             "building_db",
             self.building_db == 0.0 or exponent > 0.0,
-            "buildings weaken what the path-loss model gives: set path_loss_exponent, too",
+            "buildings add to path loss: set path_loss_exponent, too",
         )
 
 
 @dataclass(frozen=True)
 class InboxConfig(Section, key="v2x.inbox"):
-    """What a receiver keeps: its local dynamic map.
+    """The memory of a receiver: its local dynamic map.
 
     Attributes:
-        objects: vehicles, the nearest ones that it knows of.
-        events: the nearest ones.
-        signals: the nearest ones.
-        memory_s: for so long it keeps what it has heard of vehicles and signals.
+        objects: maximum number of vehicles, the nearest ones.
+        events: maximum number of events, the nearest ones.
+        signals: maximum number of signals, the nearest ones.
+        memory_s: time for which information about vehicles and signals is kept.
     """
 
     objects: Annotated[int, Whole(1, 64)] = 8
@@ -153,13 +153,13 @@ class InboxConfig(Section, key="v2x.inbox"):
 
 @dataclass(frozen=True)
 class V2xConfig(Section, key="v2x"):
-    """Vehicles and roadside units that tell each other what they know.
+    """Messages between vehicles and roadside units.
 
     Attributes:
-        enabled: true switches it on.
-        equipped: share of the background vehicles that send, by id; agents do.
-        capacity: packets that can be sent in one tick of a world; the others, those of the larger
-            ids, are dropped and counted. 0: as many as there can be.
+        enabled: true switches messages on.
+        equipped: share of the background vehicles that send, by id; all agents send.
+        capacity: packets that can be sent in one tick of a world. Packets of larger ids are dropped
+            and counted. 0: room for all.
     """
 
     enabled: bool = False
@@ -173,7 +173,7 @@ class V2xConfig(Section, key="v2x"):
     inbox: InboxConfig = field(default_factory=InboxConfig)
 
     def check_clock(self, sim_dt_s: float) -> None:
-        """Refuse rates that are no whole number of ticks of `sim_dt_s`."""
+        """Raise an error for periods that are not a whole number of ticks of `sim_dt_s`."""
         for key, rate_hz in (
             ("cam.rate_hz", self.cam.rate_hz),
             ("denm.rate_hz", self.denm.rate_hz),
@@ -194,5 +194,5 @@ class V2xConfig(Section, key="v2x"):
 
 
 def period_ticks(rate_hz: float, sim_dt_s: float) -> int:
-    """Ticks from one message to the next, of a rate that `check_clock` lets pass; 0: never."""
+    """Return the ticks between two messages, at a rate that passes `check_clock`; 0: never."""
     return round(1.0 / (rate_hz * sim_dt_s)) if rate_hz > 0.0 else 0

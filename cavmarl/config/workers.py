@@ -1,4 +1,4 @@
-"""`WorkersConfig`: how worker processes are watched and given work."""
+"""`WorkersConfig`: how worker processes are monitored and given work."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within
 
-MAX_SENSOR_WORKERS = 256  # of one process
+MAX_SENSOR_WORKERS = 256  # per process
 
 
 @dataclass(frozen=True)
 class WorkersConfig(Section, key="workers"):
-    """How worker processes are watched and given work; see docs/guides/divide_a_world.md.
+    """How worker processes are monitored and given work; see docs/guides/divide_a_world.md.
 
     Attributes:
-        timeout_s: for so long a worker may be busy with one step or reset; then it is taken to hang
-            and replaced. One that is stopped or sleeps is noticed within a second.
-        max_retries: how often a step is begun again because a worker has died.
-        pin: keep each worker on a core of its own. The system sometimes leaves two on one; but of
-            several environments with workers on one machine all take the same cores.
-        balance_steps: so many steps from one round to the next, in which worlds, or zones of a
-            split world, may change their worker by what they have cost; 0: they stay where they
-            are. Results do not depend on it.
-        imbalance_tolerance: while the slowest worker takes at most this share longer than a
-            perfect division
-            would, nothing moves.
-        max_moves: worlds or zones that change their worker in one round.
-        monitor_cpu: see how busy others keep the workers' cores, and give nothing more to
-            workers above a threshold; without it the cores are taken to be free. Zone nodes watch
-            their machines for `balance_steps`.
-        sensors: processes that the sensors of `rig` are shared out over, for each process that
-            keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
+        timeout_s: time after which a worker that is still busy with one step or reset is replaced.
+            A worker that is stopped or sleeps is noticed within a second.
+        max_retries: how often a step is retried after the death of a worker.
+        pin: bind each worker to a core of its own. Without it, the system may run two on one core.
+            With it, several environments on one machine all use the same cores.
+        balance_steps: steps between two rounds in which worlds, or zones of a divided world, may
+            move to another worker, based on their measured cost; 0: they never move. Results do
+            not depend on it.
+        imbalance_tolerance: nothing moves while the slowest worker takes at most this share longer
+            than a perfect division would.
+        max_moves: maximum number of worlds or zones that move in one round.
+        monitor_cpu: measure the load of other programs on the workers' cores, and give no more work
+            to workers above a threshold; without it, cores are assumed to be free. Zone nodes
+            measure their machines for `balance_steps`.
+        sensors: processes that compute the sensors of `rig`, for each process that runs worlds;
+            0: each process computes its own. Results do not depend on it. See
             docs/guides/sensor_workers.md.
-        sensor_placement: which of them senses what: by what it `cost` of late, or `in_turn`.
-        join_timeout_s: for so long is waited for zone nodes to join; see docs/guides/nodes.md.
-        key_file: with the key that nodes started by hand have to know; relative to the environment.
+        sensor_placement: how sensors are assigned to processes: by recent `cost`, or `in_turn`.
+        join_timeout_s: how long to wait for zone nodes to join; see docs/guides/nodes.md.
+        key_file: file with the shared key of nodes that are started by hand; relative to the
+            environment.
     """
 
     timeout_s: Annotated[float, Within(1.0, 1e6)] = 300.0

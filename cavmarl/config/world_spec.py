@@ -1,4 +1,4 @@
-"""`WorldSpec`: the arguments by which a world is named, as they travel together."""
+"""`WorldSpec`: the arguments that select a world, in one object."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.core.seeds import check_seed
 
 
 class WorldKeys(TypedDict, total=False):
-    """Keywords of functions that take a world: the fields of `WorldSpec`, and `sensors_of`."""
+    """Keyword arguments that select a world: the fields of `WorldSpec`, and `sensors_of`."""
 
     agents: int | None
     background: int | None
@@ -32,24 +32,24 @@ class WorldKeys(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldSpec:
-    """Which world to make: `make_vec(spec.env, **spec.keywords)` makes some of it."""
+    """The world to make: `make_vec(spec.env, **spec.keywords)` makes copies of it."""
 
     env: str  # name, folder or map file of an environment
-    agents: int | None = None  # shadows population.agents
-    background: int | None = None  # shadows population.background
-    max_cycles: int | None = None  # shadows horizon_s, in steps
+    agents: int | None = None  # sets population.agents
+    background: int | None = None  # sets population.background
+    max_cycles: int | None = None  # sets horizon_s, in steps
     seed: int = 0  # root of all random numbers
-    overrides: Mapping[str, Any] = field(default_factory=dict)  # values for any other key
+    overrides: Mapping[str, Any] = field(default_factory=dict)  # values of any other keys
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", check_seed(self.seed))
 
     @classmethod
     def of(cls, env: str | Path | WorldSpec, **keys: Unpack[WorldKeys]) -> WorldSpec:
-        """What a function is given that takes a world: a spec, or an environment and keywords.
+        """Return the spec for a function's arguments: a spec, or an environment and keywords.
 
         Raises:
-            ConfigError, PolicyError: `sensors_of` contradicts the overrides, or is no trained
+            ConfigError, PolicyError: `sensors_of` contradicts the overrides, or is not a trained
                 driver.
         """
         if isinstance(env, WorldSpec):
@@ -61,7 +61,7 @@ class WorldSpec:
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """For `load_world`, `make_vec` and `parallel_env`, which take the seed elsewhere."""
+        """Arguments for `load_world`, `make_vec` and `parallel_env`; they take the seed apart."""
         return {
             "agents": self.agents,
             "background": self.background,
@@ -71,9 +71,9 @@ class WorldSpec:
 
 
 def with_sensors_of_drivers(spec: WorldSpec, policies: Iterable[str | Path]) -> WorldSpec:
-    """Return the world with the sensors and actions that the trained drivers among these need.
+    """Return the world with the sensors and actions of the trained drivers in `policies`.
 
-    A world that has them already stays as it is; a change is announced on standard error.
+    A world that already has them is unchanged. A change is reported on standard error.
 
     Raises:
         ConfigError: an override of the world contradicts the drivers.

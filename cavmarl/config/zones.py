@@ -1,4 +1,4 @@
-"""`ZonesConfig`: how a map is divided."""
+"""`ZonesConfig`: how a map is divided into zones."""
 
 from __future__ import annotations
 
@@ -7,35 +7,34 @@ from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within
 
-MAX_ZONES = 256  # of one map
+MAX_ZONES = 256  # per map
 ZONE_LAYOUTS = ("grid", "strips", "bisection")
 ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
 
 
 @dataclass(frozen=True)
 class ZonesConfig(Section, key="zones"):
-    """How the map is divided; see docs/reference/zones.md.
+    """How the map is divided into zones; see docs/reference/zones.md.
 
     Attributes:
-        layout: how zones are cut: `grid`, `strips`, `bisection`, or a zone file named as
-            `map.source` is.
-        count: number of zones; of a zone file, as many as it has.
-        avoid_junctions: move cuts aside where that keeps junctions whole.
-        weight: what `bisection` shares out evenly: length of lanes, or area.
-        hysteresis_m: how far behind a border a vehicle changes its zone.
-        max_deferred_ticks: ticks for which a vehicle that has crossed stays with its old zone, if
-            the new one does not acknowledge it; then the change is forced.
-        backoff_ticks: for which a zone that has refused a vehicle is not asked again.
-        halo_m: how far zones see over their borders; default: as far as exactness needs, and less
-            is refused.
-        approach_ticks: so many ticks before a vehicle is there at its present speed, the zone that
-            it drives to is told.
+        layout: method of division: `grid`, `strips`, `bisection`; or a zone file, named like
+            `map.source`.
+        count: number of zones; a zone file sets it itself.
+        avoid_junctions: move cuts aside if that keeps junctions whole.
+        weight: quantity that `bisection` distributes evenly: length of lanes, or area.
+        hysteresis_m: distance behind a border at which a vehicle changes its zone.
+        max_deferred_ticks: ticks for which a vehicle that has crossed a border may stay with its
+            old zone, if the new one does not acknowledge it; then the change is forced.
+        backoff_ticks: ticks for which a zone that has refused a vehicle is not asked again.
+        halo_m: how far zones see over their borders; default: as far as exact results need. Less is
+            an error.
+        approach_ticks: how many ticks before a vehicle reaches a zone, at its present speed, the
+            zone is told about it.
         journal: file for the coordinator's log; empty: none. It must not exist.
-        check_invariants: watch the invariants of ownership at run time.
-        repartition_steps: every so many steps zones become others by bisection of where the
-            vehicles are,
-            if that shares them out better; results do not depend on it. 0: they stay.
-        repartition_tolerance: by which share of the mean the fullest zone has to become emptier.
+        check_invariants: check the invariants of ownership at run time.
+        repartition_steps: steps between two checks whether a bisection by the positions of vehicles
+            would distribute them better. Results do not depend on it. 0: zones stay.
+        repartition_tolerance: share of the mean by which the fullest zone must shrink.
     """
 
     layout: str = "bisection"

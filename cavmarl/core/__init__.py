@@ -1,4 +1,4 @@
-"""Ground: errors, seeds, memory, and what all kernels share.
+"""Basics of all folders: errors, seeds, memory, and shared kernels.
 
-Imports nothing of the package.
+Imports nothing from the rest of the package.
 """

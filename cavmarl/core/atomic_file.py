@@ -1,8 +1,8 @@
-"""Files that are there whole or not at all, whenever the process or the machine stops.
+"""Files that are either complete or absent, even if the process or the machine stops.
 
-A file is made in a draft, a folder of its own beside its place, which a lock ties to the process:
-the next draft in the same place removes those whose process has ended. Where the file system knows
-no locks, they stay.
+A file is written in a draft folder beside its destination. The process holds a lock on that folder:
+the next draft in the same place removes folders whose process has ended. They stay if the file
+system has no locks.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _PREFIX = ".build-"
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file in the place of an older one, which stays as it is if that fails.
+    """Replace a file; if that fails, the old file does not change.
 
     Raises:
-        OSError: it cannot be written; nothing is left behind.
+        OSError: the file cannot be written; nothing is left behind.
     """
     with draft_folder(path.parent) as folder:
         draft = folder / path.name
@@ -34,7 +34,7 @@ def write_whole(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         draft.replace(path)
-    if os.name == "posix":  # else the name may be the old file's after a power cut
+    if os.name == "posix":  # otherwise, the old file may return after a power cut
         parent = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(parent)
@@ -44,7 +44,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 @contextmanager
 def draft_folder(parent: Path) -> Iterator[Path]:
-    """A folder in `parent` that ends with the block; if the process is killed, with the next one.
+    """Yield a new folder in `parent` and remove it at the end, or in a later call if killed.
 
     Raises:
         OSError: `parent` cannot be written.
@@ -60,10 +60,10 @@ def draft_folder(parent: Path) -> Iterator[Path]:
 
 
 def remove_dead_drafts(parent: Path) -> None:
-    """Remove what processes that were killed had begun to make in a folder."""
+    """Remove the drafts in a folder that belong to processes which have ended."""
     if sys.platform == "win32":
         return
-    with suppress(OSError):  # there is none, or nothing can be removed from it
+    with suppress(OSError):  # the folder does not exist, or cannot be changed
         for name in os.listdir(parent):
             if name.startswith(_PREFIX):
                 _remove_dead(parent / name)
@@ -72,7 +72,7 @@ def remove_dead_drafts(parent: Path) -> None:
 def _remove_dead(folder: Path) -> None:
     try:
         lock = _locked(folder)
-    except OSError:  # its process lives, another one removes it, or there are no locks here
+    except OSError:  # its process lives, another process removes it, or there are no locks
         return
     try:
         shutil.rmtree(folder, ignore_errors=True)
@@ -81,14 +81,14 @@ def _remove_dead(folder: Path) -> None:
 
 
 def _made(parent: Path) -> tuple[Path, int | None]:
-    """A new folder and its lock, which goes with the process however that ends."""
+    """Return a new folder and its lock, which the system releases when the process ends."""
     while True:
         folder = Path(tempfile.mkdtemp(dir=parent, prefix=_PREFIX))
         if sys.platform == "win32":
             return folder, None
         try:
             lock = _locked(folder)
-        except (BlockingIOError, FileNotFoundError):  # another process took it for a dead one's
+        except (BlockingIOError, FileNotFoundError):  # another process took it for abandoned
             continue
         except OSError:  # this file system has no locks
             return folder, None
@@ -98,7 +98,7 @@ def _made(parent: Path) -> tuple[Path, int | None]:
 
 
 def _locked(folder: Path) -> int:
-    """Descriptor of a folder that no other process has locked."""
+    """Return a descriptor of a folder; raises an OSError if another process has locked it."""
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""The folder for what cavmarl keeps between runs: compiled kernels, converted maps."""
+"""The cache folder, for compiled kernels and converted maps."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import os
 import sys
 from pathlib import Path
 
-_TOLD: set[Path] = set()
+_REPORTED: set[Path] = set()
 
 
 def cache_dir() -> Path:
-    """`CAVMARL_CACHE_DIR`; else `cavmarl` in `XDG_CACHE_HOME`; else `~/.cache/cavmarl`."""
+    """Return `CAVMARL_CACHE_DIR`, else `cavmarl` in `XDG_CACHE_HOME`, else `~/.cache/cavmarl`."""
     if home := os.environ.get("CAVMARL_CACHE_DIR"):
         return Path(home)
     shared = os.environ.get("XDG_CACHE_HOME", "")
-    # A relative one is to be ignored (XDG Base Directory Specification).
+    # A relative path must be ignored (XDG Base Directory Specification).
     return (Path(shared) if os.path.isabs(shared) else Path.home() / ".cache") / "cavmarl"
 
 
 def tell_unwritable(error: OSError) -> None:
-    """Say on standard error, once, that nothing is kept for the next process."""
+    """Report once, on standard error, that the cache cannot be written."""
     folder = cache_dir()
-    if folder not in _TOLD:
-        _TOLD.add(folder)
+    if folder not in _REPORTED:
+        _REPORTED.add(folder)
         print(
-            f"cavmarl: {folder} cannot be written ({error.strerror or error}): kernels and maps "
-            "are made anew in every process; set CAVMARL_CACHE_DIR to a folder with room",
+            f"cavmarl: {folder} cannot be written ({error.strerror or error}): every process has "
+            "to compile kernels and read maps again; set CAVMARL_CACHE_DIR to a writable folder",
             file=sys.stderr,
             flush=True,
         )

@@ -1,38 +1,38 @@
-"""Every error that cavmarl raises on purpose.
+"""The errors that cavmarl raises on purpose.
 
     CavmarlError
-    ├── ConfigError            a key, a value, a combination or a division that cannot work
-    │   ├── UnknownEnvironmentError   no entry, path or map of that name
+    ├── ConfigError            an invalid key, value, combination or division
+    │   ├── UnknownEnvironmentError   no entry, path or map has that name
     │   └── ScenarioError         a map without a place for a scenario
-    ├── MapError               a map that cannot be read, built or driven
-    │   └── RouteError            no way from here to there
-    ├── DemandError            a file of traffic that cannot be read or does not fit its map
+    ├── MapError               a map that cannot be read, built or driven on
+    │   └── RouteError            there is no route between two places
+    ├── DemandError            a traffic file that is invalid or does not fit its map
     ├── PolicyError            a policy that cannot be loaded or does not fit
-    ├── RegisteredFunctionError   a registered function answers what it must not
+    ├── RegisteredFunctionError   a registered function returns an invalid result
     ├── MissingExtraError      an optional dependency is not installed
-    ├── ActionError            refused before any state has changed
-    ├── EpisodeError           the call does not fit the state of the episode: reset first
-    ├── KernelError            a kernel that has to be compiled, and may not or cannot be
-    ├── CapacityError          more vehicles or seats than the world can take
-    ├── EvaluationError        an evaluation that failed, or worlds that differ and must not
-    │   └── ManifestError         results whose origin is not on record
-    ├── TrainingError          a run of training that cannot begin, go on or be written
-    ├── ProtocolError          the hand-off protocol was broken, or cannot go on
-    │   ├── LostTickError         a tick that every process died of
-    │   ├── MessageError          bytes that are no message or vehicle of this run
-    │   └── JournalError          a log, or a file of a lost tick, that cannot be written or read
-    ├── WorkerError            worker processes that cannot start or go on
-    │   ├── WorkerDeathError      every process that took up a step died of it
+    ├── ActionError            an invalid action; no state has changed
+    ├── EpisodeError           a call that the episode's state does not allow: reset first
+    ├── KernelError            a kernel must be compiled, which is not allowed or possible
+    ├── CapacityError          more vehicles or agents than the world has room for
+    ├── EvaluationError        a failed evaluation, or worlds that differ but must not
+    │   └── ManifestError         results of unknown origin
+    ├── TrainingError          a training run that cannot start, continue or be written
+    ├── ProtocolError          the hand-off protocol was violated, or cannot continue
+    │   ├── LostTickError         a tick in which every process died
+    │   ├── MessageError          bytes that are not a message or vehicle of this run
+    │   └── JournalError          a log, or a file of a lost tick, that cannot be read or written
+    ├── WorkerError            worker processes that cannot start or continue
+    │   ├── WorkerDeathError      every process that ran a step died
     │   ├── WorkerFailureError    an exception in a worker, with its traceback
-    │   ├── NodeRefusedError      a node that its caller does not want
-    │   └── NoAdmissibleWorkerError   every worker is too busy to be given a shard
-    ├── ClockError             time that another than its master advances, or wants to
-    ├── FollowerError          an external stack with which the world cannot go on
+    │   ├── NodeRefusedError      a node that its caller has rejected
+    │   └── NoAdmissibleWorkerError   every worker is too busy to get a shard
+    ├── ClockError             a clock that is advanced by another than its master
+    ├── FollowerError          an external stack that sends invalid data
     │   └── FollowerLostError     it has ended, or has not answered in time
-    ├── ServiceError           the coordination service, a node of it, or a request to it
-    └── SumoError              SUMO as global traffic that cannot go on
+    ├── ServiceError           the coordination service, one of its nodes, or a request failed
+    └── SumoError              SUMO as global traffic cannot continue
 
-A message names the thing, the place and the cure.
+A message says what is wrong, where, and what to do.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ class CavmarlError(Exception):
 
 
 class ConfigError(CavmarlError):
-    """A configuration that cannot work: unknown key, wrong value, impossible combination.
+    """An invalid configuration: unknown key, wrong value, impossible combination.
 
-    So are zones that overlap or see less far than exactness needs, loads or workers by which no
-    shard can be placed, and scenarios that are unknown or broken.
+    Also raised for zones that overlap or see less far than exact results need, loads or workers
+    that allow no placement of a shard, and scenarios that are unknown or invalid.
     """
 
 
 class UnknownEnvironmentError(ConfigError):
-    """No environment, folder or map file of that name."""
+    """No environment, folder or map file has that name."""
 
 
 class ScenarioError(ConfigError):
@@ -62,80 +62,81 @@ class ScenarioError(ConfigError):
 
 
 class MapError(CavmarlError):
-    """A map that cannot be read, built or driven."""
+    """A map that cannot be read, built or driven on."""
 
 
 class RouteError(MapError):
-    """The lane graph has no way between two places."""
+    """The lane graph has no route between two places."""
 
 
 class DemandError(CavmarlError):
-    """A file of traffic demand that cannot be read, contradicts itself or does not fit its map."""
+    """A traffic file that cannot be read, contradicts itself or does not fit its map."""
 
 
 class PolicyError(CavmarlError):
-    """A policy that cannot be found, loaded, or seated in this environment."""
+    """A policy that cannot be found or loaded, or does not fit the environment."""
 
 
 class MissingExtraError(CavmarlError, ImportError):
-    """An optional dependency is not installed; the message is the command that installs it."""
+    """An optional dependency is not installed; the message gives the command that installs it."""
 
 
 class ActionError(CavmarlError):
-    """An action of the wrong shape, dtype or value, for an unknown agent, or none for a live one.
+    """An action with a wrong shape, dtype or value or an unknown agent, or a missing action.
 
-    No state has changed and the step can be repeated.
+    No state has changed, and the step can be repeated.
     """
 
 
 class EpisodeError(CavmarlError):
-    """A call that does not fit the state of the episode.
+    """A call that the state of the episode does not allow.
 
-    `step` before the first `reset`, or after every agent has left.
+    For example, `step` before the first `reset`, or after all agents have left.
     """
 
 
 class KernelError(CavmarlError):
-    """A kernel that has to be compiled, and may not or cannot be."""
+    """A kernel must be compiled, which is not allowed or not possible."""
 
 
 class CapacityError(CavmarlError):
-    """More vehicles, agents or points than this world can take."""
+    """More vehicles, agents or points than the world has room for."""
 
 
 class EvaluationError(CavmarlError):
-    """A process of an evaluation died, or worlds differ that should be the same bit for bit."""
+    """A process of an evaluation died, or worlds differ that must be equal bit for bit."""
 
 
 class ManifestError(EvaluationError):
-    """Results without a manifest, with one that was never closed, or with one of other results."""
+    """Results whose manifest is missing, unfinished, or belongs to other results."""
 
 
 class RecordingError(CavmarlError):
-    """A recording that cannot be written, or one that is cut short, damaged or of another version.
+    """A recording that cannot be written, or is truncated, damaged or of another version.
 
-    The message names the file and what to do.
+    The message names the file and says what to do.
     """
 
 
 class TrainingError(CavmarlError):
-    """A run of training that cannot begin, go on or be written.
+    """A training run that cannot start, continue or be written.
 
-    Another process writes its folder, another run lies there, its checkpoint is damaged, or the
-    disk is full.
+    Another process writes to its folder, the folder has another run, its checkpoint is damaged, or
+    the disk is full.
     """
 
 
 class ProtocolError(CavmarlError):
-    """The hand-off protocol was broken, or cannot go on.
+    """The hand-off protocol was violated, or cannot continue.
 
-    An event that a state does not know, a vehicle lost, doubled, born twice or at another epoch
-    than planned, an invariant that does not hold.
+    For example: an event that is not allowed in a state; a vehicle that is lost, duplicated,
+        created
+    twice or at another epoch than planned; an invariant that does not hold.
     """
 
 
 class LostTickError(ProtocolError):
-    """A tick that every host of a zone died of: it is not tried for ever.
+    """A tick in which every host of a zone died; no further host is started.
 
     Attributes:
         tick: the tick.
@@ -148,10 +149,10 @@ class LostTickError(ProtocolError):
 
 
 class MessageError(ProtocolError):
-    """Bytes that are no message of this run, or from which no vehicle can go on here.
+    """Bytes that are not a message of this run, or vehicles that cannot continue here.
 
-    They are cut short, damaged, of another version, build, environment, run, vehicle or tick. So is
-    an answer of a network simulator that fits no packet.
+    They are truncated, damaged, or of another version, build, environment, run, vehicle or tick.
+    Also raised if the answer of a network simulator fits no packet.
     """
 
 
@@ -160,25 +161,25 @@ class JournalError(ProtocolError):
 
 
 class WorkerError(CavmarlError):
-    """Worker processes that cannot be started, or cannot go on."""
+    """Worker processes that cannot start or continue."""
 
 
 class WorkerDeathError(WorkerError):
-    """Every process that took up a step died of it: it is not tried for ever.
+    """Every process that ran a step of a worker died; no further process is started.
 
     Attributes:
         worker: number of the worker.
-        part: what it hosts, in words.
-        order: number of the worker's order that could not be carried out.
-        causes: what each process died of.
+        part: description of the worker's worlds or zones.
+        order: number of the order that the worker could not carry out.
+        causes: cause of each death.
     """
 
     def __init__(self, worker: int, part: str, order: int, what: str, causes: list[str]) -> None:
         super().__init__(
             f"worker {worker} ({part}) could not do its {what} (order {order}): {len(causes)} "
-            f"processes died of it ({', '.join(causes)}). SIGKILL is sent by a user, or by the "
-            "system when memory runs out; what a process prints stands on standard error; "
-            "backend='local' runs the same in this process"
+            f"processes died ({', '.join(causes)}). SIGKILL comes from a user, or from the "
+            "system if memory runs out; processes print to standard error; "
+            "backend='local' runs the same worlds in this process"
         )
         self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)
 
@@ -189,8 +190,8 @@ class WorkerFailureError(WorkerError):
     Attributes:
         worker: number of the worker.
         kind: name of the exception's class.
-        text: its message.
-        traceback: as the worker would have printed it.
+        text: message of the exception.
+        traceback: traceback as the worker would have printed it.
     """
 
     def __init__(self, worker: int, part: str, kind: str, text: str, traceback: str) -> None:
@@ -199,11 +200,11 @@ class WorkerFailureError(WorkerError):
 
 
 class NodeRefusedError(WorkerError):
-    """A node that its caller does not want, and why."""
+    """A node that its caller has rejected; the message gives the reason."""
 
 
 class NoAdmissibleWorkerError(WorkerError):
-    """Every worker is too busy, or does not answer.
+    """Every worker is too busy or does not answer.
 
     Attributes:
         rejections: (worker, resource, value, threshold) of each reason; see `balance.load_score`.
@@ -217,16 +218,16 @@ class NoAdmissibleWorkerError(WorkerError):
 
 
 class ClockError(CavmarlError):
-    """Time that another than its master advances, or a second master.
+    """A clock that is advanced by another than its master, or a second master.
 
-    Also a world that is not at the tick at which its time master has left it.
+    Also raised if a world is not at the tick at which its time master left it.
     """
 
 
 class FollowerError(CavmarlError):
-    """An external stack with which it cannot go on; the world is whole and can be stepped on.
+    """An external stack has sent data that is invalid, not executable or not expected.
 
-    It has sent what cannot be understood or carried out, or is not due.
+    The world is intact and can be stepped on.
     """
 
 
@@ -234,7 +235,7 @@ class FollowerLostError(FollowerError):
     """A follower, or the connection to it, has ended, or has not answered in time.
 
     Attributes:
-        is_late: it may still be there, but has not answered in time.
+        is_late: the follower may still run, but has not answered in time.
     """
 
     def __init__(self, message: str, is_late: bool = False) -> None:
@@ -243,12 +244,12 @@ class FollowerLostError(FollowerError):
 
 
 class ServiceError(CavmarlError):
-    """The coordination service cannot start or go on, or has refused a request.
+    """The coordination service cannot start or continue, or has refused a request.
 
     Attributes:
-        status: of the HTTP answer; 0: there was none.
-        problem: name of what was wrong, as in the table of `docs/guides/service.md`.
-        retry_s: when to try again; None: that is of no use.
+        status: status of the HTTP response; 0: there was none.
+        problem: name of the problem, from the table in `docs/guides/service.md`.
+        retry_s: delay until another attempt; None: do not retry.
     """
 
     retry_s: float | None = None
@@ -259,26 +260,26 @@ class ServiceError(CavmarlError):
 
 
 class SumoError(CavmarlError):
-    """SUMO as global traffic cannot go on.
+    """SUMO as global traffic cannot continue.
 
-    A second simulation in one process, a SUMO that has ended or hangs, or one that says what does
-    not fit the world.
+    A second simulation in one process, a SUMO process that has ended or hangs, or SUMO data that
+    does not fit the world.
     """
 
 
 class RegisteredFunctionError(CavmarlError):
-    """A function that was registered from outside answers what it must not."""
+    """A function that was registered by a user returns an invalid result."""
 
 
 def missing(module: str | None, extra: str) -> MissingExtraError:
-    """What to raise where a `module` cannot be imported: it says which `extra` brings that."""
+    """Return the error for a `module` that cannot be imported; it names the `extra` to install."""
     return MissingExtraError(
         f"'{module}' is not installed: pip install '.[{extra}]' in a checkout of cavmarl"
     )
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import an optional `module` or say which `extra` brings it.
+    """Import an optional `module`; if it is missing, the error names the `extra` to install.
 
     Raises:
         MissingExtraError: the module is not installed.

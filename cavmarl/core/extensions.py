@@ -1,7 +1,7 @@
-"""What users add from outside of the package, by name: one `Registry` a kind.
+"""Extensions that users register by name: one `Registry` for each kind.
 
-Worker processes import the modules in which something was registered, so it has to be registered
-where a module is imported.
+Worker processes import the modules that registered extensions. So registration must happen when a
+module is imported.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """Entries of one kind by name, in the order in which they were registered."""
+    """Entries of one kind by name, in order of registration."""
 
     def __init__(self, kind: str) -> None:
         self._kind = kind
         self._entries: dict[str, T] = {}
-        self.modules: dict[str, str] = {}  # of each entry
+        self.modules: dict[str, str] = {}  # module of each entry
 
     def __contains__(self, name: str) -> bool:
         return name in self._entries
@@ -41,19 +41,21 @@ class Registry(Generic[T]):
     def add(
         self,
         name: str,  # a Python name
-        entry: T,  # what it stands for
+        entry: T,  # the registered object
         source: Callable[..., Any],  # a function of the module that registers it
-        taken: Iterable[str],  # names of the package's own
+        taken: Iterable[str],  # names of the package's own entries
     ) -> None:
-        """Register an entry; the module that has registered a name can do it again."""
+        """Register an entry; a module can register its own names again."""
         module = inspect.unwrap(getattr(source, "py_func", source)).__module__
         if not name.isidentifier():
-            raise ConfigError(f"{self._kind} {name!r}: must be a name of letters, digits and _")
+            raise ConfigError(
+                f"{self._kind} {name!r}: must have letters, digits and _ only, and no digit first"
+            )
         if name in taken:
-            raise ConfigError(f"{self._kind} '{name}': one of cavmarl's own; take another name")
+            raise ConfigError(f"{self._kind} '{name}': is cavmarl's own; use another name")
         if self.modules.get(name, module) != module:
             raise ConfigError(
-                f"{self._kind} '{name}': already registered by {self.modules[name]}; take another "
+                f"{self._kind} '{name}': already registered by {self.modules[name]}; use another "
                 "name"
             )
         self._entries[name] = entry
@@ -63,9 +65,9 @@ class Registry(Generic[T]):
         del self._entries[name], self.modules[name]
 
     def advice(self) -> str:
-        """What to do about a name that is not there."""
-        there = ", ".join(self._entries) or "none"
-        return f"not registered (registered: {there}); see cavmarl.register_{self._kind}"
+        """Return what to do about a name that is not registered."""
+        known = ", ".join(self._entries) or "none"
+        return f"not registered (registered: {known}); see cavmarl.register_{self._kind}"
 
 
 REGISTERED_TERMS: Registry[Any] = Registry("term")
@@ -74,7 +76,7 @@ REGISTERED_MODELS: Registry[int] = Registry("driver_model")
 
 
 def extension_modules(names: Iterable[str]) -> list[str]:
-    """The modules that other processes have to import, in the order of registration."""
+    """Return the modules that other processes must import, in order of registration."""
     found: dict[str, None] = {}
     used = set(names)
     for registry in (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS):
@@ -84,14 +86,14 @@ def extension_modules(names: Iterable[str]) -> list[str]:
             elif name in used:
                 place = "the program itself" if module == "__main__" else f"'{module}'"
                 raise ConfigError(
-                    f"'{name}' is registered in {place}, which workers do not import: "
-                    "put it into a module of its own, or leave out workers"
+                    f"'{name}' is registered in {place}, which workers cannot import: "
+                    "move it to a module of its own, or do not use workers"
                 )
     return list(found)
 
 
 def _is_importable(module: str) -> bool:
-    """Whether another process finds a module; not what a notebook or a page has run."""
+    """Return whether another process can import a module; False for code of a notebook."""
     try:
         return module != "__main__" and find_spec(module) is not None
     except (ImportError, ValueError):
@@ -99,9 +101,11 @@ def _is_importable(module: str) -> bool:
 
 
 def load_extensions(modules: Iterable[str]) -> None:
-    """Import the modules that register what a configuration names."""
+    """Import the modules that register the extensions of a configuration."""
     for module in modules:
         try:
             importlib.import_module(module)
         except ImportError as error:
-            raise WorkerError(f"{module}, which registers parts of the world: {error}") from error
+            raise WorkerError(
+                f"{module}, which registers parts of the world, cannot be imported: {error}"
+            ) from error

@@ -1,8 +1,8 @@
-"""Makes arrays in huge pages: a tick reads many places, and each small page costs a look-up.
+"""Arrays in huge pages, which save address translations: a tick reads many places in memory.
 
-In a virtual machine a page that the processor does not know by heart costs two walks through
-tables. Linux gives pages of 2 MiB on request, where they are not switched off
-(`/sys/kernel/mm/transparent_hugepage/enabled`); elsewhere arrays are NumPy's own.
+In a virtual machine, a page that is not in the processor's translation buffer costs two walks
+through page tables. Linux provides pages of 2 MiB on request, unless they are switched off
+(`/sys/kernel/mm/transparent_hugepage/enabled`). On other systems, arrays are NumPy's own.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 PAGE = 1 << 21  # bytes
-LEAST = 1 << 16  # bytes of an array that is worth it
+LEAST = 1 << 16  # bytes; smaller arrays gain nothing
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _TUNABLES = "GLIBC_TUNABLES"
-_LINE = 64  # bytes of a cache line: no two arrays share one
+_LINE = 64  # bytes of a cache line, which no two arrays share
 
 
 class _Pages:
-    """Whole pages, which arrays take one after the other; they go with the last of them."""
+    """Whole pages from which arrays are cut one after another; freed with the last array."""
 
     def __init__(self) -> None:
         self._bytes = np.zeros(0, dtype=np.uint8)
         self._lock = threading.Lock()
 
     def take(self, size: int) -> NDArray[np.uint8]:
-        """So many bytes, all 0."""
+        """Return `size` bytes, all 0."""
         with self._lock:
             if size > self._bytes.size:
                 self._bytes = _map(-(-size // PAGE) * PAGE)
@@ -46,7 +46,7 @@ _PAGES = _Pages()
 
 
 def huge_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
-    """As `numpy.zeros`; a large array shares huge pages with others, where there are any."""
+    """Return zeros, as `numpy.zeros`; large arrays share huge pages, if the system has them."""
     kind = np.dtype(dtype)
     sides = (shape,) if isinstance(shape, int) else shape
     size = prod(sides) * kind.itemsize
@@ -56,9 +56,10 @@ def huge_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> N
 
 
 def huge_copy(array: NDArray[Any], also_mapped: bool = False) -> NDArray[Any]:
-    """The same array in huge pages, as writable as it was; a small one is not copied.
+    """Return the array in huge pages, with the same writeability.
 
-    Nor is one that lies in them, or in a file that is mapped, unless `also_mapped` says so.
+    Arrays that are small, in huge pages already, or (unless `also_mapped`) in a mapped file are
+    returned as they are.
     """
     if array.nbytes < LEAST or (_is_mapped(array) and not also_mapped):
         return array
@@ -70,7 +71,7 @@ def huge_copy(array: NDArray[Any], also_mapped: bool = False) -> NDArray[Any]:
 
 
 def _is_mapped(array: NDArray[Any]) -> bool:
-    """Whether it has come out of `huge_zeros` or of a file, by the memory that its base is of."""
+    """Return whether an array is from `huge_zeros` or a mapped file, by its base's memory."""
     base: Any = array
     while isinstance(base, np.ndarray):
         base = base.base
@@ -78,16 +79,16 @@ def _is_mapped(array: NDArray[Any]) -> bool:
 
 
 def huge_heap() -> dict[str, str]:
-    """With these variables of its environment a process has its heap in huge pages; glibc can.
+    """Return environment variables that put the heap of a process in huge pages; needs glibc.
 
-    What the user has set of the C library comes last, and so counts.
+    The user's own settings of the C library come last and take precedence.
     """
     own = os.environ.get(_TUNABLES)
     return {_TUNABLES: ":".join(["glibc.malloc.hugetlb=1", *([own] if own else [])])}
 
 
 def trim() -> None:
-    """Give memory of the C library that is free back to the system; glibc alone can."""
+    """Return free memory of the C library to the system; needs glibc."""
     give_back = getattr(_LIBC, "malloc_trim", None)
     if give_back is not None:
         give_back(ctypes.c_size_t(0))
@@ -98,16 +99,16 @@ def _map(size: int) -> NDArray[np.uint8]:
     try:
         memory.madvise(mmap.MADV_HUGEPAGE)
     except OSError:
-        pass  # a kernel without them: the memory is as good in small pages
+        pass  # a kernel without huge pages: small pages work, too
     whole = np.frombuffer(memory, dtype=np.uint8)
     first = -whole.ctypes.data % PAGE
     return whole[first : first + size]
 
 
 def forget(array: NDArray[Any]) -> None:
-    """Give the memory of an array back, as far as it has whole pages: it reads as 0 or as it was.
+    """Release the whole pages of an array's memory: later reads return 0 or the old values.
 
-    Linux alone can; the array is contiguous, and nothing else lies between its first and last byte.
+    Only on Linux. The array must be contiguous and alone between its first and last byte.
     """
     size = mmap.PAGESIZE
     begin = array.ctypes.data

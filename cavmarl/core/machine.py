@@ -1,4 +1,4 @@
-"""What a program runs on and from: processor, memory, system, packages, commit."""
+"""Describes the machine and the code: processor, memory, system, packages, commit."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ UNKNOWN_COMMIT = "unknown: not a checkout"
 
 
 def describe_machine() -> dict[str, Any]:
-    """What stands in every record: hardware, software and code."""
+    """Return the hardware, software and code for the header of a record."""
     return {
         "hardware": describe_hardware(),
         "software": describe_software(),
@@ -39,7 +39,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def describe_hardware() -> dict[str, str | int | float | list[str] | None]:
-    """Processor, cores, memory and GPUs; None where the system does not tell."""
+    """Return processor, cores, memory and GPUs; None for what the system does not report."""
     return {
         "cpu": _processor(),
         "architecture": platform.machine(),
@@ -51,7 +51,7 @@ def describe_hardware() -> dict[str, str | int | float | list[str] | None]:
 
 
 def describe_software() -> dict[str, str | dict[str, str | None]]:
-    """System, Python, and versions of the packages that a result depends on; None: not there."""
+    """Return system, Python, and versions of relevant packages; None: not installed."""
     return {
         "os": platform.platform(),
         "python": f"{platform.python_implementation()} {platform.python_version()}",
@@ -60,16 +60,16 @@ def describe_software() -> dict[str, str | dict[str, str | None]]:
 
 
 def describe_code() -> dict[str, str | bool | None]:
-    """Commit of the checkout that this package lies in, and whether files differ from it."""
+    """Return the commit of this package's checkout, and whether files differ from it."""
     git = shutil.which("git")
     if git is None or not (_ROOT / ".git").exists():
         return {"commit": UNKNOWN_COMMIT, "dirty": None}
-    commit = _said([git, "-C", str(_ROOT), "rev-parse", "HEAD"])
+    commit = _output_of([git, "-C", str(_ROOT), "rev-parse", "HEAD"])
     if not commit:
         return {"commit": UNKNOWN_COMMIT, "dirty": None}
     return {
         "commit": commit,
-        "dirty": bool(_said([git, "-C", str(_ROOT), "status", "--porcelain"])),
+        "dirty": bool(_output_of([git, "-C", str(_ROOT), "status", "--porcelain"])),
     }
 
 
@@ -81,7 +81,7 @@ def _version(package: str) -> str | None:
 
 
 def _processor() -> str:
-    """The processor's name, where the system tells it; else its architecture."""
+    """Return the processor's name if the system reports it, otherwise its architecture."""
     info = Path("/proc/cpuinfo")
     if info.is_file():
         for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -102,11 +102,11 @@ def _memory_gb() -> float | None:
 
 
 def _gpus() -> list[str]:
-    """NVIDIA GPUs with their identifiers; evaluation itself runs on the processor."""
+    """Return NVIDIA GPUs with their identifiers; evaluation itself runs on the processor."""
     tool = shutil.which("nvidia-smi")
-    return _said([tool, "-L"]).splitlines() if tool else []
+    return _output_of([tool, "-L"]).splitlines() if tool else []
 
 
-def _said(command: list[str]) -> str:
+def _output_of(command: list[str]) -> str:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     return done.stdout.strip() if done.returncode == 0 else ""

@@ -1,4 +1,4 @@
-"""Files whose bytes are read where the system keeps them: memory has only what is used of them."""
+"""Memory-mapped files: only the parts that are used take up memory."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 
 
 class MappedFile(mmap.mmap):
-    """The bytes of a file, which cannot be written; the same memory for all processes."""
+    """The bytes of a file, read-only; all processes share the same memory."""
 
 
 def mapped(path: Path) -> MappedFile:
-    """Map a file. It may be replaced meanwhile, but not written.
+    """Map a file. It may be replaced while it is mapped, but not overwritten.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is empty.
+        OSError: the file cannot be read.
+        ValueError: the file is empty.
     """
     with path.open("rb") as file:
         return MappedFile(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
 def file_of(array: NDArray[Any]) -> MappedFile | None:
-    """The mapped file that an array is a view of; None: it is of none."""
+    """Return the mapped file that an array is a view of, or None."""
     base: Any = array
     while isinstance(base, np.ndarray):
         base = base.base
@@ -35,6 +35,6 @@ def file_of(array: NDArray[Any]) -> MappedFile | None:
 
 
 def let_go(file: MappedFile) -> None:
-    """Give the memory of a file back; what is used from now on is read again."""
+    """Release the memory of a file; later accesses read it again."""
     if hasattr(mmap, "MADV_DONTNEED"):
         file.madvise(mmap.MADV_DONTNEED)

@@ -1,4 +1,4 @@
-"""`Zeros` makes the arrays that a tick writes, in memory of one process or of several."""
+"""`Zeros`: a function that allocates arrays in the memory of one process or of several."""
 
 from __future__ import annotations
 
@@ -8,4 +8,4 @@ from typing import Any, TypeAlias
 from numpy.typing import NDArray
 
 Zeros: TypeAlias = Callable[..., NDArray[Any]]
-"""Called like `numpy.zeros`, which it is unless processes share a world."""
+"""Called like `numpy.zeros`, the default unless processes share a world."""

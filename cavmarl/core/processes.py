@@ -1,6 +1,6 @@
-"""Processes that end with the one that has started them, however that ends.
+"""Child processes that end with the process that started them, in any case.
 
-Ctrl-C in a terminal is for that one, which sees to the rest: they do not hear it.
+Ctrl-C in a terminal only interrupts the parent, which then ends its children.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ _LIBC = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
 def is_fork(pid: int) -> bool:
-    """Whether this process is a fork of the one that has made something, `pid`."""
+    """Return whether this process is a fork of the process `pid`."""
     return os.getpid() != pid
 
 
 def refuse_fork(pid: int, things: str) -> None:
-    """See that this process may use `things`, which process `pid` has made.
+    """Raise an error if this process is a fork of process `pid`, which made some objects.
 
     Raises:
-        WorkerError: it is a fork of that one: both would speak to the same process, or write the
-            same file.
+        WorkerError: this is a fork. Both processes would use the same connection or file. `things`
+            describes the objects.
     """
     if is_fork(pid):
         raise WorkerError(
@@ -43,12 +43,12 @@ def refuse_fork(pid: int, things: str) -> None:
 
 
 def die_with_parent() -> None:
-    """Let the system kill this process when the thread that started it ends; Linux alone can."""
+    """Let the system kill this process when the thread that started it ends; Linux only."""
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
 
 
-# Runs in a fresh interpreter: code between fork and exec may hang where there are threads.
+# Runs in a new interpreter: with threads, code between fork and exec may hang.
 _WRAPPER = """
 import ctypes, os, signal, sys
 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -59,7 +59,7 @@ if os.getppid() == int(sys.argv[3]):
 
 
 def dying_with_parent(command: Sequence[str]) -> list[str]:
-    """A command that runs another one, a path and its arguments, which ends with this process."""
+    """Return a command that runs `command`, a path with arguments, and ends with this process."""
     if sys.platform != "linux":
         return list(command)
     numbers = (_PR_SET_PDEATHSIG, int(signal.SIGKILL), os.getpid())
@@ -67,9 +67,9 @@ def dying_with_parent(command: Sequence[str]) -> list[str]:
 
 
 def start_dying_with_process(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-    """Start a command that ends with this process, not with the thread that asks for it.
+    """Start a command that ends with this process, not with the calling thread.
 
-    The system watches the thread that starts a process: that is the main one, or one that stays.
+    The system watches the thread that starts a process, so this is the main or a permanent thread.
     """
 
     def start() -> subprocess.Popen[Any]:
@@ -83,12 +83,12 @@ def start_dying_with_process(command: Sequence[str], **options: Any) -> subproce
 def start_python(
     words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any
 ) -> subprocess.Popen[Any]:
-    """Start a Python that ends with this process and finds the modules that this one finds.
+    """Start a Python that ends with this process and finds the same modules.
 
-    A module in the working directory is not found there, unless this process finds it.
+    It finds modules in the working directory only if this process does.
 
-    `words`: `-m` and a module, or `-c` and a program, and arguments. `env`: variables of the
-    environment beside those of this process.
+    `words`: `-m` and a module, or `-c` and a program, and arguments. `env`: environment variables
+    in addition to those of this process.
     """
     here = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join([here, *(place for place in sys.path if place)])
@@ -101,5 +101,5 @@ def start_python(
 
 @cache
 def _staying_thread(_: int) -> ThreadPoolExecutor:
-    """One for each process: a fork does not take it along."""
+    """Return one thread per process: a fork does not inherit it."""
     return ThreadPoolExecutor(1, "starts-processes")

@@ -1,4 +1,4 @@
-"""Bars of what takes longer than two seconds: how much is done, the rate, the time left."""
+"""Progress bars for long operations: share done, rate, remaining time."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from rich.text import Text
 
 
 class RateColumn(ProgressColumn):
-    """How many are done in a second, or how long one takes."""
+    """Shows items per second, or the duration of an item."""
 
     def render(self, task: Task) -> Text:
-        """The text beside the bar of a task."""
+        """Return the text beside the bar of a task."""
         speed = task.finished_speed or task.speed
         if not speed:
             return Text("")
@@ -31,7 +31,7 @@ class RateColumn(ProgressColumn):
 
 
 def progress_bar(console: Console) -> Progress:
-    """A bar that goes away when the work is done; without a terminal there is none."""
+    """Return a bar that disappears at the end; without a terminal, it is never shown."""
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
@@ -48,7 +48,7 @@ def progress_bar(console: Console) -> Progress:
 
 @contextmanager
 def counting(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar while something is done; it moves when it is told how much of how much is."""
+    """Yield a function of the items done and the total that updates a progress bar."""
     with progress_bar(console) as bar:
         task = bar.add_task(what)
         yield lambda done, total: bar.update(task, completed=done, total=total)
@@ -56,7 +56,7 @@ def counting(console: Console, what: str) -> Iterator[Callable[[int, int], None]
 
 @contextmanager
 def in_stages(console: Console, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
-    """A bar while something is done stage by stage; it moves when it is told which one begins."""
+    """Yield a function that shows the beginning of a stage, by name, in a progress bar."""
     with progress_bar(console) as bar:
         task = bar.add_task("", total=len(stages))
         yield lambda stage: bar.update(task, description=stage, completed=stages.index(stage))

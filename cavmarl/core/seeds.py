@@ -1,4 +1,4 @@
-"""Seeds at the border: which ones are taken, and what is taken where none is given."""
+"""Checks of seeds, and the default seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SEED_BITS = 63
 
 
 def check_seed(seed: Any) -> int:
-    """A seed that all random numbers can be rooted in."""
+    """Return a valid seed as an int; raise a ConfigError for any other value."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
         raise ConfigError(f"seed = {seed!r}: must be a whole number")
     if not 0 <= int(seed) < 1 << SEED_BITS:
@@ -21,10 +21,10 @@ def check_seed(seed: Any) -> int:
 
 
 def first_seed(given: Any, default: int | None) -> int:
-    """The seed of a reset: the one given, else the default, else a fresh one.
+    """Return the seed of a reset: the given seed, else the default, else a random one.
 
     Raises:
-        ConfigError: a given seed that `check_seed` refuses.
+        ConfigError: the given seed is not valid; see `check_seed`.
     """
     if given is not None:
         return check_seed(given)

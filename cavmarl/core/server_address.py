@@ -9,7 +9,7 @@ from cavmarl.core.errors import ServiceError
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is of this machine alone."""
+    """Return whether an address can only be reached from this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -17,12 +17,12 @@ def is_loopback(host: str) -> bool:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that is bound.
+    """Return a socket that listens at an address.
 
-    Raises ServiceError: the address is not of this machine, or its port is taken.
+    Raises ServiceError: the address does not belong to this machine, or its port is in use.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio switches Nagle's delays off where the protocol is named: else 40 ms an answer.
+    # asyncio disables Nagle's algorithm, which delays answers by 40 ms, only for a named protocol.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -35,5 +35,5 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def shown_host(host: str) -> str:
-    """An address as it stands in a URL."""
+    """Return an address as it is written in a URL."""
     return f"[{host}]" if ":" in host else host

@@ -1,4 +1,4 @@
-"""Tracebacks of faults in the code of users: without the frames of the program that called it."""
+"""Tracebacks of errors in users' code, without the frames of the program that called it."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ def print_traceback(error: BaseException) -> None:
 
 
 def traceback_text(error: BaseException) -> str:
-    """An exception as Python prints it, from the first line on that is a user's.
+    """Return an exception as Python prints it, from the first frame of a user's code on.
 
-    Where none is, all of it: the fault is that of the program.
+    If there is no such frame, the error is in the program, and all frames are included.
     """
     shown = _from_users_code(error.__traceback__) or error.__traceback__
     return "".join(traceback.format_exception(type(error), error, shown))
 
 
 def fault_in(file: Path, error: Exception) -> str:
-    """What a file of a user has raised while it was read, with the file and line."""
-    said = f"{type(error).__name__}: {error}"
+    """Return a message with file and line for an error that occurred while reading a file."""
+    message = f"{type(error).__name__}: {error}"
     if isinstance(error, SyntaxError):
         place = f"{error.filename or file}, line {error.lineno}"
         return f"{place}: {type(error).__name__}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not _is_foreign(frame.filename)]
-    return f"{own[-1].filename}, line {own[-1].lineno}: {said}" if own else f"{file}: {said}"
+    return f"{own[-1].filename}, line {own[-1].lineno}: {message}" if own else f"{file}: {message}"
 
 
 def _from_users_code(frames: TracebackType | None) -> TracebackType | None:
@@ -50,7 +50,7 @@ def _from_users_code(frames: TracebackType | None) -> TracebackType | None:
 
 
 def _is_foreign(path: str) -> bool:
-    """Whether a file is of the package, of a library, or the program that was started."""
+    """Return whether a file belongs to the package or a library, or is the started program."""
     if path.startswith("<") or os.path.realpath(path) == os.path.realpath(sys.argv[0]):
         return True
     return path.startswith(_FOREIGN)

@@ -1,4 +1,4 @@
-"""The worlds that run: simulation, the order of a tick, signals and outputs shared by all zones.
+"""The simulation of worlds: the order of a tick, and the signals and outputs of all zones.
 
-Stands on `shards` and `handoff`; `parallel` runs it in processes.
+It builds on `shards` and `handoff`; `parallel` runs it in several processes.
 """

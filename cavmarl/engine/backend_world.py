@@ -1,4 +1,4 @@
-"""`BackendWorld`: one world whose zones are run by backends, of one kind or of more."""
+"""`BackendWorld`: one world whose zones are run by backends of one or several kinds."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class BackendWorld:
-    """Keeps backends at one tick, shows them their ghosts, and hands vehicles over at borders.
+    """A world that steps its backends together, exchanges ghosts and hands vehicles over.
 
     A vehicle's owner changes between two ticks, when its centre is in another zone.
 
     Args:
         partition: the zones.
-        backends: one a zone, in their order.
+        backends: one per zone, in the order of zones.
     """
 
     def __init__(self, partition: ZonePartition, backends: Sequence[ShardBackend]) -> None:
         self._zones, self._count = partition.arrays, partition.count
         self.resume(backends)
-        self._shown: list[set[int]] = [set() for _ in backends]  # ghosts of each
-        self._controls: dict[int, VehicleControl] = {}  # the last ones
+        self._shown: list[set[int]] = [set() for _ in backends]  # ids of each backend's ghosts
+        self._controls: dict[int, VehicleControl] = {}  # the latest of each vehicle
         self._seen: dict[int, NDArray[np.float32]] = {}
         self.tick = 0
         self.handed_over = 0
 
     def reset(self, seed: int, vehicles: NDArray[np.void]) -> None:
-        """Begin with the vehicles VEHICLE (n,), each in the zone that it is in."""
+        """Begin with the vehicles VEHICLE (n,), each owned by the zone in which it is."""
         zones = np.array([zone_of(self._zones, row["x"], row["y"]) for row in vehicles], dtype=int)
         self.tick = self.handed_over = 0
         self._controls.clear()
@@ -47,40 +47,42 @@ class BackendWorld:
         self._sense()
 
     def resume(self, backends: Sequence[ShardBackend]) -> None:
-        """Go on with other backends, which are where those before were: from their snapshots."""
+        """Replace the backends by others that have restored the snapshots of the former ones."""
         if [one.zone for one in backends] != [*range(self._count)]:
             raise ConfigError(
-                f"backends of zones {[one.zone for one in backends]}: must be one for each of the "
-                f"{self._count} zones, in their order"
+                f"the backends run the zones {[one.zone for one in backends]}; pass one for each "
+                f"of the {self._count} zones, in their order"
             )
         self._backends = tuple(backends)
 
     def step(self, controls: Mapping[int, VehicleControl]) -> None:
-        """One tick; `controls` are of vehicles of agents, by their ids."""
+        """Run one tick. `controls` are those of agents' vehicles, by vehicle id."""
         left = dict(controls)
         self._controls |= left
         for backend in self._backends:
             own = backend.read_vehicles()["id"].tolist()
             backend.apply_controls({one: left.pop(one) for one in own if one in left})
         if left:
-            raise ConfigError(f"vehicle {min(left)}: is in no zone; leave it out")
+            raise ConfigError(f"vehicle {min(left)} is in no zone; omit its controls")
         for backend in self._backends:
             backend.advance()
         self._share()
         ticks = {backend.commit() for backend in self._backends}
         if len(ticks) > 1:
-            raise ConfigError(f"backends are at ticks {sorted(ticks)}: all must be at one")
+            raise ConfigError(
+                f"the backends are at ticks {sorted(ticks)}; restore them to the same tick"
+            )
         (self.tick,) = ticks
-        self._sense()  # by those that have owned them in this tick
+        self._sense()  # the owners of this tick have the observations
         self._hand_over()
 
     def vehicles(self) -> NDArray[np.void]:
-        """VEHICLE (n,) of all zones, by rising ids."""
+        """Return the vehicles VEHICLE (n,) of all zones, in the order of their ids."""
         found = np.concatenate([backend.read_vehicles() for backend in self._backends])
         return found[np.argsort(found["id"])]
 
     def observations(self) -> dict[int, NDArray[np.float32]]:
-        """(D,) of each agent's vehicle that has sensed, by its id."""
+        """Return the latest observation (D,) of each agent's vehicle, by vehicle id."""
         return self._seen
 
     def _sense(self) -> None:
@@ -88,7 +90,7 @@ class BackendWorld:
         self._seen = {vehicle: seen for some in found for vehicle, seen in some.items()}
 
     def _share(self) -> None:
-        """Show each backend the vehicles of others that it may ask about."""
+        """Update the ghosts of each backend: vehicles of other zones within its reach."""
         owned = [backend.read_vehicles() for backend in self._backends]
         for backend, shown in zip(self._backends, self._shown, strict=True):
             limit = backend.reach_m * backend.reach_m

@@ -1,4 +1,4 @@
-"""Sees to it that kernels are compiled before they are needed, and says so."""
+"""Compilation of kernels before they are needed, with messages to the user."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from cavmarl.core.compiled.machine_code import CompileListener, kernel_source, l
 
 
 class _Announcer(CompileListener):
-    """Says so when the first kernel is compiled in this process."""
+    """Prints a message when the first kernel is compiled in this process."""
 
     def __init__(self) -> None:
-        self.has_told = False
+        self.has_printed = False
 
     def on_compile(self, name: str) -> None:
-        # Those of processes are small, and compiled in workers, after the caller has told.
+        # Kernels of `parallel` are small, and workers compile them after the caller's message.
         is_long = name.startswith("cavmarl.") and not name.startswith("cavmarl.parallel.")
-        if is_long and not self.has_told:
-            self.has_told = True
+        if is_long and not self.has_printed:
+            self.has_printed = True
             print(
                 "cavmarl: compiling kernels that this world needs, once for this version and "
                 "machine",
@@ -37,16 +37,17 @@ _ANNOUNCER = _Announcer()
 
 
 def prepare_kernels() -> None:
-    """Compile the kernels of a plain world in two processes, if none are kept on this machine.
+    """Compile the kernels of a plain world in two processes, if this machine has none cached.
 
-    From now on say on standard error when a kernel is compiled in this process.
+    Afterwards, the first compilation of a kernel in this process prints a message on standard
+    error.
     """
     if _ANNOUNCER in listeners:
         return
     listeners.append(_ANNOUNCER)
     if compiled_before() or not numba_version() or _marker("plain").exists():
         return
-    if not _can_keep():
+    if not _can_cache():
         return
     print(
         "cavmarl: compiling the kernels of a first step, once for this version and machine: about "
@@ -56,31 +57,31 @@ def prepare_kernels() -> None:
     )
     command = [sys.executable, "-m", "cavmarl.prebuild", "compile"]
     if subprocess.run(command, check=False).returncode == 0:
-        _leave(_marker("plain"))
+        _write_marker(_marker("plain"))
 
 
 def compiled_before() -> bool:
-    """Return whether all kernels of this version are on this machine, or are never compiled."""
+    """Return whether all kernels of this version are cached here, or need no compilation."""
     return IS_PLAIN or kernel_source().library is not None or _marker("complete").exists()
 
 
 @contextmanager
 def compiling_all() -> Iterator[None]:
-    """Note that all kernels are compiled when the block ends.
+    """Record at the end of the block that all kernels are compiled.
 
-    What runs inside has to call every kernel that a tick may need.
+    The code in the block must call every kernel that a tick may need.
     """
     yield
     if not compiled_before():
-        _leave(_marker("complete"))
+        _write_marker(_marker("complete"))
 
 
 def _marker(name: str) -> Path:
     return cache_dir() / "kernels" / sources_digest() / f"{machine_digest()}.{name}"
 
 
-def _can_keep() -> bool:
-    """Return whether compiled kernels can be kept on this machine; if not, say so once."""
+def _can_cache() -> bool:
+    """Return whether compiled kernels can be cached on this machine; if not, print it once."""
     try:
         _marker("plain").parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -89,6 +90,6 @@ def _can_keep() -> bool:
     return True
 
 
-def _leave(marker: Path) -> None:
-    if _can_keep():
+def _write_marker(marker: Path) -> None:
+    if _can_cache():
         marker.touch()

@@ -1,7 +1,7 @@
 """`CompiledStep`: the ticks of a step as one compiled call, for plain undivided worlds.
 
-In a small world Python needs longer to go from phase to phase than the phases take. The calls here
-are those that `Tick` makes, in its order; a test holds that both give the same bytes.
+In a small world, Python takes longer between the phases than the phases themselves take. This
+module makes the calls of `Tick` in the same order; a test checks that both give the same bytes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cavmarl.shards.shard_group import ShardGroup
 
 
 class CompiledStep:
-    """The ticks of a step, from the first to the sensing at its end."""
+    """The ticks of a step and the sensing at its end, as one sequence of compiled calls."""
 
     def __init__(self, tick: Tick, group: ShardGroup) -> None:
         self.departures = tick.departures
@@ -55,7 +55,7 @@ class CompiledStep:
             sequence.call(tick.shared.signal_switch(tick.common))
 
     def _add_leave(self, sequence: CallSequence) -> None:
-        """Append what `Tick.leave` calls."""
+        """Append the calls of `Tick.leave`."""
         tick, calls = self._tick, self.group.departure_calls(self.departures)
         worlds, traffic = tick.worlds, tick.traffic
         sequence.call(tick.occasions)
@@ -69,7 +69,7 @@ class CompiledStep:
                 sequence.call(traffic.calls(self.departures, worlds.ticks, worlds.keys).settle)
 
     def _add_enter(self, sequence: CallSequence) -> None:
-        """Append what `Tick.let_in` calls."""
+        """Append the calls of `Tick.let_in`."""
         tick, calls = self._tick, self.group.departure_calls(self.departures)
         departures, worlds = self.departures, tick.worlds
         traffic = tick.traffic.calls(departures, worlds.ticks, worlds.keys)
@@ -92,7 +92,7 @@ class CompiledStep:
                 sequence.call(bind(clear, departures.num_passing))
 
     def _add_sense(self, sequence: CallSequence) -> None:
-        """Append what `Tick.sense` calls."""
+        """Append the calls of `Tick.sense`."""
         shared, calls = self._tick.shared, self.group.calls
         sequence.call(shared.clearing)
         sequence.call(calls.sense)
@@ -105,11 +105,11 @@ class CompiledStep:
 
 
 def compiled_step(tick: Tick, last: CompiledStep | None) -> CompiledStep | None:
-    """Return the compiled step of worlds that can have one.
+    """Return a compiled step, or None if these worlds need phases that it does not include.
 
     Args:
-        tick: of the worlds.
-        last: what this function returned before; it is used again if nothing has changed.
+        tick: the tick of the worlds.
+        last: the result of the previous call; it is reused while its parts are the same.
     """
     group = tick.executor
     if (

@@ -1,8 +1,8 @@
-"""What acts in each tick beside the traffic: mounted sensors, messages, scripts, other simulators.
+"""Components that act in each tick besides the traffic: mounted sensors, messages, scripts.
 
-Each part is made by `tick_setup.attach`, keeps its state in arrays (W, …) and is asked at fixed
-points of a tick. It reads the rows of all shards and writes only what is its own, so that nothing
-depends on how a world is divided.
+`tick_setup.attach` makes the components. A component keeps its state in arrays (W, …) and is called
+at fixed points of a tick. It reads the rows of all shards and writes only its own arrays, so its
+results do not depend on the division of a world.
 """
 
 from __future__ import annotations
@@ -23,52 +23,52 @@ from cavmarl.shards.shard import Commands, Shard
 
 
 class ComponentContext(NamedTuple):
-    """What a part is attached to."""
+    """The worlds to which a component is attached."""
 
     config: EnvConfig
     network: RoadNetwork
     num_worlds: int  # W
-    shards: Sequence[Shard]  # one a zone; their rows are what a part reads
-    division: ZonedShards  # all of them together
+    shards: Sequence[Shard]  # one per zone; components read their rows
+    division: ZonedShards  # of all shards
     travel: TripTables
-    outputs: Outputs  # what the agents get
-    zeros: Zeros  # makes the arrays that outlive a tick
-    frames: Frames  # what the rigs of the agents get
+    outputs: Outputs  # of the agents
+    zeros: Zeros  # allocates the arrays that outlive a tick
+    frames: Frames  # samples of the agents' rigs
 
 
 class Component(Protocol):
-    """A part that acts in each tick of W worlds.
+    """A part of W worlds that acts in each tick.
 
-    A tick may be begun again, with everything in `arrays` as it was before.
+    A tick may be repeated: then `arrays` are restored to their state before the tick.
 
     Attributes:
-        reads_all: the names of those calls, `begin` or `end`, that read vehicles of all zones; the
-            others read those of zones in this process and what these see, and what is in `arrays`
-            of an agent is kept where its vehicle is.
+        reads_all: names of the methods, `begin` or `end`, that read the vehicles of all zones.
+            Other methods read the vehicles and ghosts of the zones in this process. An agent's part
+            of `arrays` is kept in the process that has its vehicle.
     """
 
     reads_all: tuple[str, ...]
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Begin an episode in the chosen worlds (W,): vehicles and signals are in their places."""
+        """Begin an episode in the chosen worlds (W,), after vehicles and signals are placed."""
         ...
 
     def begin(self, commands: Commands) -> None:
-        """Begin a tick: the rows are those of tick t, and their ownership is settled."""
+        """Begin a tick. The rows are those of tick t, and their owners are decided."""
         ...
 
     def end(self) -> None:
-        """The rows and the signals are those of t + 1; agents sense after this."""
+        """End a tick. The rows and the signals are those of t + 1; agents sense afterwards."""
         ...
 
     def arrays(self) -> Iterator[NDArray[Any]]:
-        """All that outlives a tick, always the same arrays (W, …); the state's hash is over them.
+        """Return all arrays (W, …) that outlive a tick, the same ones in each call.
 
-        An item of one world must not say how it is divided or where its rows lie, and records have
-        no gaps between their fields: what stands there is not kept.
+        The hash of the state covers them. They must not depend on the division of a world or on
+        the places of its rows. Records must have no padding, because padding is not saved.
         """
         ...
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """What is wrong with saved arrays of the shapes of `arrays`; empty: nothing."""
+        """Return what is wrong with saved arrays of the shapes of `arrays`; empty if nothing."""
         ...

@@ -28,17 +28,18 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class KinematicShard:
-    """One zone of one world, whose vehicles others spawn.
+    """One zone of one world. Its caller spawns all vehicles.
 
     Args:
-        config: of the world; vehicles come by `spawn` alone.
-        network: its roads.
-        partition: all of its zones.
-        zone: the one that is run here.
+        config: of the world; vehicles enter by `spawn` only.
+        network: the roads of the world.
+        partition: all zones of the world.
+        zone: the zone of this shard.
 
     Raises:
-        ConfigError: the world asks for what zones share beside their vehicles: messages, mounted
-            sensors, scenarios, actuated signals, delayed controls, earlier frames, team rewards.
+        ConfigError: the world uses features for which zones share more than vehicles: messages,
+            mounted sensors, scenarios, actuated signals, delayed controls, earlier frames, team
+            rewards.
     """
 
     def __init__(
@@ -74,15 +75,15 @@ class KinematicShard:
             "terms.team_share": config.terms.team_share > 0.0,
             "action.kind = discrete": config.action.kind == "discrete",
         }
-        for what, is_there in wrong.items():
-            if is_there:
+        for feature, is_used in wrong.items():
+            if is_used:
                 raise ConfigError(
-                    f"{what}: not in a world over backends, whose zones share vehicles alone; "
-                    "leave it out, or run the zones on nodes (make_vec(..., nodes=k))"
+                    f"{feature}: a world over backends cannot have it, because its zones share "
+                    "only vehicles; turn it off, or run the zones on nodes (make_vec(..., nodes=k))"
                 )
 
     def reset(self, seed: int) -> None:
-        """Go to tick 0, without vehicles."""
+        """Return to tick 0, without vehicles."""
         self._shard.align()
         worlds = self._shard.worlds
         worlds.keys[0], worlds.ticks[0] = world_key(seed, 0, 0), 0
@@ -94,30 +95,30 @@ class KinematicShard:
         self._shared.switch_signals(common_of(worlds))
 
     def spawn(self, vehicles: NDArray[np.void]) -> None:
-        """Own the vehicles VEHICLE (n,) from the present tick on."""
+        """Add owned vehicles VEHICLE (n,)."""
         own = self.read_vehicles()
         for vehicle in vehicles["id"].tolist():
             if vehicle in own["id"] or vehicle in self._ghosts:
                 raise ConfigError(
-                    f"vehicle {vehicle}: is in zone {self.zone} already; destroy it, or remove "
+                    f"vehicle {vehicle} is in zone {self.zone} already; destroy it, or remove "
                     "its ghost, first"
                 )
         self._write(np.concatenate([own, vehicles]))
 
     def destroy(self, vehicles: Sequence[int]) -> None:
-        """Forget owned vehicles."""
+        """Remove owned vehicles."""
         own = self.read_vehicles()
         for vehicle in vehicles:
             self._check_owned(own, vehicle)
         self._write(own[~np.isin(own["id"], vehicles)])
 
     def apply_controls(self, controls: Mapping[int, VehicleControl]) -> None:
-        """What agents' vehicles do until they are told otherwise."""
+        """Set the controls of agents' vehicles until the next call."""
         own = self.read_vehicles()
         for vehicle in controls:
             agent = self._check_owned(own, vehicle)["agent"]
             if agent < 0:
-                raise ConfigError(f"vehicle {vehicle}: is driven by no agent; leave it out")
+                raise ConfigError(f"vehicle {vehicle} has no agent; omit its controls")
         for vehicle, control in controls.items():
             agent = self._check_owned(own, vehicle)["agent"]
             self._commands.controls[0, agent] = control
@@ -129,26 +130,29 @@ class KinematicShard:
             self._executor.begin_step(self._commands)
         self._executor.advance(self._commands)
         self._tick.leave()
-        self._tick.departures.num_queue[:] = 0  # those that would follow are others' to spawn
+        self._tick.departures.num_queue[:] = 0  # the caller spawns all further vehicles
         self._is_moved = True
 
     def upsert_ghosts(self, vehicles: NDArray[np.void]) -> None:
-        """Show other zones' vehicles VEHICLE (n,) as they are now."""
+        """Add or update ghosts: the present rows VEHICLE (n,) of other zones' vehicles."""
         own = self.read_vehicles()
         if both := set(own["id"].tolist()) & set(vehicles["id"].tolist()):
-            raise ConfigError(f"vehicle {min(both)}: is owned by zone {self.zone}, no ghost of it")
+            raise ConfigError(
+                f"vehicle {min(both)}: zone {self.zone} owns it, so it cannot be a ghost; "
+                "destroy it first"
+            )
         for row in vehicles:
             self._ghosts[int(row["id"])] = row.copy()
         self._write(own)
 
     def remove_ghosts(self, vehicles: Sequence[int]) -> None:
-        """Show ghosts no more."""
+        """Remove ghosts."""
         for vehicle in vehicles:
             self._ghosts.pop(vehicle, None)
         self._write(self.read_vehicles())
 
     def commit(self) -> int:
-        """End the tick; its number."""
+        """End the tick, and return the number of the new one."""
         self._executor.resolve()
         self._executor.commit()
         self._is_moved = False
@@ -160,11 +164,11 @@ class KinematicShard:
         return int(worlds.ticks[0])
 
     def read_vehicles(self) -> NDArray[np.void]:
-        """VEHICLE (n,), a copy."""
+        """Return a copy of the owned vehicles, VEHICLE (n,)."""
         return self._rows()[: self._shard.worlds.num_owned[0]].copy()
 
     def read_sensors(self) -> dict[int, NDArray[np.float32]]:
-        """What the owned vehicles of agents have sensed last, by their ids: (D,) each."""
+        """Return the latest observation (D,) of each owned vehicle of an agent, by its id."""
         own, outputs = self.read_vehicles(), self._shared.outputs
         driven = own[own["agent"] >= 0]
         return {
@@ -174,9 +178,9 @@ class KinematicShard:
         }
 
     def snapshot(self) -> bytes:
-        """All that the next tick depends on."""
+        """Return the state that the next tick depends on."""
         if self._is_moved:
-            raise ConfigError(f"zone {self.zone}: is in the middle of a tick; commit first")
+            raise ConfigError(f"zone {self.zone} is in the middle of a tick; call commit first")
         common = common_of(self._shard.worlds)
         ghosts = [*self._ghosts.values()]
         arrays: dict[str, Any] = {
@@ -192,7 +196,7 @@ class KinematicShard:
         return content.getvalue()
 
     def restore(self, data: bytes) -> None:
-        """Go on from a snapshot of this zone."""
+        """Resume from a snapshot of this zone."""
         try:
             saved = dict(np.load(io.BytesIO(data), allow_pickle=False))
             vehicles, ghosts = (
@@ -206,11 +210,11 @@ class KinematicShard:
                 *((getattr(common, name), saved[f"common_{name}"]) for name in SharedState._fields),
             ]
             if any(_plain(target).shape != array.shape for target, array in targets):
-                raise ValueError("arrays of another size")
+                raise ValueError("its arrays have different sizes")
         except (ValueError, KeyError, OSError, EOFError, BadZipFile) as error:
             raise MessageError(
-                f"zone {self.zone}: no snapshot of this world ({error}); take one of the same "
-                "configuration, map and zones"
+                f"zone {self.zone}: this is not a snapshot of this world ({error}); use one of the "
+                "same configuration, map and zones"
             ) from error
         self._shard.align()
         self._is_moved = False
@@ -225,19 +229,19 @@ class KinematicShard:
         return rows
 
     def _write(self, own: NDArray[np.void]) -> None:
-        """Owned rows come first, ghosts after them."""
+        """Write owned rows, then ghosts."""
         worlds, rows, num = self._shard.worlds, self._rows(), len(own)
         every = num + len(self._ghosts)
         if every > len(rows):
             raise ConfigError(
-                f"zone {self.zone}: {every} vehicles and ghosts, and room for {len(rows)}: more "
-                "population.background"
+                f"zone {self.zone} has {every} vehicles and ghosts, but room for {len(rows)}; "
+                "increase population.background"
             )
         rows[:num] = own
         for place, ghost in enumerate(self._ghosts.values(), num):
             rows[place] = ghost
         worlds.num_owned[0], worlds.num_rows[0], worlds.num_near[0] = num, every, every
-        worlds.step_at[0, :every] = 0  # what is known of their ways is looked up again
+        worlds.step_at[0, :every] = 0  # steps of routes are looked up again
         worlds.num_outer[0] = -1
 
     def _check_owned(self, own: NDArray[np.void], vehicle: int) -> np.void:
@@ -245,11 +249,11 @@ class KinematicShard:
         if not len(found):
             ghost = self._ghosts.get(vehicle)
             owner = "another zone" if ghost is None else f"zone {ghost['owner']}"
-            raise ConfigError(f"vehicle {vehicle}: zone {self.zone} does not own it; ask {owner}")
+            raise ConfigError(f"vehicle {vehicle}: zone {self.zone} does not own it; call {owner}")
         row: np.void = found[0]
         return row
 
 
 def _plain(array: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Records as bytes, which are saved without pickles."""
+    """Return records as bytes, which NumPy can save without pickles."""
     return array.view(np.uint8) if array.dtype.names else array

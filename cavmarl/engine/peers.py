@@ -1,8 +1,8 @@
 """`Peers`: the other processes that hold zones of the same worlds.
 
-Where zones live in several processes, each runs the same ticks on its own zones. What all of them
-have to know goes between them at fixed points of a tick, so that departures, signals and outputs
-are worked out everywhere alike.
+If zones are in several processes, each process runs the same ticks on its own zones. The processes
+exchange shared data at fixed points of a tick, so that all of them compute the same departures,
+signals and outputs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cavmarl.handoff.division import ZonedShards
 
 
 class Peers(Protocol):
-    """Each method returns when all processes have called it in the same place of the tick.
+    """Collective operations: each call returns when all processes have called it in the same tick.
 
     Attributes:
         are_none: whether this process runs all zones.
@@ -27,60 +27,63 @@ class Peers(Protocol):
     are_none: bool
 
     def keep_own(self, chosen: NDArray[np.bool_]) -> None:
-        """After a reset of the chosen worlds (W,), of which all have made all vehicles."""
+        """Drop the vehicles of other processes' zones, after a reset of the chosen worlds (W,).
+
+        Each process has made the vehicles of all zones.
+        """
         ...
 
     def take_up(self, departures: DepartureQueue, side: int) -> None:
-        """Zones have their vehicles of another tick, on `side`."""
+        """Resume from the restored rows of the zones, which are on `side`."""
         ...
 
     def everybody(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
-        """The time in which the owned rows of all zones, on `side`, are in each process.
+        """Return a context in which each process has the owned rows of all zones, on `side`.
 
-        What is changed of rows stays where they are owned. What is counted in `departures.counts`
-        meanwhile is counted everywhere alike.
+        Changes of rows are kept in the process that owns them. All processes must count the same in
+        `departures.counts` meanwhile.
         """
         ...
 
     def share_rows(self, departures: DepartureQueue, side: int) -> None:
-        """Ghosts of the next rows, which are on `side`, and vehicles that leave.
+        """Exchange ghosts of the next rows, which are on `side`, and vehicles that leave.
 
-        Those of all zones stand in `departures.passing` then, and how often vehicles took another
-        way in `departures.counts`.
+        Afterwards, `departures.passing` has the leaving vehicles of all zones, and
+        `departures.counts` their changes of route.
         """
         ...
 
     def running(self) -> NDArray[np.int64]:
-        """(W,) vehicles of each world, in all zones, after `share_rows`."""
+        """Return the number of vehicles of each world (W,) in all zones, after `share_rows`."""
         ...
 
     def clear_ranks(self, departures: DepartureQueue) -> None:
-        """Before zones rank the lanes where departures may enter."""
+        """Clear the ranks of lanes where departures may enter, before zones write them."""
         ...
 
     def share_ranks(self, departures: DepartureQueue) -> None:
-        """`departures.ranks` and `departures.last_s`, as the zones wrote them."""
+        """Exchange `departures.ranks` and `departures.last_s`, as the zones wrote them."""
         ...
 
     def share_proposals(self, departures: DepartureQueue) -> None:
-        """Departures that found a gap: `departures.passing` and `departures.places`."""
+        """Exchange departures that found a gap: `departures.passing` and `departures.places`."""
         ...
 
     def share_leavers(self, departures: DepartureQueue) -> None:
-        """Agents' vehicles whose trip has ended, in `departures.passing`."""
+        """Exchange agents' vehicles whose trip has ended, in `departures.passing`."""
         ...
 
     def share_detections(self, worlds: Worlds) -> None:
-        """`worlds.detected_s`: when detectors have seen a vehicle last."""
+        """Exchange `worlds.detected_s`, the times of the latest detections of vehicles."""
         ...
 
     def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
-        """What the agents of the chosen worlds (W,) have got, but for their observations."""
+        """Exchange the outputs of agents in the chosen worlds (W,), except observations."""
         ...
 
 
 class NoPeers:
-    """All zones are in this process, so nothing has to be shared."""
+    """A replacement for peers where this process has all zones."""
 
     are_none = True
 
@@ -88,36 +91,36 @@ class NoPeers:
         self._division = division
 
     def keep_own(self, chosen: NDArray[np.bool_]) -> None:
-        """All vehicles are of this process."""
+        """Do nothing: all vehicles belong to this process."""
 
     def take_up(self, departures: DepartureQueue, side: int) -> None:
-        """There is no other process to tell."""
+        """Do nothing: there are no other processes."""
 
     def everybody(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
-        """Return at once: the rows of all zones are always here."""
+        """Return an empty context: this process has the rows of all zones."""
         return nullcontext()
 
     def share_rows(self, departures: DepartureQueue, side: int) -> None:
-        """All ghosts are here."""
+        """Do nothing: this process has all ghosts."""
 
     def running(self) -> NDArray[np.int64]:
-        """Return (W,) vehicles of each world, in all zones."""
+        """Return the number of vehicles of each world (W,) in all zones."""
         return self._division.running()
 
     def clear_ranks(self, departures: DepartureQueue) -> None:
-        """The zones of this process write all ranks."""
+        """Do nothing: the zones of this process write all ranks."""
 
     def share_ranks(self, departures: DepartureQueue) -> None:
-        """All ranks are here."""
+        """Do nothing: this process has all ranks."""
 
     def share_proposals(self, departures: DepartureQueue) -> None:
-        """All proposals are here."""
+        """Do nothing: this process has all proposals."""
 
     def share_leavers(self, departures: DepartureQueue) -> None:
-        """All vehicles that leave are here."""
+        """Do nothing: this process has all leaving vehicles."""
 
     def share_detections(self, worlds: Worlds) -> None:
-        """All detectors are here."""
+        """Do nothing: this process has all detectors."""
 
     def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
-        """All outputs are here."""
+        """Do nothing: this process has all outputs."""

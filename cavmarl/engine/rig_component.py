@@ -1,4 +1,4 @@
-"""`RigComponent`: lets the rig of all agents sense after each tick, as a `Component` part."""
+"""`RigComponent`: the sensor rigs of all agents as a `Component`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from cavmarl.shards.shard import Commands
 
 
 class RigComponent:
-    """The rig of an environment; see `Component`.
+    """A `Component` that lets the rigs of all agents sense in each tick.
 
     Attributes:
-        platform: what the sensors are mounted on.
+        platform: the vehicles that carry the sensors.
     """
 
     reads_all: tuple[str, ...] = ()
@@ -40,7 +40,7 @@ class RigComponent:
         ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
         ids[...] = -1
         self._host = host
-        self.rig = Rig(config.rig, self.platform, host.frames, ids)  # all of its sensors
+        self.rig = Rig(config.rig, self.platform, host.frames, ids)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Take the samples that are due at the reset of the chosen worlds (W,)."""
@@ -56,11 +56,11 @@ class RigComponent:
         return self.rig.arrays()
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return nothing: no number of them is the place of something."""
+        """Return "": the arrays hold no indices, so any values are valid."""
         return ""
 
     def scenes(self) -> list[SensedScene]:
-        """What the agents of each zone can see now."""
+        """Return the present surroundings of the agents of each zone."""
         return [
             SensedScene(
                 roads=shard.roads,

@@ -15,9 +15,9 @@ from cavmarl.shards.shard import Commands, Shard
 
 
 class Cues:
-    """Looks at the agents of all zones at the beginning of each tick; `Component` to the worlds.
+    """A `Component` that checks the agents of all zones at the beginning of each tick.
 
-    Which cues have come is among what all shards have in common, `Worlds.cues`.
+    The detected cues are in `Worlds.cues`, which all shards share.
     """
 
     reads_all: tuple[str, ...] = ("begin",)
@@ -31,21 +31,21 @@ class Cues:
         self._note_cues = specialized(note_cues)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Nothing to do: with the actors of an episode no cue has come yet."""
+        """Do nothing: the new actors of an episode have reset the cues."""
 
     def begin(self, commands: Commands) -> None:
-        """Note cues whose time has come, or that an agent is near."""
+        """Record each cue whose time has come, or near which an agent is."""
         zoned, worlds = self._division.zoned, self._worlds
         rows = zoned.rows[self._division.side]
         self._note_cues(self._cues, rows, zoned.num_owned, worlds.ticks, worlds.cues)
 
     def end(self) -> None:
-        """Nothing to do: rows follow their scripts as they move."""
+        """Do nothing: scripted vehicles move with all others."""
 
     def arrays(self) -> Iterator[NDArray[Any]]:
-        """None of its own."""
+        """Return no arrays: the cues are in `Worlds`."""
         return iter(())
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return nothing: no number of them is the place of something."""
+        """Return "": there are no arrays."""
         return ""

@@ -16,17 +16,17 @@ from cavmarl.shards.shard_group import ShardGroup
 
 
 class ShardClock(PhaseExecutor):
-    """Runs the phases of a tick zone by zone and adds up what each zone takes.
+    """An executor that runs the phases of a tick zone by zone and sums the time of each zone.
 
-    What is done once for all zones (ghosts, the departure queue, signals, owners) is in no zone's
-    time.
+    Work that is done once for all zones (ghosts, the departure queue, signals, ownership) counts
+    for no zone.
     """
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # one a zone, in the order of zones
-        # one tick of so many is run zone by zone, and its time stands for the others. The first one
-        # of them is not counted: it makes ready what the others use
+        shards: Sequence[Shard],  # one per zone, in the order of zones
+        # One tick of `every` is run zone by zone, and its time stands for all of them. The first
+        # of these is not counted, because its calls are bound then.
         every: int = 1,
     ) -> None:
         self._alone = [ShardGroup((shard,)) for shard in shards]
@@ -36,7 +36,7 @@ class ShardClock(PhaseExecutor):
         self._spent_ns = np.zeros(len(self._alone), dtype=np.int64)
 
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
-        """Run a phase on all shards, in some ticks one after the other."""
+        """Run a phase on all shards; in measured ticks, shard by shard."""
         self._ticks += phase is Phase.ADVANCE
         if self._ticks % self._every:
             phase.run(self._together, arguments)
@@ -48,7 +48,7 @@ class ShardClock(PhaseExecutor):
                 self._spent_ns[zone] += time.thread_time_ns() - began
 
     def take_s(self) -> NDArray[np.float64]:
-        """Seconds of each zone since the last call, (k,)."""
+        """Return the seconds (k,) of each zone since the last call, and reset them."""
         spent_s: NDArray[np.float64] = self._spent_ns.astype(np.float64) * (1e-9 * self._every)
         self._spent_ns[:] = 0
         return spent_s

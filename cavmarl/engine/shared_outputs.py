@@ -1,4 +1,4 @@
-"""`SharedOutputs`: signals and agents' outputs, which all zones of a world share."""
+"""`SharedOutputs`: the signals and the agents' outputs that all zones of a world share."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from cavmarl.sensors.observed import frame_size
 
 
 class SharedOutputs:
-    """What all shards of W worlds share, and the steps that are taken once for all of them.
+    """Signals and outputs of W worlds, and the phases that run once for all shards.
 
     Attributes:
-        outputs: of all agents; every shard writes at the indices of its own ones.
-        chosen: (W,) that `clearing` and `settling` read.
+        outputs: of all agents; each shard writes at the indices of its own agents.
+        chosen: (W,) the chosen worlds, which `clearing` and `settling` read.
     """
 
     def __init__(
@@ -31,9 +31,9 @@ class SharedOutputs:
         config: EnvConfig,
         network: RoadNetwork,  # the roads of the whole map
         num_worlds: int,  # W
-        # (W, A, D) where the agents' are written; None: made for them
+        # (W, A, D) the array for the agents' observations; None: allocated here
         observations: NDArray[np.float32] | None = None,
-        zeros: Zeros = huge_zeros,  # makes all other outputs
+        zeros: Zeros = huge_zeros,  # allocates all other outputs
     ) -> None:
         self.outputs = make_outputs(config, num_worlds, observations, zeros)
         self._roads = network.arrays
@@ -58,7 +58,7 @@ class SharedOutputs:
 
     @cached_property
     def clearing(self) -> BoundCall[None]:
-        """The call that makes all agents absent."""
+        """The call that marks all agents as absent."""
         return bind(clear_outputs, outputs=self.outputs, chosen=self.chosen)
 
     @cached_property
@@ -75,12 +75,12 @@ class SharedOutputs:
         )
 
     def switch_signals(self, common: SharedState) -> None:
-        """Bring the signals to the present tick, after `detect` of all shards."""
+        """Switch the signals to the present tick, after `detect` of all shards."""
         if self.has_signals:
             self.signal_switch(common)()
 
     def clear_outputs(self, chosen: NDArray[np.bool_]) -> None:
-        """Make all agents of the chosen worlds (W,) absent, before `sense` of all shards."""
+        """Mark all agents of the chosen worlds (W,) as absent, before `sense` of all shards."""
         np.copyto(self.chosen, chosen)
         self.clearing()
 
@@ -93,10 +93,10 @@ class SharedOutputs:
 def make_outputs(
     config: EnvConfig,
     num_worlds: int,  # W
-    observations: NDArray[np.float32] | None = None,  # (W, A, D) to be used; None: they are made
-    zeros: Zeros = np.zeros,  # makes all others
+    observations: NDArray[np.float32] | None = None,  # (W, A, D) to be used; None: allocated here
+    zeros: Zeros = np.zeros,  # allocates all other outputs
 ) -> Outputs:
-    """Outputs of W empty worlds."""
+    """Return the outputs of W empty worlds."""
     agents = (num_worlds, config.population.num_ids)
     if observations is None:
         size = config.sensors.stack * frame_size(config.sensors)

@@ -34,12 +34,17 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
+_NO_EPISODES = (
+    "the state is damaged: the seed and the number of each world's episode are missing; "
+    "use an intact state"
+)
+
 
 class Simulation(WorldViews):
     """W worlds of one environment on one map.
 
     Attributes:
-        frames: what the rigs of the agents have sensed; arrays that the next step overwrites.
+        frames: the samples of the agents' sensor rigs; the next step overwrites these arrays.
     """
 
     def __init__(
@@ -47,26 +52,26 @@ class Simulation(WorldViews):
         config: EnvConfig,
         network: RoadNetwork,
         num_worlds: int = 1,  # W
-        # whose vehicles drive beside the generator's; of a file, or SUMO's
+        # vehicles in addition to the generator's, from a demand file or from SUMO
         demand: DemandFile | SumoDemand | None = None,
         partition: ZonePartition | None = None,  # the zones; None: cut as `config.zones` says
         *,
-        # (W, A, D) float32, where the agents' are written; None: made for them
+        # (W, A, D) float32, the array for the agents' observations; None: allocated here
         observations: NDArray[np.float32] | None = None,
-        # where the samples of their rigs are written; None: made for them
+        # arrays for the samples of the agents' rigs; None: allocated here
         frames: Frames | None = None,
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
-        zeros: Zeros = huge_zeros,  # makes the arrays that shards write
-        like: Simulation | None = None,  # of the same environment, whose tables are used
-        runs: Sequence[OpenRun] | None = None,  # what coordinators go by; None: `config.zones`
-        late_ticks: int = 0,  # for so many more a vehicle that has crossed may stay with its zone
+        zeros: Zeros = huge_zeros,  # allocates the arrays that shards write
+        like: Simulation | None = None,  # of the same environment; its tables are shared
+        runs: Sequence[OpenRun] | None = None,  # one per world; None: made as `config.zones` says
+        late_ticks: int = 0,  # extra ticks that a vehicle across a border may stay with its owner
     ) -> None:
         self._carried_from = carried_from(config.sensors)
         self.demand = demand
         self._seed = 0
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
-        self.everywhere = np.ones(num_worlds, dtype=np.bool_)  # (W,) all of the worlds
+        self.everywhere = np.ones(num_worlds, dtype=np.bool_)  # (W,) all worlds chosen
         self.frames: Frames = make_frames(config, num_worlds, zeros) if frames is None else frames
         self._compiled_step: CompiledStep | None = None
         prepare_kernels()
@@ -100,13 +105,13 @@ class Simulation(WorldViews):
         self._episodes[:] = 0
 
     def seed(self, seed: int, first_world: int = 0) -> None:
-        """Set the root of all random numbers; the next reset of each world is its first episode."""
+        """Set the seed of all random numbers; the next reset of each world is its first episode."""
         self._seed = seed
         self._first_world = first_world
         self._episodes[:] = 0
 
     def reset(self, chosen: NDArray[np.bool_] | None = None) -> None:
-        """Begin a new episode in the chosen worlds (W,), all by default, and sense.
+        """Begin a new episode in the chosen worlds (W,), by default in all, and let agents sense.
 
         World w's episode is a function of (seed, first_world + w, its resets since `seed`).
         """
@@ -118,7 +123,7 @@ class Simulation(WorldViews):
             raise CapacityError(
                 f"population.agents = {agents}: the map '{self.network.name}' has free places for "
                 f"{int(seated.min())}; use fewer agents, or population.mode = open or respawn, "
-                "where the others wait until there is room"
+                "where further agents wait until there is room"
             )
 
     def _populate(self, chosen: NDArray[np.bool_]) -> None:
@@ -141,11 +146,11 @@ class Simulation(WorldViews):
         tick.sense(chosen)
 
     def step(self, commands: Commands) -> None:
-        """One agent step: its ticks, then what the agents sense.
+        """Run one agent step: its ticks, and the sensing of the agents in the last tick.
 
         Raises:
-            SumoError: SUMO cannot go on; the worlds are as they were before the step, but for
-                those that share zones with other processes: they end.
+            SumoError: SUMO cannot continue. The worlds are restored to their state before the
+                step, unless other processes hold some of their zones; such worlds end.
         """
         if self.sumo is None or not self._tick.peers.are_none:
             self._run_ticks(commands)
@@ -172,14 +177,14 @@ class Simulation(WorldViews):
         self._tick.run(commands, is_first, is_last)
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
-        """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
+        """Replace each part that runs phases by `wrap(part)`, to time the phases."""
         self.zones.refuse_changes("measuring the phases of a tick")
         self._tick.instrument(wrap)
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
-        """Let `wrap(executor)` note the phases of a tick, and attached parts name theirs to `note`.
+        """Report the phases of a tick: the executor's by `wrap(executor)`, components' by `note`.
 
-        A part that has phases of its own (another simulator's step, say) has a method `trace`.
+        A component with phases of its own (such as another simulator's step) has a method `trace`.
         """
         self._tick.trace(wrap, note)
 
@@ -189,23 +194,24 @@ class Simulation(WorldViews):
             coordinator.close()
 
     def retire_agents(self) -> None:
-        """Take out the agents whose trip ended in the last step; to be called after it is read."""
+        """Remove the agents whose trip ended in the last step. Call after reading its results."""
         if not self.outputs.terminated.any():
             return
         self._tick.retire_agents()
 
     def save(self) -> list[NDArray[Any]]:
-        """All that the next step depends on, between two steps; views, to be copied."""
+        """Return the state that the next step depends on. The arrays are views: copy them."""
         roots = np.array([self._seed, self._first_world], dtype=np.int64)
         return [roots, self._episodes, *snapshot.save(self._parts())]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Go on from what `save` gave, in worlds of the same environment.
+        """Resume from a state that `save` returned in worlds of the same environment.
 
         Raises:
-            ConfigError: it is damaged, or one of other worlds; these are as they were.
-            JournalError: the state is not one of the run whose journal this is.
-            SumoError: SUMO moves vehicles there, and what it was told is not on record; see
+            ConfigError: the state is damaged or belongs to different worlds. These worlds are
+                unchanged.
+            JournalError: the state does not belong to the run of the open journal.
+            SumoError: SUMO moves vehicles in the state, but its commands are not on record; see
                 `SumoTraffic.keep_logs`.
         """
         self._put_back(saved)
@@ -215,7 +221,7 @@ class Simulation(WorldViews):
         tick.peers.take_up(tick.departures, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
-        """`load` where other processes hold zones: each goes on with its own, one is `home`."""
+        """Resume like `load` where each process holds some zones; `home` is a zone of this one."""
         self._put_back(saved, home)
         tick = self._tick
         tick.sumo.catch_up(self._shard.worlds)
@@ -232,30 +238,33 @@ class Simulation(WorldViews):
         self._tick.departures = snapshot.load(self._parts(), rest, ownership, home)
 
     def check(self, saved: Sequence[NDArray[Any]]) -> None:
-        """See that worlds can go on from what `save` gave. Raises ConfigError: they cannot."""
+        """Check that `load` can take a state. Raises ConfigError if it cannot."""
         if len(saved) < 2 or saved[0].shape != (2,) or saved[1].shape != self._episodes.shape:
-            raise ConfigError("the state is damaged: it says of no episode which one it is")
+            raise ConfigError(_NO_EPISODES)
         snapshot.form_of(self._parts()).check(saved[2:])
 
     def check_share(self, share: Sequence[NDArray[Any]]) -> None:
-        """See that `join` can take what `share_of` gave. Raises ConfigError: it cannot."""
+        """Check that `join` can take a state of one world. Raises ConfigError if it cannot."""
         if [array.shape for array in share[:2]] != [(2,), (1,)]:
-            raise ConfigError("the state is damaged: it says of no episode which one it is")
+            raise ConfigError(_NO_EPISODES)
         snapshot.form_of(self._parts()).check_share(share[2:])
 
     def _saved_ownership(self, saved: Sequence[NDArray[Any]]) -> list[SavedOwnership] | None:
-        """The owners of vehicles in a saved state, if they are known and the zones are the same."""
+        """Return the owners of vehicles in a saved state; None: unknown, or of other zones."""
         found = snapshot.ownership_of(self._parts(), saved)
         return found if found is not None and self.zones.take_saved(found[0]) else None
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
-        """What `save` would give if there were no world but one; views, to be copied."""
+        """Return the state of one world, as `save` returns it for a simulation of one world.
+
+        The arrays are views: copy them.
+        """
         roots = np.array([self._seed, self._first_world + world], dtype=np.int64)
         episodes = self._episodes[world : world + 1]
         return [roots, episodes, *snapshot.share_of(self._parts(), world)]
 
     def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
-        """What `load` takes, of worlds of which each share has been one by itself."""
+        """Join states of single worlds, as `share_of` returns them, to a state for `load`."""
         episodes = np.concatenate([share[1] for share in shares])
         return [
             shares[0][0], episodes, *snapshot.join(self._parts(), [share[2:] for share in shares])
@@ -278,14 +287,14 @@ class Simulation(WorldViews):
         )
 
     def suggest(self, out: NDArray[np.float64]) -> None:
-        """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
+        """Write the actions that the built-in driver would take for agents to `out` (W, A, 2)."""
         self._tick.executor.suggest(out)
 
     def state_hash(self, world: int = 0) -> str:
-        """Hex digest of a world's state.
+        """Return a hex digest of a world's state.
 
-        Over all vehicles in the order of their ids, the queue, the signals, the tick and the key of
-        all random numbers; not over where a record lives, nor over what a view keeps (steps to the
-        horizon, held actions).
+        It covers all vehicles in the order of their ids, the departure queue, the signals, the tick
+        and the key of all random numbers. It covers neither the places of records in memory nor
+        the state of an environment's view (steps to the horizon, held actions).
         """
         return snapshot.digest_world(self._parts(), world)

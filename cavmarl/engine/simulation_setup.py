@@ -1,4 +1,4 @@
-"""What a `Simulation` does once, before its first step: SUMO, coordinators, warm kernels."""
+"""Setup of a `Simulation` before its first step: SUMO, coordinators, warm kernels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cavmarl.zones.reach import longest_move_m
 
 
 def add_sumo(tick: Tick, demand: object, network: RoadNetwork) -> None:
-    """Let SUMO run beside the worlds, if the demand is of SUMO."""
+    """Attach SUMO to the worlds, if it simulates the demand."""
     if isinstance(demand, SumoDemand):
         travel, zoned = tick.traffic.travel, tick.division.zoned
         traffic = SumoTraffic(demand, network, travel, travel.num_fixed, zoned, blank_vehicle())
@@ -31,10 +31,10 @@ def add_sumo(tick: Tick, demand: object, network: RoadNetwork) -> None:
 def add_coordinators(
     tick: Tick, config: EnvConfig, network: RoadNetwork, runs: Sequence[OpenRun] | None
 ) -> tuple[TransferLog, ...]:
-    """Let coordinators decide ownership, if there are several zones or they are watched.
+    """Let coordinators decide ownership, if there are several zones, a journal or checks.
 
     Returns:
-        a log of transfers for each world; none without coordinators.
+        One log of transfers per world; none without coordinators.
     """
     zones = config.zones
     if tick.division.count == 1 and not (zones.journal or zones.check_invariants):
@@ -46,7 +46,7 @@ def add_coordinators(
 
 
 def call_rare_kernels(tick: Tick) -> None:
-    """Call the kernels that a first step may leave out, so that all of them are loaded."""
+    """Call the kernels that a first step may skip, so that all kernels are loaded."""
     departures, division = tick.departures, tick.division
     tick.let_in()
     tick.traffic.accept(departures, tick.worlds, tick.peers.running())

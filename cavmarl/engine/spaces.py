@@ -1,4 +1,4 @@
-"""Observation and action spaces: pure functions of the config. No world is built for a shape."""
+"""Observation and action spaces, computed from the configuration without building a world."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cavmarl.sensors.registry import type_of
 
 # Features of one vehicle in the global state: present, x, y, cos, sin, speed.
 STATE_FEATURES = 6
-STATE_SPEED_MPS = 40.0  # that is 1 in it
+STATE_SPEED_MPS = 40.0  # the speed that the global state scales to 1
 
 
 def _box(size: int) -> spaces.Box:
@@ -32,10 +32,11 @@ def _box(size: int) -> spaces.Box:
 
 
 def flat_observation_space(config: EnvConfig) -> spaces.Box:
-    """All features of all sensors in one Box, whatever `observation.kind` says.
+    """Return one Box of all features of all sensors, for any `observation.kind`.
 
-    Within [-1, 1], but for features that are left unscaled. With `sensors.stack` the frames follow
-    one another, oldest first. In the mode `sensors`, the samples of the rig in its order.
+    Features are within [-1, 1], except those that are left unscaled. With `sensors.stack` the
+    frames follow one another, oldest first. In the mode `sensors`, the Box has the samples of the
+    rig, in the order of its sensors.
     """
     if config.observation.mode == "sensors":
         boxes = [_frame_box(config, name) for name in config.rig]
@@ -52,9 +53,9 @@ def flat_observation_space(config: EnvConfig) -> spaces.Box:
 
 
 def frames_space(config: EnvConfig) -> spaces.Dict:
-    """The latest samples of each sensor of the rig, one Box each.
+    """Return a Dict with one Box per sensor of the rig, for its latest samples.
 
-    A sensor that takes several samples in a step has them as the first axis.
+    If a sensor takes several samples in a step, they are the first axis.
     """
     return spaces.Dict({name: _frame_box(config, name) for name in config.rig})
 
@@ -70,7 +71,7 @@ def _frame_box(config: EnvConfig, name: str) -> spaces.Box:
 
 
 def observation_space(config: EnvConfig) -> spaces.Box | spaces.Dict:
-    """What one agent observes: a flat Box, or a Dict with one Box a sensor.
+    """Return the space of one agent's observation: a flat Box, or a Dict with one Box per sensor.
 
     With `sensors.stack` the Boxes of a Dict have the frames as their first axis.
     """
@@ -109,7 +110,7 @@ class ObservationPart:
 
 
 def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
-    """The sensors that are on, in the order of their features."""
+    """Return the parts of the enabled sensors, in the order of their features."""
     places = layout(config)
     parts = {}
     for sensor in sensors_of(config):
@@ -125,7 +126,10 @@ def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
 
 
 def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
-    """The frames of W worlds as observations of mode `sensors`: views (W, A, …) by sensor."""
+    """Return the frames of W worlds as observations of mode `sensors`.
+
+    Each sensor's observation is a view (W, A, …).
+    """
     return {
         name: sensor.data if sensor.data.shape[2] > 1 else sensor.data[:, :, 0]
         for name, sensor in frames.items()
@@ -136,7 +140,7 @@ def named_observation(
     parts: Mapping[str, ObservationPart],  # of `observation_parts`
     frames: NDArray[np.float32],  # (…, stack, frame size): flat observations, reshaped
 ) -> dict[str, NDArray[Any]]:  # an array (…, *shape) a sensor
-    """Flat observations by sensor: views of them, but for images, which become bytes."""
+    """Return flat observations by sensor. They are views, except images, which become bytes."""
     before = frames.shape[:-2]
     return {
         name: frames[..., part.place].reshape(*before, *part.shape).astype(part.dtype, copy=False)
@@ -149,7 +153,7 @@ def flat_observation(
     named: Mapping[str, NDArray[Any]],  # an array a sensor, in any order
     stack: int,  # frames in an observation
 ) -> NDArray[np.float32]:
-    """The flat observation (stack · frame size,) of one that is named by sensor."""
+    """Return the flat observation (stack · frame size,) from the observations by sensor."""
     frames = [np.asarray(named[name], np.float32).reshape(stack, -1) for name in names]
     return np.concatenate(frames, axis=1).ravel()
 
@@ -166,24 +170,28 @@ def write_sensed(
 
 
 def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
-    """What one agent does: (throttle, steering) in [-1, 1], or the number of a choice."""
+    """Return the space of one agent's action.
+
+    It is (throttle, steering) in [-1, 1], or the number of a choice.
+    """
     if config.kind == "continuous":
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
     return spaces.Discrete(config.choices)
 
 
 def state_space(capacity: int) -> spaces.Box:
-    """The global state: `STATE_FEATURES` numbers for each vehicle that the world can hold."""
+    """Return the space of the global state: `STATE_FEATURES` numbers per possible vehicle."""
     return _box(capacity * STATE_FEATURES)
 
 
 def global_state(
     network: RoadNetwork, vehicles: NDArray[np.void], space: spaces.Box
 ) -> NDArray[np.float32]:
-    """All vehicles in the order of their ids: present, x, y, cos, sin of the heading, speed.
+    """Return the global state: all vehicles in the order of their ids.
 
-    x and y go from -1 to 1 over the map's extent, speed is over 40 m/s; places without a vehicle
-    are 0.
+    The features of a vehicle are present, x, y, cosine and sine of the heading, and speed. x and y
+    are scaled to [-1, 1] over the map's extent, speed is divided by 40 m/s. Places without a
+    vehicle are 0.
     """
     state = np.zeros((space.shape[0] // STATE_FEATURES, STATE_FEATURES), dtype=np.float32)
     rows = vehicles[np.argsort(vehicles["id"])]
@@ -199,10 +207,10 @@ def global_state(
 
 
 def observation_table(config: SensorsConfig) -> str:
-    """A Markdown table of a frame, index by index, for the cards of `envs/`.
+    """Return a Markdown table of a frame, index by index, for the cards of `envs/`.
 
-    Features that repeat (points, neighbours, rays, cells) are folded into one line. Frame `k` of a
-    stack, 0 the oldest, begins at `k` times the size of a frame.
+    Repeated features (points, neighbours, rays, cells) share one line. In a stack, frame `k` (0 is
+    the oldest) begins at `k` times the size of a frame.
     """
     lines = ["| index | sensor | feature | meaning | 1.0 is |", "|---|---|---|---|---|"]
     places = layout(config)
@@ -214,7 +222,7 @@ def observation_table(config: SensorsConfig) -> str:
 
 
 def _lines(sensor: str, start: int, features: list[Feature]) -> list[str]:
-    """One line for each name without its numbers; the first of its features says what it means."""
+    """Return one line per feature name without numbers; its first feature gives the meaning."""
     groups: dict[str, list[int]] = {}
     for k, feature in enumerate(features):
         groups.setdefault(re.sub(r"(_\d+)+$", "", feature.name), []).append(k)

@@ -1,7 +1,7 @@
-"""Checks a saved state before anything of it reaches the worlds.
+"""Checks of a saved state before any part of it reaches the worlds.
 
-A state comes from a file, from a worker that has died, or from another node. Kernels go by its
-numbers without a look at how long the tables are that they name places in.
+A state comes from a file, from a worker that has died, or from another node. Kernels use its
+numbers as indices without bounds checks.
 """
 
 from __future__ import annotations
@@ -44,32 +44,29 @@ _NUMBERS = ("pos", "speed", "speed_factor")
 
 
 class StateForm(NamedTuple):
-    """What a saved state of these worlds looks like."""
+    """The form that a saved state of these worlds must have."""
 
     roads: RoadArrays
     division: ZonedShards
     traffic: NativeTraffic
     attached: tuple[Component, ...]
-    fixed: Sequence[Array]  # arrays of the dtypes and shapes of the first ones
-    rerouting: Sequence[Array]  # likewise, of vehicles that find their own ways; or none
+    fixed: Sequence[Array]  # examples of the first arrays, with their dtypes and shapes
+    rerouting: Sequence[Array]  # examples of the arrays of rerouting; empty without rerouting
 
     def check(self, saved: Sequence[Array]) -> None:
-        """See that worlds can go on from a state.
-
-        Args:
-            saved: what `world_snapshot.save` returned.
+        """Check that worlds can resume from a state that `world_snapshot.save` returned.
 
         Raises:
             ConfigError: they cannot; the message says why.
         """
         if wrong := self._wrong(saved):
             raise ConfigError(
-                f"the state is damaged, or one of other worlds: {wrong}; use the environment and "
-                "the version that saved it"
+                f"the state is damaged or belongs to different worlds: {wrong}; use the "
+                "environment and the version that saved it"
             )
 
     def check_share(self, share: Sequence[Array]) -> None:
-        """See that a state of one world has arrays of the right shapes. Raises ConfigError."""
+        """Check the shapes of the arrays of one world's state. Raises ConfigError."""
         num_worlds, queue = self.division.num_worlds, len(self.fixed)
         grown, words = queue + 3, queue + len(self.rerouting) + 1
         rows = np.zeros((num_worlds, 0))
@@ -80,7 +77,7 @@ class StateForm(NamedTuple):
                 shape = (1, *array.shape[1:])
             if array.shape != shape:
                 raise ConfigError(
-                    f"the state is damaged, or one of other worlds: array {n} has the shape "
+                    f"the state is damaged or belongs to different worlds: array {n} has the shape "
                     f"{array.shape}, not {shape}"
                 )
 
@@ -101,13 +98,13 @@ class StateForm(NamedTuple):
                 name = names[n] if n < len(names) else f"array {n}"
                 return f"{name} is {array.dtype} {array.shape}, not {like.dtype} {like.shape}"
         if queue.dtype != DEPARTURE or queue.ndim != 2 or len(queue) != num_worlds:
-            return f"the queue is {queue.dtype} {queue.shape}"
+            return f"the departure queue is {queue.dtype} {queue.shape}"
         if words.dtype != np.int64 or words.ndim != 2 or len(words) != num_worlds:
-            return f"what is known of owners is {words.dtype} {words.shape}"
+            return f"the ownership is {words.dtype} {words.shape}"
         if contacts.dtype != np.int64 or contacts.shape != (num_worlds,) or (contacts < 0).any():
-            return "contacts are no numbers of each world"
+            return "the contacts are not one count per world"
         if any(rows.dtype != VEHICLE or rows.ndim != 1 for rows in vehicles):
-            return "vehicles are no records of them"
+            return "the vehicles are not VEHICLE records"
         named = dict(zip(names, fixed, strict=False))
         return (
             self._wrong_rerouting(rerouting)
@@ -134,28 +131,28 @@ class StateForm(NamedTuple):
             return ""
         for array, like in zip(saved, self.rerouting, strict=True):
             if array.dtype != like.dtype or array.shape[:1] != like.shape[:1]:
-                return f"what rerouting knows is {array.dtype} {array.shape}"
+                return f"an array of rerouting is {array.dtype} {array.shape}"
         past, sums, looks, steps = saved
         if [past.shape, sums.shape, steps.shape] != [
             self.rerouting[n].shape for n in (0, 1, 3)
         ] or looks.ndim != 2:
-            return "what rerouting knows has other shapes"
+            return "the arrays of rerouting have wrong shapes"
         edges, lanes, links = map(len, (self.roads.edges, self.roads.lanes, self.roads.links))
         if _outside(looks["goal"], 0, edges) or _outside(looks["seen"], -1, edges):
-            return "rerouting drives to an edge that is none"
+            return "a vehicle is rerouted to an edge that does not exist"
         if _outside(steps["next"], -1, lanes) or _outside(steps["link"], -1, links):
-            return "a way that was found leads to a lane or link that is none"
+            return "a route of rerouting leads to a lane or link that does not exist"
         return ""
 
     def _wrong_common(self, named: dict[str, Array]) -> str:
         roads = self.roads
         phases, controllers = named["signal_phase"], named["controllers"]
         if _outside(phases, 0, max(len(roads.phases), 1)):
-            return "signal_phase is out of all phases"
+            return "signal_phase names a phase that does not exist"
         if phases.size:
             ends = roads.phases["first_state"][phases] + roads.signals["num_links"]
             if (ends > len(roads.phase_states)).any():
-                return "signal_phase is one of another signal"
+                return "signal_phase names a phase of another signal"
         if controllers.size:
             programs = roads.programs[roads.programs["controller"] >= 0]
             own = programs[np.argsort(programs["controller"])]
@@ -163,14 +160,14 @@ class StateForm(NamedTuple):
             if ((phase != 0) & ((phase < first) | (phase >= first + own["num_phases"]))).any():
                 return "a controller has a phase of another program"
         if np.isnan(named["detected_s"]).any() or not np.isfinite(named["pending"]).all():
-            return "detected_s or pending is no number"
+            return "detected_s or pending is not a number"
         for name, least in (
             ("ticks", 0), ("cues", -1), ("next_order", 0), ("num_queue", 0), ("next_id", 0),
             ("num_entered", 0), ("counts", 0),
         ):  # fmt: skip
             if (named[name] < least).any():
                 return f"{name} is below {least}"
-        return "sums are no numbers" if np.isnan(named["sums"]).any() else ""
+        return "sums are not numbers" if np.isnan(named["sums"]).any() else ""
 
     def _wrong_vehicles(
         self,
@@ -182,20 +179,20 @@ class StateForm(NamedTuple):
         zones, tail = self.division.count, rerouting[-1] if rerouting else None
         capacity = self.traffic.capacity
         if (named["num_queue"] > queue.shape[1]).any():
-            return "num_queue is more than there are in the queue"
+            return "num_queue is larger than the departure queue"
         for w, key in enumerate(named["keys"].tolist()):
             num_orders = self.traffic.num_orders(key)
             if named["next_order"][w] > num_orders or queue.shape[1] > capacity + num_orders:
-                return f"world {w} has more departures than there are"
+                return f"world {w} has more departures than its episode"
             rows = np.concatenate(vehicles[w * zones : (w + 1) * zones])
             waiting = queue[w, : named["num_queue"][w]]
             if len(rows) > capacity:
-                return f"world {w} has {len(rows)} vehicles, and room for {capacity}"
+                return f"world {w} has {len(rows)} vehicles, but room for only {capacity}"
             next_id = named["next_id"][w]
             if (rows["id"] >= next_id).any() or (waiting["id"] >= next_id).any():
-                return f"world {w} has vehicles whose ids are still to come"
+                return f"world {w} has vehicles whose ids are not assigned yet"
             check = self.division.row_check
-            # SUMO numbers its vehicles as they come, however many there will be.
+            # SUMO numbers vehicles as they enter, so their number is unknown.
             numbers = num_orders if self.traffic.sumo is None else MOST
             wrong = check.wrong(rows, tail, numbers) or _wrong_codes(waiting)
             wrong = wrong or check.wrong(_as_vehicles(waiting), tail, numbers)
@@ -205,7 +202,7 @@ class StateForm(NamedTuple):
 
 
 def _as_vehicles(waiting: NDArray[np.void]) -> NDArray[np.void]:
-    """VEHICLE (n,) of vehicles that wait to enter, with what is known of them."""
+    """Return VEHICLE (n,) of waiting departures, with the fields that are known already."""
     rows = blank_vehicle().repeat(len(waiting))
     for name in ("id", "way", "agent", "order", "vtype", "goal", "lane", "stop", "stops_end"):
         rows[name] = waiting[name]
@@ -216,10 +213,10 @@ def _as_vehicles(waiting: NDArray[np.void]) -> NDArray[np.void]:
 def _wrong_codes(waiting: NDArray[np.void]) -> str:
     for name, (low, high) in _CODES.items():
         if _outside(waiting[name], low, high + 1):
-            return f"a vehicle in the queue has a {name} that is none"
+            return f"a vehicle in the queue has an invalid {name}"
     for name in _NUMBERS:
         if not (np.abs(waiting[name]) <= _LARGEST).all():
-            return f"a vehicle in the queue has a {name} that is none"
+            return f"a vehicle in the queue has an invalid {name}"
     return ""
 
 

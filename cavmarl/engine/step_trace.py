@@ -1,9 +1,8 @@
-"""`StepTrace` records the order in which the parts of a lock-step cycle act.
+"""`StepTrace` records the order of the phases in a lock-step cycle of a co-simulation.
 
-Algorithm 1 of the co-simulation paper: SUMO goes to t + Δt, its vehicles are mirrored, the world
-ticks exactly once, sensors deliver the frame of t + Δt, the stack computes u, and u is queued for
-the next cycle. Each part notes the name of its phase; without a trace this costs
-nothing.
+The phases are those of Algorithm 1 of the co-simulation paper: SUMO steps to t + Δt, its vehicles
+are mirrored, the world ticks exactly once, sensors deliver the frame of t + Δt, the stack computes
+u, and u is queued for the next cycle. Each part notes the name of its phase.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ from typing import Any, Protocol, runtime_checkable
 from cavmarl.shards.executor import Executor, PhaseExecutor
 from cavmarl.shards.phases import Phase
 
-SUMO = "sumo"  # another simulator has gone to t + Δt
-MIRROR = "mirror"  # its vehicles have been moved to where it has them
-TICK = "tick"  # the world goes on by one tick
-SENSORS = "sensors"  # the frame of t + Δt is made
-STACK = "stack"  # controls have come back for it
-QUEUE = "queue"  # they wait for the next cycle
+SUMO = "sumo"  # the other simulator steps to t + Δt
+MIRROR = "mirror"  # its vehicles are moved to their new positions
+TICK = "tick"  # the world advances by one tick
+SENSORS = "sensors"  # sensors make the frame of t + Δt
+STACK = "stack"  # the stack returns the controls for this frame
+QUEUE = "queue"  # the controls are queued for the next cycle
 
 # In the order of Algorithm 1.
 PHASES = (SUMO, MIRROR, TICK, SENSORS, STACK, QUEUE)
 
-# Phases of the runtime's executor that are phases of a cycle.
-# The world is at t + Δt when its rows are committed; those that SUMO moves have moved by then.
+# Phases of the executor that are phases of a cycle. A commit brings the world to t + Δt, after the
+# vehicles of SUMO have moved.
 _OF_EXECUTOR = {Phase.COMMIT: TICK, Phase.SENSE: SENSORS}
 
 
@@ -35,12 +34,12 @@ class Traced(Protocol):
     """A part with phases of its own."""
 
     def trace(self, note: Callable[[str], None]) -> None:
-        """From now on call `note` with the name of each phase when it begins."""
+        """Call `note` with the name of each phase when it begins, from now on."""
         ...
 
 
 class StepTrace:
-    """Notes phases, cycle by cycle."""
+    """A record of the phases of the last cycles."""
 
     def __init__(self, cycles: int = 10_000) -> None:
         self._cycles: deque[list[str]] = deque(maxlen=cycles)
@@ -54,12 +53,15 @@ class StepTrace:
         self._cycles.append([])
 
     def note(self, phase: str) -> None:
-        """A phase begins; before the first cycle nothing is noted."""
+        """Record that a phase begins. Phases before the first cycle are ignored."""
         if self._cycles:
             self._cycles[-1].append(phase)
 
     def around(self, executor: Executor) -> Executor:
-        """Return an executor that notes the phases of another; see `Simulation.trace`."""
+        """Return an executor that runs and records the phases of `executor`.
+
+        See `Simulation.trace`.
+        """
         return _Traced(executor, self.note)
 
 
@@ -69,7 +71,7 @@ class _Traced(PhaseExecutor):
         self._note = note
 
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
-        """Run a phase, and note it if it is one of the cycle's."""
+        """Run a phase, and record it if it belongs to a cycle."""
         named = _OF_EXECUTOR.get(phase)
         if named is not None:
             self._note(named)

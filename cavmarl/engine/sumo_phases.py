@@ -1,4 +1,4 @@
-"""What SUMO beside a world does in a tick, and what the world does instead where there is none."""
+"""The phases of a tick that SUMO runs, and their replacement in a world without SUMO."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ class GlobalTraffic(Protocol):
         ...
 
     def catch_up(self, worlds: Worlds) -> None:
-        """Go to the ticks of worlds whose state was loaded; errors as of `SumoTraffic`."""
+        """Advance to the ticks of worlds whose state was loaded. Raises as `SumoTraffic` does."""
         ...
 
     def follow(self, tick: Tick) -> None:
-        """Move the vehicles of the other simulator, after ours have moved."""
+        """Move the vehicles of the other simulator, after cavmarl's own vehicles."""
         ...
 
     def let_in(self, tick: Tick) -> None:
-        """Add the vehicles that the other simulator has let in."""
+        """Add the vehicles that have entered in the other simulator."""
         ...
 
     def switch_signals(self, tick: Tick) -> None:
-        """Bring the signals to the present tick."""
+        """Switch the signals to the present tick."""
         ...
 
     def close(self) -> None:
@@ -51,49 +51,49 @@ class GlobalTraffic(Protocol):
 
 
 class NoSumo:
-    """There is no other simulator: signals are switched by their own programs."""
+    """The replacement where there is no other simulator: signals follow their own programs."""
 
     traffic: SumoTraffic | None = None
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
-        """Nothing begins."""
+        """Do nothing."""
 
     def catch_up(self, worlds: Worlds) -> None:
-        """Nothing has a tick of its own."""
+        """Do nothing."""
 
     def follow(self, tick: Tick) -> None:
-        """There are no other vehicles."""
+        """Do nothing: there are no other vehicles."""
 
     def let_in(self, tick: Tick) -> None:
-        """There are no other vehicles."""
+        """Do nothing: there are no other vehicles."""
 
     def switch_signals(self, tick: Tick) -> None:
-        """Ask the detectors of all zones, then switch the signals once."""
+        """Read the detectors of all zones, then switch the signals once."""
         tick.executor.detect()
         tick.peers.share_detections(tick.worlds)
         tick.shared.switch_signals(tick.common)
 
     def close(self) -> None:
-        """There is nothing to end."""
+        """Do nothing."""
 
 
 class SumoPhases:
-    """SUMO beside the worlds of a tick."""
+    """The phases of a tick in worlds with SUMO."""
 
     def __init__(self, traffic: SumoTraffic) -> None:
         self.traffic: SumoTraffic | None = traffic
         self._sumo = traffic
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
-        """Start SUMO anew in the chosen worlds (W,)."""
+        """Restart SUMO in the chosen worlds (W,)."""
         self._sumo.reset(chosen, worlds)
 
     def catch_up(self, worlds: Worlds) -> None:
-        """Repeat what SUMO did up to the worlds' ticks."""
+        """Replay SUMO's commands up to the worlds' ticks."""
         self._sumo.catch_up(worlds)
 
     def follow(self, tick: Tick) -> None:
-        """Let SUMO take its step; then its vehicles move to their new places, or leave."""
+        """Step SUMO, then move its vehicles to their new places or remove them."""
         sumo, departures, worlds, side = (
             self._sumo,
             tick.departures,
@@ -116,7 +116,10 @@ class SumoPhases:
             tick.traffic.settle(departures, worlds)
 
     def let_in(self, tick: Tick) -> None:
-        """Add the vehicles that SUMO has let in: as its own, or to the queue as ours."""
+        """Add the vehicles that have entered in SUMO.
+
+        If SUMO drives, they become its rows; otherwise they join cavmarl's departure queue.
+        """
         sumo, departures, worlds = self._sumo, tick.departures, tick.worlds
         tick.meet()
         if not sumo.drives:
@@ -125,7 +128,7 @@ class SumoPhases:
             tick.admit()
 
     def switch_signals(self, tick: Tick) -> None:
-        """Show what the signals of SUMO show."""
+        """Copy the states of SUMO's signals."""
         self._sumo.show(tick.worlds)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""`Tick` runs one tick of W worlds, phase by phase. The order is written here, once."""
+"""`Tick` runs one tick of W worlds, phase by phase. Only this module defines the order."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Tick:
 
     Attributes:
         executor: runs the phases of the shards, in this process or in several.
-        departures: through which vehicles come and go; a reset may replace it.
+        departures: the queue through which vehicles enter and leave; a reset may replace it.
         coordination: decides which zone owns which vehicle.
         peers: the processes that run the other zones.
-        sumo: the simulator beside these worlds.
+        sumo: the phases of another simulator, or their replacement where there is none.
         common: ticks, keys and signals of the worlds, which all zones share.
     """
 
@@ -44,7 +44,7 @@ class Tick:
         traffic: NativeTraffic,  # departures, routes and arrivals
         shared: SharedOutputs,  # signals and outputs of all shards
         departures: DepartureQueue,
-        attached: tuple[Component, ...],  # components that act in each tick beside the traffic
+        attached: tuple[Component, ...],  # components that act in each tick
     ) -> None:
         self.shards = shards
         self.division = division
@@ -74,16 +74,16 @@ class Tick:
 
     @property
     def worlds(self) -> Worlds:
-        """The rows of the first zone, and what all zones have in common."""
+        """The rows of the first zone, and the state that all zones share."""
         return self._shard.worlds
 
     def run(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """Begin → components → begin the step → advance … signals → components → sense → end.
 
         Args:
-            commands: of the step.
+            commands: the commands of the step.
             is_first: whether this is the first tick of the step.
-            is_last: whether it is the last one, in which agents sense.
+            is_last: whether this is the last tick of the step, in which agents sense.
         """
         self.coordination.begin(commands)
         for part in self.attached:
@@ -103,11 +103,11 @@ class Tick:
         self.coordination.end()
 
     def all_rows(self, needed: bool, side: int) -> AbstractContextManager[None]:
-        """Return the time in which the vehicles of all zones are in this process, if needed."""
+        """Return a context in which this process has the vehicles of all zones, if needed."""
         return self.peers.everybody(self.departures, side) if needed else nullcontext()
 
     def begin_step(self, commands: Commands) -> None:
-        """Open the accounts of the step, and queue the vehicles that the caller inserts."""
+        """Clear the sums of the step, and queue the vehicles that the caller inserts."""
         self.executor.begin_step(commands)
         if commands.inserted.size:
             self.traffic.insert(self.departures, self.worlds, commands.inserted)
@@ -126,7 +126,7 @@ class Tick:
             self.traffic.settle(self.departures, self.worlds)
         self.executor.resolve()
         if self._gathers:
-            self.division.note_gathered()  # others may still be about their contacts
+            self.division.note_gathered()  # other workers may still be resolving contacts
         self._enter()
         self.executor.commit()
         self.count_tick()
@@ -143,7 +143,7 @@ class Tick:
         self.executor.credit(chosen)
 
     def leave(self) -> None:
-        """Pick new goals, let arrived vehicles leave, answer requests for routes."""
+        """Choose new goals, let arrived vehicles leave, answer requests for routes."""
         traffic, departures, worlds = self.traffic, self.departures, self.worlds
         begins_second, some_arrived = self.occasions()
         if begins_second:
@@ -152,7 +152,7 @@ class Tick:
             self.executor.leave(departures)
             if any(departures.num_passing.tolist()):
                 self.coordination.left(departures)
-                if self.peers.are_none:  # if not, those of all zones settle after `share_rows`
+                if self.peers.are_none:  # with peers, all zones settle after `share_rows`
                     traffic.settle(departures, worlds)
         if begins_second and traffic.rerouting is not None:
             with (
@@ -162,7 +162,7 @@ class Tick:
                 traffic.rerouting.act(departures, everybody)
 
     def _enter(self) -> None:
-        """Waiting departures that find a gap enter `next_rows`."""
+        """Add departures that find a gap to `next_rows`."""
         self.sumo.let_in(self)
         self.traffic.call_orders(self.departures, self.worlds)
         if any(self.departures.num_queue.tolist()):
@@ -182,13 +182,13 @@ class Tick:
             self.admit()
 
     def admit(self) -> None:
-        """Admitted vehicles become rows of the zones that they are in."""
+        """Add admitted vehicles to the rows of the zones in which they are."""
         self.executor.admit(self.departures)
         self.coordination.entered(self.departures)
         self.departures.num_passing[:] = 0
 
     def retire_agents(self) -> None:
-        """Between two steps: take out the agents whose trip ended in the last one."""
+        """Remove the agents whose trip ended in the last step. Call between two steps."""
         departures = self.departures
         self.executor.retire(departures)
         if any(departures.num_passing.tolist()):
@@ -199,7 +199,7 @@ class Tick:
             self.traffic.settle(departures, self.worlds)
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
-        """Put `wrap(part)` in the place of each part that runs phases, to time them."""
+        """Replace each part that runs phases by `wrap(part)`, to time the phases."""
         self.executor = wrap(self.executor)
         self.division = wrap(self.division)
         self.traffic = wrap(self.traffic)
@@ -209,9 +209,9 @@ class Tick:
             self.sumo = SumoPhases(wrap(self.sumo.traffic))
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
-        """Let `wrap(executor)` note the phases, and components name theirs to `note`.
+        """Report phases: the executor's by `wrap(executor)`, components' by `note`.
 
-        A component that has phases of its own has a method `trace`.
+        A component with phases of its own has a method `trace`.
         """
         self.executor = wrap(self.executor)
         self.note_phase = note
@@ -224,15 +224,15 @@ class Tick:
         # called with the shards, and with the arguments of the phase `gather`
         make: Callable[[Sequence[Shard], tuple[float, float]], TeamExecutor],
     ) -> None:
-        """From now on let several processes run the phases of the shards, as `make` says."""
+        """Let the executor that `make` returns run the shards' phases in several processes."""
         team = make(self.shards, self.division.gathering)
         self.executor, self.meet = team, team.meet
         self._gathers = self.division.let_gather(team)
 
 
 def _no_wait() -> None:
-    """One process runs all phases, so there is nothing to wait for."""
+    """Do nothing: one process runs all phases."""
 
 
 def _ignore(phase: str) -> None:
-    """Ignore the name of a phase: there is no trace."""
+    """Do nothing: there is no trace."""

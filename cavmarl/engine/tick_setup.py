@@ -1,4 +1,4 @@
-"""Makes the parts of a tick: traffic, shards, components and the queue of departures."""
+"""Construction of the parts of a tick: traffic, shards, components and the departure queue."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def make_tick(
     config: EnvConfig,
     network: RoadNetwork,
     partition: ZonePartition,
-    demand: DemandFile | SumoDemand | None,  # of files, or SUMO's, beside the generator's
-    shared: SharedOutputs,  # what all zones of a world share
+    demand: DemandFile | SumoDemand | None,  # vehicles in addition to the generator's
+    shared: SharedOutputs,  # signals and outputs of all zones
     frames: Frames,  # of the mounted sensors
-    zeros: Zeros,  # where large arrays lie
-    # of other worlds of the same environment, as many as these; None: it is made
+    zeros: Zeros,  # allocates large arrays
+    # of another simulation of this environment with as many worlds; None: made here
     traffic: NativeTraffic | None,
     late_ticks: int = 0,  # see `divide`
 ) -> Tick:
-    """The phases of a tick, over shards that are made here."""
+    """Make the shards of W worlds and the tick that runs their phases."""
     num_worlds = shared.outputs.present.shape[0]
     blank = blank_vehicle()
     if traffic is None:
@@ -74,7 +74,7 @@ def make_tick(
 
 
 def attach(host: ComponentContext) -> tuple[Component, ...]:
-    """The parts that the environment asks for, in the order in which they act."""
+    """Make the components that the environment configures, in the order in which they act."""
     parts: list[Component] = []
     if host.config.scenario.name:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
@@ -86,7 +86,7 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
 
 
 def make_frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
-    """Room for what the rigs of all agents sense."""
+    """Allocate arrays for the samples of all agents' rigs."""
     layout = frame_layout(config, num_worlds)
     return frames_in({name: zeros(shape, dtype=kind) for name, (kind, shape) in layout.items()})
 

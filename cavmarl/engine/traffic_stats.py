@@ -23,22 +23,22 @@ from cavmarl.handoff.division import ZonedShards
 class TrafficStats:
     """Traffic of one world since its reset; agents count as vehicles."""
 
-    departed: int  # vehicles that have entered, those placed at reset included
+    departed: int  # vehicles that have entered, including those placed at reset
     waiting: int  # departures that wait for a safe gap
     running: int  # vehicles in the world
     arrived: int  # vehicles that reached their goal
-    contacts: int  # vehicles that began to touch another one
-    removed: int  # agents taken out after a collision or off the road
-    rerouted: int  # vehicles that took another way; one that did so twice counts twice
+    contacts: int  # vehicles that began to touch another vehicle
+    removed: int  # agents removed after a collision or off the road
+    rerouted: int  # changes of route; a vehicle that was rerouted twice counts twice
     mean_speed_mps: float  # over the vehicles in the world now
-    mean_trip_m: float  # over the arrived ones
-    mean_trip_s: float  # over the arrived ones
-    # over the arrived ones, time above what the way takes at the speed that limit and driver allow
+    mean_trip_m: float  # over the arrived vehicles
+    mean_trip_s: float  # over the arrived vehicles
+    # over the arrived vehicles, time above that of the route at the speed of limits and driver
     mean_delay_s: float
 
 
 def count_traffic(departures: DepartureQueue, division: ZonedShards, world: int) -> TrafficStats:
-    """Counts and means of one world since its reset."""
+    """Return the traffic statistics of one world since its reset."""
     counts, sums = departures.counts[world], departures.sums[world]
     rows = division.vehicles(world)
     arrived = int(counts[COUNT_ARRIVED])

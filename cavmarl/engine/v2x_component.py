@@ -1,4 +1,4 @@
-"""`V2xComponent`: the bus of messages as a part that acts in each tick."""
+"""`V2xComponent`: the message bus as a `Component`."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 class V2xComponent:
-    """Lets the stations of W worlds send and receive at the end of each tick; a `Component`.
+    """A `Component` that lets the stations of W worlds send and receive at the end of each tick.
 
-    What is received in a tick is in the inboxes when agents sense, at its end.
+    Messages that are received in a tick are in the inboxes when agents sense at its end.
     """
 
     reads_all: tuple[str, ...] = ("end",)
@@ -44,7 +44,7 @@ class V2xComponent:
         self.bus.reset(chosen)
 
     def begin(self, commands: Commands) -> None:
-        """Take what agents tell others of in this step; they say it once, in its first tick."""
+        """Pass the agents' declared intentions to the bus, in the first tick of a step."""
         if commands.declared.size and self._ticks.item(0) % self._ticks_per_step == 0:
             self.bus.declare(commands.declared)
 
@@ -52,7 +52,7 @@ class V2xComponent:
         self.bus.exchange(self._division.side)
 
     def arrays(self) -> Iterator[NDArray[Any]]:
-        """The inboxes, the counts, and what is in flight."""
+        """Return the inboxes, the counts and the messages in flight."""
         return self.bus.arrays()
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
@@ -60,6 +60,6 @@ class V2xComponent:
 
 
 def without_network(attached: Iterable[object]) -> AbstractContextManager[None]:
-    """Return the time in which no network simulator is asked; see `Bus.muted`."""
+    """Return a context in which no network simulator is called; see `Bus.muted`."""
     buses = (part.bus for part in attached if isinstance(part, V2xComponent))
     return next((bus.muted() for bus in buses), nullcontext())

@@ -1,4 +1,4 @@
-"""Where a vehicle is going: the middle of the lanes of its way, for pictures."""
+"""The remaining route of a vehicle as a line along lane centres, for pictures."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ MOST_LANES = 400
 
 
 def way_ahead(simulation: WorldViews, vehicle: int, world: int = 0) -> NDArray[np.float64]:
-    """Points (n, 2) in m from where a vehicle is to the end of its way.
+    """Return points (n, 2) in m from a vehicle's position to the end of its route.
 
-    None of one that is not there, that follows a script or that has no way.
+    There are no points if the vehicle is not in the world, follows a script or has no route.
     """
     rows = simulation.vehicles(world)
     rows = rows[rows["id"] == vehicle]
@@ -34,7 +34,7 @@ def way_ahead(simulation: WorldViews, vehicle: int, world: int = 0) -> NDArray[n
             if not 0 <= at < len(steps):
                 break
             step = steps[at]
-            if step["change"]:  # its way goes on from the lane beside
+            if step["change"]:  # the route continues on the adjacent lane
                 following = int(row["left"] if step["change"] > 0 else row["right"])
                 if following < 0:
                     break
@@ -49,7 +49,7 @@ def way_ahead(simulation: WorldViews, vehicle: int, world: int = 0) -> NDArray[n
 
 
 def _from(line: NDArray[np.float64], start_m: float) -> NDArray[np.float64]:
-    """The part of a line (n, 2) after its first metres."""
+    """Return the part of a line (n, 2) after `start_m`."""
     if start_m <= 0.0:
         return line
     along = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(line, axis=0).T))])

@@ -1,4 +1,4 @@
-"""What a world is, for manifests: its settings whole, all else by hashes."""
+"""Description of a world for manifests: its configuration, and hashes of its data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def describe_world(
     demand: DemandFile | SumoDemand | None,
     partition: ZonePartition,
 ) -> dict[str, Any]:
-    """The environment whole; its roads, its demand, its zones and the kernels by their hashes."""
+    """Return the configuration, and the hashes of the roads, demand, zones and kernels."""
     resolved = asdict(config)
     text = json.dumps(resolved, sort_keys=True)
     return {

@@ -1,4 +1,4 @@
-"""`WorldFrame`: one world between two steps, as viewers and recordings need it."""
+"""`WorldFrame`: one world between two steps, for viewers and recordings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.engine.kernels.seen_rows import write_seen
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.zone_view import TransferInFlight
 
-# One vehicle as it is seen. Units and frames as in `driving.vehicles.VEHICLE`.
+# One vehicle of a frame. Units and coordinate frames are those of `driving.vehicles.VEHICLE`.
 SEEN = np.dtype(
     [
         ("id", "<i8"),
@@ -41,14 +41,14 @@ SEEN = np.dtype(
         ("agent", "<i4"),
         ("events", "<i4"),
         ("vclass", "<i2"),
-        ("zone", "<i2"),  # its owner
+        ("zone", "<i2"),  # the owner
         ("target_zone", "<i2"),  # of the transfer in flight; -1: none
         ("driver", "i1"),
         ("blinker", "i1"),
         ("transfer", "i1"),
     ]
 )
-# An agent whose vehicle ended in the step before the frame, and by which EVENT_* bits.
+# An agent whose trip ended in the step before the frame, and the EVENT_* bits that ended it.
 ENDED = np.dtype([("agent", "<i4"), ("events", "<i4")])
 NONE_ENDED = np.zeros(0, dtype=ENDED)
 
@@ -63,7 +63,7 @@ _KINDS = {
 
 
 class WorldFrame(NamedTuple):
-    """One world between two steps; the arrays are its own."""
+    """One world between two steps. It owns its arrays."""
 
     world: int
     tick: int  # since the reset
@@ -71,21 +71,21 @@ class WorldFrame(NamedTuple):
     vehicles: NDArray[np.void]  # SEEN (n,), by id
     signals: NDArray[np.int32]  # (num_signals,) PHASE rows that are on
     transfers: tuple[TransferInFlight, ...] = ()
-    ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids that it sees of others
-    ended: NDArray[np.void] = NONE_ENDED  # ENDED (m,): they are not among `vehicles`
-    # kind and detail of what was put into the world in the step before
+    ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids of its ghosts
+    ended: NDArray[np.void] = NONE_ENDED  # ENDED (m,): agents that are not among `vehicles`
+    # kind and detail of each change that the caller made in the step before
     asked: tuple[tuple[str, str], ...] = ()
 
 
 class FrameEvent(NamedTuple):
-    """What happened between two frames."""
+    """An event between two frames."""
 
     tick: int  # of the later frame
     # departed, left, arrived, collision, off_road, wrong_way, red_light, out_of_time,
-    # transferred, signal; inserted or closed: put there from outside
+    # transferred, signal; inserted and closed: changes by the caller
     kind: str
-    vehicle: int  # id; -1: of no vehicle
-    agent: int  # index; -1: no agent's
+    vehicle: int  # id; -1: no vehicle
+    agent: int  # index; -1: no agent
     detail: str
 
 
@@ -97,19 +97,19 @@ def frame_of(
     asked: tuple[tuple[str, str], ...] = (),
     room: Callable[[int], NDArray[np.void]] | None = None,
 ) -> WorldFrame:
-    """The present moment of one world.
+    """Return a frame of the present state of one world.
 
     Args:
         simulation: the worlds.
-        world: which of them.
-        ghosts: whether to tell what each zone sees of the others' vehicles.
+        world: the index of the world.
+        ghosts: whether to include the ids of each zone's ghosts.
         ended: ENDED, of the last step.
-        asked: what was put into the world in it.
-        room: memory for so many SEEN; None: new memory.
+        asked: kind and detail of each change that the caller made in the last step.
+        room: returns memory for n records SEEN; None: new memory.
     """
     rows = simulation.vehicles(world)
     seen = np.empty(len(rows), dtype=SEEN) if room is None else room(len(rows))
-    order = np.argsort(rows["id"], kind="stable")  # faster where many are sorted already
+    order = np.argsort(rows["id"], kind="stable")  # fast for ids that are almost sorted
     write_seen(rows, order, simulation.types, seen)
     view = simulation.zones.view(world) if simulation.partition.count > 1 else None
     tick = int(simulation.ticks()[world])
@@ -127,7 +127,7 @@ def frame_of(
 
 
 def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent]:
-    """What happened from one frame to the next of the same episode, in the order of vehicles."""
+    """Yield the events between two frames of an episode, in the order of vehicles."""
     for kind, detail in after.asked:
         yield FrameEvent(after.tick, kind, -1, -1, detail)
     ids, were = after.vehicles["id"], before.vehicles["id"]
@@ -145,15 +145,15 @@ def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent
                 yield FrameEvent(after.tick, kind, int(row["id"]), int(row["agent"]), "")
         both, old, new = np.intersect1d(were, ids, assume_unique=True, return_indices=True)
     rows, zones = after.vehicles[new], before.vehicles["zone"][old]
-    told = rows["events"]
+    events = rows["events"]
     moved = zones != rows["zone"]
-    for k in np.flatnonzero(moved | (told != 0)):
+    for k in np.flatnonzero(moved | (events != 0)):
         row, agent = rows[k], int(rows["agent"][k])
         for bit, kind in _KINDS.items():
-            if told[k] & bit:
+            if events[k] & bit:
                 yield FrameEvent(after.tick, kind, int(both[k]), agent, "")
         if moved[k]:
-            way = f"{zones[k]} to {row['zone']}"
-            yield FrameEvent(after.tick, "transferred", int(both[k]), agent, way)
+            detail = f"{zones[k]} to {row['zone']}"
+            yield FrameEvent(after.tick, "transferred", int(both[k]), agent, detail)
     for signal in np.flatnonzero(before.signals != after.signals):
         yield FrameEvent(after.tick, "signal", -1, -1, f"{signal}: phase {after.signals[signal]}")

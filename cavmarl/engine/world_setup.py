@@ -1,4 +1,4 @@
-"""Loads what a world is made of, by name: config and roads."""
+"""Loading of a world by name: its configuration, roads, demand and zones."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ from cavmarl.zones.partition.zone_file import zones_for
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-# Networks of this process that something still uses, by whether there are agents and the names and
-# hashes of their files.
+# Networks that are in use in this process. The key is whether there are agents, followed by the
+# names and hashes of the map files.
 _LOADED: WeakValueDictionary[tuple[object, ...], RoadNetwork] = WeakValueDictionary()
 
 
 class World(NamedTuple):
-    """What a world is made of."""
+    """The configuration of a world and the data that it names."""
 
     config: EnvConfig
     network: RoadNetwork
-    # whose vehicles drive beside the generator's; of a file, or SUMO's
+    # vehicles in addition to the generator's, from a demand file or from SUMO
     demand: DemandFile | SumoDemand | None
     partition: ZonePartition
 
@@ -72,14 +72,16 @@ def load_world(
     max_cycles: int | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> World:
-    """What an entry, a folder or a map file describes; keywords as in `parallel_env`.
+    """Load the world that an entry, a folder or a map file describes.
+
+    Keywords are as in `parallel_env`.
 
     Raises:
-        ConfigError: a key, value or combination that cannot work; zones that cannot be, or not on
-            this map; the zones do not fit the map.
-        MapError: the map cannot be read or driven.
-        DemandError: a demand file is missing, broken or another map's.
-        RouteError: its routes do not connect.
+        ConfigError: a key, a value or a combination of them is invalid, or the zones do not fit
+            the map.
+        MapError: the map cannot be read, or has no roads to drive on.
+        DemandError: a demand file is missing, damaged or of another map.
+        RouteError: a route of the demand is not connected.
     """
     config, base_dir = load_config(
         env,
@@ -93,9 +95,9 @@ def load_world(
 
 
 def make_world(config: EnvConfig, base_dir: Path) -> World:
-    """What a configuration describes, with its horizon if the map says it.
+    """Load the world of a configuration, and derive its horizon from the map if it asks for that.
 
-    Raises CavmarlError: as of `load_world`.
+    Raises the errors of `load_world`.
     """
     network = load_roads(config, base_dir)
     if config.horizon_s == BY_MAP:
@@ -112,15 +114,16 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
     scene = plan_scene(config.scenario, network)
     if scene is not None and scene.outages:
         network = with_outages(network, dict(scene.outages))
-    trim()  # what files were read into
+    trim()  # return the memory that reading files has freed
     return World(config, network, demand, load_zones(config, base_dir, network))
 
 
 def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
-    """The roads of a configuration, with the buildings and the signal programs that it names.
+    """Load the roads of a configuration, with its buildings and signal programs.
 
     Raises:
-        MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
+        MapError: the map or a file of buildings or programs cannot be read, or a file does not fit
+            the map.
     """
     network = _joined(resolve_maps(config, base_dir), config.population.agents > 0)
     if len(network.maps) > 1:
@@ -132,11 +135,11 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
 
 
 def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
-    """The network of map files; worlds of one process that are made of the same files share it.
+    """Return the network of map files. Worlds of one process share the network of the same files.
 
-    With agents it says where these sweep.
+    With agents, the network includes the swept areas of steered vehicles.
 
-    Raises MapError: what is wrong with any of them, all together.
+    Raises MapError with the errors of all files.
     """
     files: list[Path] = []
     contents: list[tuple[str, str]] = []
@@ -163,7 +166,7 @@ def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
 
 
 def _refuse_of_one_map(config: EnvConfig) -> None:
-    """Refuse keys that name things of one map where there are several."""
+    """Refuse keys that name elements of one map if there are several maps."""
     named = {
         "map.programs": config.map.programs,
         "map.program": config.map.program,
@@ -178,16 +181,17 @@ def _refuse_of_one_map(config: EnvConfig) -> None:
     for key, value in named.items():
         if value:
             raise ConfigError(
-                f"{key} = {value!r}: is of one map, and map.source names several; leave one out"
+                f"{key} = {value!r}: needs a single map, but map.source names several; remove "
+                f"{key}, or name one map"
             )
 
 
 def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZonePartition:
-    """The zones of a configuration.
+    """Return the zones of a configuration, from its zone file or by cutting the map.
 
     Raises:
-        ConfigError: a zone file that cannot be read, or more zones than the map can hold; a zone
-            file of another number of zones, or of another map.
+        ConfigError: the zone file cannot be read, or is of another map or number of zones; or the
+            map cannot be cut into this many zones.
     """
     settings = config.zones
     path = resolve_zones(config, base_dir)
@@ -203,10 +207,10 @@ def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZoneP
 
 
 def find_map(env: str | Path) -> Path:
-    """The SUMO network of an entry, a folder or a map file.
+    """Return the path of the SUMO network of an entry, a folder or a map file.
 
     Raises:
-        UnknownEnvironmentError: nothing of that name.
+        UnknownEnvironmentError: there is no entry, folder or file of this name.
         MapError: the map cannot be read.
     """
     if str(env) not in entries() and Path(env).is_file():

@@ -1,8 +1,9 @@
-"""The state that the next tick of W worlds depends on: as arrays to go on from, and as a digest.
+"""The state of W worlds that the next tick depends on: as arrays to resume from, and as a digest.
 
-Ownership is a part that changes no result. Worlds of the same zones go on with it, so that vehicles
-change their owner in the same ticks, and a journal goes on as if nothing had been loaded. Worlds of
-other zones leave it out, and give each vehicle to the zone that it is in, as at a reset.
+Ownership is part of the state, but changes no result. Worlds with the same zones restore it, so
+that vehicles change their owners in the same ticks and the journal continues without a break.
+Worlds with different zones ignore it, and give each vehicle to the zone in which it is, as at a
+reset.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ class Parts(NamedTuple):
 
     worlds: Worlds  # of the first shard
     division: ZonedShards  # of all shards
-    departures: DepartureQueue  # through which vehicles come and go
-    traffic: NativeTraffic  # what comes
-    outputs: Outputs  # what agents have got; the frames of the next observation, too
+    departures: DepartureQueue  # through which vehicles enter and leave
+    traffic: NativeTraffic  # departures, routes and arrivals
+    outputs: Outputs  # of the agents, including the frames that the next observation stacks
     coordination: OwnershipRuntime  # decides ownership
     partition: ZonePartition  # the zones
-    repartition_steps_done: int  # that have been made, where zones are cut anew from time to time
-    has_past: bool  # an observation takes something from the one before
-    attached: tuple[Component, ...]  # what acts in each tick beside the traffic
-    sumo: SumoTraffic | None  # beside the worlds; None: there is none
+    repartition_steps_done: int  # steps begun so far, which decide when zones are cut anew
+    has_past: bool  # whether an observation depends on the one before
+    attached: tuple[Component, ...]  # components that act in each tick
+    sumo: SumoTraffic | None  # the other simulator; None: there is none
 
 
 def save(parts: Parts) -> list[Array]:
-    """The arrays; some of them are views, to be copied before the next tick."""
+    """Return the arrays. Some of them are views: copy them before the next tick."""
     worlds, departures = parts.worlds, parts.departures
     waiting = int(departures.num_queue.max(initial=0))
     return [
@@ -66,27 +67,27 @@ def save(parts: Parts) -> list[Array]:
 def load(
     parts: Parts,
     saved: Sequence[Array],
-    ownership: Sequence[SavedOwnership] | None,  # of each world, as `ownership_of` gives it
+    ownership: Sequence[SavedOwnership] | None,  # of each world, as `ownership_of` returns it
     home: int | None = None,  # the zone of this process, if others hold some; see `put_back`
 ) -> DepartureQueue:  # the departure queue, or a larger one
-    """Put everything in its place: vehicles in the zones that they are in, or that owned them.
+    """Restore a state. Vehicles go to their former owners, or to the zones in which they are.
 
     Raises:
-        JournalError: a journal has never ended where it did then.
+        JournalError: the journal does not contain the position that the state names.
     """
     everywhere = np.ones(len(parts.worlds.ticks), dtype=np.bool_)
     rest = iter(saved)
     parts.division.align()
     for array in _fixed(parts):
         array[...] = next(rest)
-    # What is ordered follows from the keys; what has been ordered so far is in the departure queue.
+    # The keys determine all orders; the departure queue holds those that are due already.
     departures = parts.traffic.draw_orders(parts.departures, parts.worlds, everywhere)
     queue = next(rest)
     departures.queue[:, : queue.shape[1]] = queue
     departures.num_passing[:] = 0
     for array in _of_rerouting(parts):
         _put(array, next(rest))
-    next(rest)  # the words of ownership
+    next(rest)  # the packed ownership, which the caller has read
     contacts = next(rest)
     vehicles = [[next(rest) for _ in range(parts.division.count)] for _ in everywhere]
     if home is not None:
@@ -106,7 +107,7 @@ def load(
 
 
 def form_of(parts: Parts) -> StateForm:
-    """What a saved state of these worlds looks like."""
+    """Return the form that a saved state of these worlds must have."""
     rerouting = [*_of_rerouting(parts)]
     return StateForm(
         parts.traffic.network.arrays,
@@ -119,10 +120,10 @@ def form_of(parts: Parts) -> StateForm:
 
 
 def ownership_of(parts: Parts, saved: Sequence[Array]) -> list[SavedOwnership] | None:
-    """The owners of vehicles in a saved state; None: not known, or worlds had other zones.
+    """Return the owners of vehicles in a saved state; None: unknown, or of different zones.
 
     Raises:
-        ConfigError: it says what cannot be.
+        ConfigError: the ownership contradicts the vehicles of the state.
     """
     division, num_worlds = parts.division, len(parts.worlds.ticks)
     if not parts.coordination.coordinators:
@@ -142,9 +143,9 @@ def ownership_of(parts: Parts, saved: Sequence[Array]) -> list[SavedOwnership] |
 
 
 def _has_its_journals(parts: Parts, ownership: Sequence[SavedOwnership]) -> bool:
-    """Whether all journals go on where they ended in a saved state, if there are some.
+    """Return whether all journals, if any, can continue from their position in a saved state.
 
-    Not where a state comes from a file: then a journal says that an episode begins.
+    A state from a file has no position; the journal then begins a new episode.
     """
     pairs = zip(parts.coordination.coordinators, ownership, strict=True)
     return all(
@@ -153,7 +154,7 @@ def _has_its_journals(parts: Parts, ownership: Sequence[SavedOwnership]) -> bool
 
 
 def _ownership(parts: Parts, w: int) -> Array:
-    """(n,) words about the owners of vehicles of one world; none where they are not known here."""
+    """Return the packed ownership (n,) of one world; empty if this process does not know it."""
     saved = parts.coordination.save(w)
     if saved is None:
         return np.zeros(0, dtype=np.int64)
@@ -162,7 +163,7 @@ def _ownership(parts: Parts, w: int) -> Array:
 
 
 def share_of(parts: Parts, w: int) -> list[Array]:
-    """What `save` would give if there were no world but one; some are views, to be copied."""
+    """Return the arrays of `save` for one world alone. Some of them are views: copy them."""
     departures, rerouting = parts.departures, parts.traffic.rerouting
     waiting = departures.queue[w : w + 1, : departures.num_queue.item(w)]
     owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
@@ -185,7 +186,7 @@ def share_of(parts: Parts, w: int) -> list[Array]:
 
 
 def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
-    """What `save` would give of worlds of which each share has been one."""
+    """Join states of single worlds to the arrays that `save` would return for all of them."""
     zones, rerouting = parts.division.count, parts.traffic.rerouting
     if parts.sumo is not None:
         shares = [_shifted(parts, parts.sumo, share, w) for w, share in enumerate(shares)]
@@ -203,7 +204,7 @@ def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
 def _shifted(
     parts: Parts, sumo: SumoTraffic, share: Sequence[Array], worlds: int
 ) -> Sequence[Array]:
-    """A share whose rows and queue are those of so many worlds later."""
+    """Return a copy of a share with its rows and queue moved up by a number of worlds."""
     found = list(share)
     queue = sum(1 for _ in _fixed(parts))
     for n in (queue, *range(len(found) - parts.division.count, len(found))):
@@ -213,7 +214,7 @@ def _shifted(
 
 
 def _stacked(shares: Sequence[Array]) -> Array:
-    """Rows of one world each below one another, shorter ones with zeros behind."""
+    """Return arrays of one world each, stacked; shorter ones are padded with zeros."""
     if shares[0].ndim < 2:
         return np.concatenate(shares)
     longest = max(share.shape[1] for share in shares)
@@ -224,7 +225,7 @@ def _stacked(shares: Sequence[Array]) -> Array:
 
 
 def _fixed(parts: Parts) -> Iterator[Array]:
-    """The arrays whose shapes follow from the environment, (W, …)."""
+    """Yield the arrays whose shapes (W, …) follow from the environment."""
     yield from arrays_of(parts.worlds, SharedState, Use.SAVED)
     yield from arrays_of(parts.departures, DepartureQueue, Use.SAVED)
     for array in arrays_of(parts.outputs, Outputs, Use.SAVED):
@@ -240,13 +241,16 @@ def _of_rerouting(parts: Parts) -> Iterator[Array]:
 
 
 def _put(target: Array, saved: Array) -> None:
-    """Copy what both have: room for the orders of an episode grows as it is needed."""
+    """Copy the part that both arrays have: room for the orders of an episode grows on demand."""
     shared = tuple(slice(min(pair)) for pair in zip(target.shape, saved.shape, strict=True))
     target[shared] = saved[shared]
 
 
 def digest_world(parts: Parts, world: int) -> str:
-    """Hex digest of one world, whatever the order of rows; see `Simulation.state_hash`."""
+    """Return a hex digest of one world, independent of the order of rows.
+
+    See `Simulation.state_hash`.
+    """
     worlds, departures, rerouting = parts.worlds, parts.departures, parts.traffic.rerouting
     sumo = parts.sumo
     rows = parts.division.vehicles(world)

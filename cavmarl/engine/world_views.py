@@ -1,4 +1,4 @@
-"""`WorldViews`: what can be read of running worlds, between two steps."""
+"""`WorldViews`: read access to running worlds between two steps."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class WorldViews:
-    """Read access to W worlds that run; `Simulation` makes and steps them.
+    """Read access to W running worlds; `Simulation` makes and steps them.
 
     Attributes:
-        zones: where the zones are, and which processes run them.
+        zones: the zones, and the processes that run them.
     """
 
     def __init__(
@@ -45,22 +45,22 @@ class WorldViews:
 
     @property
     def num_worlds(self) -> int:
-        """W."""
+        """The number W of worlds."""
         return self._tick.division.num_worlds
 
     @property
     def partition(self) -> ZonePartition:
-        """Where the zones are now."""
+        """The present zones."""
         return self.zones.partition
 
     @property
     def _shard(self) -> Shard:
-        """The first shard; what all shards have in common is read from it."""
+        """The first shard, from which the state that all shards share is read."""
         return self._shards[0]
 
     @property
     def shards(self) -> Sequence[Shard]:
-        """One a zone, for the caller that runs their phases."""
+        """One shard per zone, for the caller that runs their phases."""
         return self._shards
 
     @property
@@ -69,20 +69,20 @@ class WorldViews:
 
     @property
     def outputs(self) -> Outputs:
-        """What the agents got at the end of the last step; arrays that the next step overwrites."""
+        """The agents' outputs of the last step; the next step overwrites these arrays."""
         return self._tick.shared.outputs
 
     @property
     def messages(self) -> Bus:
-        """What vehicles and roadside units tell each other."""
+        """The bus of messages between vehicles and roadside units."""
         for part in self._tick.attached:
             if isinstance(part, V2xComponent):
                 return part.bus
-        raise ConfigError("no messages are sent here: set v2x.enabled to true")
+        raise ConfigError("v2x.enabled = false: there are no messages; set it to true")
 
     @property
     def departures(self) -> DepartureQueue:
-        """Departures waiting in each world, and counts since its reset; resets may replace it."""
+        """Waiting departures of each world, and counts since its reset; a reset may replace it."""
         return self._tick.departures
 
     @property
@@ -97,28 +97,28 @@ class WorldViews:
 
     @property
     def travel(self) -> TripTables:
-        """Types and ways of all vehicles."""
+        """Types and routes of all vehicles."""
         return self._shard.travel
 
     @property
     def scene(self) -> Scene | None:
-        """What is played to the agent of each world."""
+        """The scenario that each world plays to its agent; None: there is none."""
         return self._tick.traffic.scene
 
     @property
     def plans(self) -> NDArray[np.void]:
-        """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
+        """PLAN (G, L): the routes of agents, by `VEHICLE["goal"]`."""
         return self._tick.traffic.plans
 
     @property
     def division(self) -> ZonedShards:
-        """The shards together, and the rows that go between them."""
+        """All shards together, and the rows that are exchanged between them."""
         return self._tick.division
 
     def vehicles(self, world: int = 0) -> NDArray[np.void]:
-        """The live vehicles of one world, VEHICLE records in no order.
+        """Return the vehicles of one world, VEHICLE records in any order.
 
-        A view, or, where the world is divided, a copy.
+        They are a view; in a divided world, a copy.
         """
         return self._tick.division.vehicles(world)
 
@@ -127,40 +127,40 @@ class WorldViews:
 
     @property
     def migrations(self) -> int:
-        """How many vehicles have changed their owner since the worlds were made."""
+        """Number of changes of owner since the worlds were made."""
         return sum(coordinator.switched for coordinator in self.coordinators)
 
     @property
     def coordinators(self) -> tuple[Coordinator, ...]:
-        """The coordinators, one a world; none where all is one zone."""
+        """The coordinators, one per world; none in an undivided world."""
         return self._tick.coordination.coordinators
 
     @property
     def attached(self) -> tuple[Component, ...]:
-        """What acts in each tick beside the traffic."""
+        """The components that act in each tick."""
         return self._tick.attached
 
     @property
     def worlds(self) -> Worlds:
-        """The vehicles and signals of all worlds, for tools that measure; each tick swaps them.
+        """The vehicles and signals of all worlds, for measuring tools. Each tick swaps the arrays.
 
-        A copy where worlds are divided.
+        In divided worlds they are a copy.
         """
         return self._tick.division.whole()
 
     @property
     def mounted(self) -> RigComponent | None:
-        """The rigs of the agents; None: they have none."""
+        """The sensor rigs of the agents; None: there are none."""
         rigs = (part for part in self._tick.attached if isinstance(part, RigComponent))
         return next(rigs, None)
 
     def agent_arrays(self) -> list[NDArray[Any]]:
-        """What is kept of agents, (W, A, …); over nodes each has it of the vehicles it has."""
+        """Return the agents' state arrays (W, A, …). A node has the state of its own vehicles."""
         rig = () if self.mounted is None else self.mounted.arrays()
         return [self._tick.shards[0].worlds.pending, self.outputs.observations, *rig]
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
-        """PHASE rows that are on, (num_signals,)."""
+        """Return the present PHASE rows (num_signals,) of the signals."""
         phases: NDArray[np.int32] = self._shard.worlds.signal_phase[world]
         return phases
 
@@ -169,7 +169,7 @@ class WorldViews:
 
     @property
     def sumo(self) -> SumoTraffic | None:
-        """SUMO beside these worlds; None where `traffic.source` is native."""
+        """SUMO in these worlds; None if `traffic.source` is native."""
         return self._tick.sumo.traffic
 
     def agents_to_come(self) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""`ZoneHosting`: where the zones of running worlds are, and which processes run them."""
+"""`ZoneHosting`: the zones of running worlds, and the processes that run them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ZoneHosting:
     """The zones of the worlds of a `Tick`.
 
     Attributes:
-        partition: where the zones are; it changes if `zones.repartition_steps` is set.
+        partition: the zones; it changes if `zones.repartition_steps` is set.
     """
 
     def __init__(self, tick: Tick, partition: ZonePartition) -> None:
@@ -37,7 +37,7 @@ class ZoneHosting:
         self._repartitioner: Repartitioner | None = None
 
     def let_zones_change(self, network: RoadNetwork, settings: ZonesConfig) -> None:
-        """Look for better zones every `zones.repartition_steps` steps, if that is set."""
+        """Search for better zones every `zones.repartition_steps` steps, if that is set."""
         coordination = self._tick.coordination
         if (
             settings.repartition_steps
@@ -53,7 +53,7 @@ class ZoneHosting:
             )
 
     def before_step(self) -> None:
-        """Take other zones, if it is time and they share out the vehicles better."""
+        """Change the zones, if a search is due and finds zones with a better balance."""
         if self._repartitioner is not None:
             partition = self._repartitioner.before_step(self.partition)
             if partition is not None:
@@ -65,22 +65,22 @@ class ZoneHosting:
         # called with the shards, and with the arguments of the phase `gather`
         make: Callable[[Sequence[Shard], tuple[float, float]], TeamExecutor],
     ) -> None:
-        """From now on let several processes run the phases of the shards, as `make` says.
+        """Let the executor that `make` returns run the phases of the shards in several processes.
 
         Raises:
-            ConfigError: zones may change, and the other processes would not be told.
+            ConfigError: zones may change, which the other processes would not notice.
         """
         self.refuse_changes("the zones of one world over workers")
         self._tick.host(make)
 
     def host_zones(self, peers: Peers, coordination: OwnershipRuntime, executor: Executor) -> None:
-        """From now on run only the zones of this executor; other processes (peers) run the rest."""
+        """Run only the zones of this executor here; other processes (peers) run the rest."""
         tick = self._tick
         tick.peers, tick.coordination, tick.executor = peers, coordination, executor
-        self._repartitioner = None  # no process has the places of all vehicles
+        self._repartitioner = None  # no process has the positions of all vehicles
 
     def set_zones(self, partition: ZonePartition) -> None:
-        """Say where zones are, before they have their vehicles."""
+        """Set the zones, before their vehicles are placed."""
         if partition.content_hash != self.partition.content_hash:
             self.partition = partition
             self._tick.division.divide(partition)
@@ -89,9 +89,9 @@ class ZoneHosting:
         self,
         partition: ZonePartition,
         vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world, of all zones
-        contacts: NDArray[np.int64],  # (W,) that all zones have counted
+        contacts: NDArray[np.int64],  # (W,) counted in all zones
     ) -> None:
-        """Take other zones where peers run some of them; `host_zones` has to follow."""
+        """Change the zones where peers run some of them. Call `host_zones` afterwards."""
         tick = self._tick
         everywhere = np.ones(len(contacts), dtype=np.bool_)
         self.set_zones(partition)
@@ -101,16 +101,16 @@ class ZoneHosting:
         tick.peers.take_up(tick.departures, tick.division.side)
 
     def measure_costs(self, every: int = 1) -> ShardClock:
-        """From now on measure the processor time of each zone, in one tick of `every`."""
-        self.refuse_changes("measuring what each zone costs")
+        """Measure the processor time of each zone from now on, in one tick of `every`."""
+        self.refuse_changes("measuring the cost of each zone")
         clock = ShardClock(self._tick.shards, every)
         self._tick.executor = clock
         return clock
 
     def take_saved(self, saved: SavedOwnership) -> bool:
-        """Take the zones of a saved state; return whether the worlds have these zones now.
+        """Restore the zones of a saved state. Return whether the worlds have these zones now.
 
-        Other zones than the present ones are taken only if zones may change while worlds run.
+        Zones that differ from the present ones are restored only if zones may change in a run.
         """
         if saved.zones.tobytes() != zone_table(self.partition).tobytes():
             if self._repartitioner is None:
@@ -123,23 +123,24 @@ class ZoneHosting:
 
     @property
     def repartition_steps_done(self) -> int:
-        """Steps that count towards the next look for better zones; 0: zones never change."""
+        """Steps begun so far, which decide when a search is due; 0 if zones never change."""
         return 0 if self._repartitioner is None else self._repartitioner.steps
 
     def refuse_changes(self, what: str) -> None:
         """Raise ConfigError if zones may change while the worlds run."""
         if self._repartitioner is not None:
             raise ConfigError(
-                f"zones.repartition_steps: {what} needs zones that stay; leave one out"
+                f"zones.repartition_steps is set, but {what} needs zones that do not change; set "
+                "it to 0"
             )
 
     @property
     def repartitions(self) -> Sequence[Repartition]:
-        """When other zones were taken; see `zones.repartition_steps`."""
+        """The changes of zones so far; see `zones.repartition_steps`."""
         return () if self._repartitioner is None else self._repartitioner.repartitions
 
     def loads(self) -> ZoneLoads:
-        """Return how many vehicles and ghosts each zone has."""
+        """Return the numbers of vehicles and ghosts of each zone."""
         return self._tick.division.loads()
 
     def view(self, world: int = 0) -> ZoneView:
@@ -150,8 +151,5 @@ class ZoneHosting:
         return view_zones(tick.shards, self.partition, halo_m, world, transfers)
 
     def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
-        """Return VEHICLE (n,), what a zone sees of other zones' vehicles in the present tick.
-
-        The view cannot be written.
-        """
+        """Return a read-only view of the ghosts VEHICLE (n,) of a zone in the present tick."""
         return self._tick.division.ghosts(world, zone)

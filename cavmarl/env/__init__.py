@@ -1,4 +1,4 @@
-"""What a policy sees: PettingZoo's view, the vector environment, actions, and registration.
+"""Environments: the PettingZoo environment, the vector environment, actions, and registration.
 
-Stands on `parallel`; `policies`, `adapters` and `evaluate` use it.
+Builds on `parallel`; used by `policies`, `adapters` and `evaluate`.
 """

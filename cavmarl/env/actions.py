@@ -1,4 +1,4 @@
-"""Actions from outside: checked before any state changes, then decoded for the shards."""
+"""Checks the actions of agents before any state changes, and decodes them for the shards."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
 from cavmarl.shards.shard import Commands
 
-# The keys of `parallel_env(lenient=True)`.
+# Values of `parallel_env(lenient=True)`.
 LENIENT = {
     "action.out_of_range": "clip",
     "action.missing_action": "hold",
@@ -28,16 +28,16 @@ class ActionDecoder:
 
     Attributes:
         clipped: (W,) values beyond ±1 that were clipped in this episode (`out_of_range = clip`).
-        held: (W,) missing actions that were replaced by the last one (`missing_action = hold`).
+        held: (W,) missing actions that were replaced by the last action (`missing_action = hold`).
         ignored: (W,) actions for agents that had left (`late_actions = ignore`).
     """
 
     def __init__(
         self,
-        config: ActionConfig,  # what an agent can do
+        config: ActionConfig,  # what the agents can do
         num_worlds: int,  # W
-        agents: Sequence[str],  # the A agent ids
-        # where decoded actions are written, over those of the step before; None: made
+        agents: Sequence[str],  # ids of the A agents
+        # output, overwritten in each step; None: new arrays
         commands: Commands | None = None,
     ) -> None:
         self._config = config
@@ -51,12 +51,12 @@ class ActionDecoder:
             else np.full(shape, config.idle_choice, dtype=np.int64)
         )
         self._idle = self._last.copy()
-        # One for each number: over pairs NumPy takes four times as long.
+        # Has the full shape: NumPy takes four times as long to broadcast a pair.
         self._scale = np.empty((*shape, 2))
         self._scale[:] = config.acceleration_mps2, config.steering_rad
         if commands is None:
             commands = Commands(np.empty((*shape, 2)), np.empty(shape, dtype=np.int64))
-        # (choices, 2) what each choice of a grid means
+        # (choices, 2): acceleration (m/s²) and steering angle (rad) of each choice of a grid
         self._pairs = np.array(config.pairs) * (config.acceleration_mps2, config.steering_rad)
         commands.controls[:] = 0.0
         commands.meta_actions[:] = ACTION_IDLE
@@ -69,7 +69,7 @@ class ActionDecoder:
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
-        """What later actions depend on, and what `tolerated` counts."""
+        """The last actions and the counts of `tolerated`, as arrays that can be saved."""
         return self._last, self.clipped, self.held, self.ignored
 
     @memory.setter
@@ -77,7 +77,7 @@ class ActionDecoder:
         self._last, self.clipped, self.held, self.ignored = memory
 
     def tolerated(self, world: int = 0) -> dict[str, int]:
-        """How many actions of a world's episode were tolerated, by the names of traffic_stats."""
+        """Return how many actions of a world's episode were tolerated, by key of traffic_stats."""
         return {
             "actions_clipped": int(self.clipped[world]),
             "actions_held": int(self.held[world]),
@@ -85,13 +85,13 @@ class ActionDecoder:
         }
 
     def forget(self, chosen: NDArray[np.bool_]) -> None:
-        """Begin an episode in the chosen worlds (W,): no last actions, nothing tolerated."""
+        """Begin an episode in the chosen worlds (W,): clear the last actions and all counts."""
         self._last[chosen] = self._idle[chosen]
         for count in (self.clipped, self.held, self.ignored):
             count[chosen] = 0
 
     def check(self, agent: str, action: Any) -> None:
-        """Refuse an action that cannot be decoded, without decoding it.
+        """Raise an error for an action that cannot be decoded, without decoding it.
 
         Raises:
             ActionError: wrong shape, dtype or value.
@@ -101,13 +101,13 @@ class ActionDecoder:
         self._check_values(batch)
 
     def idle(self) -> Commands:
-        """Commands of a step in which no agent acts."""
+        """Return the commands of a step in which no agent acts."""
         return self._commands(self._idle)
 
     def from_dict(
         self, actions: Mapping[str, Any], live: Sequence[str], needed: Sequence[str]
     ) -> Commands:
-        """Decode the actions of one world; those of live agents without a vehicle are not read."""
+        """Decode the actions of one world. Only those of `needed` agents are read."""
         if not isinstance(actions, Mapping):
             raise ActionError(
                 f"actions are a {type(actions).__name__}: pass a dict from agent id to action"
@@ -135,8 +135,8 @@ class ActionDecoder:
         return self._commands(checked)
 
     def from_array(self, actions: Any, mask: NDArray[np.bool_]) -> Commands:
-        """Decode the actions of all worlds; entries where `mask` (W, A) is False are not read."""
-        if self._decode_at_once(actions, mask):
+        """Decode the actions of all worlds. Entries where `mask` (W, A) is False are not read."""
+        if self._decode_fast(actions, mask):
             return self._decoded
         array = self._as_numbers(actions, "actions")
         if array.shape != self._last.shape:
@@ -151,8 +151,8 @@ class ActionDecoder:
         self._last = checked
         return self._commands(checked)
 
-    def _decode_at_once(self, actions: Any, mask: NDArray[np.bool_]) -> bool:
-        """Decode actions of a usual kind if all are in range; False: look closer."""
+    def _decode_fast(self, actions: Any, mask: NDArray[np.bool_]) -> bool:
+        """Decode arrays of a common dtype whose values are in range; otherwise return False."""
         if type(actions) is not np.ndarray or actions.shape != self._last.shape:
             return False
         if not (actions.flags.carray and mask.flags.carray):
@@ -177,7 +177,7 @@ class ActionDecoder:
         )  # fmt: skip
 
     def encode(self, raw: NDArray[np.float64]) -> NDArray[Any]:
-        """The inverse of decoding: actions (W, A, …) for raw controls (W, A, 2) as suggested."""
+        """Return the actions (W, A, …) nearest to raw controls (W, A, 2); inverse of decoding."""
         if self._continuous:
             shares: NDArray[Any] = np.clip(raw / self._scale, -1.0, 1.0).astype(np.float32)
             return shares
@@ -194,26 +194,26 @@ class ActionDecoder:
         return np.array([self._index[agent] for agent in agents], dtype=np.intp)
 
     def _check_ids(self, actions: Mapping[str, Any], live: Sequence[str]) -> int:
-        """How many actions are for agents that are not there; refuses those that never could be."""
+        """Return how many actions are for absent agents; raise an error for unknown ids."""
         alive = set(live)
         if actions.keys() <= alive:
             return 0
-        strangers = [agent for agent in actions if agent not in self._index]
-        if strangers:
+        unknown = [agent for agent in actions if agent not in self._index]
+        if unknown:
             raise ActionError(
-                f"no agent {strangers[0]!r}: the ids are {self._agents[0]} … {self._agents[-1]}"
+                f"no agent {unknown[0]!r}: the ids are {self._agents[0]} … {self._agents[-1]}"
             )
         late = [agent for agent in actions if agent not in alive]
         if late and self._config.late_actions == "error":
             raise ActionError(
-                f"{', '.join(late)}: not in the world now; pass actions for the ids in env.agents "
+                f"{', '.join(late)}: not in the episode; pass actions for the ids in env.agents "
                 "only, or set action.late_actions = ignore"
             )
         return len(late)
 
     def _stack(self, values: list[Any], agents: Sequence[str]) -> NDArray[Any]:
-        """The actions as one array; refuses the first that has another shape or is no number."""
-        alike = self._stack_alike(values)
+        """Return the actions as one array; raise an error for a wrong shape or dtype."""
+        alike = self._stack_uniform(values)
         if alike is not None:
             return alike
         shape = self._last.shape[2:]
@@ -225,10 +225,10 @@ class ActionDecoder:
             arrays.append(array)
         return np.stack(arrays)
 
-    def _stack_alike(self, values: list[Any]) -> NDArray[Any] | None:
-        """The actions as one array where all are of one kind that needs no look at each; or None.
+    def _stack_uniform(self, values: list[Any]) -> NDArray[Any] | None:
+        """Return the actions as one array if they share a type that needs no check of each action.
 
-        That is what policies give, and it takes a fifth of the time.
+        Otherwise return None. This fast path takes a fifth of the time; most policies use it.
         """
         kinds = set(map(type, values))
         if self._continuous:
@@ -243,35 +243,35 @@ class ActionDecoder:
         return None
 
     def _as_numbers(self, value: Any, name: str) -> NDArray[Any]:
-        """An array of a dtype that loses nothing when it is cast; refuses what is none."""
+        """Return an array of a dtype that can be cast without loss; raise an error for others."""
         kind = "numbers" if self._continuous else "whole numbers"
         try:
             array = np.asarray(value)
         except ValueError as error:
-            raise ActionError(f"{name}: no array of {kind}: {error}") from error
+            raise ActionError(f"{name}: not an array of {kind}: {error}") from error
         if array.dtype.kind not in ("fiu" if self._continuous else "iu"):
-            raise ActionError(f"{name}: dtype {array.dtype} given, {kind} needed")
+            raise ActionError(f"{name}: dtype is {array.dtype}; pass {kind}")
         if array.dtype == np.uint64:
-            # Cast to int64 the largest ones would wrap around.
+            # A cast of the largest values to int64 would wrap around.
             array = np.minimum(array, np.uint64(np.iinfo(np.int64).max)).astype(np.int64)
         return array
 
     def _check_values(self, batch: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64] | int]:
-        """(values in range, how many were clipped in each world)."""
+        """Return the values in range, and how many values were clipped in each world."""
         if not self._continuous:
             wrong = (batch < 0) | (batch >= self._config.choices)
             if wrong.any():
                 self._refuse(batch, wrong, f"must be from 0 to {self._config.choices - 1}")
             return batch, 0
         size = np.abs(batch)
-        if size.max(initial=0.0) <= 1.0:  # False of what is no number, too
+        if size.max(initial=0.0) <= 1.0:  # also False for NaN
             return batch, 0
         beyond = ~(size <= 1.0)
         if not np.isfinite(batch).all():
             self._refuse(batch, ~np.isfinite(batch), "must be finite")
         if self._config.out_of_range == "error":
             self._refuse(
-                batch, beyond, "must be within [-1, 1]; action.out_of_range = clip cuts it off"
+                batch, beyond, "must be within [-1, 1]; to clip it, set action.out_of_range = clip"
             )
         return np.clip(batch, -1.0, 1.0), beyond.sum(axis=(1, 2))
 
@@ -288,7 +288,7 @@ class ActionDecoder:
         decoded = self._decoded
         if self._continuous:
             np.multiply(batch, self._scale, out=decoded.controls)
-            np.add(decoded.controls, 0.0, out=decoded.controls)  # of -0.0 too, 0.0
+            np.add(decoded.controls, 0.0, out=decoded.controls)  # turns -0.0 into 0.0
         elif self._config.kind == "grid":
             decoded.controls[:] = self._pairs[batch]
         else:
@@ -297,7 +297,7 @@ class ActionDecoder:
 
 
 def _nearest(values: tuple[float, ...], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The places of the values that are nearest to the wanted ones; of two, the first."""
+    """Return the indices of the values nearest to the wanted ones; the first one wins a tie."""
     away = np.abs(wanted[..., None] - np.array(values))
     found: NDArray[np.int64] = away.argmin(axis=-1)
     return found

@@ -1,4 +1,4 @@
-"""`AgentDicts`: rows of the step arrays as dicts from agent to observation and to info."""
+"""Rows of the step arrays as dicts: from agent to observation, and from agent to info."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from cavmarl.parallel.worlds.step_arrays import StepArrays
 
 Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 Listed = NDArray[np.intp] | slice
-"""Which rows of an array are those of the agents in the episode."""
+"""Rows of an array that belong to the agents in the episode."""
 
-# What an agent's info holds, behind the terms.
+# Keys of an agent's info after the terms.
 _OF_VEHICLE = ("active", "vehicle_done", "vehicle_id")
 
 
 class AgentDicts:
-    """Makes the dicts of one world as PettingZoo has them.
+    """Makes the dicts of one world that PettingZoo's API returns.
 
     Args:
-        config: of the world.
+        config: configuration of the world.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -42,7 +42,7 @@ class AgentDicts:
     def observations(
         self, arrays: StepArrays, agents: list[str], listed: Listed
     ) -> dict[str, Observation]:
-        """Return the observation of each agent, copied."""
+        """Return a copy of each agent's observation."""
         if self._senses:
             sensed = {
                 name: data[0, listed].copy()
@@ -65,7 +65,7 @@ class AgentDicts:
     def infos(
         self, arrays: StepArrays, agents: list[str], listed: Listed
     ) -> dict[str, dict[str, float]]:
-        """Return the info of each agent: every term, and what its vehicle is."""
+        """Return the info of each agent: every term, and the state of its vehicle."""
         done, ids = arrays.vehicle_done[0, listed], arrays.vehicle_ids[0, listed]
         active = (ids >= 0) & ~done
         terms = arrays.terms[0, listed].T

@@ -1,4 +1,4 @@
-"""When worlds that are over begin anew, by Gymnasium's names for it."""
+"""Gymnasium's autoreset modes: when a world whose episode is over begins a new one."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from cavmarl.core.errors import ConfigError, EpisodeError
 
 
 def known_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """Gymnasium's mode of that name.
+    """Return Gymnasium's mode of that name.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no such mode.
     """
     try:
         return AutoresetMode(mode)
@@ -26,27 +26,27 @@ def known_mode(mode: AutoresetMode | str) -> AutoresetMode:
 
 
 def present_mode(in_next_step: bool, disabled: bool) -> AutoresetMode:
-    """The mode of worlds that would begin anew in the next step, or in the same."""
+    """Return the mode of worlds that reset in the next step, or in the same step."""
     if disabled:
         return AutoresetMode.DISABLED
     return AutoresetMode.NEXT_STEP if in_next_step else AutoresetMode.SAME_STEP
 
 
 def refuse_over(over: NDArray[np.bool_]) -> None:
-    """Refuse a step of worlds of which some wait for a reset.
+    """Raise an error if a world still waits for a reset.
 
     Raises:
-        EpisodeError: a world is over; (W,).
+        EpisodeError: the episode of a world (W,) is over.
     """
     if over.any():
         raise EpisodeError(
-            f"world {int(over.argmax())} is over, and autoreset_mode is 'Disabled': call "
-            "reset(options={'reset_mask': …}) before the next step()"
+            f"the episode of world {int(over.argmax())} is over, and autoreset_mode is 'Disabled': "
+            "call reset(options={'reset_mask': …}) before the next step()"
         )
 
 
 def with_rows(array: NDArray[Any], others: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
-    """A copy of an array (W, …) with the chosen rows (W,) of another one."""
+    """Return a copy of an array (W, …) with the chosen rows (W,) taken from another array."""
     found = array.copy()
     found[chosen] = others[chosen]
     return found

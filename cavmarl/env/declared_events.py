@@ -1,4 +1,4 @@
-"""`DeclaredEvents` holds events that agents want to send, until the next step."""
+"""Events that agents want to announce by message, held until the next step."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.v2x.v2x_messages import cause_code
 
 
 class DeclaredEvents:
-    """At most one event an agent and step; a later one takes the place of an earlier one."""
+    """At most one event per agent and step; a later event replaces an earlier one."""
 
     def __init__(self, config: EnvConfig, num_worlds: int) -> None:
         self._enabled = config.v2x.enabled
@@ -23,7 +23,7 @@ class DeclaredEvents:
 
     @property
     def memory(self) -> NDArray[np.int32]:
-        """(W, A) what has been declared for the next step."""
+        """(W, A) codes of the events that are declared for the next step."""
         return self._causes
 
     @memory.setter
@@ -33,21 +33,22 @@ class DeclaredEvents:
 
     def declare(self, world: int, agent: int, cause: str) -> None:
         if not self._enabled:
-            raise ConfigError("no messages are sent here: set v2x.enabled to true")
+            raise ConfigError("no messages are sent in this world: set v2x.enabled to true")
         num_worlds, num_agents = self._causes.shape
         if not (0 <= world < num_worlds and 0 <= agent < num_agents):
             raise ActionError(
-                f"agent {agent} of world {world}: there are {num_agents} in each of {num_worlds}"
+                f"agent {agent} of world {world}: there are {num_agents} agents in each of "
+                f"{num_worlds} worlds"
             )
         self._causes[world, agent] = cause_code(cause)
         self._are_any = True
 
     def add_to(self, commands: Commands) -> Commands:
-        """Commands of a step with all that has been declared for it, which waits until `taken`."""
+        """Return the commands with the declared events, which are held until `clear`."""
         return replace(commands, declared=self._causes.copy()) if self._are_any else commands
 
-    def taken(self) -> None:
-        """The step has been: nothing waits any more."""
+    def clear(self) -> None:
+        """Drop the declared events after the step that sent them."""
         if self._are_any:
             self._causes[:] = 0
             self._are_any = False

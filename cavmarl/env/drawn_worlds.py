@@ -1,4 +1,4 @@
-"""What can be drawn of the worlds that an environment steps, and the copy that is drawn."""
+"""Which worlds of an environment can be drawn, and the local copy that is drawn."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from cavmarl.parallel.worlds.step_arrays import StepArrays, SteppedWorlds
 
 RENDER_MODES = ("human", "rgb_array")
 
-# The terms that say how an agent's vehicle ended.
+# Terms of the events that end the trip of an agent's vehicle.
 _ENDS = {
     TERMS.index("collision"): EVENT_COLLIDED,
     TERMS.index("off_road"): EVENT_OFF_ROAD,
@@ -42,10 +42,10 @@ def check_rendering(
     backend: BackendName,
     modes: tuple[str, ...] = RENDER_MODES,
 ) -> None:
-    """Refuse what cannot be drawn.
+    """Raise an error for worlds that cannot be drawn.
 
     Raises:
-        ConfigError: a mode that is not one of `modes`, or worlds whose state cannot be had here.
+        ConfigError: the mode is not one of `modes`, or the worlds' state is not available here.
     """
     if render_mode is None:
         return
@@ -55,19 +55,19 @@ def check_rendering(
     if not backend.is_local and (with_sumo or not shows_state(backend)):
         what = f" and traffic.source = {config.traffic.source!r}" if with_sumo else ""
         raise ConfigError(
-            f"render_mode = {render_mode!r} with backend = '{backend}'{what}: such worlds are only "
-            "drawn in the caller's process; use backend='local'"
+            f"render_mode = {render_mode!r} with backend = '{backend}'{what}: such worlds can only "
+            "be drawn in the caller's process; use backend='local'"
         )
 
 
 class WorldCopy:
-    """The worlds of an environment in this process: themselves, or a copy of remote ones."""
+    """The worlds of an environment in this process: local worlds, or a copy of remote ones."""
 
     def __init__(self) -> None:
         self._copied: LocalWorlds | None = None
 
     def standing(self, worlds: SteppedWorlds) -> Simulation:
-        """Return the worlds, or a copy of them as they have been at some time."""
+        """Return the local worlds, or a copy of remote worlds as of some earlier time."""
         if isinstance(worlds, LocalWorlds):
             return worlds.simulation
         if self._copied is None:
@@ -75,7 +75,7 @@ class WorldCopy:
         return self._copied.simulation
 
     def present(self, worlds: SteppedWorlds) -> Simulation:
-        """Return the worlds, or a copy of them as they are now."""
+        """Return the local worlds, or an up-to-date copy of remote worlds."""
         simulation = self.standing(worlds)
         if self._copied is not None:
             if isinstance(worlds, NodeWorlds):
@@ -91,7 +91,7 @@ class WorldCopy:
 
 
 def vehicles_that_ended(arrays: StepArrays, world: int) -> NDArray[np.void]:
-    """Return ENDED of the last step of a world."""
+    """Return ENDED: the agents whose vehicles ended in the last step of a world, and why."""
     if not arrays.vehicle_done[world].any():
         return NONE_ENDED
     agents = np.flatnonzero(arrays.vehicle_done[world])

@@ -1,4 +1,4 @@
-"""`Insertions`: what is put into running worlds from outside, until the next step."""
+"""Vehicles and barriers that a user adds to running worlds, held until the next step."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.shards.shard import Commands
 
 _CARS = 1 << VEHICLE_CLASSES.index("passenger")
-INSERTED, CLOSED, OPENED = "inserted", "closed", "opened"  # kinds of the events that tell of it
+INSERTED, CLOSED, OPENED = "inserted", "closed", "opened"  # kinds of frame events
 
 Asked = tuple[tuple[str, str], ...]
-"""Kind and detail of what was put into a world in one step, as `WorldFrame.asked` has it."""
+"""Kind and detail of the insertions into a world in one step, in the form of `WorldFrame.asked`."""
 
 
 class Insertions:
     """Vehicles and barriers for W worlds, at most `population.insertions` in an episode of each.
 
     Args:
-        config: of the worlds.
-        network: their map.
-        num_worlds: W.
+        config: configuration of the worlds.
+        network: map of the worlds.
+        num_worlds: number of worlds, W.
     """
 
     def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int) -> None:
@@ -41,13 +41,14 @@ class Insertions:
         self._lanes = {name: k for k, name in enumerate(network.lane_ids)} if self._most else {}
         self._rows = np.zeros((num_worlds, self._most, 3))
         self._waiting = np.zeros(num_worlds, dtype=np.int64)
-        self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, with those that wait
-        self._barriers = np.full((num_worlds, self._most), -1)  # LANE of each that stands; -1: none
-        self._told: list[Asked] = [()] * num_worlds  # of the last step
+        self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, waiting ones included
+        # LANE of each standing barrier; -1: none
+        self._barriers = np.full((num_worlds, self._most), -1)
+        self._last: list[Asked] = [()] * num_worlds  # insertions of the last step
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
-        """What waits, how many there have been, and which lanes are closed."""
+        """Waiting insertions, their number, the number in the episode, and the closed lanes."""
         return self._rows, self._waiting, self._used, self._barriers
 
     @memory.setter
@@ -55,31 +56,31 @@ class Insertions:
         self._rows[:], self._waiting[:], self._used[:], self._barriers[:] = memory
 
     def vehicle(self, world: int, lane: str, position_m: float) -> None:
-        """Let a car enter on a lane, at a place of its front bumper.
+        """Let a car enter on a lane, with its front bumper at a given position.
 
         Raises:
-            ActionError: no such world, lane or place, or cars may not drive there.
-            CapacityError: there have been as many as there is room for.
-            ConfigError: nothing may be put into these worlds.
+            ActionError: there is no such world, lane or position, or cars may not drive there.
+            CapacityError: the episode already has all insertions that are allowed.
+            ConfigError: these worlds allow no insertions.
         """
         row = self._lane(world, lane)
         length_m = float(self._network.lanes["length_m"][row])
         if not 0.0 <= position_m <= length_m:
             raise ActionError(
-                f"position_m = {position_m:g}: lane {lane} is {length_m:.1f} m long; give a place "
-                "on it"
+                f"position_m = {position_m:g}: lane {lane} is {length_m:.1f} m long; give a "
+                "position on it"
             )
         self._add(world, [(INSERT_VEHICLE, row, position_m)])
 
     def barrier(self, world: int, edge: str) -> None:
-        """Let a car stand on each lane of an edge until it is opened; raises likewise."""
+        """Place a standing car on each lane of an edge until it is opened; raises as `vehicle`."""
         lanes = self._network.lanes
         rows = self._lanes_of(world, edge)
         rows = rows[(lanes["permissions"][rows] & _CARS) != 0]
         if not len(rows) or lanes["internal"][rows].any():
-            raise ActionError(f"edge {edge!r}: cars drive on no lane of it; give a road")
+            raise ActionError(f"edge {edge!r}: no lane of it is open to cars; give a road")
         if np.isin(rows, self._barriers[world]).any():
-            raise ActionError(f"edge {edge!r}: it is closed already; open it, or close another one")
+            raise ActionError(f"edge {edge!r} is closed already; open it, or close another one")
         self._add(world, [(INSERT_BARRIER, int(row), 0.0) for row in rows])
         free = np.flatnonzero(self._barriers[world] < 0)
         self._barriers[world, free[: len(rows)]] = rows
@@ -87,17 +88,17 @@ class Insertions:
     def no_barrier(self, world: int, edge: str) -> None:
         """Let the cars that close an edge drive on.
 
-        Those that no step has put there yet are not, and there is room for others.
+        Cars that no step has placed yet are cancelled, and no longer count.
 
         Raises:
-            ActionError: no such world or edge, or it is not closed.
-            ConfigError: nothing may be put into these worlds.
+            ActionError: there is no such world or edge, or the edge is not closed.
+            ConfigError: these worlds allow no insertions.
         """
-        mine = np.isin(self._barriers[world], self._lanes_of(world, edge))
-        lanes = self._barriers[world, mine]
+        stands = np.isin(self._barriers[world], self._lanes_of(world, edge))
+        lanes = self._barriers[world, stands]
         if not len(lanes):
-            raise ActionError(f"edge {edge!r}: it is not closed; give the id of one that is")
-        self._barriers[world, mine] = -1
+            raise ActionError(f"edge {edge!r} is not closed; give the id of a closed edge")
+        self._barriers[world, stands] = -1
         waiting = self._rows[world, : self._waiting[world]].copy()
         new = (waiting[:, 0] == INSERT_BARRIER) & np.isin(waiting[:, 1], lanes)
         if new.any():
@@ -110,7 +111,7 @@ class Insertions:
         self._waiting[world] = len(opened)
 
     def closed(self, world: int) -> tuple[str, ...]:
-        """Edges that are closed, by id."""
+        """Return the ids of the closed edges."""
         lanes = self._barriers[world]
         edges = np.unique(self._network.lanes["edge"][lanes[lanes >= 0]])
         return tuple(self._network.edge_ids[edge] for edge in edges.tolist())
@@ -125,11 +126,11 @@ class Insertions:
     def _check(self, world: int) -> None:
         if not self._most:
             raise ConfigError(
-                "nothing may be put into these worlds: set population.insertions to how many "
-                "vehicles may be in one episode"
+                "these worlds allow no insertions: set population.insertions to the number of "
+                "vehicles that may be inserted in an episode"
             )
         if not 0 <= world < len(self._used):
-            raise ActionError(f"world {world}: there are the worlds 0 to {len(self._used) - 1}")
+            raise ActionError(f"world {world}: must be from 0 to {len(self._used) - 1}")
 
     def _lane(self, world: int, lane: str) -> int:
         self._check(world)
@@ -137,33 +138,33 @@ class Insertions:
         if row < 0:
             raise ActionError(f"lane {lane!r}: the map has no such lane; give the id of one")
         if lanes["internal"][row] or not lanes["permissions"][row] & _CARS:
-            raise ActionError(f"lane {lane!r}: cars enter on no such lane; give one of a road")
+            raise ActionError(f"lane {lane!r}: cars cannot enter there; give a car lane of a road")
         return row
 
     def _add(self, world: int, rows: list[tuple[int, int, float]]) -> None:
         used, waiting = int(self._used[world]), int(self._waiting[world])
         if used + len(rows) > self._most:
             raise CapacityError(
-                f"{len(rows)} more vehicles for world {world}: {used} of population.insertions = "
-                f"{self._most} have been put there in this episode; set it higher, or reset"
+                f"world {world}, {len(rows)} more vehicles: {used} of population.insertions = "
+                f"{self._most} have been inserted in this episode; set it higher, or reset"
             )
         self._rows[world, waiting : waiting + len(rows)] = rows
         self._waiting[world] += len(rows)
         self._used[world] += len(rows)
 
     def add_to(self, commands: Commands) -> Commands:
-        """Commands of a step with all that was asked for, which waits until `taken`."""
+        """Return the commands with the waiting insertions, which are held until `clear`."""
         return replace(commands, inserted=self._rows.copy()) if self._most else commands
 
-    def taken(self) -> None:
-        """The step has been: nothing waits any more."""
+    def clear(self) -> None:
+        """Drop the waiting insertions after the step that carried them out."""
         if self._most:
-            self._told = [self._text(w, count) for w, count in enumerate(self._waiting.tolist())]
+            self._last = [self._texts(w, count) for w, count in enumerate(self._waiting.tolist())]
             self._rows[:] = INSERT_NONE
             self._waiting[:] = 0
 
-    def _text(self, world: int, count: int) -> Asked:
-        """What waits, in words: a road once."""
+    def _texts(self, world: int, count: int) -> Asked:
+        """Return the waiting insertions in words, each road once."""
         network = self._network
         found: list[tuple[str, str]] = []
         for kind, lane, place in self._rows[world, :count].tolist():
@@ -171,14 +172,14 @@ class Insertions:
                 found.append((INSERTED, f"{network.lane_ids[int(lane)]} {place!r}"))
                 continue
             edge = network.edge_ids[int(network.lanes["edge"][int(lane)])]
-            told = (CLOSED if kind == INSERT_BARRIER else OPENED, edge)
-            if told not in found:
-                found.append(told)
+            event = (CLOSED if kind == INSERT_BARRIER else OPENED, edge)
+            if event not in found:
+                found.append(event)
         return tuple(found)
 
-    def told(self, world: int) -> Asked:
-        """What was put into a world in the last step."""
-        return self._told[world]
+    def last(self, world: int) -> Asked:
+        """Return the insertions into a world in the last step."""
+        return self._last[world]
 
     def forget(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,)."""
@@ -187,4 +188,4 @@ class Insertions:
         self._rows[chosen] = INSERT_NONE
         self._waiting[chosen] = 0
         for world in np.flatnonzero(chosen).tolist():
-            self._told[world] = ()
+            self._last[world] = ()

@@ -1,4 +1,4 @@
-"""`CavEnv`: one world as a PettingZoo parallel environment, a view on the batched simulation."""
+"""`CavEnv`: one world as a PettingZoo parallel environment, on top of the batched simulation."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ def parallel_env(
 
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
-        lenient: for libraries that act for absent agents, or beyond the bounds: values are clipped,
-            actions of agents that have left ignored, and missing ones are the last, or 0. Sets
-            action.out_of_range, .missing_action and .late_actions; traffic_stats() counts each.
+        lenient: for libraries that act for absent agents or beyond the bounds. Values are clipped,
+        actions of absent agents are ignored, and a missing action repeats the agent's last one,
+        or 0. Sets action.out_of_range, .missing_action, .late_actions; traffic_stats() counts.
         world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
             sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
 
     Raises:
-        ConfigError: a key, value or combination that cannot work.
-        PolicyError: `sensors_of` is no trained driver.
-        MapError: the map cannot be read or driven.
-        WorkerError: worker processes cannot be started, or have no memory.
-        MissingExtraError, RecordingError: no Ray, or pyarrow; `record` cannot be written.
+        ConfigError: a key, a value or a combination is not possible.
+        PolicyError: `sensors_of` is not a trained driver.
+        MapError: the map cannot be read, or vehicles cannot drive on it.
+        WorkerError: worker processes cannot be started, or have too little memory.
+        MissingExtraError, RecordingError: Ray or pyarrow is missing; `record` cannot be written.
     """
     overrides = world.get("overrides")
     if lenient and isinstance(overrides, Mapping | None):
@@ -68,25 +68,25 @@ def parallel_env(
 
 
 def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
-    """One flag an agent; in most steps none is set."""
+    """Return one flag per agent; fast if no flag is set, as in most steps."""
     if not flags.any():
         return dict.fromkeys(agents, False)
     return dict(zip(agents, flags.tolist(), strict=True))
 
 
 class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
-    """One world.
+    """One world as a PettingZoo parallel environment.
 
-    Observations, actions and rewards are described in docs/reference/environments.md. The infos of
-    each agent hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that
-    vehicle's trip ended in this step) and `vehicle_id`; all are plain numbers.
+    docs/reference/environments.md describes observations, actions and rewards. The info of each
+    agent holds every term by its name, and `active` (the agent has a vehicle), `vehicle_done` (that
+    vehicle's trip ended in this step) and `vehicle_id`. All values are plain numbers.
 
-    It runs here, or its zones over worker processes, the same bit for bit
-    (docs/guides/divide_a_world.md).
+    The world runs in this process, or its zones run in worker processes. Results are the same bit
+    for bit (docs/guides/divide_a_world.md).
 
     Args:
-        worlds: the one world; it begins anew in the next step, which never comes: a reset does.
-        seed: of the first reset, if that is given none.
+        worlds: one world. It must not reset in the same step; `reset` begins its next episode.
+        seed: seed of the first reset if that call has none.
         render_mode: `human`, `rgb_array` or None.
     """
 
@@ -115,15 +115,15 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._max_cycles = config.max_steps
         self._steps = 0
         self._rows: NDArray[np.intp]
-        self._listed: Listed  # the same
+        self._listed: Listed  # indexes the same rows
         self._list(np.zeros(0, dtype=np.intp))
 
     @property
     def max_cycles(self) -> int:
-        """Steps until truncation; it can be set to fewer than the environment was made for.
+        """Steps until truncation. It can be set to fewer steps than the environment was made for.
 
         Raises:
-            ConfigError: it is set to another number.
+            ConfigError: it is set to a number outside that range.
         """
         return self._max_cycles
 
@@ -132,17 +132,17 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         most = self.config.max_steps
         if not isinstance(steps, int | np.integer) or not 1 <= steps <= most:
             raise ConfigError(
-                f"max_cycles = {steps!r}: must be a whole number from 1 to {most}, for which the "
-                "environment was made; for more, pass max_cycles to parallel_env"
+                f"max_cycles = {steps!r}: must be a whole number from 1 to {most}, the horizon of "
+                "the environment; for more, pass max_cycles to parallel_env"
             )
         self._max_cycles = int(steps)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The same object at each call and for each agent."""
+        """Return the observation space: the same object for all agents and calls."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The same object at each call and for each agent."""
+        """Return the action space: the same object for all agents and calls."""
         return self.action_spaces[agent]
 
     def reset(
@@ -151,8 +151,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         """Begin an episode.
 
         Args:
-            seed: root of all random numbers; None goes on with the next episode of the last seed.
-            options: not used; accepted because the API has it.
+            seed: root of all random numbers; None begins the next episode of the last seed.
+            options: not used; the API requires it.
         """
         self._session.reset(seed, np.ones(1, dtype=np.bool_))
         self._steps = 0
@@ -162,14 +162,14 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         return self._observations(), self._infos()
 
     def step(self, actions: Mapping[str, Any]) -> Stepped:
-        """Let every agent act and the world go on for `step_s` seconds.
+        """Let every agent act, and advance the world by `step_s` seconds.
 
-        Agents that enter during the step are in the results, with reward 0. When all agents have
-        left and more are to come, the world goes on until one enters.
+        The results include agents that enter during the step, with reward 0. When all agents have
+        left and more are still to enter, the world advances until one enters.
 
         Raises:
-            EpisodeError: before the first reset; actions after everybody has left.
-            ActionError: a refused action; nothing has changed and the step can be repeated.
+            EpisodeError: before the first reset, or there are actions after all agents have left.
+            ActionError: an action is invalid. Nothing has changed, and the step can be repeated.
         """
         if not self._session.is_ready:
             raise EpisodeError("step() before reset(): call env.reset(seed=…) first")
@@ -185,7 +185,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         return self._report()
 
     def _report(self) -> Stepped:
-        """What the agents get after a step; decides which stay."""
+        """Return the results of a step, and drop the agents that have left."""
         arrays, truncated = self.worlds.arrays, self._steps >= self.max_cycles
         if not truncated:
             entered = arrays.vehicle_ids[0] >= 0
@@ -215,15 +215,15 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         return observations, rewards, terminations, truncations, infos
 
     def _list(self, rows: NDArray[np.intp]) -> None:
-        """Make these agents, by their index, the ones in the episode."""
+        """Set the agents in the episode, given by their index."""
         self._rows = rows
         self.agents = [self.possible_agents[k] for k in rows.tolist()]
-        # The first ones in their order, which is the usual case, can be taken without a copy.
+        # A slice takes agents in their usual order without a copy.
         in_order = bool((rows == np.arange(rows.size)).all())
         self._listed = slice(rows.size) if in_order else rows
 
     def _wait_for_agents(self) -> None:
-        """Let an empty world go on until an agent enters; ends without one at the horizon."""
+        """Advance an empty world until an agent enters, or until the horizon."""
         arrays = self.worlds.arrays
         while not arrays.episode_over[0] and self._steps < self._max_cycles:
             self._session.step(self._session.decoder.idle())
@@ -239,83 +239,85 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         return self._dicts.infos(self.worlds.arrays, self.agents, self._listed)
 
     def declare_event(self, agent: str, cause: str) -> None:
-        """Let an agent's vehicle tell others of an event in the next step (docs/reference/v2x.md).
+        """Let an agent's vehicle announce an event in the next step (docs/reference/v2x.md).
 
         Args:
-            agent: which has a vehicle.
+            agent: id of an agent with a vehicle.
             cause: `collision`, `obstacle`, `stationary` or `hard_braking`.
 
         Raises:
-            ActionError: no such agent, or it has left.
-            ConfigError: no such cause, or no messages are sent in this environment.
+            ActionError: there is no such agent, or it has left.
+            ConfigError: there is no such cause, or this environment sends no messages.
         """
         if agent not in self.agents:
-            raise ActionError(f"declare_event('{agent}', …): it is not in the episode")
+            raise ActionError(
+                f"declare_event({agent!r}, …): not in the episode; give an id from env.agents"
+            )
         self._session.events.declare(0, self.possible_agents.index(agent), cause)
 
     def frames(self, agent: str) -> dict[str, SensorFrames]:
-        """What the sensors of an agent's `rig` have got in the last step, by name.
+        """Return the samples of the last step of each sensor of an agent's `rig`, by sensor name.
 
-        The arrays are those of `SensorFrames` without the axes of worlds and agents.
+        The arrays are those of `SensorFrames`, without the axes of worlds and agents.
 
         Raises:
             ActionError: there is no such agent.
         """
         if agent not in self.possible_agents:
             raise ActionError(
-                f"no agent {agent!r}: there are {self.possible_agents[0]} to "
+                f"no agent {agent!r}: the ids are {self.possible_agents[0]} … "
                 f"{self.possible_agents[-1]}"
             )
         k = self.possible_agents.index(agent)
         return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
 
     def check_action(self, agent: str, action: Any) -> None:
-        """Refuse an action that `step` would refuse, before anything is kept of it.
+        """Raise the error that `step` would raise for an action, without acting.
 
         Raises:
-            ActionError: wrong shape, dtype or value.
+            ActionError: the shape, the dtype or a value is wrong.
         """
         self._session.decoder.check(agent, action)
 
     def state(self) -> NDArray[np.float32]:
-        """The global state, within `state_space`: see `engine.spaces.global_state`."""
+        """Return the global state, within `state_space`: see `engine.spaces.global_state`."""
         self.worlds.write_states()
         state: NDArray[np.float32] = self.worlds.arrays.states[0].copy()
         return state
 
     def state_hash(self) -> str:
-        """Hex digest over all live vehicles in id order, signals, queue and random keys."""
+        """Return a hex digest of all vehicles in id order, signals, the queue and random keys."""
         return self.worlds.state_hash(0)
 
     def traffic_stats(self) -> dict[str, float]:
-        """Traffic since reset: departed, waiting, running, arrived, contacts, mean speed and more.
+        """Return traffic counts since the reset: departed, arrived, contacts, mean speed and more.
 
-        All fields of `engine.traffic_stats.TrafficStats`, and how many actions were clipped, held
-        and ignored.
+        The keys are the fields of `engine.traffic_stats.TrafficStats`, and the numbers of actions
+        that were clipped, held and ignored.
         """
         return {**self.worlds.traffic_stats(0), **self._session.decoder.tolerated()}
 
     def suggest_actions(self) -> dict[str, Any]:
-        """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
+        """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent."""
         self.worlds.suggest()
         batch = self._session.decoder.encode(self.worlds.arrays.suggested)[0]
         return dict(zip(self.agents, batch[self._rows], strict=True))
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A frame (height, width, 3) for `rgb_array`; None and a window for `human`.
+        """Return a frame (height, width, 3) for `rgb_array`; for `human`, show a window.
 
-        A divided world is shown with its zones and owners, and with `ghosts_of` set to a zone,
-        what that one sees of the others. Without a render_mode: None, and a warning.
+        A divided world is shown with its zones and owners. If `ghosts_of` is set to a zone, its
+        ghosts of other zones' vehicles are shown. Without a render_mode: None, and a warning.
 
         Raises:
-            ConfigError: no zone of that number.
+            ConfigError: there is no zone of that number.
             EpisodeError: before the first reset.
         """
         return self._picture(0, self.ghosts_of)
 
     def close(self) -> None:
-        """Close window and recording and end the worker processes, if there are any.
+        """Close the window and the recording, and end the worker processes, if there are any.
 
-        Without workers the environment can be used on.
+        Without workers, the environment can still be used.
         """
         self._session.close()

@@ -1,4 +1,4 @@
-"""What a recording holds on request: observations, samples of sensors, messages."""
+"""Optional tables of a recording: observations, sensor samples, messages."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.sensors.observed import feature_names
 from cavmarl.v2x.kernels.v2x_records import REPORT
 
-SAMPLES = "samples-"  # begins the name of a sensor's table
+SAMPLES = "samples-"  # prefix of the name of a sensor's table
 V2X, HANDOVERS = "v2x", "handovers"
 _WHOSE = [("tick", "<i8"), ("agent", "<i4"), ("vehicle", "<i8")]
-# A report of a packet; `sent` and `from_x`, `from_y` (m) are the packet's.
+# One report of a packet; `sent` and `from_x`, `from_y` (m) belong to the packet.
 _V2X = np.dtype(
     [
         ("tick", "<i8"),
         ("from_x", "<f8"),
         ("from_y", "<f8"),
         *((name, REPORT[name].str) for name in REPORT.names or () if name != "tick"),
-        ("of_tick", "<i8"),  # when what it says was so
+        ("of_tick", "<i8"),  # tick that the report describes
     ]
 )
-# Zones, -1: the coordinator, -2: its log.
+# `sender` and `receiver` are zones; -1: the coordinator, -2: its log.
 _HANDOVERS = np.dtype(
     [("tick", "<i8"), ("sender", "<i4"), ("receiver", "<i4"), ("kind", "O"), ("text", "O")]
 )
@@ -40,20 +40,23 @@ Rows = NDArray[np.void]
 
 
 def check_extras(config: EnvConfig, include: Iterable[str], is_here: bool) -> None:
-    """Refuse to record what there is not, or not here.
+    """Raise an error if a requested table cannot be recorded.
 
     Raises:
-        ConfigError: likewise.
+        ConfigError: the worlds have no such data, or it is not available in this process.
     """
     sensed = config.observation.mode == "sensors" and config.observation.kind == "dict"
     reasons = {
-        "observations": sensed and "they are samples here: include samples",
+        "observations": sensed and "observations are sensor samples here: include samples",
         "samples": not config.rig and "no vehicle carries sensors: set rig",
         "messages": (
             not (config.v2x.enabled or config.zones.count > 1)
-            and "none are sent: set v2x.enabled, or zones.count above 1"
+            and "no messages are sent: set v2x.enabled, or zones.count above 1"
         )
-        or (not is_here and "they are only seen in the caller's process: use backend='local'"),
+        or (
+            not is_here
+            and "messages are only available in the caller's process: use backend='local'"
+        ),
     }
     for name in include:
         if reasons[name]:
@@ -61,16 +64,16 @@ def check_extras(config: EnvConfig, include: Iterable[str], is_here: bool) -> No
 
 
 class RecordedExtras:
-    """Gathers rows of the tables on request, world by world.
+    """Gathers the rows of the optional tables, world by world.
 
     Args:
-        config: of the worlds.
-        include: of `observations`, `samples` and `messages` those that are wanted.
-        arrays: what comes out of their steps.
-        simulation: the worlds, of which messages are noted from now on.
+        config: configuration of the worlds.
+        include: the wanted ones of `observations`, `samples` and `messages`.
+        arrays: results of the worlds' steps.
+        simulation: the worlds; their messages are logged from now on.
 
     Attributes:
-        dtypes: of the tables, by name.
+        dtypes: dtypes of the tables, by table name.
         features: sensor and name of each number of the newest frame of an observation.
     """
 
@@ -108,11 +111,11 @@ class RecordedExtras:
                 coordinator.watch(_HandoverWatch(log, world))
 
     def of(self, world: int, tick: int) -> Mapping[str, Rows]:
-        """The rows of a world since the last call, by table.
+        """Return the new rows of a world since the last call, by table.
 
         Args:
-            world: its number among those that are stepped.
-            tick: of its frame.
+            world: number of the world.
+            tick: tick of the frame that the rows belong to.
         """
         if not self.dtypes:
             return {}
@@ -138,7 +141,7 @@ class RecordedExtras:
     def _samples(
         self, name: str, dtype: np.dtype[Any], world: int, tick: int, agents: NDArray[np.intp]
     ) -> Rows:
-        """Those of the last step, of a sensor."""
+        """Return the samples of one sensor in the last step."""
         frames = self._arrays.frames[name.removeprefix(SAMPLES)]
         slots = frames.stamp_s.shape[2]
         fresh = np.arange(slots) >= slots - frames.fresh[world, agents, None]
@@ -151,7 +154,7 @@ class RecordedExtras:
 
 
 class _SentLog:
-    """Rows of each world, tick by tick, until they are taken; a tick begun again counts once."""
+    """Rows of each world, tick by tick, until they are taken; a repeated tick counts once."""
 
     def __init__(self, dtype: np.dtype[Any]) -> None:
         self._dtype = dtype
@@ -161,7 +164,7 @@ class _SentLog:
         self._rows.setdefault(world, []).append((tick, rows))
 
     def forget_from(self, world: int, tick: int) -> None:
-        """Forget what was sent in a tick that is begun again."""
+        """Drop the rows of a tick that is run again."""
         kept = self._rows.get(world, [])
         while kept and kept[-1][0] == tick:
             kept.pop()
@@ -172,14 +175,14 @@ class _SentLog:
 
 
 def _note_sent(log: _SentLog, world: int, tick: int, packets: Rows, reports: Rows) -> None:
-    """Note the packets of a tick, a row a report."""
+    """Log the packets of a tick, one row per report."""
     counts = packets["count"]
     packet = np.repeat(np.arange(len(packets)), counts)
     within = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
-    said = reports[packets["first"][packet] + within]
-    rows = np.zeros(len(said), _V2X)
+    row_reports = reports[packets["first"][packet] + within]
+    rows = np.zeros(len(row_reports), _V2X)
     for name in REPORT.names or ():
-        rows["of_tick" if name == "tick" else name] = said[name]
+        rows["of_tick" if name == "tick" else name] = row_reports[name]
     rows["tick"], rows["kind"] = tick, packets["kind"][packet]
     rows["from_x"], rows["from_y"] = packets["x"][packet], packets["y"][packet]
     rows["sender"] = packets["sender"][packet]
@@ -188,7 +191,7 @@ def _note_sent(log: _SentLog, world: int, tick: int, packets: Rows, reports: Row
 
 
 class _HandoverWatch:
-    """Notes what a coordinator and its zones tell each other; a `coordinator.Watcher`."""
+    """Logs the messages between a coordinator and its zones; a `coordinator.Watcher`."""
 
     def __init__(self, log: _SentLog, world: int) -> None:
         self._log = log

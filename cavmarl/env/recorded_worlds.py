@@ -1,4 +1,4 @@
-"""Recording the worlds that an environment steps: what a recording of them is told."""
+"""Recordings of the worlds that an environment steps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording_writer import RecordingWriter
 
 Record: TypeAlias = RecordOptions | str | Path
-"""What `record` may be."""
+"""Types of the argument `record`."""
 
 
 def check_recording(
@@ -34,10 +34,10 @@ def check_recording(
     record: Record | None,
     backend: BackendName,
 ) -> None:
-    """Refuse to record worlds whose state cannot be had here.
+    """Raise an error for worlds whose state is not available in this process.
 
     Raises:
-        ConfigError: they are such worlds.
+        ConfigError: the worlds or the requested tables cannot be recorded.
     """
     if record is None:
         return
@@ -51,23 +51,23 @@ def check_recording(
     if key or not shows_state(backend):
         what = f" and {key}" if key else ""
         raise ConfigError(
-            f"record = {str(options.path)!r} with backend = '{backend}'{what}: such worlds are "
-            "only recorded in the caller's process; use backend='local'"
+            f"record = {str(options.path)!r} with backend = '{backend}'{what}: such worlds can "
+            "only be recorded in the caller's process; use backend='local'"
         )
 
 
 class WorldRecorder:
-    """Records worlds that are stepped, with their manifest.
+    """Records worlds after their steps, with a manifest.
 
     Args:
-        record: where, and what besides what can be seen.
-        worlds: that are stepped.
-        simulation: they themselves, or a copy, for the reach of their zones.
-        more: for the manifest.
+        record: the new folder, or options with the optional tables.
+        worlds: the worlds that are stepped.
+        simulation: the worlds or a local copy, for the reach of their zones.
+        more: additional entries of the manifest.
 
     Raises:
-        ConfigError: something is wanted that there is not.
-        RecordingError: there is something at the path, or it cannot be written.
+        ConfigError: a requested table is not available.
+        RecordingError: the path exists already, or it cannot be written.
         MissingExtraError: pyarrow is not installed.
     """
 
@@ -104,19 +104,19 @@ class WorldRecorder:
 
     @property
     def path(self) -> Path:
-        """Of the recording."""
+        """The folder of the recording."""
         return self._writer.path
 
     def room(self, count: int) -> NDArray[np.void]:
-        """SEEN (count,) for a frame that is added here and used nowhere else."""
+        """Return memory, SEEN (count,), for a frame that is only passed to `add`."""
         return self._writer.memory.take(count)
 
     def add(self, frames: Iterable[WorldFrame], first: int = 0) -> None:
-        """Take frames of worlds as they are now.
+        """Add frames of worlds as they are now.
 
         Args:
-            frames: by worlds as they are stepped.
-            first: number in the recording of the first of them.
+            frames: frames with the worlds' numbers in the environment.
+            first: number of world 0 in the recording.
 
         Raises:
             RecordingError: an earlier part could not be written.
@@ -126,5 +126,5 @@ class WorldRecorder:
         self._writer.add((frame._replace(world=first + frame.world) for frame in these), extras)
 
     def close(self) -> None:
-        """Write what is left; raises as `add`."""
+        """Write the remaining rows; raises as `add`."""
         self._writer.close()

@@ -1,4 +1,4 @@
-"""The AEC forms of the environments, as PettingZoo names them: `env` and `raw_env`."""
+"""The AEC forms of the environments under PettingZoo's names: `env` and `raw_env`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.env.world_copies import OwnWorlds
 
 
 class CheckedActions(OwnWorlds, wrappers.OrderEnforcingWrapper):  # type: ignore[misc] # not typed
-    """The AEC form that refuses a wrong action at once: kept for later, it would spoil the step.
+    """The AEC form. It refuses a wrong action at once, before it can spoil the common step.
 
     Args:
         world: the parallel environment.
@@ -27,7 +27,7 @@ class CheckedActions(OwnWorlds, wrappers.OrderEnforcingWrapper):  # type: ignore
         """Let the selected agent act.
 
         Raises:
-            ActionError: wrong shape, dtype or value; the agent can act again.
+            ActionError: the shape, the dtype or a value is wrong; the agent can act again.
         """
         agent = self.agent_selection
         if action is not None and not (self.terminations[agent] or self.truncations[agent]):
@@ -36,12 +36,12 @@ class CheckedActions(OwnWorlds, wrappers.OrderEnforcingWrapper):  # type: ignore
 
 
 def raw_env(env: str | Path = "merge", **arguments: Any) -> AECEnv[str, Any, Any]:
-    """The AEC form, without checks; arguments as for `parallel_env`."""
+    """Return the AEC form without checks; arguments as for `parallel_env`."""
     return parallel_to_aec(parallel_env(env, **arguments))
 
 
 def env(env: str | Path = "merge", **arguments: Any) -> AECEnv[str, Any, Any]:
-    """The AEC form: agents act one after the other and the world moves when all have.
+    """Return the AEC form: agents act one after another; the world advances when all have acted.
 
     Calls out of order and wrong actions are refused. Arguments as for `parallel_env`.
     """

@@ -1,4 +1,4 @@
-"""The state of a session as bytes, which go into a file and hold no code."""
+"""The state of a session as bytes. The bytes can be stored in a file and contain no code."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _DIGEST_BYTES = 32
 
 
 def save_session(session: StepSession, mask: NDArray[np.bool_]) -> bytes:
-    """Return all that later steps of a session depend on, and the mask (W, A) of its last step.
+    """Return the state of a session and the mask (W, A) of its last step, as bytes.
 
     Raises:
         EpisodeError: before the first reset.
-        ConfigError: worlds have processes of their own: SUMO's.
+        ConfigError: the worlds use processes of their own, such as SUMO's.
     """
     if key := kept_elsewhere(session.config):
         raise ConfigError(
@@ -36,24 +36,24 @@ def save_session(session: StepSession, mask: NDArray[np.bool_]) -> bytes:
 
 
 def load_session(session: StepSession, mask: NDArray[np.bool_], saved: bytes) -> None:
-    """Let a session go on from what `save_session` returned, and write the mask (W, A).
+    """Restore the state that `save_session` returned, and write the mask (W, A).
 
     Raises:
-        ConfigError: it is damaged, of other worlds, of another number of them, or of another
-            version.
+        ConfigError: the state is damaged, or belongs to other worlds, another number of worlds or
+        another version.
     """
     digest, content = saved[:_DIGEST_BYTES], saved[_DIGEST_BYTES:]
     if digest != hashlib.sha256(content).digest():
         raise ConfigError(
-            "the state of worlds is damaged: its checksum is not that of its content; save it again"
+            "the saved state is damaged: its checksum differs from that of its content; save again"
         )
     memory = _memory(session, mask)
     like = [*memory, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.uint8)]
     *arrays, sizes, joined = from_bytes(content, like)
     if [array.shape for array in arrays] != [array.shape for array in memory]:
         raise ConfigError(
-            "the state is one of other worlds, or of another number of them: make the environment "
-            "as it was when it was saved"
+            "the saved state belongs to other worlds, or to another number of worlds: make the "
+            "environment with the arguments that it had when it was saved"
         )
     contents = np.split(joined, np.cumsum(sizes)[:-1])
     session.worlds.load_worlds([one.tobytes() for one in contents])
@@ -64,6 +64,6 @@ def load_session(session: StepSession, mask: NDArray[np.bool_], saved: bytes) ->
 
 
 def _memory(session: StepSession, mask: NDArray[np.bool_]) -> list[NDArray[Any]]:
-    """Return what is kept beside the worlds."""
+    """Return the arrays to save beside the worlds."""
     waiting = session.events.memory, *session.insertions.memory, *session.decoder.memory
     return [mask, *waiting, *every_array(session.worlds.arrays)]

@@ -1,4 +1,4 @@
-"""`StepSession`: the worlds that an environment steps, and all that goes into and out of a step."""
+"""`StepSession`: the worlds that an environment steps, with the inputs and outputs of a step."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ class StepSession:
     """The running worlds of one environment.
 
     A step takes decoded actions, declared events and insertions. After each reset and step, the
-    session records the worlds and calls the functions that watch them. A copy or a pickle of it has
-    worlds of its own, which go on bit for bit; it neither records nor is watched.
+    session records the worlds and calls its watchers. A copy or a pickle of a session has its own
+    worlds, which continue bit for bit; it has no recording and no watchers.
 
     Args:
-        worlds: that are stepped.
+        worlds: the worlds to step.
         in_place: whether actions are decoded into the arrays of the worlds.
-        seed: of the first reset, if that is given none.
+        seed: seed of the first reset if that call has none.
 
     Attributes:
-        worlds: that are stepped.
+        worlds: the worlds to step.
         agents: ids of the agents of a world.
         decoder: decodes actions into commands.
-        events: what agents have declared for the next step.
-        insertions: what was put into the worlds for the next step.
+        events: the events that agents have declared for the next step.
+        insertions: vehicles and barriers for the next step.
         is_ready: whether `reset` has been called.
-        simulated_s: time that all steps of the worlds have taken up to now.
+        simulated_s: wall time of all steps of the worlds so far.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class StepSession:
 
     @property
     def config(self) -> EnvConfig:
-        """What the worlds are made of."""
+        """The configuration of the worlds."""
         return self.worlds.world.config
 
     @property
@@ -82,8 +82,9 @@ class StepSession:
     def reset(self, seed: int | None, chosen: NDArray[np.bool_], first_world: int = 0) -> None:
         """Begin an episode in the chosen worlds (W,).
 
-        Without a seed, the first reset takes that of the session, a later one goes on with the last
-        one. `first_world`: number of the first world, on which its random numbers depend.
+        If `seed` is None, the first reset uses the seed of the session; a later reset begins the
+        next episodes of the last seed. Random numbers of the first world depend on its number,
+        `first_world`.
         """
         if seed is not None or not self.is_ready:
             seed = first_seed(seed, self._first_seed)
@@ -91,24 +92,24 @@ class StepSession:
         self.worlds.reset(seed, first_world)
         self.forget(chosen)
         self.is_ready = True
-        self._look(chosen)
+        self._notify(chosen)
 
     def step(self, commands: Commands) -> None:
-        """Step the worlds with all that waits for a step; after a failure that still waits."""
+        """Step the worlds with all waiting inputs. If the step fails, the inputs keep waiting."""
         began = time.perf_counter()
         self.worlds.step(self.insertions.add_to(self.events.add_to(commands)))
-        self.events.taken()
-        self.insertions.taken()
+        self.events.clear()
+        self.insertions.clear()
         self.simulated_s += time.perf_counter() - began
-        self._look()
+        self._notify()
 
     def forget(self, chosen: NDArray[np.bool_]) -> None:
-        """Forget what actions and insertions belong to the last episode of the chosen worlds."""
+        """Drop the last actions and the insertions of the chosen worlds (W,) after an episode."""
         self.decoder.forget(chosen)
         self.insertions.forget(chosen)
 
     def refuse_unready(self, call: str) -> None:
-        """Raise an EpisodeError that names a call before the first reset."""
+        """Raise an EpisodeError that names a call if there has been no reset yet."""
         if not self.is_ready:
             raise EpisodeError(f"{call} before reset(): call reset(seed=…) first")
 
@@ -116,31 +117,31 @@ class StepSession:
         """Return frames of some worlds as they are now; see `WorldsEnvironment.world_frames`."""
         count = len(self.worlds.arrays.mask)
         if wrong := [world for world in chosen if not 0 <= world < count]:
-            raise ConfigError(f"world {wrong[0]}: there are the worlds 0 to {count - 1}")
+            raise ConfigError(f"world {wrong[0]}: must be from 0 to {count - 1}")
         self.refuse_unready("world_frames()")
         return self._frames(chosen, ghosts)
 
     def way_ahead(self, vehicle: int, world: int) -> NDArray[np.float64]:
-        """Return the way of a vehicle; see `WorldsEnvironment.way_ahead`."""
+        """Return the path ahead of a vehicle; see `WorldsEnvironment.way_ahead`."""
         self.refuse_unready("way_ahead()")
         return way_ahead(self._copy.standing(self.worlds), vehicle, world)
 
     def present(self) -> Simulation:
-        """Return the worlds as they are now, or a copy where other processes run them."""
+        """Return the worlds as they are now, or a copy if other processes run them."""
         return self._copy.present(self.worlds)
 
     def picture(
         self, world: int, ghosts_of: int | None, mode: str, name: str, fps: int
     ) -> NDArray[np.uint8] | None:
-        """Draw a world as it is now; pygame is loaded at the first picture.
+        """Draw a world as it is now; the first call loads pygame.
 
         Args:
-            world: its number.
-            ghosts_of: a zone, to show what it sees of the others; None: the owners of vehicles.
-            mode: `human` for a window, or `rgb_array`; only the first call reads it, and those
-                that follow here.
-            name: of the window.
-            fps: frames a second, for the window.
+            world: number of the world.
+            ghosts_of: zone whose ghosts are shown; None: show the owners of vehicles.
+            mode: `human` for a window, or `rgb_array`. Only the first call reads `mode`, `name` and
+                `fps`.
+            name: name of the window.
+            fps: frames per second of the window.
         """
         self.refuse_unready("render()")
         simulation = self.present()
@@ -148,12 +149,12 @@ class StepSession:
             self._view = WorldView(simulation, mode, name, fps)
         return self._view.show(ghosts_of, world)
 
-    def watch(self, look: Callable[[], None]) -> Callable[[], None]:
-        """Have a function called after each reset and step; returns what ends that."""
-        self._watchers = (*self._watchers, look)
+    def watch(self, watcher: Callable[[], None]) -> Callable[[], None]:
+        """Call a function after each reset and step; return a function that stops this."""
+        self._watchers = (*self._watchers, watcher)
 
         def end() -> None:
-            self._watchers = tuple(one for one in self._watchers if one is not look)
+            self._watchers = tuple(one for one in self._watchers if one is not watcher)
 
         return end
 
@@ -163,7 +164,10 @@ class StepSession:
             return
         if self._recorder is not None:
             path = str(RecordOptions.of(record).path)
-            raise EpisodeError(f"record({path!r}): {self._recorder.path} is recorded already")
+            raise EpisodeError(
+                f"record({path!r}): {self._recorder.path} is being recorded; close the environment "
+                "first"
+            )
         standing = self._copy.standing(self.worlds)
         self._recorder = WorldRecorder(record, self.worlds, standing)
 
@@ -187,36 +191,36 @@ class StepSession:
         key = kept_elsewhere(self.config)
         if key and not isinstance(self.worlds, LocalWorlds):
             raise ConfigError(
-                f"{key}: frames of such worlds can only be had in the caller's process; use "
+                f"{key}: frames of such worlds are only available in the caller's process; use "
                 "backend='local'"
             )
-        simulation, told, arrays = self.present(), self.insertions.told, self.worlds.arrays
+        simulation, last, arrays = self.present(), self.insertions.last, self.worlds.arrays
         return [
             frame_of(
-                simulation, world, ghosts, vehicles_that_ended(arrays, world), told(world), room
+                simulation, world, ghosts, vehicles_that_ended(arrays, world), last(world), room
             )
             for world in chosen
         ]
 
-    def _look(self, chosen: NDArray[np.bool_] | None = None) -> None:
+    def _notify(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Record the chosen worlds (W,), or all, as they are now, and call the watchers."""
         if self._recorder is not None:
             every = range(len(self.worlds.arrays.mask))
             some = every if chosen is None else np.flatnonzero(chosen).tolist()
             self._recorder.add(self._frames(some, ghosts=True, room=self._recorder.room))
-        for look in self._watchers:
-            look()
+        for watcher in self._watchers:
+            watcher()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # What refers to arrays of the worlds is made anew.
+        # Objects that refer to arrays of the worlds are created again.
         memory = self.decoder.memory, self.events.memory, self.insertions.memory
         kept = self.is_ready, self.simulated_s, self._first_seed
-        return _made_again, (self.worlds, self._in_place), (kept, memory)
+        return _restored_session, (self.worlds, self._in_place), (kept, memory)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         (self.is_ready, self.simulated_s, self._first_seed), memory = state
         self.decoder.memory, self.events.memory, self.insertions.memory = memory
 
 
-def _made_again(worlds: SteppedWorlds, in_place: bool) -> StepSession:
+def _restored_session(worlds: SteppedWorlds, in_place: bool) -> StepSession:
     return StepSession(worlds, in_place=in_place)

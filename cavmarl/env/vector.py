@@ -1,4 +1,4 @@
-"""`CavVectorEnv`: many worlds, arrays in and out."""
+"""`CavVectorEnv`: many worlds that are stepped together, with arrays in and out."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from cavmarl.sensors.mounted.frames import SensorFrames
 MAX_WORLDS = 65_536
 
 Observations: TypeAlias = Any
-"""(W, A, D) float32, or an array (W, A, …) a sensor of the rig."""
+"""(W, A, D) float32, or for each sensor of the rig an array (W, A, …)."""
 
 StepResult = tuple[
     Observations, NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], dict[str, NDArray[Any]]
@@ -50,17 +50,17 @@ def make_vec(
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         num_envs: number of worlds.
-        autoreset_mode: when a world that is over begins anew; see `CavVectorEnv`.
-        copy: False returns observations without a copy.
+        autoreset_mode: when a world begins its next episode; see `CavVectorEnv`.
+        copy: False returns observations without a copy; see `CavVectorEnv`.
         world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
             sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
 
     Raises:
-        ConfigError: a key, value or combination that cannot work.
-        PolicyError: `sensors_of` is no trained driver.
-        MapError: the map cannot be read or driven.
-        WorkerError: worker processes cannot be started, or have no memory.
-        MissingExtraError, RecordingError: no Ray, or pyarrow; `record` cannot be written.
+        ConfigError: a key, a value or a combination is not possible.
+        PolicyError: `sensors_of` is not a trained driver.
+        MapError: the map cannot be read, or vehicles cannot drive on it.
+        WorkerError: worker processes cannot be started, or have too little memory.
+        MissingExtraError, RecordingError: Ray or pyarrow is missing; `record` cannot be written.
     """
     num_envs, mode = _checked(num_envs), known_mode(autoreset_mode)
     in_next_step = mode is not AutoresetMode.SAME_STEP
@@ -84,33 +84,34 @@ def _checked(num_envs: int) -> int:
 
 
 class CavVectorEnv(WorldsEnvironment):
-    """W worlds with A agent seats each; ground truth is flat, whatever `observation.kind` says.
+    """W worlds with A agents each, as arrays of the shape (num_envs, num_agents, …).
 
-    With `observation.mode: sensors` and `observation.kind: dict`, observations are dicts: an array
-    (num_envs, num_agents, …) a sensor of the rig.
+    Observations are flat arrays. With `observation.mode: sensors` and `observation.kind: dict`
+    they are dicts with an array (num_envs, num_agents, …) for each sensor of the rig.
 
-    Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a
-    vehicle and will be asked for the next action; the others' observations are 0 and their actions
-    are not read. A world whose episode is over (truncated, or all agents gone and none to come) is
-    begun anew as Gymnasium's `AutoresetMode` says:
+    `infos["mask"]` marks the agents that have a vehicle and act in the next step. Observations of
+    the other agents are 0, and their actions are not read. The episode of a world is over if it was
+    truncated, or if all agents have left and none is still to enter. The world then begins its next
+    episode according to Gymnasium's `AutoresetMode`:
 
-    - `SAME_STEP`: in the same step. The observations returned are those of the new episode,
-      `infos["final_observations"]` keeps the last ones of the old, and of each agent that left.
-    - `NEXT_STEP`: in the next step. The observations returned are the last ones, those of agents
-      that leave too; in the next step the world's actions are not read, its rewards are 0 and the
-      observations are those of the new episode.
-    - `DISABLED`: by `reset(options={"reset_mask": infos["episode_over"]})` before the next step,
-      and never by itself. What a step returns is that of `NEXT_STEP`.
+    - `SAME_STEP`: in the same step. The step returns the first observations of the new episode.
+      `infos["final_observations"]` has the last ones of the old episode and of agents that left.
+    - `NEXT_STEP`: in the next step. The step returns the last observations, also of agents that
+      leave. The next step does not read the world's actions, and returns rewards of 0 and the first
+      observations of the new episode.
+    - `DISABLED`: never by itself. Before the next step, call
+      `reset(options={"reset_mask": infos["episode_over"]})`. Steps return the same
+      observations as with `NEXT_STEP`.
 
-    Worlds run here, or over processes, which changes no bit of what comes out
+    Worlds run in this process or in other processes, with the same results bit for bit
     (docs/guides/divide_a_world.md).
 
     Args:
-        worlds: that are stepped.
-        seed: of the first reset, if that is given none.
-        copy: False returns observations as a read-only view that the next step or reset overwrites;
-            large ones are copied for longer than they are made.
-        disabled: worlds that are over wait for a reset; they are those of the next step.
+        worlds: the worlds to step.
+        seed: seed of the first reset if that call has none.
+        copy: False returns observations as a read-only view that the next step or reset overwrites.
+            Copying large observations takes longer than computing them.
+        disabled: mode `DISABLED`; `worlds` must be worlds that reset in the next step.
         render_mode: `rgb_array` or None.
     """
 
@@ -143,7 +144,7 @@ class CavVectorEnv(WorldsEnvironment):
             "render_modes": ["rgb_array"],
         }
         self._disabled = disabled
-        self._over = np.zeros(num_envs, dtype=np.bool_)  # and not begun anew yet
+        self._over = np.zeros(num_envs, dtype=np.bool_)  # over, and not yet reset
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._copy = copy
 
@@ -154,44 +155,44 @@ class CavVectorEnv(WorldsEnvironment):
 
     @property
     def state_size(self) -> int:
-        """Numbers in the global state of a world."""
+        """Length of the global state of a world."""
         return int(self.worlds.arrays.states.shape[1])
 
     @property
     def simulated_s(self) -> float:
-        """Time that all steps have taken up to now, without that for actions and for copying."""
+        """Wall time of all steps so far, without decoding actions and copying results."""
         return self._session.simulated_s
 
     @property
     def plans(self) -> tuple[Plan, ...]:
-        """Which worker hosts which worlds, or zones of each world; empty without workers.
+        """Assignments of worlds, or of each world's zones, to workers; empty without workers.
 
-        See docs/explanation/balance.md; where worlds or zones move, it is the present plan.
+        See docs/explanation/balance.md. If worlds or zones move, this is the present assignment.
         """
         return self.worlds.plans
 
     def plan_text(self) -> str:
-        """The plans as tables; each full reset logs them (`cavmarl.workers`, INFO)."""
+        """Return the plans as tables; each full reset logs them (`cavmarl.workers`, INFO)."""
         return "\n\n".join(map(describe_plan, self.plans))
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, NDArray[Any]]]:
-        """Begin an episode in every world, or in some.
+        """Begin an episode in all worlds, or in some of them.
 
         Args:
-            seed: root of all random numbers; world w's episodes depend on (seed, w) alone. None
-                goes on with the next episodes of the last seed.
-            options: `first_world`, with a seed: these are the worlds from that number on, so that
-                many worlds can be run a part at a time. `reset_mask`, without one: (W,) which
-                worlds begin anew; the others stay as they are. Others are not used.
+            seed: root of all random numbers; episodes of world w depend on (seed, w) alone. None
+                begins the next episodes of the last seed.
+            options: `first_world` (with a seed): number of the first world, to run many worlds in
+                several parts. `reset_mask` (without a seed): (W,) the worlds that begin an episode;
+                the other worlds do not change. Other options are ignored.
 
         Returns:
             observations (W, A, D) and infos.
 
         Raises:
-            ConfigError: a reset_mask of another shape or dtype, or one that comes with a seed.
-            EpisodeError: a reset_mask before the first reset.
+            ConfigError: reset_mask has another shape or dtype, or is given with a seed.
+            EpisodeError: reset_mask is given before the first reset.
         """
         options = options or {}
         chosen = self._chosen(options.get("reset_mask"), seed)
@@ -202,18 +203,18 @@ class CavVectorEnv(WorldsEnvironment):
         return self._observations(), {"mask": self._mask.copy()}
 
     def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
-        """(W,) the worlds that a reset begins anew."""
+        """Return the worlds (W,) that a reset affects."""
         if reset_mask is None:
             return np.ones(self.num_envs, dtype=np.bool_)
         chosen = np.asarray(reset_mask)
         if chosen.shape != (self.num_envs,) or chosen.dtype != np.bool_:
             raise ConfigError(
                 f"reset_mask has shape {chosen.shape} and dtype {chosen.dtype}: must be "
-                f"({self.num_envs},) and bool, one a world"
+                f"({self.num_envs},) and bool, one value per world"
             )
         if seed is not None:
             raise ConfigError(
-                "reset_mask with a seed: a seed is that of all worlds; leave one of the two out"
+                "reset_mask with a seed: a seed applies to all worlds; leave one of the two out"
             )
         if not self._session.is_ready:
             raise EpisodeError("reset_mask before the first reset: call vec.reset(seed=…)")
@@ -228,18 +229,17 @@ class CavVectorEnv(WorldsEnvironment):
 
         Returns:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
-            truncations (W, A): its trip was cut at the episode's horizon, or its own; and infos:
+            truncations (W, A): the horizon of the episode or of the trip was reached; and infos:
             `mask` (W, A) agents that act next; `acted` (W, A) agents that acted in this step, so
             their rewards count; `terms` (W, A, T) in the order of `config.terms.TERMS`;
             `arrivals` (W,) vehicles that reached their goal since the reset, agents included;
-            `episode_over` (W,) which worlds are over;
-            `final_observations` (W, A, D) before a reset and with the last ones of agents that
-            left: the same array as the observations in a step where none did.
+            `episode_over` (W,) worlds whose episode is over;
+            `final_observations` (W, A, D) observations before a reset, with the last ones of agents
+            that left: the same array as the observations if no agent left in the step.
 
         Raises:
-            EpisodeError: before the first reset, or, with `DISABLED`, before that of a world that
-                is over.
-            ActionError: wrong shape, dtype or value; nothing has changed.
+            EpisodeError: before the first reset, or with `DISABLED` if a world's episode is over.
+            ActionError: the shape, the dtype or a value is wrong; nothing has changed.
         """
         if not self._session.is_ready:
             raise EpisodeError("step() before reset(): call vec.reset(seed=…) first")
@@ -264,7 +264,7 @@ class CavVectorEnv(WorldsEnvironment):
             "mask": self._mask.copy(),
             "episode_over": over.copy(),
         }
-        terminations &= ~arrays.truncations  # a trip that its own horizon cut has no end
+        terminations &= ~arrays.truncations  # reaching the trip's own horizon is no termination
         return observations, arrays.rewards.copy(), terminations, arrays.truncations.copy(), infos
 
     def _observations(self) -> Observations:
@@ -281,7 +281,7 @@ class CavVectorEnv(WorldsEnvironment):
         return found
 
     def _given(self, array: NDArray[Any]) -> NDArray[Any]:
-        """A copy, or a view that cannot be written."""
+        """Return a copy, or a read-only view."""
         if self._copy:
             return array.copy()
         view = array.view()
@@ -289,21 +289,21 @@ class CavVectorEnv(WorldsEnvironment):
         return view
 
     def declare_event(self, world: int, agent: int, cause: str) -> None:
-        """Let the vehicle of an agent, by index, tell others of an event in the next step.
+        """Let the vehicle of an agent, given by its index, announce an event in the next step.
 
         Args:
-            world: in which it drives.
+            world: number of the world.
             agent: index in `possible_agents`.
-            cause: as of `CavEnv.declare_event`.
+            cause: see `CavEnv.declare_event`.
 
         Raises:
-            ActionError: no such agent.
-            ConfigError: no such cause, or no messages are sent in this environment.
+            ActionError: there is no such agent.
+            ConfigError: there is no such cause, or this environment sends no messages.
         """
         self._session.events.declare(world, agent, cause)
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
-        """The observations, and of the worlds (W,) where something ended those before that."""
+        """Return the observations; in the worlds `ended` (W,), those before the reset."""
         arrays = self.worlds.arrays
         if not self._senses:
             return with_rows(arrays.observations, arrays.final_observations, ended)
@@ -314,72 +314,74 @@ class CavVectorEnv(WorldsEnvironment):
         }
 
     def frames(self) -> dict[str, SensorFrames]:
-        """What the sensors of `rig` have got in the last step, by name.
+        """Return the samples of the last step of each sensor of `rig`, by sensor name.
 
-        See docs/reference/sensors.md. Agents whose vehicle ended in the step have its last samples.
-        Of a world that begins anew in the same step it is what the new episode begins with. With
-        `copy=False` they are arrays that the next step overwrites.
+        See docs/reference/sensors.md. If an agent's vehicle ended in the step, these are its last
+        samples. If a world resets in the same step, these are the first samples of the new episode.
+        With `copy=False`, the next step overwrites the arrays.
         """
         frames = self.worlds.arrays.frames
         return {name: sensor.copy() if self._copy else sensor for name, sensor in frames.items()}
 
     def final_frames(self) -> dict[str, SensorFrames]:
-        """As `frames`, of the worlds where something ended in the last step, before the reset.
+        """Return the samples before the reset, for worlds where a vehicle or the episode ended.
 
-        Those of other worlds are older, or zeros.
+        Like `frames`. For other worlds, the samples are older, or zeros.
         """
         frames = self.worlds.arrays.final_frames
         return {name: sensor.copy() for name, sensor in frames.items()}
 
     def suggest_actions(self) -> NDArray[Any]:
-        """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
+        """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent."""
         self.worlds.suggest()
         return self._session.decoder.encode(self.worlds.arrays.suggested)
 
     def state(self) -> NDArray[np.float32]:
-        """The global states (W, S), each as `CavEnv.state`; what a central critic may see.
+        """Return the global states (W, S), each as from `CavEnv.state`; input of a central critic.
 
-        Of a world that begins anew in the same step it is the new episode's.
+        For a world that resets in the same step, this is the state of the new episode.
         """
         self.worlds.write_states()
         return self.worlds.arrays.states.copy()
 
     def state_hash(self, world: int = 0) -> str:
-        """Hex digest of one world, as `CavEnv.state_hash`."""
+        """Return a hex digest of one world; see `CavEnv.state_hash`."""
         return self.worlds.state_hash(world)
 
     def traffic_stats(self, world: int = 0) -> dict[str, float]:
-        """Traffic of one world since its reset, as `CavEnv.traffic_stats`."""
+        """Return traffic counts of one world since its reset; see `CavEnv.traffic_stats`."""
         return {**self.worlds.traffic_stats(world), **self._session.decoder.tolerated(world)}
 
     def save_state(self) -> bytes:
-        """All that later steps depend on: of the worlds, of actions held, of what is shown.
+        """Return the state of the worlds, of actions and of the present results, as bytes.
+
+        All later steps depend on this state alone.
 
         Raises:
             EpisodeError: before the first reset.
-            ConfigError: worlds have processes of their own: SUMO's.
+            ConfigError: the worlds use processes of their own, such as SUMO's.
         """
         return save_session(self._session, self._mask)
 
     def load_state(self, saved: bytes) -> None:
-        """Go on from what `save_state` gave; zones and workers may be others than they were.
+        """Restore a state that `save_state` returned. Zones and workers may differ from then.
 
         Raises:
-            ConfigError: it is damaged, of other worlds, of another number of them, or of another
-                version.
+            ConfigError: the state is damaged, or of other worlds, of another number of worlds or of
+                another version.
         """
         load_session(self._session, self._mask, saved)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A frame (height, width, 3) of each world; None and a warning without a render_mode.
+        """Return a frame (height, width, 3) of each world; without a render_mode, warn.
 
         Raises:
             EpisodeError: before the first reset.
         """
-        drawn = range(self.num_envs if self.render_mode else 1)  # one is enough to warn
+        drawn = range(self.num_envs if self.render_mode else 1)  # one call is enough to warn
         frames = [self._picture(world) for world in drawn]
         return tuple(frame for frame in frames if frame is not None) or None
 
     def close(self) -> None:
-        """End recording and worker processes, if there are any; arrays that were returned stay."""
+        """End the recording and the worker processes, if any. Returned arrays stay valid."""
         self._session.close()

@@ -1,4 +1,4 @@
-"""`WorldArguments`: the keywords that `make_vec` and `parallel_env` share, and what they make."""
+"""`WorldArguments`: the keyword arguments of `make_vec` and `parallel_env`, and their worlds."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 
 
 class WorldArguments(TypedDict, total=False):
-    """Keywords of `make_vec` and `parallel_env` that say which worlds are made, and where they run.
+    """Keyword arguments of `make_vec` and `parallel_env`: the worlds, and where they run.
 
     Attributes:
-        zones: shadows zones.count, how many shards run the world; results do not depend on it.
+        zones: sets zones.count, the number of shards of the world. Results do not depend on it.
         backend: where the worlds run (docs/guides/divide_a_world.md). Results do not depend on it.
             "local": in the caller's process. "processes:N": in N worker processes of this machine.
-            "nodes:N": in N processes that share nothing, started on this machine
+            "nodes:N": in N processes without shared memory, started on this machine
             (docs/guides/nodes.md). "nodes:N@HOST:PORT": in N nodes that are started by hand and
-            join there.
-            "nodes:N@mpi": in N other ranks of an MPI run. "ray:N": in N actors of a Ray cluster
-            (docs/guides/nodes.md), "ray": in as many as are of use.
-            The name of a registered backend: there, "name:N" with N workers.
+            connect to that address. "nodes:N@mpi": in N other ranks of an MPI run.
+            "ray:N": in N actors of a Ray cluster (docs/guides/nodes.md); "ray": in as many
+            actors as are useful. The name of a registered backend: there; "name:N": there, with
+            N workers.
         workers: short form: N for "processes:N", 0 for "local".
         nodes: short form: N for "nodes:N".
-        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
-            out over (docs/guides/sensor_workers.md). Results do not depend on it.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        seed: of the first reset, if that is given none.
-        max_cycles: steps until truncation; shadows horizon_s.
-        sensors_of: a trained driver, whose sensors and actions the agents get.
-        render_mode: `rgb_array` or None; `parallel_env` also takes `human`.
+        sensor_workers: sets workers.sensors, the number of processes that compute the sensors of
+            `rig` (docs/guides/sensor_workers.md). Results do not depend on it.
+        agents: sets population.agents.
+        background: sets population.background.
+        seed: seed of the first reset if that call has none.
+        max_cycles: steps until truncation; sets horizon_s.
+        sensors_of: a trained driver; the agents get its sensors and actions.
+        render_mode: `rgb_array` or None; `parallel_env` also accepts `human`.
         record: a new folder to record into, or `RecordOptions` (docs/guides/recordings.md).
-        overrides: values for any other key, such as `{"sensors.lidar.rays": 32}`.
+        overrides: values of any other keys, such as `{"sensors.lidar.rays": 32}`.
     """
 
     zones: int | None
@@ -67,24 +67,26 @@ def start_worlds(
     render_modes: tuple[str, ...],
     **given: Unpack[WorldArguments],
 ) -> SteppedWorlds:
-    """Make the worlds that the arguments name, after all arguments are checked.
+    """Make the worlds that the arguments describe, after a check of all arguments.
 
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
-        num_worlds: how many of them.
-        in_next_step: when a world that is over begins anew; see `SteppedWorlds`.
-        render_modes: that are possible.
-        given: as `WorldArguments` describes them.
+        num_worlds: number of worlds.
+        in_next_step: whether worlds reset in the next step; see `SteppedWorlds`.
+        render_modes: allowed render modes.
+        given: see `WorldArguments`.
 
     Raises:
-        TypeError: an argument of another name.
-        ConfigError, PolicyError, MapError, WorkerError, MissingExtraError: as of `make_vec`.
+        TypeError: an argument has another name.
+        ConfigError, PolicyError, MapError, WorkerError, MissingExtraError: see `make_vec`.
     """
     if refusal := next(filter(None, map(removed_argument, given)), None):
         raise ConfigError(refusal)
     known = WorldArguments.__annotations__
     if unknown := [name for name in given if name not in known]:
-        raise TypeError(f"unexpected keyword argument {unknown[0]!r}; there are {', '.join(known)}")
+        raise TypeError(
+            f"unexpected keyword argument {unknown[0]!r}: must be one of {', '.join(known)}"
+        )
     backend = find_backend(given.get("backend"), given.get("workers"), given.get("nodes"))
     if (seed := given.get("seed")) is not None:
         check_seed(seed)

@@ -1,4 +1,4 @@
-"""Copies of environments: each has worlds of its own, which go on bit for bit."""
+"""Copies of environments. Each copy has its own worlds, which continue bit for bit."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 
 class OwnWorlds:
-    """Base of whatever holds worlds: a shallow copy would step those of the first one."""
+    """Base of objects that hold worlds. Two shallow copies would step the same worlds."""
 
     def __copy__(self) -> Any:
-        """As `copy.deepcopy`: two environments never step the same worlds."""
+        """Return a deep copy, so that two environments never step the same worlds."""
         return deepcopy(self)

@@ -1,4 +1,4 @@
-"""`WorldsEnvironment`: the methods that all environments have, each of which asks the session."""
+"""`WorldsEnvironment`: the methods that all environments share; they call the session."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from cavmarl.roads.network import RoadNetwork
 
 
 class WorldsEnvironment(OwnWorlds):
-    """Base of the environments: what can be done with their worlds, whatever form results have.
+    """Base class of the environments: all methods that do not depend on the form of the results.
 
     Args:
-        session: the worlds that it steps.
+        session: the session with the worlds to step.
         render_mode: `human`, `rgb_array` or None.
 
     Attributes:
-        metadata: with `name` and `render_fps`.
+        metadata: has `name` and `render_fps`.
         render_mode: `human`, `rgb_array` or None.
         possible_agents: ids of the agents of a world.
     """
@@ -44,7 +44,7 @@ class WorldsEnvironment(OwnWorlds):
 
     @property
     def worlds(self) -> SteppedWorlds:
-        """The worlds that it steps."""
+        """The worlds that this environment steps."""
         return self._session.worlds
 
     @worlds.setter
@@ -53,47 +53,47 @@ class WorldsEnvironment(OwnWorlds):
 
     @property
     def config(self) -> EnvConfig:
-        """What the worlds are made of."""
+        """The configuration of the worlds."""
         return self._session.config
 
     @property
     def network(self) -> RoadNetwork:
-        """The roads of the worlds."""
+        """The road network of the worlds."""
         return self._session.worlds.world.network
 
     @property
     def simulation(self) -> Simulation:
-        """The worlds behind this view, for tools that draw or measure them.
+        """The worlds behind this environment, for tools that draw or measure them.
 
         Raises:
-            ConfigError: they live in worker processes.
+            ConfigError: the worlds run in worker processes.
         """
         return self._session.worlds.simulation
 
     @property
     def step_s(self) -> float:
-        """Seconds a step."""
+        """Duration of a step in seconds."""
         return self.config.clock.ctrl_dt_s
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is a present moment: `reset` has been called."""
+        """Whether `reset` has been called, so that the worlds have a state."""
         return self._session.is_ready
 
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
         """Let a car enter a world in the next step, or as soon as there is a safe gap.
 
-        It counts in `population.insertions`, drives to a goal of the generator's and is one of its
-        vehicles from then on.
+        The car counts in `population.insertions`. It gets a goal from the generator, and is then
+        one of the generator's vehicles.
 
         Args:
             lane: id of a lane of a road.
-            position_m: on it, of the front bumper.
-            world: its number.
+            position_m: position of the front bumper on the lane, in m.
+            world: number of the world.
 
         Raises:
-            ActionError: no such lane or place, or cars may not drive there.
-            CapacityError: as many have been put there in this episode as may be.
+            ActionError: there is no such lane or position, or cars may not drive there.
+            CapacityError: the episode already has all insertions that are allowed.
             ConfigError: `population.insertions` is 0.
         """
         self._session.insertions.vehicle(world, lane, position_m)
@@ -101,65 +101,65 @@ class WorldsEnvironment(OwnWorlds):
     def close_road(self, edge: str, world: int = 0) -> None:
         """Close a road from the next step on, until it is opened or the episode is over.
 
-        On each of its lanes a car stands at its beginning, as soon as there is a safe gap; each
-        counts in `population.insertions`. Others wait behind them, or go round where they can.
+        A standing car closes each lane at its start, as soon as there is a safe gap. Each of these
+        cars counts in `population.insertions`. Other vehicles wait, or take another route.
 
         Args:
             edge: id of a road.
-            world: its number.
+            world: number of the world.
 
         Raises:
-            ActionError: as of `insert_vehicle`, or it is closed already.
-            CapacityError, ConfigError: as of `insert_vehicle`.
+            ActionError: see `insert_vehicle`; or the road is closed already.
+            CapacityError, ConfigError: see `insert_vehicle`.
         """
         self._session.insertions.barrier(world, edge)
 
     def open_road(self, edge: str, world: int = 0) -> None:
-        """Open a road that was closed: from the next step on the cars there drive on.
+        """Open a closed road: from the next step on, the cars that close it drive on.
 
-        They go to a goal of the generator's, as others that were put there; they still count in
+        They drive to goals of the generator, like other inserted cars, and still count in
         `population.insertions`.
 
         Args:
             edge: id of a road.
-            world: its number.
+            world: number of the world.
 
         Raises:
-            ActionError: no such road, or it is not closed.
+            ActionError: there is no such road, or it is not closed.
             ConfigError: `population.insertions` is 0.
         """
         self._session.insertions.no_barrier(world, edge)
 
     def closed_roads(self, world: int = 0) -> tuple[str, ...]:
-        """Ids of the roads that `close_road` has closed, also from the next step on."""
+        """Return the ids of closed roads, including those that close in the next step."""
         return self._session.insertions.closed(world)
 
     def world_frames(self, chosen: Sequence[int] = (0,), ghosts: bool = False) -> list[WorldFrame]:
-        """What is to be seen of some worlds now, as data; see `engine.world_frame.WorldFrame`.
+        """Return the visible state of some worlds now; see `engine.world_frame.WorldFrame`.
 
-        Where worlds live in other processes, all of them are copied from there.
+        If the worlds run in other processes, all of them are copied from there.
 
         Args:
-            chosen: numbers of worlds.
-            ghosts: whether to tell what each zone sees of the others' vehicles.
+            chosen: numbers of the worlds.
+            ghosts: whether frames include each zone's ghosts of other zones' vehicles.
 
         Raises:
-            ConfigError: no such world, or one whose state cannot be had here.
+            ConfigError: there is no such world, or its state is not available in this process.
             EpisodeError: before the first reset.
         """
         return self._session.frames(chosen, ghosts)
 
     def way_ahead(self, vehicle: int, world: int = 0) -> NDArray[np.float64]:
-        """Points (n, 2) in m of the way of a vehicle, as of the last `world_frames`.
+        """Return points (n, 2) in m along the path of a vehicle, as of the last `world_frames`.
 
         Raises:
             EpisodeError: before the first reset.
         """
         return self._session.way_ahead(vehicle, world)
 
-    def watch(self, look: Callable[[], None]) -> Callable[[], None]:
-        """Have a function called after each reset and step; returns what ends that."""
-        return self._session.watch(look)
+    def watch(self, watcher: Callable[[], None]) -> Callable[[], None]:
+        """Call a function after each reset and step; return a function that stops this."""
+        return self._session.watch(watcher)
 
     def record(self, record: Record | None) -> None:
         """Record all worlds from the next reset or step on, until `close`.
@@ -167,18 +167,18 @@ class WorldsEnvironment(OwnWorlds):
         See docs/guides/recordings.md.
 
         Args:
-            record: a new folder, or that and what else is recorded; None: record nothing.
+            record: a new folder, or options with the optional tables; None: record nothing.
 
         Raises:
-            ConfigError: something else is wanted that there is not.
-            EpisodeError: a recording has begun already.
-            RecordingError: there is something at `path`, or it cannot be written.
+            ConfigError: a requested table is not available.
+            EpisodeError: the worlds are being recorded already.
+            RecordingError: the path exists already, or it cannot be written.
             MissingExtraError: pyarrow is not installed.
         """
         self._session.record(record)
 
     def _picture(self, world: int, ghosts_of: int | None = None) -> NDArray[np.uint8] | None:
-        """Draw a world; None and a warning without a render_mode, as Gymnasium has it."""
+        """Draw a world; without a render_mode, warn and return None, as Gymnasium does."""
         if self.render_mode is None:
             logger.warn(
                 "render() without a render_mode shows nothing: make the environment with "

@@ -1,4 +1,4 @@
-"""How ownership is run around the shards of a divided world: shards, transfers, repartitioning.
+"""Ownership in divided worlds: coordinators, transfers between shards, repartitioning.
 
-Drives the pure core in `ownership`; `engine` calls it in each tick.
+It runs the pure core in `ownership`; `engine` calls it in each tick.
 """

@@ -1,8 +1,8 @@
-"""`ZonedShards`: the shards of one set of worlds, and the rows that go between them.
+"""`ZonedShards`: the shards of W worlds, and the rows that are exchanged between them.
 
-Ghosts go each tick to every zone that may see them (decision 012). A vehicle changes its owner
-between two ticks, when the coordinator says so: its old shard keeps it as a ghost, the new one has
-had it as a ghost already, and goes on with the state that it was sent.
+In each tick, every zone gets ghosts of the vehicles that it may see (decision 012). A coordinator
+decides changes of owner between two ticks. The old shard keeps the vehicle as a ghost. The new
+shard has a ghost already, and continues from the state that it receives.
 """
 
 from __future__ import annotations
@@ -34,40 +34,41 @@ from cavmarl.zones.visibility import Visibility
 
 
 class ZoneLoads(NamedTuple):
-    """What the zones of W worlds hold."""
+    """Numbers of vehicles in the zones of W worlds."""
 
-    owned: NDArray[np.int64]  # (k, W) vehicles
-    ghosts: NDArray[np.int64]  # (k, W) copies of other zones' vehicles
-    halo_m: float  # how far zones see over their borders
+    owned: NDArray[np.int64]  # (k, W) owned vehicles
+    ghosts: NDArray[np.int64]  # (k, W) ghosts
+    halo_m: float  # how far zones see beyond their borders
 
     def imbalance(self) -> NDArray[np.float64]:
-        """(W,) maximum over mean of the vehicles that zones own."""
+        """Return the imbalance (W,) of owned vehicles: maximum / mean over zones."""
         return np.array([imbalance(owned) for owned in self.owned.T.tolist()])
 
 
 class ZonedShards:
-    """Which zones own and see which vehicles.
+    """All shards of W worlds, with their owned vehicles and ghosts.
 
     Attributes:
-        gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
-            a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
-        neighbours: (k, k) between which zones vehicles change their owner.
-        row_count: the call that notes that an undivided world has no ghosts.
-        changes: vehicles near borders, and how they change their owner.
+        gathering: arguments of the phase `gather`: the distance in m outside of a zone within which
+            a ghost can touch a vehicle of the zone, and the distance in m within which a vehicle is
+            at a border.
+        neighbours: (k, k) whether vehicles change their owner between two zones.
+        row_count: the call that sets the numbers of rows in an undivided world.
+        changes: finds vehicles near borders and changes their owners.
     """
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # one a zone, in the order of zones
-        zoned: ZoneState,  # their rows
+        shards: Sequence[Shard],  # one per zone, in the order of zones
+        zoned: ZoneState,  # the rows of all shards
         partition: ZonePartition,
-        halo: Halo,  # what each zone sees over its borders
-        sight: Visibility,  # what says so for other zones
-        touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
-        borders: Borders,  # when a vehicle is near one
+        halo: Halo,  # of this partition
+        sight: Visibility,  # computes the halo of other partitions
+        touching_m: float,  # a ghost farther outside of a zone cannot touch a vehicle of the zone
+        borders: Borders,
         codec: TransferCodec,  # of vehicles' states
-        row_check: RowCheck,  # of rows that come from outside
-        may_teleport: bool,  # whether vehicles may be put anywhere between two ticks
+        row_check: RowCheck,  # of rows from outside
+        may_teleport: bool,  # whether vehicles may jump to any place between two ticks
     ) -> None:
         self.zones: ZoneArrays = partition.arrays
         self.neighbours = partition.within(sight.outside_m)
@@ -100,7 +101,7 @@ class ZonedShards:
         return len(self._shards[0].worlds.ticks)
 
     def distribute(self, chosen: NDArray[np.bool_]) -> None:
-        """Give every shard its vehicles of the chosen worlds (W,), which are all in the first."""
+        """Distribute the vehicles of the chosen worlds (W,) from the first shard to all shards."""
         if len(self._shards) == 1:
             return
         first = self._shards[0].worlds
@@ -117,9 +118,9 @@ class ZonedShards:
             self._exchange(first.rows, w, w + 1)
 
     def cut(self, partition: ZonePartition) -> None:
-        """Divide the plane otherwise, between two ticks: owners stay, ghosts are those of now.
+        """Change the zones between two ticks. Vehicles keep their owners, and ghosts are renewed.
 
-        A vehicle in another zone than its owner's changes its owner as at any border.
+        A vehicle outside of its owner's new zone changes its owner later, as at any border.
         """
         self.divide(partition)
         self._zoned.num_outer[...] = -1
@@ -128,10 +129,10 @@ class ZonedShards:
         for w in range(self.num_worlds):
             self._forget_offers(w)
         self._exchange(self._shards[0].worlds.rows, 0, self.num_worlds)
-        book.tick[:] = tick  # of the rows that have been looked at once more
+        book.tick[:] = tick  # the rows are still those of this tick
 
     def divide(self, partition: ZonePartition) -> None:
-        """Say where zones are from now on; owners and ghosts are to be told anew."""
+        """Set the zones. The caller must set owners and ghosts anew."""
         zones, halo = partition.arrays, self._sight.halo(partition)
         self.zones, self._halo = zones, halo
         self.neighbours = partition.within(self._sight.outside_m)
@@ -139,14 +140,14 @@ class ZonedShards:
             shard.cut(zones, halo)
 
     def _forget_offers(self, w: int) -> None:
-        """Vehicles near a border before are not to be counted again."""
+        """Forget vehicles near a border, so that they are not counted as turned away."""
         for known in (self.book.num_near, self.book.num_coming, self.book.known):
             known[w] = 0
 
     def exchange(self) -> None:
         """Renew all ghosts from the owned `next_rows`.
 
-        Where shards `gather` them, `note_gathered` has to follow before the tick is over.
+        If shards `gather` them, `note_gathered` must follow before the tick ends.
         """
         if self._gatherers is not None:
             self._gatherers.gather(*self.gathering)
@@ -155,31 +156,31 @@ class ZonedShards:
         self._exchange(worlds.next_rows, 0, len(worlds.ticks))
 
     def count_rows(self) -> None:
-        """Instead of `exchange` where one zone is all and no coordinator asks about borders."""
+        """Replace `exchange` in an undivided world without a coordinator."""
         self.row_count()
 
     def let_gather(self, executor: Executor) -> bool:
-        """From now on let shards `exchange` as a phase, if they run side by side; whether they do.
+        """Let the shards renew their ghosts in the phase `gather`. Return whether they do.
 
-        A shard that gathers asks all others, so not where there are some that it never sees.
+        A shard that gathers reads all others. So this is used only if all zones see each other.
         """
         if len(self._halo.near) == self.count**2:
             self._gatherers = executor
         return self._gatherers is not None
 
     def note_gathered(self) -> None:
-        """Note vehicles near a border, after all shards have gathered."""
+        """Record vehicles near a border, after all shards have gathered."""
         self._note_those_near(self.book)
 
     def rehearse_gathering(self) -> None:
-        """Call what is called after shards have gathered, and forget what it has found."""
+        """Call the kernel of `note_gathered` without keeping its results."""
         self._note_those_near(make_book(*self._first_side.shape))
 
     def _note_those_near(self, book: BorderRecords) -> None:
         self._note_gathered(self.zones, self.borders, self._zoned, self.next_side, book)
 
     def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
-        """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""
+        """Renew the ghosts of some worlds; `rows` are the first shard's rows or next rows."""
         self._call_exchange(
             self.zones, self._halo, self._touching_m, self.borders, self._zoned,
             self._side(rows), first, last, self.book,
@@ -191,11 +192,11 @@ class ZonedShards:
     def place(
         self,
         vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world
-        contacts: NDArray[np.int64],  # (W,) of each, as `contacts` counts them
+        contacts: NDArray[np.int64],  # (W,) as `contacts` counts them
     ) -> None:
-        """Give every vehicle to the zone that it is in, whatever zone owned it before."""
+        """Give every vehicle to the zone in which it is, independent of its former owner."""
         first = self._shards[0].worlds
-        # A tick that was not ended may have left a step that is not what this says.
+        # Steps of an unfinished tick may belong to other rows.
         self._zoned.step_at[...] = 0
         for w, rows in enumerate(vehicles):
             first.rows[w, : len(rows)] = rows
@@ -210,10 +211,10 @@ class ZonedShards:
         self,
         vehicles: Sequence[Sequence[NDArray[np.void]]],  # VEHICLE (n,) of each world and zone
         contacts: NDArray[np.int64],  # (W,) as `contacts` counts them
-        home: int,  # the zone whose contacts these are from now on
-        keeps_epochs: bool = False,  # vehicles have changed their owner as often as their rows say
+        home: int,  # the zone that stores the contacts
+        keeps_epochs: bool = False,  # whether to keep the epochs in the rows; if not, they become 0
     ) -> None:
-        """Give every zone the vehicles that it owned; ghosts are to be renewed."""
+        """Restore the owned vehicles of every zone, and renew the ghosts."""
         self._zoned.step_at[...] = 0
         self._zoned.num_outer[...] = -1
         self._zoned.num_contacts[...] = 0
@@ -230,32 +231,29 @@ class ZonedShards:
         self._exchange(self._first_side, 0, self.num_worlds)
 
     def contacts(self) -> NDArray[np.int64]:
-        """(W,) vehicles that began to touch another, since each world's reset."""
+        """Return the number (W,) of vehicles that began to touch another since the reset."""
         return np.asarray(self._zoned.num_contacts.sum(axis=0), dtype=np.int64)
 
     def align(self) -> None:
-        """Let all shards keep their rows on the same side, whatever a tick has come to."""
+        """Let all shards use the first buffer of rows, after a tick that was abandoned."""
         for shard in self._shards:
             shard.align()
 
     def owned(self, w: int, zone: int) -> NDArray[np.void]:
-        """VEHICLE (n,), the committed rows that a zone owns; a view."""
+        """Return a view of the committed rows VEHICLE (n,) that a zone owns."""
         worlds = self._shards[zone].worlds
         rows: NDArray[np.void] = worlds.rows[w, : worlds.num_owned[w]]
         return rows
 
     def ghosts(self, w: int, zone: int) -> NDArray[np.void]:
-        """VEHICLE (n,), the committed copies that a zone has of others' vehicles.
-
-        A view that cannot be written: only its owner changes a vehicle.
-        """
+        """Return a read-only view of the committed ghosts VEHICLE (n,) of a zone."""
         worlds = self._shards[zone].worlds
         rows: NDArray[np.void] = worlds.rows[w, worlds.num_owned[w] : worlds.num_rows[w]]
         rows.flags.writeable = False
         return rows
 
     def ticks(self, w: int) -> list[int]:
-        """What the zones' clocks say: ticks since the world's reset."""
+        """Return the clock of each zone: ticks since the world's reset."""
         return [shard.worlds.ticks.item(w) for shard in self._shards]
 
     @property
@@ -268,7 +266,7 @@ class ZonedShards:
 
     @property
     def side(self) -> int:
-        """On which side of `zoned.rows` the committed rows are."""
+        """The buffer of `zoned.rows` with the committed rows."""
         return self._side(self._shards[0].worlds.rows)
 
     @property
@@ -276,7 +274,7 @@ class ZonedShards:
         return self._side(self._shards[0].worlds.next_rows)
 
     def owners(self, w: int) -> list[tuple[int, int]]:
-        """(id, zone) of all vehicles of a world."""
+        """Return (id, zone) of all vehicles of a world."""
         return [
             (vehicle, shard.zone)
             for shard in self._shards
@@ -288,7 +286,7 @@ class ZonedShards:
         return counts
 
     def running(self) -> NDArray[np.int64]:
-        """(W,) vehicles of each world."""
+        """Return the number (W,) of vehicles of each world."""
         self._count_running()
         return self._running.copy()
 
@@ -298,13 +296,13 @@ class ZonedShards:
         return ZoneLoads(owned, rows - owned, self._halo.halo_m)
 
     def vehicles(self, world: int) -> NDArray[np.void]:
-        """All live vehicles of a world: of several shards a copy, of one a view."""
+        """Return all vehicles of a world: a copy of several shards, or a view of one shard."""
         parts = [s.worlds.rows[world, : s.worlds.num_owned[world]] for s in self._shards]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     @contextmanager
     def everybody_next(self) -> Iterator[Worlds]:
-        """All owned `next_rows` as one shard would hold them; what is changed there goes back."""
+        """Yield the owned `next_rows` of all zones as one shard. Changes are written back."""
         first = self._shards[0].worlds
         if len(self._shards) == 1:
             yield first
@@ -325,7 +323,7 @@ class ZonedShards:
                 place += len(part)
 
     def whole(self) -> Worlds:
-        """All worlds as one shard would hold them, without its `next_rows`: of several, a copy."""
+        """Return all zones as one shard, without `next_rows`; of several shards, a copy."""
         first = self._shards[0].worlds
         if len(self._shards) == 1:
             return first

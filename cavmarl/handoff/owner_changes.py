@@ -1,4 +1,4 @@
-"""`OwnerChanges`: vehicles of a division change the zone that owns them, between two ticks."""
+"""`OwnerChanges`: changes of vehicles' owners between two ticks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class OwnerChanges:
-    """Finds vehicles near a border and moves their rows from owner to owner.
+    """A search for vehicles near borders, and moves of their rows from owner to owner.
 
     Attributes:
         hand_over_all: the kernel `hand_over`, for the arrays of these worlds.
@@ -39,7 +39,10 @@ class OwnerChanges:
         self.release_all = specialized(release)
 
     def near(self, w: int, everybody: bool) -> list[Near]:
-        """Vehicles of a world near a border, by its committed rows."""
+        """Return the vehicles of a world near a border, in its committed rows.
+
+        `everybody`: rows have changed since ghosts were renewed, so all rows must be checked.
+        """
         division = self._division
         if everybody:
             self._look(
@@ -52,16 +55,16 @@ class OwnerChanges:
         return [Near(*entry) for entry in division.book.near[w, :num].tolist()]
 
     def find(self, w: int, vehicle: int) -> tuple[int, int]:
-        """The zone that owns a vehicle, and its committed row there."""
+        """Return the zone that owns a vehicle, and its committed row there."""
         for shard in self._shards:
             worlds = shard.worlds
             found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
             if len(found):
                 return shard.zone, int(found[0])
-        raise ConfigError(f"vehicle {vehicle} is in no zone of world {w}")
+        raise ConfigError(f"no zone of world {w} owns vehicle {vehicle}; use the id of a vehicle")
 
     def state(self, w: int, zone: int, row: int) -> bytes:
-        """The whole state of an owned vehicle of a zone, by its committed row."""
+        """Return the complete state of a zone's owned vehicle, from its committed row."""
         worlds = self._shards[zone].worlds
         return self._division.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
 
@@ -69,9 +72,9 @@ class OwnerChanges:
         self,
         w: int,
         switch: Switch,  # the vehicle, its source and its target
-        hint: int = 0,  # the row where the old one probably keeps it
-    ) -> int:  # the row where the new one keeps it
-        """Let a vehicle change its owner, which goes on with the old one's committed row."""
+        hint: int = 0,  # the probable row at the source
+    ) -> int:  # the row at the target
+        """Change a vehicle's owner. The target gets a copy of the source's committed row."""
         place = self._pass_on(
             switch.vehicle, switch.source, hint, switch.target, switch.epoch,
             self._division.zoned, self._division.side, w,
@@ -83,12 +86,12 @@ class OwnerChanges:
         return place
 
     def give_up(self, w: int, zone: int, vehicle: int) -> None:
-        """Let another process's zone have a vehicle of a zone of this one; it stays as a ghost."""
+        """Give a vehicle up to a zone of another process. Its row here becomes a ghost."""
         if not self._give_up(vehicle, zone, 0, self._division.zoned, self._division.side, w):
             raise ConfigError(f"zone {zone} does not own vehicle {vehicle}")
 
     def take_over(self, w: int, zone: int, vehicle: int, epoch: int, state: bytes) -> None:
-        """Go on with a vehicle of another zone, of which a zone of this process has a ghost."""
+        """Take a vehicle over from another zone. The state replaces its ghost in this zone."""
         place = self._take_over(vehicle, zone, epoch, self._division.zoned, self._division.side, w)
         if place < 0:
             raise self.unseen(vehicle, zone)
@@ -99,14 +102,14 @@ class OwnerChanges:
 
     @staticmethod
     def unseen(vehicle: int, zone: int) -> ConfigError:
-        """What is wrong where a zone has no ghost of a vehicle that enters it."""
+        """Return the error for a vehicle that enters a zone without a ghost of it."""
         return ConfigError(
-            f"vehicle {vehicle} entered zone {zone}, which has not seen it come: the halo is too "
-            "narrow"
+            f"vehicle {vehicle} entered zone {zone}, which has no ghost of it: the halo is too "
+            "narrow; increase zones.halo_m"
         )
 
     def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
-        """Give vehicles that are not on record yet to the zones that they are in now."""
+        """Give vehicles that are not recorded yet to the zones in which they are now."""
         settled = []
         for vehicle, zone, state in births:
             _, row = self.find(w, vehicle)

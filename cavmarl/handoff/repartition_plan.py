@@ -1,8 +1,7 @@
-"""Extension, off by default: other zones, where measured cost has gathered in a few.
+"""Proposal of new zones with an even distribution of measured cost; off by default.
 
-Only the proposal: the map is cut anew by recursive bisection (`partition.zone_layouts`), which then
-shares out measured cost and not lanes. Whether a world is cut so, and how its vehicles get there,
-is the caller's.
+The proposal cuts the map by recursive bisection (`partition.zone_layouts`), weighted by measured
+cost instead of lanes. The caller decides whether to use it, and moves the vehicles.
 """
 
 from __future__ import annotations
@@ -25,20 +24,19 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Proposal:
-    """A partition by measured cost."""
+    """A proposed partition by measured cost."""
 
-    partition: ZonePartition  # as many zones as before
-    before: float  # maximum over mean of the zones' costs as they are
-    after: float  # the same as they would be
-    moved: int  # vehicles that would be in a zone of another number
+    partition: ZonePartition  # with as many zones as before
+    before: float  # present imbalance of the zones' costs, maximum / mean
+    after: float  # imbalance with the proposed zones
+    moved: int  # vehicles whose zone would have a different number
 
 
 def vehicle_costs(
-    zones: NDArray[np.int32],  # of each vehicle
-    # measured, of each zone; what a zone without vehicles costs is left out
-    costs_s: Sequence[float],
+    zones: NDArray[np.int32],  # (n,) of each vehicle
+    costs_s: Sequence[float],  # measured, of each zone; the cost of empty zones is ignored
 ) -> Floats:
-    """Each zone's cost shared out among its vehicles, (n,)."""
+    """Return the cost (n,) of each vehicle: an equal share of its zone's cost."""
     counts = np.bincount(zones, minlength=len(costs_s))
     shares: Floats = (np.asarray(costs_s) / np.maximum(counts, 1))[zones]
     return shares
@@ -46,18 +44,19 @@ def vehicle_costs(
 
 def propose_zones(
     network: RoadNetwork,
-    partition: ZonePartition,  # its zones now
+    partition: ZonePartition,  # the present zones
     positions: Floats,  # (n, 2) x and y of vehicles in m
-    costs_s: Sequence[float],  # measured, of each zone, seconds a tick
+    costs_s: Sequence[float],  # measured, of each zone, seconds per tick
     *,
-    tolerance: float = 0.1,  # by which share of the mean the costliest zone has to become cheaper
+    tolerance: float = 0.1,  # least decrease of the imbalance
 ) -> Proposal | None:
-    """Zones of about the same cost; None where they would gain no more than the tolerance."""
+    """Return zones of about equal cost; None if the gain is within the tolerance."""
     if len(costs_s) != partition.count or not all(
         math.isfinite(cost_s) and cost_s >= 0.0 for cost_s in costs_s
     ):
         raise ConfigError(
-            f"costs {list(costs_s)}: must be one a zone of {partition.count}, seconds from 0 up"
+            f"costs {list(costs_s)}: use one number of seconds for each of {partition.count} "
+            "zones, at least 0"
         )
     if partition.count == 1 or not len(positions):
         return None
@@ -67,7 +66,7 @@ def propose_zones(
     try:
         proposed = cut_map(network, "bisection", partition.count, density=density)
     except ConfigError:
-        return None  # all stand in one place: no cut divides them
+        return None  # no cut divides vehicles that are all in one place
     proposed = _renumbered(proposed, zones, proposed.zones_of(positions))
     proposed_zones = proposed.zones_of(positions)
     before, after = (
@@ -82,7 +81,7 @@ def propose_zones(
 def _renumbered(
     partition: ZonePartition, before: NDArray[np.int32], after: NDArray[np.int32]
 ) -> ZonePartition:
-    """The same zones, numbered so that many vehicles stay in the zone that they were in."""
+    """Return the zones numbered so that many vehicles keep the number of their zone."""
     count = partition.count
     common = np.bincount(before * count + after, minlength=count * count).reshape(count, count)
     order = np.empty(count, dtype=np.int64)

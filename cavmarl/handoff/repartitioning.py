@@ -1,8 +1,8 @@
-"""`Repartitioner`: repartition running worlds whose vehicles have gathered in a few zones.
+"""`Repartitioner`: new zones for running worlds whose vehicles are unevenly distributed.
 
-An extension, off by default: the paper's zones are fixed. Between two ticks the plane is divided
-otherwise; in the next one each vehicle that is in another zone than its owner's is handed over as
-at any border. So no result depends on it.
+This is an extension, off by default: the paper's zones are fixed. The zones change between two
+ticks. In the next tick, each vehicle outside of its owner's new zone is handed over as at any
+border. So no result depends on repartitioning.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class Repartition(NamedTuple):
-    """Worlds have been cut anew."""
+    """A change of the zones."""
 
-    step: int  # after which one, of all that these worlds have made
-    before: float  # maximum over mean of the zones' vehicles
-    after: float  # the same in the new zones
-    moved: int  # vehicles that are in a zone of another number
-    ms: float  # that it took; handing them over is part of the next tick
+    step: int  # number of steps that the worlds had made before
+    before: float  # imbalance of the zones' vehicles, maximum / mean
+    after: float  # imbalance in the new zones
+    moved: int  # vehicles whose zone has a different number now
+    ms: float  # duration, without the transfers of vehicles in the next tick
 
 
 def propose_cut(
     network: RoadNetwork,
     division: ZonedShards,  # with the vehicles of all zones
-    partition: ZonePartition,  # its zones now
-    tolerance: float,  # by which share of the mean the fullest zone has to become emptier
+    partition: ZonePartition,  # the present zones
+    tolerance: float,  # least decrease of the imbalance
 ) -> Proposal | None:
-    """Zones that share out the vehicles of all worlds better; None: they would gain too little."""
+    """Return zones with a better balance of vehicles; None if the gain is within the tolerance."""
     rows = [division.vehicles(w) for w in range(division.num_worlds)]
     places = np.concatenate([np.column_stack([own["x"], own["y"]]) for own in rows])
     owners = np.concatenate([own["owner"] for own in rows])
@@ -44,12 +44,12 @@ def propose_cut(
 
 
 def is_due(step: int, every: int) -> bool:
-    """Whether zones are looked at before a step (counted from 1); `every` 0: never."""
+    """Return whether zones are checked before a step (counted from 1); `every` 0: never."""
     return every > 0 and step > 1 and (step - 1) % every == 0
 
 
 class Repartitioner:
-    """Looks every so many steps whether other zones would share out the vehicles better."""
+    """A periodic search for zones with a better balance of vehicles."""
 
     def __init__(
         self,
@@ -57,10 +57,10 @@ class Repartitioner:
         division: ZonedShards,
         coordination: WorldCoordinators,
         every: int,  # steps between checks
-        tolerance: float,  # by which share of the mean the fullest zone has to become emptier
+        tolerance: float,  # least decrease of the imbalance
     ) -> None:
-        self.repartitions: list[Repartition] = []  # what has been done
-        self.steps = 0  # that have begun
+        self.repartitions: list[Repartition] = []  # so far
+        self.steps = 0  # number of steps begun
         self._network = network
         self._division = division
         self._coordination = coordination
@@ -68,10 +68,10 @@ class Repartitioner:
         self._tolerance = tolerance
 
     def before_step(self, partition: ZonePartition) -> ZonePartition | None:
-        """Note that a step begins; its zones, if they are others than before.
+        """Count a step that begins. Return its zones if they have changed.
 
-        Nothing may look at vehicles between the cut and the next tick, which hands them over: their
-        owners may be far away from them.
+        After a change, the owners of vehicles may be far away from them until the next tick hands
+        them over. No caller may read vehicles before that.
         """
         self.steps += 1
         if not is_due(self.steps, self._every):

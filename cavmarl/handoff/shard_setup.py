@@ -1,4 +1,4 @@
-"""Makes the shards of a map, and says how far they have to see over their borders."""
+"""Construction of the shards of a map, with the distance that they see beyond their borders."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import driving_reach_m, longest_move_m
 from cavmarl.zones.visibility import Visibility
 
-# Added to the halo, so that no rounding of its sum can make it too narrow.
+# Added to the halo, so that rounding cannot make it too narrow.
 _ROUNDING_M = 1e-6
 
 
@@ -38,15 +38,15 @@ def divide(
     network: RoadNetwork,
     partition: ZonePartition,
     traffic: NativeTraffic,  # departures and routes
-    outputs: Outputs,  # where all agents get what they sense
-    num_worlds: int,  # how many worlds are stepped together
-    zeros: Zeros = huge_zeros,  # makes the arrays that shards write
-    late_ticks: int = 0,  # for so many more a vehicle that has crossed may stay with its zone
+    outputs: Outputs,  # of all agents
+    num_worlds: int,  # W
+    zeros: Zeros = huge_zeros,  # allocates the arrays that shards write
+    late_ticks: int = 0,  # extra ticks that a vehicle across a border may stay with its owner
 ) -> tuple[list[Shard], ZonedShards]:
-    """One shard a zone, and the division that knows them all.
+    """Make one shard per zone, and their division.
 
     Raises:
-        ConfigError: `zones.halo_m` is less than exactness needs.
+        ConfigError: `zones.halo_m` is too small for exact results.
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     radius_m = largest_radius_m(traffic.travel.types)
@@ -59,7 +59,7 @@ def divide(
     fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
     wide_m = halo_m(config, reach_m, partition.count, fastest_mps, late_ticks)
     touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps, late_ticks)
-    # Agents alone sense.
+    # Only agents sense.
     has_agents = config.population.agents > 0
     sensed_m = _needed_m(config, sensing_m, fastest_mps, late_ticks) if has_agents else 0.0
     near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))
@@ -107,17 +107,16 @@ def divide(
 
 
 def halo_m(
-    config: EnvConfig,  # `zones.halo_m` is taken if it is given
-    reach_m: float,  # the farthest that any driver looks
-    zones: int,  # how many there are
-    # the way of a tick over its length, with what vehicles jump on the map
-    fastest_mps: float = MAX_SPEED_MPS,
+    config: EnvConfig,  # its `zones.halo_m` is used if it is set
+    reach_m: float,  # the farthest look of any driver
+    zones: int,  # number of zones
+    fastest_mps: float = MAX_SPEED_MPS,  # longest move in a tick / tick, with jumps on the map
     late_ticks: int = 0,  # see `divide`
 ) -> float:
-    """How far zones see over their borders.
+    """Return how far zones see beyond their borders, in m.
 
     Raises:
-        ConfigError: that is less than exactness needs, with all numbers.
+        ConfigError: this is too small for exact results; the message has all numbers.
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     wide_m = settings.halo_m
@@ -135,22 +134,22 @@ def halo_m(
 
 
 def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
-    """Whether all that drivers look at can be found along the roads.
+    """Return whether drivers consider only vehicles along the roads, so that halos can be smaller.
 
-    Scripts put vehicles beside them, SUMO where it likes; and a named halo is taken whole.
+    Scripts put vehicles beside the roads, and SUMO anywhere. A configured halo is used as it is.
     """
     free = traffic.scene is not None or traffic.sumo is not None
     return config.zones.halo_m is None and not free
 
 
 def neighbours_of(division: ZonedShards) -> Neighbours:
-    """Between which zones the protocol lets vehicles change, while they are not cut anew."""
+    """Return the pairs of zones between which the protocol allows changes of owner."""
     near = (frozenset(np.flatnonzero(row).tolist()) for row in division.neighbours)
     return Neighbours(tuple(near), division.may_teleport)
 
 
 def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
-    """Deadlines of the protocol; `schema` is the version of vehicles' states."""
+    """Return the deadlines of the protocol; `schema` is the version of vehicles' states."""
     return Limits(
         deferral=settings.max_deferred_ticks,
         backoff=settings.backoff_ticks,
@@ -159,12 +158,15 @@ def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
 
 
 def _limits_at_borders(settings: ZonesConfig, late_ticks: int) -> Limits:
-    """Deadlines of hand-overs; where nothing is lost they are those of leases (decision 013)."""
+    """Return the deadlines of transfers without lost messages: those of leases (decision 013)."""
     return replace(limits_of(settings), deferral=late_ticks)
 
 
 def _approach_m(config: EnvConfig, fastest_mps: float) -> float:
-    """From so far away a vehicle can be offered: as far as it drives, or jumps in a tick."""
+    """Return the distance to a border within which a vehicle is offered.
+
+    It is as far as the vehicle drives in `approach_ticks`, or jumps in one tick.
+    """
     dt = config.clock.sim_dt_s
     return max(config.zones.approach_ticks * MAX_SPEED_MPS * dt, fastest_mps * dt)
 

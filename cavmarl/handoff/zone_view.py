@@ -1,4 +1,4 @@
-"""`ZoneView`: owned vehicles, ghosts and hand-overs of one divided world, to read."""
+"""`ZoneView`: a view of the owned vehicles, ghosts and transfers of one divided world."""
 
 from __future__ import annotations
 
@@ -14,35 +14,34 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class TransferInFlight(NamedTuple):
-    """A vehicle that is on its way from one zone to another."""
+    """A transfer of a vehicle from one zone to another that is not complete."""
 
     vehicle: int
-    source: int  # the zone that owns it
-    target: int  # the zone that it is offered or switched to
-    state: str  # of the protocol, for people to read
+    source: int  # the zone that owns the vehicle
+    target: int  # the zone to which it is offered or switched
+    state: str  # of the protocol, for display
 
 
 @dataclass(frozen=True)
 class ZoneView:
     """One world's zones between two ticks."""
 
-    partition: ZonePartition  # where the zones are
-    halo_m: float  # how far each sees over its borders
-    # (n,) the zone that owns each vehicle, in the order of `Simulation.vehicles`
+    partition: ZonePartition
+    halo_m: float  # how far each zone sees beyond its borders
+    # (n,) the owner of each vehicle, in the order of `Simulation.vehicles`
     owners: NDArray[np.int64]
-    # of each zone, the ids of other zones' vehicles that it sees
-    ghosts: tuple[NDArray[np.int64], ...]
-    transfers: tuple[TransferInFlight, ...] = ()  # in flight
+    ghosts: tuple[NDArray[np.int64], ...]  # of each zone, the ids of its ghosts
+    transfers: tuple[TransferInFlight, ...] = ()
 
 
 def view_zones(
-    shards: Sequence[Shard],  # one a zone, in the order of zones
-    partition: ZonePartition,  # where the zones are
-    halo_m: float,  # how far each sees over its borders
+    shards: Sequence[Shard],  # one per zone, in the order of zones
+    partition: ZonePartition,
+    halo_m: float,  # how far each zone sees beyond its borders
     world: int = 0,
-    transfers: Sequence[TransferInFlight] = (),  # in flight in that world
+    transfers: Sequence[TransferInFlight] = (),  # of that world
 ) -> ZoneView:
-    """What the shards hold of one world."""
+    """Return a view of the shards' vehicles in one world."""
     held = [shard.worlds for shard in shards]
     owned = [int(worlds.num_owned[world]) for worlds in held]
     ghosts = tuple(

@@ -1,4 +1,4 @@
-"""Map files: built into SUMO networks, checked, with buildings beside them.
+"""Map files: their conversion to SUMO networks, checks, and buildings.
 
-Stands on `roads`.
+Builds on `roads`.
 """

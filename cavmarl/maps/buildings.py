@@ -1,6 +1,6 @@
-"""Buildings on a map: walls that rays end at, and their footprints in convex parts.
+"""Buildings on a map: walls that end rays, and footprints as convex parts.
 
-They are read from OpenStreetMap or from SUMO's polygon files.
+They are read from OpenStreetMap or SUMO's polygon files.
 """
 
 from __future__ import annotations
@@ -27,38 +27,38 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 
 Ring = NDArray[np.float64]
 
-DEFAULT_HEIGHT_M = 8.0  # of a building that says nothing of its height
-LEVEL_M = 3.0  # of a building of which only the levels are known
+DEFAULT_HEIGHT_M = 8.0  # of a building whose height is not given
+LEVEL_M = 3.0  # height of a level, if only the number of levels is given
 
-# Values of building=* that rays pass under, or that do not stand there.
+# Values of building=* that rays pass under, or that have no walls.
 _NO_WALLS = frozenset(("no", "roof", "carport", "canopy", "demolished", "ruins"))
 _METRES = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
 _MOST_HEIGHT_M = 1000.0
-_DIGITS = 6  # of a metre; sides that are nearly level would have endless slopes
+_DIGITS = 6  # of a metre; nearly level sides would have huge slopes
 
 
 @dataclass(frozen=True)
 class Footprint:
     """One building."""
 
-    name: str  # in the file
-    # (n, 2) corners in m in the map's frame, first not repeated; a place is inside that an odd
-    # number of them goes around
+    name: str  # element and id in the file
+    # (n, 2) corners in m in the map's frame, the first not repeated; the inside is given by the
+    # even-odd rule
     rings: tuple[Ring, ...]
-    height_m: float  # over the ground
+    height_m: float  # above the ground
 
 
 def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
-    """The buildings of a file, in its order.
+    """Return the buildings of a file, in its order.
 
     Args:
-        path: OpenStreetMap (<osm>), or a SUMO file with <poly> elements; also gzipped.
-        geo: where the map lies on the earth; None: it does not say.
+        path: OpenStreetMap (<osm>), or a SUMO file with <poly> elements; may be gzipped.
+        geo: georeference of the map; None: it has none.
 
     Raises:
-        MapError: the file is broken, or is of another map, or says places on the earth while the
-            map does not say where it lies.
-        MissingExtraError: places have to be projected, and pyproj is not installed.
+        MapError: the file is broken or belongs to another map, or its coordinates are geographic
+            and the map has no georeference.
+        MissingExtraError: coordinates must be projected, and pyproj is not installed.
     """
     reader = _Reader(path, geo)
     read_xml(path, reader)
@@ -71,14 +71,14 @@ def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
         ]
         return [footprint for footprint in found if footprint.rings]
     raise MapError(
-        f"{path}: <{reader.root}> is the root of no file of buildings: give an OpenStreetMap "
+        f"{path}: <{reader.root}> is not the root of a file of buildings: give an OpenStreetMap "
         "extract (<osm>) or SUMO polygons (<additional>, .poly.xml)"
     )
 
 
 @dataclass
 class _Element:
-    """A way or relation of OSM, or a polygon of SUMO, with what is said of it."""
+    """A way or relation of OSM, or a polygon of SUMO, with its tags."""
 
     name: str
     line: int
@@ -93,7 +93,7 @@ class _Element:
 
 
 class _Reader(ContentHandler):
-    """Takes in nodes, ways and multipolygons of OSM, and polygons of SUMO."""
+    """Reads nodes, ways and multipolygons of OSM, and polygons of SUMO."""
 
     def __init__(self, path: Path, geo: GeoReference | None) -> None:
         super().__init__()
@@ -110,17 +110,17 @@ class _Reader(ContentHandler):
     def startElement(self, name: str, attrs: Any) -> None:
         self.root = self.root or name
         try:
-            self._take(name, attrs)
+            self._add(name, attrs)
         except KeyError as error:
             raise self._error(name, f"has no attribute {error}") from error
         except ValueError as error:
-            raise self._error(name, f"holds no numbers ({error})") from error
+            raise self._error(name, f"has a value that is not a number ({error})") from error
 
     def endElement(self, name: str) -> None:
         if name in ("way", "relation", "poly"):
             self._open = None
 
-    def _take(self, name: str, attrs: Mapping[str, str]) -> None:
+    def _add(self, name: str, attrs: Mapping[str, str]) -> None:
         if name == "node":
             place = (float(attrs["lon"]), float(attrs["lat"]))
             self.places[attrs["id"]] = _finite(place)
@@ -155,7 +155,7 @@ class _Reader(ContentHandler):
         return ring
 
     def _check_location(self, attrs: Mapping[str, str]) -> None:
-        """Refuse polygons that were made for a network at another place."""
+        """Raise an error for polygons that were made for a network at another place."""
         offset = tuple(map(float, attrs["netOffset"].split(",")))
         geo = self._geo
         ours = (0.0, 0.0) if geo is None else (geo.offset_x_m, geo.offset_y_m)
@@ -163,7 +163,7 @@ class _Reader(ContentHandler):
             raise self._error(
                 "location",
                 f"has the offset {attrs['netOffset']}, the map {ours[0]:.2f},{ours[1]:.2f}: these "
-                "buildings are of another network",
+                "buildings belong to another network",
             )
 
     def _error(self, name: str, problem: str) -> MapError:
@@ -181,7 +181,7 @@ def _finite(place: tuple[float, ...]) -> tuple[float, float]:
 
 
 def _osm_buildings(path: Path, osm: _Reader, geo: GeoReference | None) -> Iterator[Footprint]:
-    """Closed ways and multipolygons that are buildings; those that leave the extract are not."""
+    """Yield closed ways and multipolygons that are buildings and completely in the extract."""
     for element in [*osm.ways.values(), *osm.relations]:
         if not element.is_building:
             continue
@@ -219,14 +219,14 @@ def _closed(ways: list[list[str]]) -> list[list[str]]:
 
 
 def _rings(rings: list[Ring]) -> tuple[Ring, ...]:
-    """Those with at least three corners, to the micrometre, without the first one at the end."""
+    """Return rings of at least three corners, rounded to µm, without the repeated first one."""
     rounded = [np.round(ring, _DIGITS) for ring in rings]
     opened = [ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rounded]
     return tuple(ring for ring in opened if len(ring) >= 3)
 
 
 def _height_m(tags: Mapping[str, str]) -> float:
-    """Of `height`, else of `building:levels`; what cannot be understood is not said."""
+    """Return the height from `height`, else from `building:levels`, else the default."""
     for key, unit_m in (("height", 1.0), ("building:levels", LEVEL_M)):
         match = _METRES.fullmatch(tags.get(key, ""))
         if match is not None and 0.0 < float(match[1]) * unit_m <= _MOST_HEIGHT_M:
@@ -235,30 +235,30 @@ def _height_m(tags: Mapping[str, str]) -> float:
 
 
 def _project(path: Path, ring: Ring, geo: GeoReference | None) -> Ring:
-    """Longitudes and latitudes (n, 2) as places on the map."""
+    """Return positions on the map for longitudes and latitudes (n, 2)."""
     if geo is None:
         raise MapError(
-            f"{path}: says where its buildings lie on the earth, and the map does not say where it "
-            "lies: build it with a projection, or give buildings in the map's own frame"
+            f"{path}: its buildings have geographic coordinates, but the map has no "
+            "georeference: build it with a projection, or give buildings in the map's own frame"
         )
     return project(path, ring, geo)
 
 
-# Buildings that are farther from every road's bounding box than any sensor sees are left out.
+# Buildings farther than this from the bounding box of all roads are beyond any sensor's range.
 FARTHEST_M = 300.0
 LARGEST_M = 5000.0
 MOST_CORNERS = 4000
 
 
 def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
-    """A network with the buildings of a file.
+    """Return a network with the buildings of a file.
 
     Returns:
-        A network with another `source_hash`, for it has more than one source.
+        A network with another `source_hash`, as it has several sources.
 
     Raises:
-        MapError: see `read_footprints`; or no building of the file lies on the map, or one of them
-            is too large to be any.
+        MapError: see `read_footprints`; or no building is on the map, or one is too large to be
+            a building.
     """
     found = read_footprints(path, network.geo)
     near = [footprint for footprint in found if _is_near(network, footprint)]
@@ -266,8 +266,8 @@ def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
         _check_size(path, footprint)
     if not near:
         raise MapError(
-            f"{path}: none of its {len(found)} buildings lies within {FARTHEST_M:g} m of the map "
-            f"'{network.name}': give the file that this map was made of"
+            f"{path}: none of its {len(found)} buildings is within {FARTHEST_M:g} m of the map "
+            f"'{network.name}': give the file that this map was made from"
         )
     parts = [convex_parts(footprint.rings) for footprint in near]
     digest = hashlib.sha256(f"{network.source_hash}\0buildings={source_hash(path)}".encode())
@@ -291,18 +291,18 @@ def _is_near(network: RoadNetwork, footprint: Footprint) -> bool:
 
 
 def _check_size(path: Path, footprint: Footprint) -> None:
-    """Refuse what would take all memory or time, and is no building."""
+    """Raise an error for an object that is too large for a building, and for memory."""
     corners = np.concatenate(footprint.rings)
     size_m = float(np.ptp(corners, axis=0).max())
     if size_m > LARGEST_M or len(corners) > MOST_CORNERS:
         raise MapError(
-            f"{path}: {footprint.name} is {size_m:.0f} m long and has {len(corners)} corners, more "
-            f"than {LARGEST_M:g} m or {MOST_CORNERS}: remove it"
+            f"{path}: {footprint.name} is {size_m:.0f} m long and has {len(corners)} corners; at "
+            f"most {LARGEST_M:g} m and {MOST_CORNERS} are allowed: remove it"
         )
 
 
 def walls_of(footprints: list[Footprint]) -> NDArray[np.void]:
-    """WALL (num_walls,): the sides of all rings, building by building."""
+    """Return WALL (num_walls,): the sides of all rings, building by building."""
     rows = [
         (*start, *end, footprint.height_m, number)
         for number, footprint in enumerate(footprints)
@@ -314,11 +314,11 @@ def walls_of(footprints: list[Footprint]) -> NDArray[np.void]:
 
 
 def convex_parts(rings: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
-    """The inside of some rings as trapezoids (n, 4, 2), by the even-odd rule.
+    """Return the inside of some rings as trapezoids (n, 4, 2), by the even-odd rule.
 
-    Between the heights of two neighbouring corners the sides that pass through, sorted from left to
-    right, bound the inside by pairs. Where sides cross each other between corners, which footprints
-    do not, the parts overlap a little.
+    Between the heights of two consecutive corners, the sides that pass through, sorted from left to
+    right, bound the inside in pairs. If sides cross between corners, which footprints do not, the
+    parts overlap a little.
     """
     sides = np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings])
     low = sides[:, :, 1].min(axis=1)

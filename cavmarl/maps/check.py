@@ -1,7 +1,7 @@
-"""Is this map fit to drive on? Statistics, and everything about a network that looks wrong.
+"""Checks whether a map is fit to drive on: statistics, and places that look wrong.
 
-Lengths are those that the map states (SUMO's `length`), so sums equal what sumolib computes. Edges
-and lanes are those open to passenger cars, unless a name says otherwise.
+Lengths are those that the map gives (SUMO's `length`), so sums equal those of sumolib. Unless the
+name says otherwise, edges and lanes are those open to passenger cars.
 """
 
 from __future__ import annotations
@@ -19,50 +19,50 @@ from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
-# Slower than a walk or faster than any car: likelier a wrong unit than a speed limit.
+# Slower than walking or faster than any car: more likely a wrong unit than a speed limit.
 _SPEED_RANGE_MPS = (1.0, 70.0)
 _STEEP = 0.15
-_ROUNDING = 0.005  # of grades, by places that are written to the centimetre
-_STUB_M = 1.0  # lanes that are shorter say nothing of a grade
+_ROUNDING = 0.005  # error of grades, as positions are rounded to the centimetre
+_STUB_M = 1.0  # shorter lanes do not allow an estimate of the grade
 _WELL_CONNECTED = 0.9
 _GREEN = [SIGNAL_STATES.index(letter) for letter in "gGosOY"]
 
 
 @dataclass(frozen=True)
 class MapReport:
-    """What `check_map` found."""
+    """The result of `check_map`."""
 
-    name: str  # of the network
+    name: str  # name of the network
     source_hash: str
-    road_km: float  # stated length of all edges, of all lanes
+    road_km: float  # total length of all edges; below: of all lanes
     lane_km: float
     edges: int
     lanes: int
     junctions: int  # where more than two edges meet
     junctions_by_type: dict[str, int]  # all nodes of the map by SUMO's type
-    signals: int  # traffic lights
+    signals: int  # total number of signal programs
     programs: int  # of all traffic lights together
-    actuated_signals: int  # traffic lights whose program follows the traffic
+    actuated_signals: int  # traffic lights with an actuated program
     extent_m: tuple[float, float, float, float]  # min x, min y, max x, max y of the lanes
     elevation_m: tuple[float, float]  # lowest and highest point of the lanes
     max_grade: float  # steepest slope of a lane, as a ratio
     connected_edges: int  # edges in the largest part in which every edge reaches every other
-    connected_share: float  # of all edges
-    horizon_s: float  # of an episode, where only the map is named
+    connected_share: float  # share of these edges in all edges
+    horizon_s: float  # default duration of an episode, if only the map is given
     dead_ends: tuple[str, ...]  # edges that lead nowhere
-    lanes_without_successor: tuple[str, ...]  # lanes that lead nowhere on edges that go on
-    junctions_without_right_of_way: tuple[str, ...]  # where lanes meet and the map has no rule
+    lanes_without_successor: tuple[str, ...]  # lanes that lead nowhere, of edges that do not
+    junctions_without_right_of_way: tuple[str, ...]  # where lanes meet without a rule
     signals_without_lanes: tuple[str, ...]  # traffic lights that control no lane
-    lanes_never_green: tuple[str, ...]  # lanes whose signal never opens for a movement
-    # signal programs (signal/program) for which SUMO has rules that are not run here: a choice
-    # among following phases, delay-based and NEMA control, which run for their stated durations,
-    # and limits of single links
+    lanes_never_green: tuple[str, ...]  # lanes whose signal never opens any movement
+    # signal programs (signal/program) that are simplified: a choice between following phases,
+    # delay-based and NEMA control run with their stated durations, and limits of single links
+    # are ignored
     programs_simplified: tuple[str, ...]
     self_loops: tuple[str, ...]  # edges that end where they begin
     steep_lanes: tuple[str, ...]  # lanes that climb more than 15 %, the steepest first
     speed_outliers: tuple[str, ...]  # lanes with a speed limit below 1 or above 70 m/s
-    problems: tuple[str, ...]  # why the map cannot be driven; empty if it can
-    notes: tuple[str, ...]  # what else to know
+    problems: tuple[str, ...]  # why the map cannot be driven on; empty if it can
+    notes: tuple[str, ...]  # other remarks
 
     @property
     def drivable(self) -> bool:
@@ -73,9 +73,9 @@ class MapReport:
 
 
 def check_map(source: str | Path | RoadNetwork) -> MapReport:
-    """Gather statistics of a SUMO network and look for what makes it unfit.
+    """Collect statistics of a SUMO network, and find what makes it unfit.
 
-    Raises MapError: the network cannot be read at all; see `read_network`.
+    Raises MapError: the network cannot be read; see `read_network`.
     """
     network = source if isinstance(source, RoadNetwork) else load_network(source)
     cars = _Cars(network)
@@ -194,7 +194,7 @@ def _junctions_by_type(network: RoadNetwork) -> dict[str, int]:
 
 
 def _grades(network: RoadNetwork) -> NDArray[np.float64]:
-    """The steepest slope of each lane, as a ratio."""
+    """Return the steepest slope of each lane, as a ratio."""
     slopes = np.abs(network.points["slope"])
     steepest = np.maximum.reduceat(slopes, network.lanes["first_point"])
     return np.where(network.lanes["length_m"] >= _STUB_M, steepest, 0.0)
@@ -235,7 +235,8 @@ def _notes(findings: dict[str, tuple[str, ...]], share: float, grade: float) -> 
     notes = []
     if share < _WELL_CONNECTED:
         notes.append(
-            f"only {share:.0%} of the edges reach one another: trips elsewhere end at the map's rim"
+            f"only {share:.0%} of the edges reach one another: trips from other edges may end at "
+            "the map's border"
         )
     for name, ids in findings.items():
         if ids:

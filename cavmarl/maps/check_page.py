@@ -1,4 +1,4 @@
-"""A page with a map's picture, and the places marked that look wrong."""
+"""A page with a picture of a map and marks at the places that look wrong."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _STYLE = "body{font:14px sans-serif;margin:2em}td,th{text-align:left;padding:2px
 
 
 def write_check_page(path: Path, network: RoadNetwork, defects: Sequence[Defect]) -> None:
-    """Raises ConfigError: the page cannot be written."""
+    """Write the page; raises ConfigError if that is not possible."""
     kinds = list(dict.fromkeys(defect.kind for defect in defects))
     color = {kind: _COLORS[n % len(_COLORS)] for n, kind in enumerate(kinds)}
     min_x, min_y, max_x, max_y = network.extent_m
@@ -28,7 +28,7 @@ def write_check_page(path: Path, network: RoadNetwork, defects: Sequence[Defect]
     )
     marks = "".join(
         f'<circle cx="{defect.x_m:.1f}" cy="{-defect.y_m:.1f}" r="{wide / 120:.2f}" '
-        f'stroke="{color[defect.kind]}"><title>{_said(defect)}</title></circle>'
+        f'stroke="{color[defect.kind]}"><title>{_tooltip(defect)}</title></circle>'
         for defect in defects
         if np.isfinite(defect.x_m)
     )
@@ -57,5 +57,5 @@ def _points(network: RoadNetwork, lane: int) -> str:
     return " ".join(f"{x:.1f},{-y:.1f}" for x, y, _ in network.lane_polyline(lane).tolist())
 
 
-def _said(defect: Defect) -> str:
+def _tooltip(defect: Defect) -> str:
     return html.escape(f"{defect.kind}: {defect.name} {defect.about}")

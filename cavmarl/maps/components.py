@@ -1,4 +1,4 @@
-"""Strongly connected parts of a directed graph."""
+"""Strongly connected components of a directed graph."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 
 def strong_components(num_nodes: int, arcs: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The component of every node of a directed graph.
+    """Return the component of every node of a directed graph.
 
-    Kosaraju's two searches, without recursion: a city is deeper than Python's stack.
+    Kosaraju's algorithm without recursion: a city's graph is deeper than Python's stack.
 
     `arcs`: (num_arcs, 2) from-node, to-node.
 
-    Returns (N,) component numbers from 0; nodes that reach each other share one.
+    Returns (N,) component numbers from 0; nodes that reach each other have the same number.
     """
     onward: list[list[int]] = [[] for _ in range(num_nodes)]
     backward: list[list[int]] = [[] for _ in range(num_nodes)]
@@ -38,7 +38,7 @@ def strong_components(num_nodes: int, arcs: NDArray[np.int32]) -> NDArray[np.int
 
 
 def _finishing_order(onward: list[list[int]]) -> list[int]:
-    """All nodes in the order in which a depth-first search leaves them."""
+    """Return all nodes in the order in which a depth-first search finishes them."""
     seen = [False] * len(onward)
     order: list[int] = []
     for root in range(len(onward)):

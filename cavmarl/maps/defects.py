@@ -1,4 +1,4 @@
-"""Places of a map that look wrong, each with its kind and where it lies."""
+"""Places of a map that look wrong, each with its kind and position."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 CAR_WIDTH_M = 1.8
-LEVEL_M = 3.0  # lanes that differ more in height are a bridge and the road below it
-STEP_M = 0.1  # of height, between lanes of which one leads into the other
+LEVEL_M = 3.0  # lanes with a larger difference in height are a bridge and the road below it
+STEP_M = 0.1  # in height, between lanes that lead into each other
 SEARCHES = ("crossings", "signals", "lanes", "steps", "parts", "stop lines", "buildings")
-_DEEP_M = 1.0  # that a stop line may lie inside its junction
+_DEEP_M = 1.0  # maximum distance of a stop line inside its junction
 
 Points = NDArray[np.float64]
 
@@ -45,17 +45,17 @@ def find_defects(
     buildings: Path | None = None,
     told: Callable[[str], None] = lambda stage: None,
 ) -> list[Defect]:
-    """Everything that looks wrong, kind by kind.
+    """Return everything that looks wrong, kind by kind.
 
     Args:
         network: the map.
-        path: its file, which has rules and shapes of junctions.
-        buildings: OSM or SUMO polygons; None: they are not asked.
-        told: which of `SEARCHES` begins.
+        path: the map's file, which has rules and shapes of junctions.
+        buildings: OSM or SUMO polygons; None: buildings are not checked.
+        told: called with each of `SEARCHES` as it begins.
 
     Raises:
-        MapError: a file cannot be read, or the buildings are of another map.
-        MissingExtraError: buildings have to be projected, and pyproj is not installed.
+        MapError: a file cannot be read, or the buildings belong to another map.
+        MissingExtraError: buildings must be projected, and pyproj is not installed.
     """
     document = NetDocument(path)
     searches: list[Callable[[], Iterable[Defect]]] = [
@@ -69,14 +69,14 @@ def find_defects(
     if buildings is not None:
         searches.append(lambda: _buildings_on_roads(with_buildings(network, buildings)))
     found: list[Defect] = []
-    for name, search in zip(SEARCHES, searches, strict=False):  # the last one may be missing
+    for name, search in zip(SEARCHES, searches, strict=False):  # the last search may be missing
         told(name)
         found += search()
     return found
 
 
 def cut_off_edges(network: RoadNetwork) -> list[int]:
-    """EDGE rows for cars that the largest part of the map neither reaches nor is reached from."""
+    """Return EDGE rows for cars that are connected to the largest part in neither direction."""
     from cavmarl.maps.components import strong_components
 
     open_lanes = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
@@ -113,9 +113,9 @@ def _middle(network: RoadNetwork, edge: int) -> tuple[float, float]:
 
 
 def _unruled_crossings(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
-    """Paths that cross in a junction, and neither has to give way nor is signalled.
+    """Find paths that cross in a junction without a rule or a signal.
 
-    Asked is the file: where it has no rule, the reader takes one.
+    The rules are taken from the file, because the reader adds missing rules.
     """
     links = network.links
     rules = {
@@ -166,7 +166,7 @@ def _path(network: RoadNetwork, link: int) -> Points:
 
 
 def crossing_of(one: Points, other: Points) -> tuple[float, float] | None:
-    """Where two polylines (n, 3) cross on one level, in the plane; None: nowhere."""
+    """Return where two polylines (n, 3) cross on one level, in the plane, or None."""
     if len(one) < 2 or len(other) < 2:
         return None
     a, b = one[:-1, None], one[1:, None]
@@ -247,7 +247,7 @@ def _to_rim(place: Points, rim: Points) -> float:
 
 
 def _buildings_on_roads(network: RoadNetwork) -> Iterator[Defect]:
-    """Middles of lanes under a roof: a building that was drawn over a road, or its passage."""
+    """Find lanes with points under a roof: the building covers the road, or has a passage."""
     lane_of = np.repeat(np.arange(len(network.lanes)), network.lanes["num_points"])
     places = np.stack([network.points["x"], network.points["y"]], axis=1)
     seen: set[int] = set()

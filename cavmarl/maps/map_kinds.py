@@ -1,4 +1,4 @@
-"""The kind of a map file, told by its content and not by its name."""
+"""The kind of a map file, determined by its content and not by its name."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendri
 
 
 class _Root(ContentHandler):
-    """Remembers the root element; the parser around it finds what is broken or hostile."""
+    """Remembers the root element; the parser reports broken or malicious XML."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,9 +33,9 @@ class _Root(ContentHandler):
 
 
 def map_kind(path: Path) -> MapKind:
-    """Read a map file to its end and tell its kind by its root element.
+    """Read a map file to its end, and return the kind of its root element.
 
-    Raises MapError: the file cannot be read, is broken or hostile XML, or is no map.
+    Raises MapError: the file cannot be read, is broken or malicious XML, or is not a map.
     """
     root = _Root()
     try:
@@ -43,8 +43,8 @@ def map_kind(path: Path) -> MapKind:
     except MapError as error:
         no_xml = isinstance(error.__cause__, SAXParseException) and not root.name
         if no_xml and not path.name.endswith(MAP_ENDINGS):
-            raise MapError(f"{path}: is no map: {_KINDS}") from error
+            raise MapError(f"{path}: not a map: {_KINDS}") from error
         raise
     if root.name not in _ROOTS:
-        raise MapError(f"{path}: <{root.name}> is the root of no map: {_KINDS}")
+        raise MapError(f"{path}: <{root.name}> is not the root of a map: {_KINDS}")
     return _ROOTS[root.name]

@@ -1,4 +1,4 @@
-"""A SUMO network file as a tree: what may be changed in it without netconvert."""
+"""A SUMO network file as a tree, for changes without netconvert."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class DocumentLane:
 
     @cached_property
     def points(self) -> Points:
-        """(n, 2) or (n, 3), as the file says them."""
+        """(n, 2) or (n, 3), as in the file."""
         return points_of(self.element)
 
     @property
     def ways(self) -> list[str]:
-        """Ids of the ways of OSM that it was made of."""
+        """Ids of the OSM ways from which the lane was made."""
         for param in self.element.iter("param"):
             if param.get("key") == "origId":
                 return param.get("value", "").split()
@@ -57,14 +57,14 @@ class NetDocument:
     """The elements of a network file."""
 
     def __init__(self, path: Path) -> None:
-        """Raises MapError: the file is no network or is broken."""
+        """Read a file; raises MapError if it is not a network, or is broken."""
         self.path = path
         try:
             root = read_tree(path)
         except (ParseError, DefusedXmlException, ValueError, OSError) as error:
             raise MapError(f"{path}: cannot be read ({error}): build it again") from error
         if root.tag != "net":
-            raise MapError(f"{path}: <{root.tag}> is no SUMO network")
+            raise MapError(f"{path}: <{root.tag}> not a SUMO network: give a .net.xml file")
         self.root = root
         self.lanes = [
             DocumentLane(edge, lane) for edge in root.iter("edge") for lane in edge.iter("lane")
@@ -82,13 +82,13 @@ class NetDocument:
         return self.root.iter("junction")
 
     def content(self, head: bytes = b"") -> bytes:
-        """The file's bytes; `head`: a comment that goes before the root."""
+        """Return the file's bytes; `head` is a comment before the root."""
         text: bytes = tostring(self.root, "utf-8")
         return b'<?xml version="1.0" encoding="UTF-8"?>\n' + head + text + b"\n"
 
 
 def points_of(element: Element) -> Points:
-    """The `shape` of an element; (0, 2) where it has none."""
+    """Return the `shape` of an element; (0, 2) if it has none."""
     words = [word.split(",") for word in element.get("shape", "").split()]
     if not words:
         return np.zeros((0, 2))
@@ -100,7 +100,7 @@ def points_of(element: Element) -> Points:
 
 
 def shape_text(plane: list[str], heights_m: Points) -> str:
-    """A `shape` of places as they were written, and heights."""
+    """Return a `shape` of positions as they were written, with heights."""
     return " ".join(
         f"{place},{height:.{HEIGHT_DIGITS}f}"
         for place, height in zip(plane, heights_m.tolist(), strict=True)

@@ -1,8 +1,8 @@
-"""OpenStreetMap and OpenDRIVE made into SUMO networks by netconvert of the `eclipse-sumo` wheel.
+"""Converts OpenStreetMap and OpenDRIVE to SUMO networks with netconvert (`eclipse-sumo` wheel).
 
-The same source and options give the same bytes: netconvert's comment with the date is dropped.
+The same source and options give the same bytes: netconvert's comment with the date is removed.
 
-Each says inside where it comes from (`maps.provenance`); heights are laid under it here.
+Each network file names its source (`maps.provenance`). Heights are added here.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ OSM_OPTIONS = (
     "--tls.join",
     "--keep-edges.by-vclass=passenger",
     "--remove-edges.isolated",
-    "--output.original-names",  # of the ways of each lane: bridges, names, defaults
+    "--output.original-names",  # of the ways of each lane: for bridges, names, defaults
 )
 OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
 
@@ -66,7 +66,7 @@ _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.t
 _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
-_FAR_M = 100_000.0  # from the origin: the projection is no longer true to scale
+_FAR_M = 100_000.0  # from the origin; farther away, the projection distorts lengths
 
 Origin = tuple[float, float]  # latitude and longitude, degrees
 Told = Callable[[str], None]
@@ -80,22 +80,22 @@ def _silent(stage: str) -> None:
 
 @dataclass(frozen=True)
 class BuildResult:
-    """What a build did."""
+    """The result of a build."""
 
     path: Path  # the SUMO network
     source: Path  # the file it was made from
     kind: MapKind  # of the source
-    options: tuple[str, ...]  # netconvert's options; empty where a SUMO network was taken as it is
+    options: tuple[str, ...]  # netconvert's options; empty if a SUMO network was copied
     # netconvert's warnings, counted by their text without names and numbers
     warnings: dict[str, int]
-    # what netconvert says it changed: junctions joined, roundabouts guessed …
+    # changes that netconvert reports: joined junctions, guessed roundabouts …
     corrections: tuple[str, ...]
-    # with `tolerant`, the errors that netconvert ignored: what they name was left out
+    # with `tolerant`, ignored errors of netconvert; the objects that they name were left out
     dropped: tuple[str, ...]
-    provenance: dict[str, str]  # what the file says of its own origin
-    defaults: tuple[RoadDefaults, ...] = ()  # what OSM does not say and the type map gave
+    provenance: dict[str, str]  # origin of the map, as written in its file
+    defaults: tuple[RoadDefaults, ...] = ()  # missing values of OSM from the type map
     heights: HeightReport | None = None
-    levels: int = 0  # lanes that cross one another on a bridge or in a tunnel, without `heights`
+    levels: int = 0  # lanes that cross on a bridge or in a tunnel, without `heights`
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self) | {"path": str(self.path), "source": str(self.source)}
@@ -114,31 +114,31 @@ def build_network(
     timeout_s: float | None = None,
     told: Told = _silent,
 ) -> BuildResult:
-    """Make a SUMO network of a map file and prove that it can be read.
+    """Make a SUMO network from a map file, and check that it can be read.
 
     Args:
-        source: OpenStreetMap or OpenDRIVE, which netconvert turns into a network, or a SUMO
-            network, which is taken as it is. Plain or gzipped.
-        target: where the network goes, gzipped if it ends in `.gz`. By default the cache, or the
-            source itself where nothing has to be done.
-        options: more options for netconvert.
+        source: OpenStreetMap or OpenDRIVE, which netconvert converts to a network, or a SUMO
+            network, which is copied. May be gzipped.
+        target: destination of the network, gzipped if it ends in `.gz`. Default: the cache, or
+            the source itself if nothing has to be done.
+        options: additional options for netconvert.
         bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
-            OSM, else metres in the source's own frame.
+            OSM, otherwise metres in the source's own frame.
         origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
             the roads, in UTM.
-        heights: models of the ground, laid under the roads; nothing moves in the plane. Without
-            them the ground is flat, and bridges and tunnels of OSM leave it where they cross roads.
-        licences: of the source and of the models of heights, where the map is to say others.
-        tolerant: let netconvert leave out what it cannot use instead of giving up.
-        timeout_s: how long netconvert may take; None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
+        heights: terrain models for the roads; nothing moves in the plane. Without them, the ground
+            is flat, and bridges and tunnels of OSM leave it where they cross roads.
+        licences: licences of the source and of the terrain models, if not the default ones.
+        tolerant: let netconvert leave out what it cannot use instead of failing.
+        timeout_s: time limit of netconvert; None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
         told: called with each of `STAGES` as it begins.
 
     Raises:
-        ConfigError: an empty `bbox`, or an origin that is on no earth or of another map.
-        MapError: the source is broken, hostile or no map, netconvert refuses it (its own lines are
-            in the message), nothing in the result can be driven, the heights cannot be laid under
-            it, or the target cannot be written.
-        MissingExtraError: netconvert, or what heights and levels need, is not installed.
+        ConfigError: `bbox` is empty, or the origin is not on the earth or far from the map.
+        MapError: the source is broken, malicious or not a map; netconvert fails (its output is in
+            the message); the result has no drivable lane; the heights cannot be used; or the target
+            cannot be written.
+        MissingExtraError: netconvert, or a package for heights and levels, is not installed.
     """
     source = Path(source)
     kind = map_kind(source)
@@ -171,7 +171,7 @@ def build_network(
 
 
 def map_file(path: str | Path) -> Path:
-    """The SUMO network of any map file: the file itself, or what netconvert once made of it.
+    """Return the SUMO network of a map file: the file itself, or the result of netconvert.
 
     Raises MapError: see `build_network`.
     """
@@ -191,7 +191,7 @@ def _cache_entry(
     require("sumo", "sumo")
     words = [source_hash(source), version("eclipse-sumo"), *options]
     if heights is None:
-        words.append("levels 4")  # of bridges and tunnels; the number counts the ways to find them
+        words.append("levels 4")  # of bridges and tunnels; the number is the algorithm's version
     else:
         words += [*map(source_hash, heights.models), repr(heights)]
     digest = hashlib.sha256("\0".join(words).encode())
@@ -213,11 +213,11 @@ def _centred(source: Path, kind: MapKind, origin: Origin | None) -> tuple[str, .
     latitude, longitude = origin
     if kind != "osm":
         raise ConfigError(
-            f"--origin: {source} states its own frame: an origin is for OpenStreetMap"
+            f"--origin: {source} has its own frame: an origin is only for OpenStreetMap"
         )
     if not (abs(latitude) < 90.0 and abs(longitude) <= 180.0):
         raise ConfigError(
-            f"--origin {latitude:g},{longitude:g}: is no latitude and longitude: give LAT,LON in "
+            f"--origin {latitude:g},{longitude:g}: not a latitude and longitude: give LAT,LON in "
             "degrees"
         )
     projection = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +x_0=0 +y_0=0"
@@ -242,12 +242,12 @@ class _Build:
     levels: int = 0
 
     def run(self) -> None:
-        """Make the network beside its place, and put it there when it is whole."""
+        """Make the network beside its destination, and move it there when it is complete."""
         place = self.place
         if place.exists() and place.samefile(self.source):
             raise MapError(f"{place}: the target is the source: give another target")
         place.parent.mkdir(parents=True, exist_ok=True)
-        cache = cache_dir() / "maps"  # all builds there share it, so that one clears after another
+        cache = cache_dir() / "maps"  # shared by all builds, so that one cleans up after another
         with draft_folder(cache if place.is_relative_to(cache) else place.parent) as folder:
             draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
@@ -262,7 +262,7 @@ class _Build:
             os.replace(draft, place)
 
     def _finished(self, draft: Path) -> bytes:
-        """The network with what netconvert does not do: heights, and where it is from."""
+        """Return the network with additions to netconvert's output: heights and origin."""
         if not self.options and self.heights is None:
             return draft.read_bytes()
         self.told(STAGES[1])
@@ -283,7 +283,7 @@ class _Build:
         return content.replace(b"<net ", facts + b"<net ", 1)
 
     def _facts(self, document: NetDocument) -> dict[str, str]:
-        """What the map says of its own origin."""
+        """Return the map's origin, for its file."""
         facts = read_provenance(self.source) if self.kind == "sumo" else {}
         if not facts:
             facts = {"source": self.source.name, "source sha256": source_hash(self.source)}
@@ -316,7 +316,7 @@ def _check_near(source: Path, document: NetDocument, origin: Origin | None) -> N
     corners = [float(word) for word in location.get("convBoundary", "0").split(",")]
     if max(map(abs, corners)) > _FAR_M or not all(map(math.isfinite, corners)):
         raise ConfigError(
-            f"--origin {origin[0]:g},{origin[1]:g}: {source} lies more than {_FAR_M / 1e3:g} km "
+            f"--origin {origin[0]:g},{origin[1]:g}: {source} is more than {_FAR_M / 1e3:g} km "
             "away: give LAT,LON in this order, near the roads"
         )
 
@@ -330,9 +330,9 @@ def _convert(
     cures = Cures(
         f"crop the map (cavmarl map build {source} --bbox …) or allow more time (--timeout-s, or "
         f"{TIME_LIMIT})",
-        "mend the source"
+        "repair the source"
         if "--ignore-errors" in options
-        else f"mend the source, or leave out what is broken: cavmarl map build {source} --tolerant",
+        else f"repair the source, or drop its broken parts: cavmarl map build {source} --tolerant",
     )
     return run_netconvert(arguments, source, timeout_s, cures)
 
@@ -342,7 +342,7 @@ def _check_readable(source: Path, draft: Path, log: BuildLog) -> None:
         read_network(draft)
     except MapError as error:
         message = f"{source}: {str(error).removeprefix(f'{draft}: ')}"
-        said = (*log.errors(), *log.warnings())
-        if said:
-            message += f"\nnetconvert said:\n{quoted(said)}"
+        reported = (*log.errors(), *log.warnings())
+        if reported:
+            message += f"\nnetconvert reported:\n{quoted(reported)}"
         raise MapError(message) from error

@@ -1,4 +1,4 @@
-"""One run of netconvert as a process, and what it says."""
+"""A run of netconvert as a process, and its output."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.core.processes import dying_with_parent
 from cavmarl.roads.sumo_net.xml_source import limit
 
 MAX_NETCONVERT_S = 600
-TIME_LIMIT = "CAVMARL_MAX_NETCONVERT_S"  # the environment's variable with another limit
+TIME_LIMIT = "CAVMARL_MAX_NETCONVERT_S"  # environment variable for another limit
 _SHOWN_LINES = 10
 _QUOTED = re.compile(r"'[^']*'")
 _NUMBERED = re.compile(r"\S*\d\S*")
@@ -23,43 +23,41 @@ _CORRECTION = re.compile(r"^(Joined|Guessed|Removed) |^[1-9]\d* .*(removed|compu
 
 
 class BuildLog:
-    """The output of one run with `--verbose` and without aggregated warnings."""
+    """The output of a run with `--verbose` and without aggregated warnings."""
 
     def __init__(self, stdout: str = "", stderr: str = "") -> None:
-        self._said = stdout.splitlines()
-        self._complained = stderr.splitlines()
+        self._stdout = stdout.splitlines()
+        self._stderr = stderr.splitlines()
 
     def errors(self) -> tuple[str, ...]:
         return self._after("Error: ")
 
     def warnings(self) -> dict[str, int]:
-        """How often each warning came, by its text with `%` for names and numbers."""
+        """Return counts of warnings, by their text with `%` for names and numbers."""
         kinds = Counter(
             _NUMBERED.sub("%", _QUOTED.sub("'%'", line)) for line in self._after("Warning: ")
         )
         return dict(kinds.most_common())
 
     def corrections(self) -> tuple[str, ...]:
-        """What netconvert changed on its own account, in its words."""
-        lines = (line.strip().rstrip(".") for line in self._said if line.startswith(" "))
+        """Return netconvert's own changes, in its words."""
+        lines = (line.strip().rstrip(".") for line in self._stdout if line.startswith(" "))
         return tuple(line for line in lines if _CORRECTION.search(line))
 
     def complaint(self) -> tuple[str, ...]:
-        """The errors or, if it died without one, all that it complained about."""
-        return self.errors() or tuple(self._complained) or ("no message",)
+        """Return the errors or, if there are none, the complete error output."""
+        return self.errors() or tuple(self._stderr) or ("no message",)
 
     def _after(self, prefix: str) -> tuple[str, ...]:
-        return tuple(
-            line.removeprefix(prefix) for line in self._complained if line.startswith(prefix)
-        )
+        return tuple(line.removeprefix(prefix) for line in self._stderr if line.startswith(prefix))
 
 
 @dataclass(frozen=True)
 class Cures:
-    """What a message advises."""
+    """Advice for error messages."""
 
     too_long: str = f"allow more time ({TIME_LIMIT})"
-    refused: str = "mend the source"
+    refused: str = "repair the source"
 
 
 def run_netconvert(
@@ -67,13 +65,13 @@ def run_netconvert(
 ) -> BuildLog:
     """Run netconvert of the `eclipse-sumo` wheel.
 
-    `source`: the file that messages name. `timeout_s`: None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
-    `cures`: what they advise.
+    `source`: the file for messages. `timeout_s`: None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
+    `cures`: advice for messages.
 
     Raises:
-        ConfigError: that variable is no whole number above 0.
-        MapError: it fails or takes too long.
-        MissingExtraError: it is not installed.
+        ConfigError: that variable is not a whole number above 0.
+        MapError: netconvert fails or takes too long.
+        MissingExtraError: netconvert is not installed.
     """
     timeout_s = limit(TIME_LIMIT, MAX_NETCONVERT_S) if timeout_s is None else timeout_s
     home = sumo_home()
@@ -98,14 +96,14 @@ def run_netconvert(
     log = BuildLog(done.stdout, done.stderr)
     if done.returncode != 0:
         raise MapError(
-            f"{source}: netconvert gave up (exit code {done.returncode}):\n"
+            f"{source}: netconvert failed (exit code {done.returncode}):\n"
             f"{quoted(log.complaint())}\nCure: {cures.refused}"
         )
     return log
 
 
 def sumo_home() -> Path:
-    """Raises MissingExtraError: SUMO is not installed."""
+    """Return the home folder of SUMO; raises MissingExtraError if SUMO is not installed."""
     return Path(require("sumo", "sumo").SUMO_HOME)
 
 

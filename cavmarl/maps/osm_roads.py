@@ -1,4 +1,4 @@
-"""What OpenStreetMap says of roads beyond what netconvert takes over: levels, names, gaps."""
+"""Information of OpenStreetMap that netconvert does not use: levels, names, missing tags."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class RoadWay:
 
     @property
     def level(self) -> int:
-        """Above (bridges) or below (tunnels) the ground; 0: on it."""
+        """Level above (bridges) or below (tunnels) the ground; 0: on it."""
         for key, sign in (("bridge", 1), ("tunnel", -1)):
             if self.tags.get(key, "no") not in _ON_THE_GROUND:
                 try:
@@ -49,7 +49,7 @@ class OsmRoads(ContentHandler):
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises MapError: the file is broken."""
+        """Read a file; raises MapError if it is broken."""
         super().__init__()
         self.ways: dict[str, RoadWay] = {}
         self.places: dict[str, tuple[float, float]] = {}

@@ -1,4 +1,4 @@
-"""Longitudes and latitudes as places of a map, as the map says."""
+"""Conversion between longitude, latitude and positions on a map, with the map's projection."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Places = NDArray[np.float64]
 
 
 def project(source: Path | str, degrees: Places, geo: GeoReference) -> Places:
-    """X and y in m (n, 2) of longitudes and latitudes (n, 2).
+    """Return x and y in m (n, 2) of longitudes and latitudes (n, 2).
 
     Raises:
-        MapError: one cannot be projected; `source` names where it is from.
+        MapError: a place cannot be projected; `source` is its file, for the message.
         MissingExtraError: pyproj is not installed.
     """
     pyproj: Any = require("pyproj", "maps")
@@ -28,13 +28,13 @@ def project(source: Path | str, degrees: Places, geo: GeoReference) -> Places:
         lost = int(np.flatnonzero(~np.isfinite(placed).all(axis=1))[0])
         raise MapError(
             f"{source}: longitude {degrees[lost, 0]:g}, latitude {degrees[lost, 1]:g} cannot be "
-            "projected as the map is: export the file again for this map"
+            "projected as in the map: export the file again for this map"
         )
     return placed
 
 
 def unproject(places: Places, geo: GeoReference) -> Places:
-    """Longitudes and latitudes (n, 2) of x and y in m (n, 2).
+    """Return longitudes and latitudes (n, 2) of x and y in m (n, 2).
 
     Raises MissingExtraError: pyproj is not installed.
     """

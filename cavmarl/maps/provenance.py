@@ -1,4 +1,4 @@
-"""Where a map comes from, kept inside its file: a comment before the root, `key: value` a line."""
+"""The origin of a map, stored in its file as a comment: one `key: value` per line."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _GUESSED = {"lanes": "numLanes", "maxspeed": "speed", "width": "width"}
 
 @dataclass(frozen=True)
 class RoadDefaults:
-    """What netconvert's type map gave the roads of one kind that do not say it."""
+    """Values from netconvert's type map for roads of one kind without the tag."""
 
-    kind: str  # OSM's `highway`, as netconvert names it
+    kind: str  # OSM's `highway`, as named by netconvert
     edges: int
     guessed: str  # lanes, maxspeed or width
-    value: str  # the commonest; speeds in m/s, widths in m
+    value: str  # the most frequent one; speeds in m/s, widths in m
     used_for: int  # edges
 
     def to_dict(self) -> dict[str, Any]:
@@ -42,14 +42,14 @@ class RoadDefaults:
 
 
 def head_of(facts: Mapping[str, str]) -> bytes:
-    """The comment that goes into a map's file."""
+    """Return the comment for a map's file."""
     lines = [f"{key}: {' '.join(value.split())}" for key, value in facts.items()]
     text = "\n".join(lines).replace("--", "- -")
     return f"<!-- {_TITLE}\n{text}\n-->\n".encode()
 
 
 def read_provenance(path: Path) -> dict[str, str]:
-    """What the file of a map says of its own origin; empty: nothing."""
+    """Return the origin of a map from its file; empty if it has none."""
     try:
         with path.open("rb") as raw:
             head = raw.read(_HEAD_BYTES)
@@ -63,7 +63,7 @@ def read_provenance(path: Path) -> dict[str, str]:
 
 
 def road_defaults(document: NetDocument, roads: OsmRoads) -> tuple[RoadDefaults, ...]:
-    """Which kinds of road were built with guessed lanes, speeds and widths, and how often."""
+    """Return the kinds of road with guessed lanes, speeds and widths, and their counts."""
     counts: Counter[str] = Counter()
     values: dict[tuple[str, str], Counter[str]] = {}
     seen = set()

@@ -1,4 +1,4 @@
-"""What can be mended in a network without its source: netconvert writes it anew."""
+"""Repairs a network without its source: netconvert writes it again."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _TIMEOUT_S = 600.0
 
 
 def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str], list[Defect]]:
-    """Write a network without what is cut off, and with right of way and signals made anew.
+    """Write a network without unconnected parts, and with new right of way and signals.
 
     Args:
         source: a SUMO network.
-        target: where the mended one goes.
-        before: what was found in the source.
+        target: file of the repaired network.
+        before: defects of the source.
 
-    Returns what was done, and what is found in the mended network.
+    Returns the changes, and the defects of the repaired network.
 
-    Raises MapError: netconvert refuses the network, or the target is the source.
+    Raises MapError: netconvert fails, or the target is the source.
     """
     if target.exists() and target.samefile(source):
         raise MapError(f"{target}: the target is the source: give another target")
@@ -46,7 +46,7 @@ def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str
     done = [f"removed edge {name}: cut off from the rest" for name in cut]
     left = {(defect.kind, defect.name) for defect in after}
     done += [
-        f"{defect.kind} {defect.name}: made anew"
+        f"{defect.kind} {defect.name}: repaired"
         for defect in before
         if (defect.kind, defect.name) not in left and defect.kind != "unreachable part"
     ]

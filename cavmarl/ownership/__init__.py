@@ -1,7 +1,7 @@
-"""Ownership of vehicles: the protocol that moves it from zone to zone.
+"""The protocol that moves the ownership of vehicles from zone to zone.
 
-See docs/explanation/ownership.md. Pure: the standard library, no input or output, no clock, no
-threads, no chance. `Directory` is the coordinator's side and `Endpoint` that of a zone host; both
-take messages and answer with what to do. `runtime/` puts stores, journals and processes around
-them.
+See docs/explanation/ownership.md. The package is pure: it uses only the standard library, without
+input or output, clocks, threads or random numbers. `Directory` is the coordinator's side, and
+`Endpoint` is the side of a zone host. Both receive messages and return actions. `handoff` and
+`parallel` provide stores, journals and processes.
 """

@@ -1,11 +1,11 @@
-"""Messages as bytes: a header, the fields in the order of the class, a checksum.
+"""Conversion of messages to bytes and back: a header, the fields of the class, a checksum.
 
     4 bytes  "CVMO"      2 bytes  version      1 byte  kind      1 byte  zero
-    the message's fields: whole numbers of 8 bytes (digests of rows: 16), flags of 1 byte,
-    byte strings and lists with their length in 4 bytes before them
-    4 bytes  CRC-32 of all that precedes
+    the message's fields: integers of 8 bytes (digests of rows: 16), flags of 1 byte, byte strings
+    and lists after their length in 4 bytes
+    4 bytes  CRC-32 of all bytes before
 
-All numbers are little-endian. What is not exactly so is refused, never repaired.
+All numbers are little-endian. Bytes in any other form are refused, never repaired.
 """
 
 from __future__ import annotations
@@ -54,35 +54,42 @@ def encode(message: Message) -> bytes:
 
 
 def decode(
-    data: bytes,  # one whole message
-    run: bytes | None = None,  # of the receiver; None accepts all
+    data: bytes,  # one complete message
+    run: bytes | None = None,  # of the receiver; None accepts all runs
 ) -> Message:
-    """The message of a wire form."""
+    """Decode a message.
+
+    Raises:
+        MessageError: the bytes are damaged, or are of another version or run.
+    """
     if len(data) < _HEADER.size + _CRC.size:
-        raise MessageError(f"a message of {len(data)} bytes has no room for its header")
+        raise MessageError(f"a message of {len(data)} bytes is shorter than a header")
     magic, version, kind, zero = _HEADER.unpack_from(data)
     if magic != MAGIC:
         raise MessageError(f"a message begins with {MAGIC!r}, not with {magic!r}")
     if version != VERSION:
-        raise MessageError(f"version {version} of the messages; known is {VERSION}")
+        raise MessageError(
+            f"the message has version {version}, but this build reads {VERSION}; run the same "
+            "version of cavmarl on all machines"
+        )
     body = data[: -_CRC.size]
     if zlib.crc32(body) != _CRC.unpack_from(data, len(body))[0]:
         raise MessageError(f"the checksum of a message of {len(data)} bytes is wrong")
     if kind >= len(KINDS) or zero:
-        raise MessageError(f"kind {kind} of message does not exist")
+        raise MessageError(f"messages of kind {kind} do not exist")
     plain = _PLAIN.get(kind)
     message: Message | None = None if plain is None else plain.read(data)
     if message is None:
         message, at = _FORMS[kind].read(body, _HEADER.size)
         if at != len(body):
-            raise MessageError(f"{len(body) - at} bytes follow after the message")
+            raise MessageError(f"{len(body) - at} extra bytes follow the message")
     if run is not None and message.run != run:
-        raise MessageError(f"a message of run {message.run.hex()}; this is {run.hex()}")
+        raise MessageError(f"the message is of run {message.run.hex()}, not of {run.hex()}")
     return message
 
 
 class _Numbers:
-    """Fields that follow each other and have a fixed size: whole numbers, flags, wide digests."""
+    """Consecutive fields of fixed sizes: integers, flags, wide digests."""
 
     def __init__(self, hints: Sequence[tuple[str, Any]]) -> None:
         self._names = [name for name, _ in hints]
@@ -101,7 +108,7 @@ class _Numbers:
         parts.append(self._whole.pack(*found))
 
     def read(self, body: bytes, at: int, values: list[Any]) -> int:
-        """Add the fields to `values`; where they end."""
+        """Append the fields to `values`. Return where they end."""
         end = at + self._whole.size
         if end > len(body):
             raise MessageError(f"a message ends inside fields of {self._whole.size} bytes")
@@ -110,7 +117,7 @@ class _Numbers:
             found[n] = int.from_bytes(found[n], "little")
         for n, kind, known in self._few:
             if found[n] not in known:
-                raise MessageError(f"{found[n]} is none of {[int(value) for value in known]}")
+                raise MessageError(f"{found[n]} is not one of {[int(value) for value in known]}")
             found[n] = kind(found[n])
         values += found
         return end
@@ -139,7 +146,7 @@ class _Bytes:
 
 
 class _List:
-    """A field of entries of one class."""
+    """A list of entries of one class."""
 
     def __init__(self, name: str, kind: type[Any]) -> None:
         self._name = name
@@ -162,7 +169,7 @@ class _List:
 
 
 class _ListOfNumbers:
-    """A field of whole numbers."""
+    """A list of integers."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -180,7 +187,7 @@ class _ListOfNumbers:
 
 
 class _Entry:
-    """A field of a class of its own."""
+    """A field that is an instance of another class."""
 
     def __init__(self, name: str, kind: type[Any]) -> None:
         self._name = name
@@ -196,7 +203,7 @@ class _Entry:
 
 
 class _Form:
-    """The fields of a class, in their order; made once, for a tick has several messages."""
+    """The fields of a class, in their order. It is made once per class, to save time."""
 
     def __init__(self, kind: type[Any], hints: Sequence[tuple[str, Any]]) -> None:
         self._kind = kind
@@ -230,13 +237,13 @@ def _part(name: str, hint: Any) -> Any:
 
 
 def _length(body: bytes, at: int) -> tuple[int, int]:
-    """How many bytes or entries a field has, and where they begin."""
+    """Return the number of bytes or entries of a field, and where they begin."""
     begin = at + _LENGTH.size
     if begin > len(body):
         raise MessageError(f"a message ends inside a field of {_LENGTH.size} bytes")
     length: int = _LENGTH.unpack_from(body, at)[0]
     if length > len(body) - begin:
-        raise MessageError(f"a field of {length} bytes or entries is cut short")
+        raise MessageError(f"a field of {length} bytes or entries is incomplete")
     return length, begin
 
 
@@ -250,15 +257,15 @@ def _message_hints(kind: type[Message]) -> tuple[tuple[str, Any], ...]:
 
 
 class _Plain:
-    """A STEP or DONE of which all lists are empty, as bytes in one go.
+    """A STEP or DONE with empty lists only, converted at once.
 
-    Most are, and this takes a quarter of the time of going from field to field.
+    Most are of this form, and this takes a quarter of the time of a conversion field by field.
     """
 
     def __init__(self, number: int, kind: type[Message]) -> None:
         self._begin = _HEADER.pack(MAGIC, VERSION, number, 0) + _LENGTH.pack(RUN_BYTES)
         self._kind = kind
-        self._empty: list[tuple[int, Any]] = []  # where there is a list or bytes, and what it is
+        self._empty: list[tuple[int, Any]] = []  # indices of lists and bytes, with empty values
         self._wide: list[int] = []
         letters, names = f"{RUN_BYTES}s", ["run"]
         for name, hint in _message_hints(kind)[1:]:
@@ -291,7 +298,7 @@ class _Plain:
         return body + _CRC.pack(zlib.crc32(body))
 
     def read(self, data: bytes) -> Message | None:
-        """None: it is no such message."""
+        """Read a message. Return None if it does not have this form."""
         if len(data) != self._size or not data.startswith(self._begin):
             return None
         values: list[Any] = list(self._numbers.unpack_from(data, len(self._begin)))

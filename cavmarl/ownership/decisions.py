@@ -1,4 +1,4 @@
-"""Changes of owner in the next tick: a function of the committed state and of what is ready."""
+"""Decisions on the owners in the next tick, from the committed state and the acknowledgements."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ class CommittedStates(Protocol):
     """The part of the committed store that decisions read."""
 
     def state(self, vehicle: int) -> bytes:
-        """The vehicle's whole state as of the committed tick."""
+        """Return the vehicle's complete state at the committed tick."""
 
     def digest_of(self, vehicle: int) -> bytes:
-        """`ledger.state_digest` of it."""
+        """Return `ledger.state_digest` of this state."""
 
 
 class Neighbours(NamedTuple):
-    """Between which zones vehicles may change; known before the first tick."""
+    """The zones between which vehicles may change."""
 
-    near: tuple[frozenset[int], ...]  # zone → those that its vehicles can be in a tick later
-    may_teleport: bool = False  # whether vehicles may be put elsewhere; then it is logged
+    near: tuple[frozenset[int], ...]  # zone → zones that its vehicles can reach in one tick
+    may_teleport: bool = False  # whether vehicles may jump to other zones; jumps are logged
 
     def is_teleport(self, vehicle: int, source: int, target: int) -> bool:
-        """Whether a change of owner goes to a zone that is no neighbour.
+        """Return whether the target of a change of owner is not a neighbour of the source.
 
         Raises:
-            ProtocolError: it does, and vehicles are put nowhere.
+            ProtocolError: it is not a neighbour, and vehicles may not jump.
         """
         if target in self.near[source]:
             return False
@@ -43,29 +43,29 @@ class Neighbours(NamedTuple):
 
 
 def refused(vehicle: int, source: int, target: int, near: Iterable[int]) -> str:
-    """What is wrong with a change of owner that goes to a zone that is no neighbour."""
+    """Return the error message for a change of owner between zones that are not neighbours."""
     others = ", ".join(str(zone) for zone in sorted(near) if zone != source)
     return (
-        f"vehicle {vehicle} of zone {source} is refused by zone {target}, which is no neighbour: "
-        f"no vehicle drives further than to zones {others} in a tick; what says where it is has "
-        "failed, and zones.check_invariants tells when"
+        f"vehicle {vehicle} of zone {source} cannot change to zone {target}, which is not a "
+        f"neighbour: in one tick, vehicles can reach only zones {others}; its position is wrong, "
+        "so set zones.check_invariants to find the tick of the error"
     )
 
 
 def _check_exist(table: Table, vehicle: int, zone: int) -> None:
     if vehicle not in table.owners or zone not in table.hosts:
-        raise ProtocolError(f"vehicle {vehicle} in zone {zone}: one of them does not exist")
+        raise ProtocolError(f"vehicle {vehicle} or zone {zone} does not exist")
 
 
 class Decisions:
-    """Decides for each vehicle outside its owner's zone: switch, wait, or be forced."""
+    """Decides for each vehicle outside of its owner's zone: switch, defer, or force the switch."""
 
     def __init__(
         self,
         readiness: Readiness,
         store: CommittedStates,
         limits: Limits,
-        neighbours: Neighbours | None = None,  # None: each zone has all others
+        neighbours: Neighbours | None = None,  # None: all zones are neighbours
     ) -> None:
         self.neighbours = neighbours
         self._readiness = readiness
@@ -75,10 +75,14 @@ class Decisions:
     def switches(
         self, table: Table, movers: Iterable[tuple[int, int]]
     ) -> tuple[tuple[Switch, ...], tuple[Deferral, ...], tuple[int, ...]]:
-        """What becomes of (vehicle, zone that contains it), and the ids of those put elsewhere.
+        """Decide on movers, (vehicle, zone that contains it).
+
+        Returns:
+            The switches, the deferrals, and the ids of switches between zones that are not
+            neighbours.
 
         Raises:
-            ProtocolError: a vehicle or a zone does not exist, or the zone is no neighbour.
+            ProtocolError: a vehicle or a zone does not exist, or the zone is not a neighbour.
         """
         switches, deferred, teleports = [], [], []
         for vehicle, zone in sorted(movers):
@@ -99,16 +103,16 @@ class Decisions:
         return tuple(switches), tuple(deferred), tuple(v for v in teleports if v in gone)
 
     def check_births(self, table: Table, births: Iterable[Birth]) -> None:
-        """See that new vehicles are new."""
+        """Check the zones and the ids of new vehicles. Raises ProtocolError."""
         ids = set()
         for vehicle, zone, _ in births:
             if zone not in table.hosts:
                 raise ProtocolError(
-                    f"vehicle {vehicle} begins in zone {zone}, which does not exist"
+                    f"vehicle {vehicle} enters in zone {zone}, which does not exist"
                 )
             if vehicle in table.seen or vehicle in ids or vehicle < 0:
                 raise ProtocolError(
-                    f"vehicle {vehicle} begins: an episode uses an id once, and none below 0"
+                    f"new vehicle {vehicle}: use each id from 0 up at most once in an episode"
                 )
             ids.add(vehicle)
 

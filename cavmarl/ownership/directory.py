@@ -1,10 +1,10 @@
-"""The coordinator's side of the protocol: the owner of each vehicle, and its next one.
+"""The coordinator's side of the protocol: the present and the next owner of each vehicle.
 
-Each method answers with an `Output`: records to append to the log, then messages to send. What a
-record changes is done by `Table.apply` and nowhere else, so a coordinator that replays its log
-(`restore`) decides nothing anew.
+Each method returns an `Output`: records to append to the log, then messages to send. Only
+`Table.apply` carries out a record, so a coordinator that replays its log (`restore`) repeats all
+decisions.
 
-A tick costs what changes in it: vehicles that stay where they are are never looked at.
+The cost of a tick grows with its changes: vehicles that keep their owner are not visited.
 """
 
 from __future__ import annotations
@@ -46,20 +46,23 @@ SILENCE = Output()
 
 
 class StoreError(ProtocolError):
-    """What is stored is not what the zones say they stored."""
+    """The rows in the store differ from the rows that zones reported."""
 
     def __init__(self, zones: tuple[int, ...]) -> None:
-        super().__init__(f"zones {list(zones)} stored other rows than they told: host them anew")
-        self.zones = zones  # those that have to be hosted anew and step again
+        super().__init__(
+            f"the stored rows of zones {list(zones)} differ from those that the zones reported; "
+            "host these zones anew"
+        )
+        self.zones = zones  # zones that need a new host, which repeats the tick
 
 
 class Directory:
-    """Decides the owners in the next tick, and sees it done.
+    """Decides the owners in the next tick, and checks the results of the zones.
 
     Attributes:
-        table: owners, hosts and the tick in progress, as the log has them.
-        dropped: (kind, reason) → messages or entries that did not count.
-        refusals: reason → how often a target did not hold a state.
+        table: owners, hosts and the tick in progress, according to the log.
+        dropped: (kind, reason) → number of dropped messages or entries.
+        refusals: reason → number of refused states.
     """
 
     def __init__(
@@ -68,13 +71,13 @@ class Directory:
         zones: Iterable[int],
         store: CommittedStates,
         limits: Limits | None = None,
-        neighbours: Neighbours | None = None,  # None: each zone has all others
+        neighbours: Neighbours | None = None,  # None: all zones are neighbours
     ) -> None:
         self.run = run
         self.table = Table(zones)
         self.dones: dict[int, Done] = {}  # zone → its DONE for the tick in progress
-        self.is_quiet = False  # the tick in progress is one of `begin_quiet`
-        self.readiness = Readiness()  # what targets have acknowledged
+        self.is_quiet = False  # whether the tick in progress began with `begin_quiet`
+        self.readiness = Readiness()  # acknowledgements of targets
         self.dropped: Counter[tuple[str, str]] = Counter()
         self.refusals: Counter[Refusal] = Counter()
         self._payloads: Mapping[int, bytes] = {}
@@ -91,22 +94,24 @@ class Directory:
         limits: Limits | None = None,
         neighbours: Neighbours | None = None,
     ) -> Directory:
-        """The coordinator that wrote these records. Send what `resend` says before all else."""
+        """Restore the coordinator that wrote these records. Send `resend` before all else."""
         if not records or not isinstance(records[0], Reset):
-            raise JournalError("a log begins with a RESET, which names the run")
+            raise JournalError(
+                "the log does not begin with the RESET that has the run's id; use an intact log"
+            )
         directory = cls(records[0].run, zones, store, limits, neighbours)
         for record in records:
             directory.table.apply(record)
         return directory
 
     def know(self, neighbours: Neighbours) -> None:
-        """From now on let vehicles change between neighbours only."""
+        """Set the zones between which vehicles may change."""
         self._decisions.neighbours = neighbours
 
     # Episodes and hosts
 
     def reset(self) -> Output:
-        """Begin an episode, the first one or another. Whatever is under way is void."""
+        """Begin an episode. A tick in progress becomes void."""
         table = self.table
         tick = table.tick + self.is_quiet if table.plan is None else table.plan.record.tick
         episode = table.episode + 1
@@ -114,14 +119,14 @@ class Directory:
         return self._logged(Reset(episode, tick, self.run))
 
     def host(self, zone: int, worker: int) -> Output:
-        """Give a zone to a new process of `worker`, which has to be loaded with `hosting(zone)`.
+        """Give a zone to a new process of `worker`, which must be loaded with `hosting(zone)`.
 
-        In the middle of a tick the zone has to be fenced first; its STEP is sent again.
+        During a tick, the zone must be fenced first. Its STEP is sent again.
         """
         table = self.table
         if table.plan is not None:
             if table.states[zone] is State.HOSTED:
-                raise ProtocolError(f"zone {zone} moves in the middle of a tick: fence it first")
+                raise ProtocolError(f"zone {zone} has a host during a tick; fence it first")
             if table.repeats[zone] >= self._limits.repeats:
                 raise LostTickError(table.plan.record.tick, table.repeats[zone] + 1, zone)
         incarnation = table.hosts[zone][1] + 1
@@ -129,7 +134,7 @@ class Directory:
         return Output(output.records, self.resend((zone,)).messages)
 
     def fence(self, zone: int) -> Output:
-        """The zone's process is dead to us; whatever it still says is dropped. Once is enough."""
+        """Drop all further messages of the zone's process. Repeated calls do nothing."""
         if self.table.states[zone] is State.FENCED:
             return SILENCE
         self.dones.pop(zone, None)
@@ -137,7 +142,7 @@ class Directory:
         return self._logged(Fence(self.table.episode, self.table.tick, zone, incarnation))
 
     def hosting(self, zone: int) -> Hosting:
-        """What the zone's present host has to be loaded with. Looks at every vehicle."""
+        """Return the data to load the zone's present host. This visits all vehicles."""
         table = self.table
         owned = {vehicle: at[1] for vehicle, at in table.owners.items() if at[0] == zone}
         return Hosting(
@@ -148,17 +153,17 @@ class Directory:
 
     def begin(
         self,
-        # (vehicle, zone that contains it) for the vehicles outside their owner's zone by more than
-        # the hysteresis, and for no others
+        # (vehicle, zone that contains it) of exactly the vehicles that are outside of their owner's
+        # zone by more than the hysteresis
         movers: Iterable[tuple[int, int]],
         births: Iterable[Birth] = (),
         inputs: bytes = b"",  # digest of the actions
-        payloads: Mapping[int, bytes] | None = None,  # zone → what rides with its STEP
+        payloads: Mapping[int, bytes] | None = None,  # zone → payload of its STEP
     ) -> Output:
-        """Decide the way to the next tick: BEGIN, then a STEP for every zone."""
+        """Decide the owners in the next tick: BEGIN, then a STEP for every zone."""
         table = self.table
         if table.plan is not None or self.is_quiet:
-            raise ProtocolError(f"tick {table.tick + 1} is not committed")
+            raise ProtocolError(f"tick {table.tick + 1} is not committed; commit it first")
         new = tuple(sorted(births))
         self.check_births(new)
         switches, deferred, teleports = self._decisions.switches(table, movers)
@@ -167,20 +172,20 @@ class Directory:
         return Output(begun.records, self.resend(payloads=payloads or {}).messages)
 
     def check_births(self, births: Sequence[Birth]) -> None:
-        """See that new vehicles are new.
+        """Check the ids and the zones of new vehicles.
 
         Raises:
-            ProtocolError: an id that the episode has seen, or a zone that does not exist.
+            ProtocolError: an id has been in the episode, or a zone does not exist.
         """
         self._decisions.check_births(self.table, births)
 
     def resend(
         self,
         zones: Iterable[int] | None = None,  # only these
-        # as in `begin`, whose payloads are kept; needed after `restore`
+        # needed only after `restore`; else the payloads of `begin` are used
         payloads: Mapping[int, bytes] | None = None,
     ) -> Output:
-        """The STEPs once more, of zones that have not answered."""
+        """Return the STEPs of zones that have not answered, to send them again."""
         if payloads is not None:
             self._payloads = payloads
         asked = self.waiting_for() if zones is None else tuple(zones)
@@ -193,7 +198,7 @@ class Directory:
         )
 
     def waiting_for(self) -> tuple[int, ...]:
-        """Zones without a DONE for the tick in progress."""
+        """Return the zones without a DONE for the tick in progress."""
         if self.table.plan is None:
             return ()
         if len(self.dones) == len(self.table.hosts):
@@ -202,16 +207,18 @@ class Directory:
 
     def commit(
         self,
-        rows: Mapping[int, int],  # zone → digest of the rows that the store holds for the tick
+        rows: Mapping[int, int],  # zone → digest of the tick's rows in the store
     ) -> Output:
-        """Make the tick in progress the truth: every zone is done, and the ledger is exact.
+        """Commit the tick in progress, after all zones are done, and check their tallies.
 
         Raises:
-            StoreError: the store holds other rows than a zone told of. Fence and host it anew.
+            StoreError: the stored rows of a zone differ from its report. Fence it and host it anew.
         """
         table = self.table
         if table.plan is None or self.waiting_for():
-            raise ProtocolError(f"nothing to commit: zones {list(self.waiting_for())} are at work")
+            raise ProtocolError(
+                f"no tick is complete: zones {list(self.waiting_for())} have not answered"
+            )
         self._check_dones(rows)
         dones = [self.dones[zone] for zone in table.hosts]
         zones = tuple(
@@ -224,31 +231,31 @@ class Directory:
         return output
 
     def begin_quiet(self) -> bool:
-        """Begin a tick of which there is nothing to say: no vehicle changes its owner, none is new.
+        """Begin a quiet tick, in which no vehicle changes its owner or is new.
 
-        No STEP is sent, and no DONE is awaited: `Endpoint.go_on` and `rest` stand for them. For a
-        coordinator without a log.
+        No STEP is sent and no DONE is needed: `Endpoint.go_on` and `rest` replace them. Only a
+        coordinator without a log may call this.
 
         Returns:
-            whether there can be such a tick; else nothing has begun.
+            Whether the tick can be quiet; if not, no tick has begun.
         """
         table = self.table
         self.is_quiet = table.plan is None and not table.deferred
         return self.is_quiet
 
     def commit_quiet(self) -> None:
-        """Make a quiet tick the truth: no zone has anything to say of it."""
+        """Commit a quiet tick."""
         self.is_quiet = False
         self.table.settle(self.table.tick + 1)
         self.readiness.forget(self.table.tick)
 
     def break_quiet(self) -> Output:
-        """A zone has something to say: the tick goes on as if all had been told by STEP."""
+        """Turn a quiet tick into a usual one, as if all zones had received a STEP."""
         self.is_quiet = False
         return Output(self.begin(()).records)
 
     def answer_for_silent(self) -> None:
-        """Zones that say nothing of a tick that was quiet have changed nothing in it."""
+        """Add a DONE without changes for each zone that has not answered in a former quiet tick."""
         table, plan = self.table, self.table.planned
         for zone in self.waiting_for():
             self.dones[zone] = Done(
@@ -257,7 +264,7 @@ class Directory:
             )  # fmt: skip
 
     def on_message(self, message: Message) -> Output:
-        """Take a message in. One that comes late or from elsewhere is dropped and counted."""
+        """Process a message. Late and foreign messages are dropped and counted."""
         reason = self._misfit(message)
         if reason is not None:
             self.dropped[type(message).__name__, reason] += 1
@@ -331,9 +338,9 @@ class Directory:
 
 
 def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -> Step:
-    """The lease of a zone's present host for the tick in progress.
+    """Return the lease of a zone's present host for the tick in progress.
 
-    States ride along for vehicles whose switch is forced, and for those that have to be sent again.
+    States are attached for vehicles whose switch is forced, and for those that must be sent again.
     """
     plan = table.planned
     enter = tuple(

@@ -1,11 +1,11 @@
-"""Three distances at a border, and how wide the overlap has to be.
+"""The three distances at a border, and the least width of the overlap.
 
     approach      the owner begins to offer the vehicle                  PREPARE
-    control       past the border by more than the hysteresis            SWITCH
-    overlap       out of the strip that the old zone sees as ghosts      RELEASE
+    control       the vehicle is beyond the border and the hysteresis    SWITCH
+    overlap       the vehicle is outside of the old zone's halo          RELEASE
 
-A depth is how far a vehicle is beyond the border of a zone: positive outside the owner's zone,
-negative inside. The runtime compares whole arrays of depths with the same thresholds.
+A depth is the distance of a vehicle beyond its owner's border: positive outside of the owner's
+zone, negative inside. The runtime compares arrays of depths with the same thresholds.
 """
 
 from __future__ import annotations
@@ -20,40 +20,40 @@ from cavmarl.ownership.limits import Limits
 class Distances:
     """The three distances of a world."""
 
-    approach_m: float  # before the border; offers begin
-    hysteresis_m: float  # beyond the border; up to there the owner stays
-    overlap_m: float  # width of the strip around a zone that it sees and has roads for (B)
+    approach_m: float  # before the border; within it, the vehicle is offered
+    hysteresis_m: float  # beyond the border; up to it, the owner does not change
+    overlap_m: float  # width of the strip around a zone that the zone sees (B)
 
     def __post_init__(self) -> None:
         if min(self.approach_m, self.hysteresis_m) < 0:
-            raise ConfigError(f"distances at a border are not below 0: {self}")
+            raise ConfigError(f"{self} has a distance below 0; use distances from 0 up")
         if self.overlap_m <= max(self.approach_m, self.hysteresis_m):
             raise ConfigError(
-                f"an overlap of {self.overlap_m:g} m has to be wider than the approach of "
-                f"{self.approach_m:g} m and the hysteresis of {self.hysteresis_m:g} m: widen it or "
-                "shorten them"
+                f"an overlap of {self.overlap_m:g} m must be wider than the approach of "
+                f"{self.approach_m:g} m and the hysteresis of {self.hysteresis_m:g} m; increase "
+                "the overlap, or decrease the other distances"
             )
 
     def offers(self, depth_m: float) -> bool:
-        """Whether the owner offers the vehicle to the zone behind the border."""
+        """Return whether the owner offers the vehicle to the zone beyond the border."""
         return depth_m > -self.approach_m
 
     def switches(self, depth_m: float) -> bool:
-        """Whether the vehicle has crossed, and is a mover for `Directory.begin`."""
+        """Return whether the vehicle has crossed, and is a mover for `Directory.begin`."""
         return depth_m > self.hysteresis_m
 
     def releases(self, depth_m: float) -> bool:
-        """Whether the vehicle is out of the sight of the zone that it left."""
+        """Return whether the zone that the vehicle left does not see it."""
         return depth_m > self.overlap_m
 
 
 def needed_overlap_m(
     reach_m: float, hysteresis_m: float, limits: Limits, v_max_mps: float, dt_s: float
 ) -> float:
-    """The least overlap: B = R + h + (D + 1) · v_max · dt.
+    """Return the least overlap, B = R + h + (D + 1) · v_max · dt.
 
-    A zone that keeps a vehicle for D more ticks must see all that the vehicle can see, `reach_m`
-    around it, however far it has come in that time.
+    A zone may keep a vehicle for D more ticks. It must see everything within `reach_m` of the
+    vehicle, however far the vehicle has moved in that time.
     """
     return reach_m + hysteresis_m + (limits.deferral + 1) * v_max_mps * dt_s
 
@@ -61,16 +61,17 @@ def needed_overlap_m(
 def check_coverage(
     distances: Distances, limits: Limits, *, reach_m: float, v_max_mps: float, dt_s: float
 ) -> None:
-    """Refuse a world in which "the source stays authoritative" would not be safe."""
+    """Raise ConfigError if the source of a vehicle could not safely keep it during a transfer."""
     needed = needed_overlap_m(reach_m, distances.hysteresis_m, limits, v_max_mps, dt_s)
     if distances.overlap_m < needed:
         raise ConfigError(
-            f"an overlap of {distances.overlap_m:g} m is too narrow: {needed:g} m = reach "
-            f"{reach_m:g} m + hysteresis {distances.hysteresis_m:g} m + "
-            f"({limits.deferral} + 1) ticks · {v_max_mps:g} m/s · {dt_s:g} s are needed"
+            f"an overlap of {distances.overlap_m:g} m is too narrow; use at least {needed:g} m = "
+            f"reach {reach_m:g} m + hysteresis {distances.hysteresis_m:g} m + "
+            f"({limits.deferral} + 1) ticks · {v_max_mps:g} m/s · {dt_s:g} s"
         )
     if distances.approach_m < v_max_mps * dt_s:
         raise ConfigError(
-            f"an approach of {distances.approach_m:g} m is shorter than the way of a tick, "
-            f"{v_max_mps * dt_s:g} m: vehicles would cross before they are offered"
+            f"an approach of {distances.approach_m:g} m is too short, because vehicles would cross "
+            f"before they are offered; use at least the longest move in a tick, "
+            f"{v_max_mps * dt_s:g} m"
         )

@@ -1,9 +1,9 @@
-"""A zone host's side of the protocol.
+"""The zone host's side of the protocol.
 
-The host may advance its vehicles while it has a lease, and a STEP is a lease for one tick:
-`on_message` answers it with an `Advance` for the shard to carry out, `complete` ends it with DONE,
-and `offer` then tells neighbours about vehicles that come near. Everything in here is volatile: a
-host that dies is loaded anew from the committed store.
+A host may advance its vehicles only while it has a lease. A STEP is a lease for one tick:
+`on_message` returns an `Advance` for the shard, `complete` ends the lease with a DONE, and `offer`
+then offers approaching vehicles to neighbours. All state here is volatile: after a host dies, a new
+host is loaded from the committed store.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ class Endpoint:
     """The host of one zone.
 
     Attributes:
-        retained: vehicle → epoch of rows that wait for the commit of their switch.
-        dropped: (kind, reason) → messages or entries that did not count.
+        retained: vehicle → epoch of rows that are kept until their switch is committed.
+        dropped: (kind, reason) → number of dropped messages or entries.
     """
 
     def __init__(self, hosting: Hosting, limits: Limits) -> None:
         self.run, self.episode = hosting.run, hosting.episode
         self.zone, self.incarnation = hosting.zone, hosting.incarnation
-        self.tick = hosting.tick  # the tick that the rows are at
-        self.lease: int | None = None  # the tick that the rows may be advanced to now, or None
+        self.tick = hosting.tick  # the tick of the rows
+        self.lease: int | None = None  # the tick to which the rows may be advanced now, or None
         self.owned = dict(hosting.owned)  # vehicle → epoch
         self.tally = tally(self.run, self.owned)
         self.retained: dict[int, int] = {}
-        self.replicas = Replicas(limits)  # states of vehicles that may come
-        self.offers = Offers(limits)  # states that neighbours were offered
+        self.replicas = Replicas(limits)  # states of vehicles that may enter
+        self.offers = Offers(limits)  # states offered to neighbours
         self.dropped: Counter[tuple[str, str]] = Counter()
         self._answer: Done | None = None
         self._entering: tuple[Confirmed, ...] = ()
@@ -67,7 +67,7 @@ class Endpoint:
         return State.RETAINED if vehicle in self.retained else State.NONE
 
     def on_message(self, message: Message) -> Reaction:
-        """Take a message in. One that comes late or from elsewhere is dropped and counted."""
+        """Process a message. Late and foreign messages are dropped and counted."""
         reason = self._misfit(message)
         if reason is not None:
             return self._drop(message, reason)
@@ -87,27 +87,33 @@ class Endpoint:
         return self._drop(message, "kind")
 
     def go_on(self) -> None:
-        """Take a lease for the next tick without a STEP: the zone owns what it owned before."""
+        """Take a lease for the next tick without a STEP. The zone keeps its vehicles."""
         if self.lease is not None:
-            raise ProtocolError(f"zone {self.zone} has a lease for tick {self.lease} already")
+            raise ProtocolError(
+                f"zone {self.zone} has a lease for tick {self.lease} already; complete it first"
+            )
         self._release()
         self._hold(self.tick + 1, ())
 
     def rest(self) -> None:
-        """End a lease of `go_on` in which no vehicle has left the world: there is no DONE of it."""
+        """End a lease of `go_on` without a DONE, if no vehicle has left the world."""
         if self.lease is None:
-            raise ProtocolError(f"zone {self.zone} has no lease after tick {self.tick}")
+            raise ProtocolError(
+                f"zone {self.zone} has no lease after tick {self.tick}; call go_on first"
+            )
         self._end_lease(self.lease)
 
     def complete(
         self,
-        rows: int,  # digest of the rows that were stored (`world_digest` of their `row_hash`)
+        rows: int,  # digest of the stored rows (`world_digest` of their `row_hash`)
         removed: Sequence[Removed] = (),  # vehicles that left the world in this tick
         payload: bytes = b"",  # for the runtime
     ) -> Done:
-        """End the lease: the result is in the store."""
+        """End the lease, after the result is in the store. Return the DONE."""
         if self.lease is None:
-            raise ProtocolError(f"zone {self.zone} has no lease: no STEP after tick {self.tick}")
+            raise ProtocolError(
+                f"zone {self.zone} has no lease after tick {self.tick}; wait for a STEP"
+            )
         for vehicle, _ in removed:
             after(Party.ROW, self.row_state(vehicle), Event.REMOVE)
             self.tally = self.tally.minus(self.run, vehicle, self.owned.pop(vehicle))
@@ -121,10 +127,10 @@ class Endpoint:
 
     def _end_lease(self, tick: int) -> None:
         self.tick, self.lease = tick, None
-        self.offers.owed.clear()  # what is not answered by now is of the tick before
+        self.offers.owed.clear()  # unanswered offers are of the tick before
 
     def offer(self, approaches: Iterable[Approach]) -> tuple[Message, ...]:
-        """After `complete`, tell other zones of vehicles that come near, all of a tick at once."""
+        """Offer all approaching vehicles of a tick to other zones, after `complete`."""
         offers, withdrawn = self.offers.renew(self.tick, approaches, self.owned)
         aborts = tuple(
             Abort(self.run, self.episode, self.tick, self.zone, self.incarnation, target, entries)
@@ -133,12 +139,12 @@ class Endpoint:
         return aborts + tuple(self._prepare(target, offers[target]) for target in offers)
 
     def offer_again(self) -> tuple[Message, ...]:
-        """Repeat what was not answered; nothing after the last attempt of the tick."""
+        """Repeat offers without an answer; none after the last attempt of the tick."""
         offers = self.offers.again()
         return tuple(self._prepare(target, offers[target]) for target in offers)
 
     def refuse(self, message: Prepare) -> Reaction:
-        """Answer a PREPARE with a NACK: the host has no room."""
+        """Answer a PREPARE with a NACK, because the host has no room."""
         if self._misfit(message) is not None:
             return self.on_message(message)
         refused = tuple(
@@ -217,7 +223,7 @@ class Endpoint:
         )  # fmt: skip
 
     def _release(self) -> tuple[int, ...]:
-        """Let go of the rows that were kept until their switch was committed."""
+        """Release the rows that were kept until their switch was committed."""
         release = tuple(self.retained)
         for vehicle in release:
             after(Party.ROW, self.row_state(vehicle), Event.RELEASE)

@@ -1,7 +1,7 @@
-"""Counts and digests of sets, cheap to change by one member and independent of order.
+"""Counts and digests of sets, which are cheap to update and independent of order.
 
-A set's digest is the sum of its members' keyed hashes modulo a power of two (invariant I10).
-Two parties that hold the same (count, digest) hold the same set, but for a chance of 2**-64.
+A set's digest is the sum of its members' keyed hashes modulo a power of two (invariant I10). If two
+sets have the same count and digest, they differ only with a probability of 2**-64.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ _WORD = _OWNED - 1
 DIGEST_BYTES = 16
 
 
-# One hand-over asks for a state's digest in five places.
+# One transfer needs the digest of a state in five places.
 @lru_cache(maxsize=256)
 def state_digest(state: bytes) -> bytes:
-    """Digest of one vehicle's state, 16 bytes."""
+    """Return the digest, 16 bytes, of one vehicle's state."""
     return blake2b(state, digest_size=DIGEST_BYTES).digest()
 
 
 def row_hash(vehicle: int, state: bytes) -> int:
-    """What a row adds to the digest of the world, in [0, 2**128)."""
+    """Return a row's term in the digest of the world, in [0, 2**128)."""
     return int.from_bytes(
         blake2b(_ID.pack(vehicle) + state, digest_size=16, person=b"cavmarl row").digest(), "little"
     )
 
 
 def world_digest(parts: Iterable[int]) -> int:
-    """Digest of a world from those of its rows, or of its zones."""
+    """Return the digest of a world from the digests of its rows or of its zones."""
     return sum(parts) % _WORLD
 
 
 class OwnedTally(NamedTuple):
-    """How many vehicles a zone owns, and the digest of their (id, epoch)."""
+    """The number of vehicles that a zone owns, and the digest of their (id, epoch)."""
 
     vehicles: int = 0
     digest: int = 0
@@ -53,22 +53,22 @@ class OwnedTally(NamedTuple):
         return OwnedTally(self.vehicles - 1, (self.digest - member(run, vehicle, epoch)) % _OWNED)
 
     def check(self, other: OwnedTally, where: str) -> None:
-        """Compare with another count."""
+        """Compare with another tally. Raises ProtocolError if they differ."""
         if self == other:
             return
-        what = (
+        difference = (
             f"{other.vehicles} vehicles instead of {self.vehicles}"
             if self.vehicles != other.vehicles
             else f"{self.vehicles} vehicles, but not the expected ones or not at their epochs"
         )
-        raise ProtocolError(f"{where}: {what}")
+        raise ProtocolError(f"{where}: {difference}")
 
 
 def member(run: bytes, vehicle: int, epoch: int) -> int:
-    """Keyed hash of an owned vehicle, in [0, 2**64).
+    """Return the keyed hash of an owned vehicle, in [0, 2**64).
 
-    SplitMix64's finalizer (Steele, Lea, Flood 2014): its task is to tell sets apart that differ by
-    mistake, several times in a tick; it need not withstand attacks.
+    This is SplitMix64's finalizer (Steele, Lea, Flood 2014). It is fast, because it runs several
+    times per tick. It detects sets that differ by mistake, but does not withstand attacks.
     """
     word = int.from_bytes(run[:8], "little") + vehicle * 0x9E3779B97F4A7C15
     word = (word + epoch * 0xC2B2AE3D27D4EB4F) & _WORD
@@ -84,9 +84,9 @@ def tally(run: bytes, owned: Mapping[int, int]) -> OwnedTally:
 
 
 class SeenIds:
-    """Ids that have been in an episode; small as long as they are handed out in about their order.
+    """The ids that have been in an episode: all ids below `floor`, and those in `above`.
 
-    All ids below `floor` have been seen, and those in `above`.
+    The set is small if ids are assigned roughly in rising order.
     """
 
     def __init__(self, floor: int = 0, above: Iterable[int] = ()) -> None:

@@ -11,14 +11,14 @@ from cavmarl.core.errors import ConfigError
 class Limits:
     """Deadlines that all parties of a run share."""
 
-    # Ticks for which the source goes on without a confirmation (D); then the vehicle is handed over
-    # with its state attached.
+    # Ticks for which the source keeps a crossed vehicle without an acknowledgement (D). Afterwards,
+    # the vehicle is handed over with its state attached.
     deferral: int = 2
     lifetime: int = 16  # ticks after which a replica that is not refreshed is dropped (K)
-    attempts: int = 3  # how often a PREPARE is sent inside one tick (A)
-    repeats: int = 3  # new hosts for one tick of one zone (R_max)
+    attempts: int = 3  # number of times that a PREPARE is sent in one tick (A)
+    repeats: int = 3  # number of new hosts for one tick of one zone (R_max)
     backoff: int = 4  # ticks without an offer to a target that refused
-    capacity: int = 100_000  # replicas that one host keeps
+    capacity: int = 100_000  # number of replicas that one host keeps
     schema: int = 1  # version of the vehicles' states
 
     def __post_init__(self) -> None:
@@ -26,4 +26,4 @@ class Limits:
         least |= {"capacity": 0, "schema": 0}
         for name, bound in least.items():
             if getattr(self, name) < bound:
-                raise ConfigError(f"{name} is {getattr(self, name)}: it has to be {bound} or more")
+                raise ConfigError(f"{name} = {getattr(self, name)}: must be at least {bound}")

@@ -1,11 +1,10 @@
-"""Log records as JSON lines, and back.
+"""Conversion of log records to JSON lines and back.
 
 A line is an object with the keys `schema` ("cavmarl.ownership/5"), `sequence` (0, 1, 2, …),
 `kind` (RESET, BEGIN, COMMIT, FENCE, HOST), `episode`, `tick`, the fields of that kind, and
-`checksum`: BLAKE2b of 8 bytes, in hex, over the checksum of the line before, if there is one, and
-the line as it would be without that key. So a line of another log, or of an earlier one, is none of
-this one. Bytes are written in hex, digests of rows and sets too. A list of entries is a list of
-lists.
+`checksum`. The checksum is BLAKE2b of 8 bytes, in hex, over the checksum of the line before, if
+any, and the line without the key `checksum`. So lines of another log are detected. Bytes and the
+digests of rows and sets are in hex. A list of entries is a list of lists.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ _WIDE = frozenset({"world", "rows", "digest"})
 
 
 class LogChain:
-    """Where a log stands: writes its next line, or reads it.
+    """The position in a log, which writes or reads the next line.
 
     Attributes:
         sequence: the number of the next line.
-        last: the checksum of the line before; of the first line nothing.
+        last: the checksum of the line before; empty before the first line.
     """
 
     def __init__(self) -> None:
@@ -61,29 +60,41 @@ class LogChain:
         except (ValueError, RecursionError) as error:
             raise JournalError(f"line {self.sequence + 1} of the log: {error}") from error
         if not isinstance(content, dict):
-            raise JournalError(f"line {self.sequence + 1} of the log is no JSON object")
+            raise JournalError(
+                f"line {self.sequence + 1} of the log is not a JSON object; use an intact log"
+            )
         record = self.from_dict(content)
         text = line if isinstance(line, str) else line.decode("utf-8", "replace")
-        if text.removesuffix("\n") != _json(content):  # white space, a key twice, other escapes
+        # Other text with the same content has white space, duplicate keys or different escapes.
+        if text.removesuffix("\n") != _json(content):
             raise JournalError(
-                f"line {self.sequence} of the log is not as it was written: it is damaged"
+                f"line {self.sequence} of the log has been changed; use an intact log"
             )
         return record
 
     def from_dict(self, line: dict[str, Any]) -> Record:
         where = f"line {self.sequence + 1} of the log"
         if line.get("schema") != SCHEMA:
-            raise JournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
+            raise JournalError(
+                f"{where} has schema {line.get('schema')!r}, but this build reads {SCHEMA!r}; use "
+                "the version that wrote it"
+            )
         if line.get("sequence") != self.sequence:
-            raise JournalError(f"{where} has number {line.get('sequence')}: lines are missing")
+            raise JournalError(
+                f"{where} has number {line.get('sequence')}, so lines are missing; use an intact "
+                "log"
+            )
         checksum = line.get("checksum")
         if checksum != sealed(line, self.last)["checksum"]:
             raise JournalError(
-                f"{where} does not match its checksum: it is damaged, or of another log"
+                f"{where} does not match its checksum: it is damaged or belongs to another log; "
+                "use an intact log"
             )
         kind = KINDS.get(str(line.get("kind")))
         if kind is None:
-            raise JournalError(f"{where} is of kind {line.get('kind')!r}, which is none")
+            raise JournalError(
+                f"{where} has kind {line.get('kind')!r}; the kinds are {', '.join(KINDS)}"
+            )
         try:
             values = [parse(line[name]) for name, parse in _PARSE[kind]]
         except (KeyError, TypeError, ValueError) as error:
@@ -97,13 +108,13 @@ class LogChain:
 
 
 def sealed(line: dict[str, Any], last: str = "") -> dict[str, Any]:
-    """A line with the checksum of what stands in it, behind a line with the checksum `last`."""
+    """Return a line with its checksum, after a line with the checksum `last`."""
     content = {key: value for key, value in line.items() if key != "checksum"}
     return content | {"checksum": _checksum(last, _json(content))}
 
 
 def lines_of(records: Iterable[Record]) -> list[str]:
-    """A log from its first line on."""
+    """Return the lines of a complete log."""
     chain = LogChain()
     return [chain.write(record) for record in records]
 
@@ -113,16 +124,20 @@ def records_from_lines(text: str) -> tuple[Record, ...]:
     records = []
     for line in text.splitlines(keepends=True):
         if not line.endswith("\n"):
-            raise JournalError(f"line {chain.sequence + 1} of the log is cut short: {line[:40]!r}")
+            raise JournalError(
+                f"line {chain.sequence + 1} of the log is incomplete: {line[:40]!r}; remove it"
+            )
         records.append(chain.read(line))
     return tuple(records)
 
 
 def replay(records: Iterable[Record]) -> Table:
-    """The table that a log leads to, for any number of zones."""
+    """Return the table that results from a log, for any number of zones."""
     log = tuple(records)
     if not log or not isinstance(log[0], Reset):
-        raise JournalError("a log begins with a RESET, which names the run")
+        raise JournalError(
+            "the log does not begin with the RESET that has the run's id; use an intact log"
+        )
     table = Table({record.zone for record in log if isinstance(record, Host)})
     for record in log:
         table.apply(record)
@@ -138,7 +153,7 @@ def _content(record: Record, sequence: int) -> dict[str, Any]:
 
 
 def _plain(name: str, hint: Any) -> Callable[[Any], Any] | None:
-    """What makes plain values of a field's; None: they are."""
+    """Return a function from a field's values to JSON values; None: they are the same."""
     if hint is bytes:
         return bytes.hex
     if hint is int and name in _WIDE:
@@ -157,7 +172,7 @@ def _plain(name: str, hint: Any) -> Callable[[Any], Any] | None:
 
 
 def _parse(name: str, hint: Any) -> Callable[[Any], Any]:
-    """What makes a field's value of plain ones."""
+    """Return a function from JSON values to a field's values."""
     if hint is bytes:
         return bytes.fromhex
     if hint is int and name in _WIDE:
@@ -173,7 +188,7 @@ def _parse(name: str, hint: Any) -> Callable[[Any], Any]:
 
 def _checked(name: str, kind: type[int], value: Any) -> int:
     if type(value) is not kind or abs(value) >= _LARGEST:
-        raise TypeError(f"{name} is {value!r}")
+        raise TypeError(f"{name} = {value!r} is not {kind.__name__} within ±2**63")
     return value
 
 

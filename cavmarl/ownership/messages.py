@@ -1,13 +1,13 @@
-"""What coordinator and zone hosts say to each other, and what the coordinator writes down.
+"""The messages between coordinator and zone hosts, and the records of the coordinator's log.
 
-A message carries its fences: the run, the episode, the tick, and the incarnation of the process
-that it comes from or is meant for. Each entry about a vehicle carries the vehicle's epoch. States
-of vehicles are opaque bytes with a digest; what stands in them is the runtime's affair.
+A message has its fences: the run, the episode, the tick, and the incarnation of the sending or
+receiving process. Each entry about a vehicle has the vehicle's epoch. States of vehicles are opaque
+bytes with a digest; only the runtime reads them.
 
-The rule of the core: **write the records down, then send the messages** (`Output`).
+The rule of the core: **store the records, then send the messages** (`Output`).
 
-A message or a record does not change once it is made. The classes are not frozen all the same: to
-make a frozen one takes 2.4 µs instead of 0.4, and an idle tick of four zones makes twenty.
+Messages and records are never changed. Their classes are not frozen, because a frozen instance
+takes 2.4 µs to make instead of 0.4 µs, and an idle tick of four zones makes twenty of them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeAlias
 from cavmarl.ownership.ledger import OwnedTally
 
 COORDINATOR = -1
-"""Where messages to the coordinator go; zones are numbered from 0."""
+"""The destination of messages to the coordinator; zones are numbered from 0."""
 
 RUN_BYTES = 16
 
@@ -27,7 +27,7 @@ _TO_COORDINATOR = (COORDINATOR,)
 
 
 class Refusal(IntEnum):
-    """Why a target does not hold a state."""
+    """The reason why a target refuses a state."""
 
     LOAD = 1
     SCHEMA = 2
@@ -35,7 +35,7 @@ class Refusal(IntEnum):
 
 
 class In(NamedTuple):
-    """The zone is to own the vehicle; with `forced` the state rides along."""
+    """The zone must own the vehicle; with `forced`, the state is attached."""
 
     vehicle: int
     epoch: int
@@ -45,7 +45,7 @@ class In(NamedTuple):
 
 
 class Out(NamedTuple):
-    """The zone owns the vehicle no longer; `epoch` is the one that ends."""
+    """The zone must give up the vehicle; `epoch` is that of the ownership that ends."""
 
     vehicle: int
     epoch: int
@@ -59,7 +59,7 @@ class Spawn(NamedTuple):
 
 
 class Offer(NamedTuple):
-    """The state of a vehicle as of the tick of its message."""
+    """The state of a vehicle at the tick of its message."""
 
     vehicle: int
     epoch: int
@@ -68,7 +68,7 @@ class Offer(NamedTuple):
 
 
 class Held(NamedTuple):
-    """The sender holds exactly that state."""
+    """The sender has exactly this state."""
 
     vehicle: int
     epoch: int
@@ -76,14 +76,14 @@ class Held(NamedTuple):
 
 
 class Withdrawn(NamedTuple):
-    """The replica is no longer needed."""
+    """The replica is not needed."""
 
     vehicle: int
     epoch: int
 
 
 class Refused(NamedTuple):
-    """The sender does not hold the state."""
+    """The sender refuses the state."""
 
     vehicle: int
     epoch: int
@@ -91,7 +91,7 @@ class Refused(NamedTuple):
 
 
 class Confirmed(NamedTuple):
-    """The vehicle that came IN has been advanced by its new owner."""
+    """The new owner has advanced the vehicle of an IN."""
 
     vehicle: int
     epoch: int
@@ -106,20 +106,20 @@ class Removed(NamedTuple):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Message:
-    """What every message carries."""
+    """The fields of every message."""
 
     run: bytes  # 16 random bytes of this run
     episode: int  # counts the resets; messages of earlier episodes are void
     tick: int  # of the state that the message is about
 
     def destinations(self) -> tuple[int, ...]:
-        """Zones, or COORDINATOR, that it goes to."""
+        """Return the destinations: zones or COORDINATOR."""
         return _TO_COORDINATOR
 
 
 @dataclass(slots=True, unsafe_hash=True)
 class Step(Message):
-    """C → Z: the lease to advance the owned vehicles to `tick`; it also says what is committed."""
+    """C → Z: a lease to advance the owned vehicles to `tick`; `committed` is the committed tick."""
 
     zone: int
     incarnation: int
@@ -136,7 +136,7 @@ class Step(Message):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Done(Message):
-    """Z → C: `tick` is in the store. `owned` counts after `removed`; `rows` is their digest."""
+    """Z → C: `tick` is in the store. `owned` is after `removed`; `rows` is the rows' digest."""
 
     zone: int
     incarnation: int
@@ -149,7 +149,7 @@ class Done(Message):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Prepare(Message):
-    """S → T: here are vehicles as of `tick`."""
+    """S → T: the states of vehicles at `tick`."""
 
     source: int
     incarnation: int
@@ -176,7 +176,7 @@ class Abort(Message):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Ack(Message):
-    """T → C and S: `zone` holds exactly these states of `tick`."""
+    """T → C and S: `zone` has exactly these states of `tick`."""
 
     zone: int
     incarnation: int
@@ -184,13 +184,13 @@ class Ack(Message):
     entries: tuple[Held, ...]
 
     def destinations(self) -> tuple[int, ...]:
-        """The coordinator, and the source of the states."""
+        """Return the coordinator and the source of the states."""
         return (COORDINATOR, self.source)
 
 
 @dataclass(slots=True, unsafe_hash=True)
 class Nack(Message):
-    """T → C and S: `zone` does not hold these states."""
+    """T → C and S: `zone` refuses these states."""
 
     zone: int
     incarnation: int
@@ -198,13 +198,13 @@ class Nack(Message):
     entries: tuple[Refused, ...]
 
     def destinations(self) -> tuple[int, ...]:
-        """The coordinator, and the source of the states."""
+        """Return the coordinator and the source of the states."""
         return (COORDINATOR, self.source)
 
 
 @dataclass(slots=True, unsafe_hash=True)
 class Need(Message):
-    """Z → C: vehicles came IN without a matching replica; send their states."""
+    """Z → C: there are no replicas for these vehicles of IN; send their states."""
 
     zone: int
     incarnation: int
@@ -212,7 +212,7 @@ class Need(Message):
 
 
 class Switch(NamedTuple):
-    """A hand-off that begins; `epoch` is the new one."""
+    """A change of owner; `epoch` is that of the new ownership."""
 
     vehicle: int
     source: int
@@ -222,14 +222,14 @@ class Switch(NamedTuple):
 
 
 class Deferral(NamedTuple):
-    """A vehicle stays with its source, for the `ticks`-th tick in a row."""
+    """A crossed vehicle stays with its source, for the `ticks`-th tick in a row."""
 
     vehicle: int
     ticks: int
 
 
 class Birth(NamedTuple):
-    """A vehicle that a zone begins to own."""
+    """A vehicle that enters the world in a zone."""
 
     vehicle: int
     zone: int
@@ -237,7 +237,7 @@ class Birth(NamedTuple):
 
 
 class ZoneLedger(NamedTuple):
-    """What a zone owned when a tick was committed, and the digest of its rows."""
+    """The tally of a zone at the commit of a tick, and the digest of its rows."""
 
     zone: int
     incarnation: int
@@ -255,16 +255,16 @@ class Record:
 
 @dataclass(slots=True, unsafe_hash=True)
 class Reset(Record):
-    """An episode begins without vehicles; whatever was under way is void. First line of a log."""
+    """An episode begins without vehicles, and a tick in progress is void. First line of a log."""
 
     run: bytes
 
 
 @dataclass(slots=True, unsafe_hash=True)
 class Begin(Record):
-    """What has been decided for the way to `tick`. `inputs` is the digest of the actions.
+    """The decisions for `tick`. `inputs` is the digest of the actions.
 
-    `teleports` are the vehicles among `switches` whose new zone is no neighbour of the old one.
+    `teleports` are the vehicles of `switches` whose new zone is not a neighbour of the old one.
     """
 
     switches: tuple[Switch, ...] = ()
@@ -276,7 +276,7 @@ class Begin(Record):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Commit(Record):
-    """`tick` is the truth."""
+    """`tick` is committed."""
 
     removed: tuple[Removed, ...] = ()
     zones: tuple[ZoneLedger, ...] = ()
@@ -285,7 +285,7 @@ class Commit(Record):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Fence(Record):
-    """That process is dead to us."""
+    """Messages of the process with this incarnation are dropped from now on."""
 
     zone: int
     incarnation: int
@@ -302,7 +302,7 @@ class Host(Record):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Output:
-    """Records to write down, then messages to send."""
+    """Records to store, then messages to send."""
 
     records: tuple[Record, ...] = ()
     messages: tuple[Message, ...] = ()

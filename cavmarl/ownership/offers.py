@@ -1,8 +1,7 @@
-"""The source's side of an approach: what it has offered to which zone, and what it still owes.
+"""The source's side of an approach: its offers to other zones, and offers without an answer.
 
-For each pair of vehicle and target a tick has at most one PREPARE or ABORT. A PREPARE that no
-target answers is sent again, at most A times in its tick. A target that refused is left alone for
-some ticks.
+For each vehicle and target, a tick has at most one PREPARE or ABORT. A PREPARE without an answer is
+sent at most A times in its tick. After a refusal, the target gets no offer for some ticks.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from cavmarl.ownership.messages import Ack, Nack, Offer, Refusal, Withdrawn
 
 
 class Approach(NamedTuple):
-    """A vehicle that comes near a zone, and its state."""
+    """A vehicle that approaches a zone, and its state."""
 
     vehicle: int
     target: int
@@ -26,12 +25,12 @@ class Approach(NamedTuple):
 
 
 class Offers:
-    """Offers of one source.
+    """The offers of one source.
 
     Attributes:
-        open: (vehicle, target) → epoch of the last offer that has not been withdrawn.
-        owed: (vehicle, target) → offer of this tick that has not been answered.
-        barred: (vehicle, target) → first tick in which it may be offered again.
+        open: (vehicle, target) → epoch of the last offer, if it has not been withdrawn.
+        owed: (vehicle, target) → offer of this tick without an answer.
+        barred: (vehicle, target) → first tick in which the vehicle may be offered again.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -44,16 +43,16 @@ class Offers:
     def renew(
         self, tick: int, approaches: Iterable[Approach], epochs: Mapping[int, int]
     ) -> tuple[dict[int, tuple[Offer, ...]], dict[int, tuple[Withdrawn, ...]]]:
-        """The offers of a tick, and what is withdrawn because it is not among them.
+        """Replace the offers by those of a new tick.
 
         Returns:
-            Target → offers, and target → withdrawals.
+            Target → offers, and target → earlier offers that are withdrawn.
         """
         self.barred = {pair: until for pair, until in self.barred.items() if until > tick}
         before, self.open, self.owed, self.attempts = self.open, {}, {}, 1
         for vehicle, target, state in approaches:
             if vehicle not in epochs:
-                raise ProtocolError(f"a zone offers vehicle {vehicle}, which it does not own")
+                raise ProtocolError(f"a zone offers vehicle {vehicle}, but does not own it")
             pair, epoch = (vehicle, target), epochs[vehicle]
             if pair in self.barred:
                 if pair in before:
@@ -69,12 +68,15 @@ class Offers:
         return self._by_target(), withdrawn
 
     def forget(self, vehicle: int) -> None:
-        """The vehicle has been handed over. An ABORT now could reach its target before the STEP."""
+        """Forget the offers of a vehicle that was handed over.
+
+        An ABORT now could reach its target before the STEP.
+        """
         for pair in [pair for pair in self.open if pair[0] == vehicle]:
             del self.open[pair]
 
     def again(self) -> dict[int, tuple[Offer, ...]]:
-        """Offers without an answer, target → offers; none after the last attempt."""
+        """Return offers without an answer, target → offers; none after the last attempt."""
         if self.attempts >= self._limits.attempts:
             return {}
         self.attempts += 1
@@ -87,7 +89,7 @@ class Offers:
                 del self.owed[vehicle, ack.zone]
 
     def refused(self, nack: Nack) -> None:
-        """Leave a target alone for a while. A state that was damaged on its way is sent again."""
+        """Stop offers to a target for some ticks, unless the state was damaged in transit."""
         for vehicle, _, reason in nack.entries:
             if reason is not Refusal.DIGEST and (vehicle, nack.zone) in self.owed:
                 del self.owed[vehicle, nack.zone]

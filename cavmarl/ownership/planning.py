@@ -1,6 +1,6 @@
-"""What a logged BEGIN means: a plan that is a function of the record and of the committed owners.
+"""The plan of a tick: a function of the logged BEGIN and of the committed owners.
 
-The plan of a live coordinator and that of one which replays its log are made by this same code.
+A running coordinator and a coordinator that replays its log make their plans with this code.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from cavmarl.ownership.messages import Begin, Confirmed, Done, Out, Removed, Spa
 
 @dataclass(slots=True)
 class OwnershipPlan:
-    """The way from the committed tick to the next."""
+    """The changes of owner between the committed tick and the next tick."""
 
-    record: Begin  # the decision, as logged
-    # zone → what it owns after IN, OUT and SPAWN, before any is removed
+    record: Begin  # the logged decision
+    # zone → tally of its vehicles after IN, OUT and SPAWN, before removals
     expected: Mapping[int, OwnedTally]
     switches: dict[int, Switch] = field(default_factory=dict)  # vehicle → its switch
     births: dict[int, int] = field(default_factory=dict)  # vehicle → its zone
     enter: dict[int, list[Switch]] = field(default_factory=dict)  # zone → switches into it
-    leave: dict[int, list[Out]] = field(default_factory=dict)  # zone → vehicles that it gives away
+    leave: dict[int, list[Out]] = field(default_factory=dict)  # zone → vehicles that leave it
     spawn: dict[int, list[Spawn]] = field(default_factory=dict)  # zone → new vehicles
-    attach: set[int] = field(default_factory=set)  # vehicles whose state rides with STEP
+    attach: set[int] = field(default_factory=set)  # vehicles whose state is attached to STEP
 
     def changes(self, zone: int) -> bool:
-        """Whether a vehicle enters the zone, leaves it, or is born there."""
+        """Return whether a vehicle enters or leaves the zone, or is new there."""
         return zone in self.enter or zone in self.leave or zone in self.spawn
 
     def owner(self, vehicle: int, committed: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
-        """(zone, epoch) of a vehicle under this plan."""
+        """Return (zone, epoch) of a vehicle under this plan."""
         if vehicle in self.switches:
             switch = self.switches[vehicle]
             return switch.target, switch.epoch
@@ -42,7 +42,7 @@ class OwnershipPlan:
 
 
 def make_plan(run: bytes, record: Begin, committed: Mapping[int, OwnedTally]) -> OwnershipPlan:
-    """The plan of a BEGIN record, given what the zones owned when the last tick was committed."""
+    """Return the plan of a BEGIN record, given the tallies of zones at the committed tick."""
     if not record.switches and not record.births:
         return OwnershipPlan(record, committed)
     expected = dict(committed)
@@ -66,12 +66,14 @@ def make_plan(run: bytes, record: Begin, committed: Mapping[int, OwnedTally]) ->
 def check_done(
     run: bytes, plan: OwnershipPlan, done: Done, owners: Mapping[int, tuple[int, int]]
 ) -> None:
-    """Compare what a zone did with what was planned."""
+    """Compare the DONE of a zone with the plan. Raises ProtocolError if they differ."""
     expected = plan.expected[done.zone]
     for vehicle, _ in done.removed:
         zone, epoch = plan.owner(vehicle, owners)
         if zone != done.zone:
-            raise ProtocolError(f"{_where(done)} removed vehicle {vehicle}, which zone {zone} owns")
+            raise ProtocolError(
+                f"{_where(done)} removed vehicle {vehicle}, but zone {zone} owns it"
+            )
         expected = expected.minus(run, vehicle, epoch)
     planned = tuple(
         Confirmed(entry.vehicle, entry.epoch) for entry in plan.enter.get(done.zone, ())
@@ -89,5 +91,5 @@ def _where(done: Done) -> str:
 
 
 def all_removed(dones: Iterable[Done]) -> tuple[Removed, ...]:
-    """Vehicles that left the world, in order of ids."""
+    """Return the vehicles that left the world, in the order of their ids."""
     return tuple(sorted(entry for done in dones for entry in done.removed))

@@ -1,4 +1,4 @@
-"""What goes between a zone's endpoint and those around it, apart from messages."""
+"""Data that a zone's endpoint exchanges with its shard and its process, besides messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavmarl.ownership.messages import Message, Spawn
 
 @dataclass(slots=True)
 class Hosting:
-    """What a new host is told: its identity, and what its zone owns at the committed tick."""
+    """The identity of a new host, and the vehicles of its zone at the committed tick."""
 
     run: bytes
     episode: int
@@ -22,20 +22,20 @@ class Hosting:
 
 @dataclass(slots=True)
 class Advance:
-    """The shard's work for one tick: change the rows that are owned, then advance all of them."""
+    """The shard's work for one tick: change the set of owned rows, then advance all of them."""
 
-    episode: int  # when it changes, all earlier rows are void
+    episode: int  # a new episode makes all earlier rows invalid
     tick: int  # the tick to reach
-    release: tuple[int, ...]  # rows kept from earlier switches, which may go or become ghosts now
-    leave: tuple[int, ...]  # rows that are frozen as they are and kept
-    enter: tuple[tuple[int, bytes], ...]  # (vehicle, state) of rows that come in
+    release: tuple[int, ...]  # rows of committed switches, which may be dropped or become ghosts
+    leave: tuple[int, ...]  # rows that are frozen and kept
+    enter: tuple[tuple[int, bytes], ...]  # (vehicle, state) of rows that enter the zone
     spawn: tuple[Spawn, ...]  # new rows
-    payload: bytes  # the STEP's own, for the runtime
+    payload: bytes  # of the STEP, for the runtime
 
 
 @dataclass(slots=True)
 class Reaction:
-    """What a message leads to: messages to send, and with a new lease work for the shard."""
+    """The response to a message: messages to send and, with a new lease, work for the shard."""
 
     messages: tuple[Message, ...] = ()
     advance: Advance | None = None

@@ -1,4 +1,4 @@
-"""What targets have acknowledged: the coordinator's volatile set "ready"."""
+"""The acknowledgements of targets: the coordinator's volatile set "ready"."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Readiness:
     def ready(
         self, vehicle: int, zone: int, *, tick: int, epoch: int, incarnation: int, digest: bytes
     ) -> bool:
-        """Whether the zone's living host holds exactly that state of the vehicle."""
+        """Return whether the zone's present host has exactly that state of the vehicle."""
         found = self.held.get(tick, {}).get((vehicle, zone))
         return found == (incarnation, epoch, digest)
 

@@ -1,8 +1,8 @@
-"""The replicas that a zone host keeps for vehicles which may come, and the fences around them.
+"""The replicas that a zone host keeps of vehicles that may enter, and their fences.
 
-A fence is the newest (epoch, tick) of a vehicle that has been heard in a PREPARE or an ABORT. Only
-what is newer counts, in whatever order messages arrive. Nothing older than the lifetime is heard
-at all, so that older fences can be forgotten.
+A fence is the newest (epoch, tick) of a vehicle in any PREPARE or ABORT so far. Only newer messages
+count, in any order of arrival. Messages older than the lifetime are ignored, so that older fences
+can be forgotten.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cavmarl.ownership.transitions import Event, Party, State, after
 
 
 class Replica(NamedTuple):
-    """A state as of a tick, which is not advanced."""
+    """The state of a vehicle at a tick, which is not advanced."""
 
     epoch: int
     tick: int
@@ -26,10 +26,10 @@ class Replica(NamedTuple):
 
 
 class Replicas:
-    """Replicas by vehicle.
+    """The replicas of one host, by vehicle.
 
     Attributes:
-        fences: vehicle → (epoch, tick) of the newest PREPARE or ABORT heard.
+        fences: vehicle → (epoch, tick) of the newest PREPARE or ABORT so far.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -42,12 +42,12 @@ class Replicas:
         return State.PREPARED if vehicle in self.held else State.EMPTY
 
     def prepare(self, offer: Offer, tick: int, schema: int) -> Refusal | bool:
-        """Take a state in: True if it is held now, False if it came too late, or why not."""
+        """Store a state. Return whether it is stored (False: it came too late), or the refusal."""
         held = self.held.get(offer.vehicle)
         if not self._newer(offer.vehicle, offer.epoch, tick):
             return held is not None and held[:3] == (offer.epoch, tick, offer.digest)
         if state_digest(offer.state) != offer.digest:
-            return Refusal.DIGEST  # damaged on its way: not heard, so it may be sent again
+            return Refusal.DIGEST  # damaged in transit: no fence, so it may be sent again
         if schema != self._limits.schema:
             return self.refuse(offer, tick, Refusal.SCHEMA)
         if held is None and len(self.held) >= self._limits.capacity:
@@ -58,12 +58,12 @@ class Replicas:
         return True
 
     def refuse(self, offer: Offer, tick: int, reason: Refusal) -> Refusal:
-        """Hear a state, but do not take it in."""
+        """Raise the fence for a state without storing it."""
         self._raise_fence(offer.vehicle, offer.epoch, tick)
         return reason
 
     def abort(self, vehicle: int, epoch: int, tick: int) -> bool:
-        """Drop a replica; False if the message is older than what has been heard."""
+        """Drop a replica. Return False if the message is not newer than the fence."""
         if not self._newer(vehicle, epoch, tick):
             return False
         after(Party.REPLICA, self.state(vehicle), Event.ABORT)
@@ -76,13 +76,13 @@ class Replicas:
         return held is not None and held[:3] == (epoch, tick, digest)
 
     def take(self, vehicle: int) -> bytes:
-        """Promote: the state leaves the slot, if there is one. The fence stays."""
+        """Remove and return the state that becomes a row, or b"". The fence stays."""
         after(Party.REPLICA, self.state(vehicle), Event.IN)
         held = self.held.pop(vehicle, None)
         return b"" if held is None else held.state
 
     def expire(self, now: int) -> None:
-        """Drop what has not been refreshed for the lifetime, with its fence."""
+        """Drop replicas that have not been refreshed for the lifetime, with their fences."""
         last = now - self._limits.lifetime
         if not self._heard or min(self._heard) > last:
             return

@@ -1,7 +1,7 @@
-"""What the log says: owners, hosts and the tick in progress.
+"""The table of owners and hosts, which results from the log.
 
-The table changes by records alone, so a coordinator that replays its log comes to the table that
-it died with, and any other reader that replays it knows all owners.
+Only records change the table. So a coordinator that replays its log restores its former table, and
+any other reader that replays the log gets all owners.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from cavmarl.ownership.planning import OwnershipPlan, make_plan
 from cavmarl.ownership.transitions import Event, Party, State, after
 
 _Move: TypeAlias = tuple[int, int, int, bool]
-"""(vehicle, zone, epoch, whether it comes or goes)."""
+"""(vehicle, zone, epoch, whether it enters the zone or leaves it)."""
 
 
 class Table:
-    """The state that a log leads to.
+    """The state that results from a log.
 
     Attributes:
-        run: as the first record says.
-        tick: the committed tick. It never goes back, also not at a reset.
-        episode: counts the resets; -1 before the first.
-        owners: vehicle → (zone, epoch) as of the committed tick.
-        deferred: vehicle → ticks that it has been with a zone which does not contain it.
-        hosts: zone → (worker, incarnation); incarnation 0 means never hosted.
-        counts: zone → how many vehicles it owned at the committed tick.
+        run: the id of the run, from the first record.
+        tick: the committed tick. It never decreases, not even at a reset.
+        episode: the number of resets - 1; -1 before the first reset.
+        owners: vehicle → (zone, epoch) at the committed tick.
+        deferred: vehicle → ticks with an owner whose zone does not contain it.
+        hosts: zone → (worker, incarnation); incarnation 0: never hosted.
+        counts: zone → number of owned vehicles at the committed tick.
     """
 
     def __init__(self, zones: Iterable[int]) -> None:
@@ -51,11 +51,11 @@ class Table:
         self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
         self.states = dict.fromkeys(self.hosts, State.UNHOSTED)  # zone → UNHOSTED, HOSTED or FENCED
         self.seen = SeenIds()  # ids that have been in the episode
-        self.repeats: Counter[int] = Counter()  # zone → new hosts in the tick in progress
-        self.plan: OwnershipPlan | None = None  # the tick in progress, or None
+        self.repeats: Counter[int] = Counter()  # zone → number of new hosts in the present tick
+        self.plan: OwnershipPlan | None = None  # of the tick in progress, or None
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())
-        self._moves: list[_Move] = []  # that are not in the tallies yet
+        self._moves: list[_Move] = []  # not in the tallies yet
 
     @property
     def tallies(self) -> dict[int, OwnedTally]:
@@ -73,11 +73,11 @@ class Table:
     @property
     def planned(self) -> OwnershipPlan:
         if self.plan is None:
-            raise ProtocolError("no tick is in progress")
+            raise ProtocolError("no tick is in progress; call begin first")
         return self.plan
 
     def state(self, vehicle: int) -> State:
-        """UNKNOWN, OWNED, SWITCHING or REMOVED."""
+        """Return UNKNOWN, OWNED, SWITCHING or REMOVED."""
         if vehicle not in self.owners:
             return State.REMOVED if vehicle in self.seen else State.UNKNOWN
         switching = self.plan is not None and vehicle in self.plan.switches
@@ -85,18 +85,18 @@ class Table:
 
     def settle(
         self,
-        tick: int,  # which one; in those before nothing has changed
-        switches: Iterable[Switch] = (),  # changes of owner
+        tick: int,  # the later tick
+        switches: Iterable[Switch] = (),  # changes of owner up to this tick
         births: Iterable[Birth] = (),
-        # vehicles that have left the world, of those before and of these
-        removed: Iterable[Removed] = (),
+        removed: Iterable[Removed] = (),  # vehicles that left the world, possibly from `births`
     ) -> None:
         """Reach a later tick at once, as a BEGIN and a COMMIT with the same contents would.
 
-        For a coordinator that has checked them itself, and whose log, if there is one, has them.
+        The calling coordinator must have checked the changes, and must have them in its log, if
+        there is one.
         """
         if self.plan is not None or self.deferred:
-            raise ProtocolError(f"tick {self.tick + 1} is in progress")
+            raise ProtocolError(f"tick {self.tick + 1} is in progress; commit it first")
         owners, counts, moves = self.owners, self.counts, self._moves
         for vehicle, zone, _ in births:
             self.seen.add(vehicle)
@@ -108,7 +108,7 @@ class Table:
             if owner != (source, epoch - 1):
                 raise ProtocolError(
                     f"vehicle {vehicle} changed from zone {source} to {target} by tick {tick}, "
-                    f"and its owner on record was {owner}"
+                    f"but its owner on record was {owner}"
                 )
             owners[vehicle] = (target, epoch)
             counts[source] -= 1
@@ -117,12 +117,12 @@ class Table:
             moves.append((vehicle, target, epoch, True))
         for vehicle, _ in removed:
             if vehicle not in owners:
-                raise ProtocolError(f"vehicle {vehicle} has left the world, and no zone owned it")
+                raise ProtocolError(f"vehicle {vehicle} has left the world, but no zone owned it")
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
-        # More moves than vehicles: callers count anew, and need to know no more than that.
-        # It stays so, since with every new vehicle comes a move.
+        # With more moves than vehicles, `tallies` counts anew and ignores the moves. One surplus
+        # move is enough to tell, because every new vehicle adds a move.
         del moves[len(owners) + 1 :]
         self.tick = tick
 
@@ -130,13 +130,13 @@ class Table:
         self,
         run: bytes,
         episode: int,  # -1: none has begun
-        tick: int,  # that was committed last
-        owners: dict[int, tuple[int, int]],  # as of that tick
+        tick: int,  # the committed tick
+        owners: dict[int, tuple[int, int]],  # at that tick
         seen: SeenIds,
     ) -> None:
-        """Become the table of a coordinator whose zones all live in its own process.
+        """Resume as the table of a coordinator whose zones are all in one process.
 
-        Each of them has been hosted once, when the first episode began.
+        Each zone has been hosted once, when the first episode began.
         """
         has_begun = episode >= 0
         self.run, self.tick, self.episode = run, tick, episode
@@ -151,15 +151,15 @@ class Table:
         self._moves = [(v, zone, epoch, True) for v, (zone, epoch) in owners.items()]
 
     def alive(self, zone: int, incarnation: int) -> bool:
-        """Whether that process hosts the zone now."""
+        """Return whether the process of this incarnation hosts the zone now."""
         return self.states[zone] is State.HOSTED and self.hosts[zone][1] == incarnation
 
     def apply(self, record: Record) -> None:
-        """Change by one record.
+        """Apply one record.
 
         Raises:
-            JournalError: a coordinator would not have written it here.
-            ProtocolError: the same, for one vehicle or zone.
+            JournalError: a correct coordinator does not write this record here.
+            ProtocolError: the record is wrong for one vehicle or zone.
         """
         match record:  # the frequent ones first
             case Begin():
@@ -175,7 +175,9 @@ class Table:
 
     def _reset(self, record: Reset) -> None:
         if len(record.run) != RUN_BYTES:
-            raise JournalError(f"a run has {RUN_BYTES} bytes, not {len(record.run)}")
+            raise JournalError(
+                f"the id of the run has {len(record.run)} bytes; it must have {RUN_BYTES}"
+            )
         self.run, self.tick, self.episode = record.run, record.tick, record.episode
         self.owners, self.deferred, self.plan = {}, {}, None
         self.counts = dict.fromkeys(self.hosts, 0)
@@ -186,14 +188,19 @@ class Table:
 
     def _begin(self, record: Begin) -> None:
         if self.plan is not None or record.tick != self.tick + 1:
-            raise JournalError(f"BEGIN of tick {record.tick} after tick {self.tick}, or once more")
+            raise JournalError(
+                f"BEGIN of tick {record.tick} does not follow the commit of tick {record.tick - 1}"
+            )
         if record.switches or record.births:
             self._check_zones(switch.target for switch in record.switches)
             self._check_zones(birth.zone for birth in record.births)
         for vehicle, source, _, epoch, _ in record.switches:
             after(Party.VEHICLE, self.state(vehicle), Event.SWITCH)
             if self.owners[vehicle] != (source, epoch - 1):
-                raise JournalError(f"BEGIN of tick {record.tick} takes {vehicle} from {source}")
+                raise JournalError(
+                    f"BEGIN of tick {record.tick} takes vehicle {vehicle} from zone {source}, "
+                    f"which does not own it at epoch {epoch - 1}"
+                )
         for vehicle, _, _ in record.births:
             after(Party.VEHICLE, self.state(vehicle), Event.SPAWN)
             self.seen.add(vehicle)
@@ -202,10 +209,14 @@ class Table:
     def _commit(self, record: Commit) -> None:
         plan = self.planned
         if record.tick != plan.record.tick:
-            raise JournalError(f"COMMIT of tick {record.tick}, but {plan.record.tick} was begun")
-        told = [entry.zone for entry in record.zones]
-        if told != list(self.hosts):
-            raise JournalError(f"COMMIT of tick {record.tick} tells of zones {told}")
+            raise JournalError(
+                f"COMMIT of tick {record.tick}, but tick {plan.record.tick} was begun"
+            )
+        zones = [entry.zone for entry in record.zones]
+        if zones != list(self.hosts):
+            raise JournalError(
+                f"COMMIT of tick {record.tick} has the zones {zones}, not {list(self.hosts)}"
+            )
         for vehicle, zone in plan.births.items():
             self.owners[vehicle] = (zone, 0)
         for vehicle, _ in record.removed:

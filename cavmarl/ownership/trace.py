@@ -1,8 +1,8 @@
-"""What happened, in order: the coordinator's records, and every message that arrived somewhere.
+"""Traces: the coordinator's records and all delivered messages, in order.
 
-A driver notes each record when it is logged and each message when it is delivered, before it is
-known whether the receiver drops it. `trace_check` judges such a trace without any of the
-protocol's code; `Trace.text` prints it for people.
+A driver adds each record when it is logged, and each message when it is delivered, before the
+receiver may drop it. `trace_check` checks a trace without the code of the protocol; `Trace.text`
+formats it for people.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LOG = -2
 
 
 class TraceEntry(NamedTuple):
-    """A record (destination LOG), or a message at its destination."""
+    """A record (destination LOG), or a message and its destination."""
 
     destination: int
     item: Item
@@ -51,7 +51,7 @@ class Trace:
         self.entries.extend(TraceEntry(LOG, record) for record in records)
 
     def delivered(self, destination: int, message: Message) -> None:
-        """Note a message that arrives at a zone, or at the coordinator."""
+        """Add a message that arrives at a zone or at the coordinator."""
         self.entries.append(TraceEntry(destination, message))
 
     def text(self) -> str:

@@ -1,11 +1,11 @@
-"""Judges a trace by the rules of docs/explanation/ownership.md, without any of the protocol's code.
+"""Check of a trace by the rules of docs/explanation/ownership.md, without the protocol's code.
 
-It accepts what every correct run leaves behind, and refuses a trace in which a vehicle has two
-owners or none, a hand-off begins without the exact state at its target (PREPARE < ACK < SWITCH <
-CONFIRM < RELEASE), something is sent before it is logged, or a tick is committed that a living
-host has not computed.
+It accepts the traces of correct runs. It refuses a trace in which a vehicle has two owners or none,
+a switch begins without the exact state at its target (PREPARE < ACK < SWITCH < CONFIRM < RELEASE),
+a message is sent before its record is logged, or a tick is committed that a present host has not
+computed.
 
-A tick costs what changes in it: vehicles that stay where they are are never looked at.
+The cost of a tick grows with its changes: vehicles that keep their owner are not visited.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Holding = tuple[int, int, int, int, bytes]
 
 
 class KnownOwners(Protocol):
-    """What a log has led to; see `ownership.table`, which the judge does not use."""
+    """The state that results from a log; see `ownership.table`, which the check does not use."""
 
     @property
     def hosts(self) -> Mapping[int, tuple[Any, int]]: ...
@@ -70,7 +70,7 @@ Owner = tuple[int, int]
 
 
 class OwnerStep(NamedTuple):
-    """What a tick did to the owner of a vehicle; None: it is not in the world."""
+    """The change of a vehicle's owner in a tick; None: it is not in the world."""
 
     vehicle: int
     before: Owner | None
@@ -79,7 +79,7 @@ class OwnerStep(NamedTuple):
 
 @dataclass(slots=True)
 class _Orders:
-    """What a BEGIN says to one zone."""
+    """The decisions of a BEGIN for one zone."""
 
     entered: set[tuple[int, int]] = field(default_factory=set)
     left: set[tuple[int, int]] = field(default_factory=set)
@@ -101,20 +101,20 @@ def _require(holds: bool, otherwise: str) -> None:
 
 
 class TraceChecker:
-    """Follows a trace entry by entry; `take` raises ProtocolError at the first that is wrong."""
+    """Checks a trace entry by entry; `take` raises ProtocolError at the first wrong entry."""
 
     def __init__(
         self,
-        longest_deferral: int,  # ticks that a vehicle may be with a zone that does not contain it
+        longest_deferral: int,  # ticks that a vehicle may have an owner whose zone it has left
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
-        # zones and coordinator live in one process, so that there are records alone, and perhaps
-        # only of ticks that have something to tell of
+        # zones and coordinator are in one process, so that there are only records, and possibly
+        # only those of ticks with changes
         is_direct: bool = False,
         near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
     ) -> None:
         self._is_direct, self.near = is_direct, near
-        self.owners: dict[int, Owner] = {}  # vehicle → owner as of the committed tick
-        self.changes: list[OwnerStep] = []  # what the last COMMIT did to them
+        self.owners: dict[int, Owner] = {}  # vehicle → owner at the committed tick
+        self.changes: list[OwnerStep] = []  # of the last COMMIT
         self._longest, self._lifetime = longest_deferral, lifetime
         self._run, self._episode, self._tick = b"", -1, 0
         self._tallies: defaultdict[int, OwnedTally] = defaultdict(OwnedTally)
@@ -160,7 +160,7 @@ class TraceChecker:
         self._holdings.clear()
 
     def go_on(self, table: KnownOwners) -> None:
-        """Know what a log says that led to a table, of a coordinator without messages."""
+        """Resume with the table of a coordinator without messages."""
         self._incarnations = {zone: number for zone, (_, number) in table.hosts.items() if number}
         self._episode, self._tick = table.episode - 1, 0
         self._reset(Reset(table.episode, table.tick, table.run))
@@ -260,7 +260,7 @@ class TraceChecker:
     def _ack(self, message: Ack) -> None:
         process = (message.zone, message.incarnation)
         if self._incarnations.get(message.zone) != message.incarnation:
-            return  # a zombie's: what it still hears is not in the trace
+            return  # of a replaced process, whose further messages are not in the trace
         for vehicle, epoch, digest in message.entries:
             holding = (*process, vehicle, epoch, digest)
             known = holding in self._holdings.get(message.tick, ())
@@ -278,14 +278,14 @@ class TraceChecker:
         begun = self._begun
         if begun is None or record.tick != begun.tick:
             raise ProtocolError("commits a tick that was not begun")
-        told = [ledger.zone for ledger in record.zones]
-        _require(told == sorted(self._incarnations), f"tells of zones {told}")
+        zones = [ledger.zone for ledger in record.zones]
+        _require(zones == sorted(self._incarnations), f"has the zones {zones}")
         changed = self._planned(begun)
         if self._is_direct:
             changed.update((entry.vehicle, None) for entry in record.removed)
         else:
             removed: list[Removed] = []
-            for zone in told:
+            for zone in zones:
                 removed += self._confirmed(zone, changed)
             _require(record.removed == tuple(sorted(removed)), "removes others than the zones did")
         self.changes = [
@@ -294,9 +294,9 @@ class TraceChecker:
         ]
         self._change_owners()
         for ledger in record.zones:
-            told_by_zone = ledger if self._is_direct else self._dones[ledger.zone]
-            exact = ledger.owned == told_by_zone.owned == self._tallies[ledger.zone]
-            _require(exact, f"zone {ledger.zone} does not own what it should")
+            own = ledger if self._is_direct else self._dones[ledger.zone]
+            exact = ledger.owned == own.owned == self._tallies[ledger.zone]
+            _require(exact, f"zone {ledger.zone} does not own the expected vehicles")
         self._tick, self._begun, self._dones = record.tick, None, {}
         self._deferred = {v: ticks for v, ticks in begun.deferred if v in self.owners}
         self._forget()
@@ -308,7 +308,7 @@ class TraceChecker:
         return changed
 
     def _confirmed(self, zone: int, changed: dict[int, Owner | None]) -> tuple[Removed, ...]:
-        """What a zone's DONE adds to the changes: removed vehicles."""
+        """Add the removals of a zone's DONE to the changes, and return them."""
         done = self._dones.get(zone)
         if done is None:
             raise ProtocolError(f"zone {zone} has not said DONE")

@@ -1,4 +1,4 @@
-"""What many transfers have in common: how many, how they ended, how long they took."""
+"""Statistics of transfers: their number, their results and their durations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cavmarl.ownership.transfers import Transfer
 
 
 class Spread(NamedTuple):
-    """Nearest-rank percentiles; all None without values."""
+    """Nearest-rank percentiles; all are None without values."""
 
     p50: float | None
     p95: float | None
@@ -30,37 +30,36 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class TransferSummary:
-    """Of transfers and of what led to none."""
+    """Statistics of transfers, and of approaches without a transfer."""
 
-    transfers: int  # vehicles that have changed their owner
-    forced: int  # of them, with the state attached, since no acknowledgement came in time
-    removed: int  # of them, that left the world in the same tick
-    deferred: int  # ticks in which a vehicle that had crossed stayed with its owner, summed
-    refused: int  # states that a target did not take
+    transfers: int  # number of changes of owner
+    forced: int  # transfers with the state attached, because no acknowledgement came in time
+    removed: int  # transfers of vehicles that left the world in the same tick
+    deferred: int  # sum over vehicles of ticks with the old owner after the crossing
+    refused: int  # states that a target refused
     aborted: int  # approaches that ended without a transfer
-    # by phase: `acknowledge`, no answer by the end of the tick (as many as `deferred`); `switch`,
-    # none by the deadline (as many as `forced`); `replica`, states that were neither asked for nor
+    # by phase: `acknowledge`, no answer by the end of the tick (same as `deferred`); `switch`, no
+    # answer by the deadline (same as `forced`); `replica`, states that were neither used nor
     # withdrawn in their lifetime
     timeouts: Mapping[str, int]
-    latency_ticks: Spread  # from the first state at the target until it had confirmed
-    waited_ticks: Spread  # of these, those behind the border
-    latency_ms: Spread  # the same as `latency_ticks`, by the clock
-    state_bytes: Spread  # of a vehicle
-    # how far outside of its owner's zone at the first state, less than 0 inside
+    latency_ticks: Spread  # from the first state at the target to its confirmation
+    waited_ticks: Spread  # the part of `latency_ticks` after the crossing
+    latency_ms: Spread  # as `latency_ticks`, by the clock
+    state_bytes: Spread  # size of a vehicle's state
+    # distance outside of the owner's zone at the first state; negative inside
     prepare_depth_m: Spread
-    switch_depth_m: Spread  # at the switch
-    release_depth_m: Spread  # outside of its old zone when the switch was committed
-    failure_rate: float | None  # share of transfers that had to be forced; None without transfers
+    switch_depth_m: Spread  # the same at the switch
+    release_depth_m: Spread  # distance outside of the old zone at the commit of the switch
+    failure_rate: float | None  # share of forced transfers; None without transfers
 
     @classmethod
     def of(
         cls,
-        rows: Iterable[Transfer],  # whose spread is told
-        # of a `TransferLog`, or the sum of several; they may know of more transfers than there are
-        # rows left
+        rows: Iterable[Transfer],  # for the percentiles
+        # of a `TransferLog`, or the sum over several; they may include more transfers than `rows`
         counts: Mapping[str, int],
     ) -> TransferSummary:
-        """A summary."""
+        """Return the statistics of transfers."""
         kept = list(rows)
         forced = counts.get("forced", 0)
         transfers = forced + counts.get("switched", 0)

@@ -1,6 +1,7 @@
-"""A row for every transfer: when it was prepared, how long it waited, how it ended.
+"""Rows about transfers: when they were prepared, how long they waited, how they ended.
 
-A `TransferLog` is told what a `Trace` is told, and keeps what is under way and the newest rows.
+A `TransferLog` receives the same records and messages as a `Trace`. It keeps current approaches and
+the newest transfers.
 """
 
 from __future__ import annotations
@@ -30,33 +31,31 @@ KEPT_ROWS = 10_000
 class Transfer(NamedTuple):
     """A change of owner."""
 
-    episode: int  # in which it was
-    tick: int  # the tick that the new owner computed first
-    vehicle: int  # that changed
-    source: int  # from where
-    target: int  # to where
-    epoch: int  # the new one
-    forced: bool  # whether the state rode along, since the target was not ready in time
+    episode: int
+    tick: int  # the first tick that the new owner computed
+    vehicle: int
+    source: int  # the old owner
+    target: int  # the new owner
+    epoch: int  # of the new ownership
+    forced: bool  # whether the state was attached, because the target was not ready in time
     removed: bool  # whether the vehicle left the world in that tick
     approached: int  # tick of the first state that arrived at the target, or -1
-    waited: int  # ticks for which the source went on after the crossing
-    offers: int  # states that arrived at the target, repeats included
-    # size of the last of them; 0 where no bytes were sent, since both zones live in one process
-    state_bytes: int
-    # how far it was outside of its owner's zone when the first of them arrived, less than 0 inside;
-    # None: unknown
+    waited: int  # ticks for which the source kept the vehicle after the crossing
+    offers: int  # number of states that arrived at the target, including repeats
+    state_bytes: int  # size of the last of them; 0 if both zones are in one process
+    # distance outside of the owner's zone when the first state arrived; negative inside; None:
+    # unknown
     prepare_depth_m: float | None = None
-    switch_depth_m: float | None = None  # the same when its switch was decided
-    # how far outside of its old zone when that was committed, and the old owner's copy went; None:
-    # unknown, or it has left the world
+    switch_depth_m: float | None = None  # the same when the switch was decided
+    # distance outside of the old zone when the switch was committed; None: unknown, or the vehicle
+    # has left the world
     release_depth_m: float | None = None
-    # from that first state, or else from BEGIN, until the target has confirmed; None: without a
-    # clock
+    # from the first state, or from BEGIN without one, to the target's confirmation; None: no clock
     ms: float | None = None
 
     @property
     def ticks(self) -> int:
-        """From the first state that arrived at the target, or else from BEGIN, until DONE."""
+        """Ticks from the first state at the target, or from BEGIN without one, to DONE."""
         return self.tick - self.approached if self.approached >= 0 else 1 + self.waited
 
 
@@ -72,10 +71,10 @@ _NEVER = _Approach(-1, -1, 0, 0)
 
 
 class TransferLog:
-    """Follows records and deliveries.
+    """A log of transfers, made from records and delivered messages.
 
     Attributes:
-        ask: called before each reading, to bring late records up to date.
+        ask: called before each access, so that its caller can add outstanding entries.
     """
 
     def __init__(
@@ -95,7 +94,7 @@ class TransferLog:
 
     @property
     def rows(self) -> deque[Transfer]:
-        """The newest KEPT_ROWS transfers that have been committed; `take` takes them away."""
+        """The newest KEPT_ROWS committed transfers; `take` removes them."""
         self.ask()
         self._make_rows()
         return self._rows
@@ -107,7 +106,7 @@ class TransferLog:
         return self._counts
 
     def take(self) -> list[Transfer]:
-        """The rows, which are not kept any longer."""
+        """Return and remove the rows."""
         rows = list(self.rows)
         self._rows.clear()
         return rows
@@ -145,7 +144,7 @@ class TransferLog:
                 self._counts["refused"] += len(message.entries)
 
     def add_later(self, number: int, removed: int, make: Callable[[], Iterable[Transfer]]) -> None:
-        """Note changes of owner that no message tells of; rows are made when they are read."""
+        """Add changes of owner without messages. Their rows are made when they are read."""
         self._counts["switched"] += number
         if removed:
             self._counts["removed"] += removed
@@ -168,7 +167,7 @@ class TransferLog:
         self._rows.append(row)
 
     def count(self, **numbers: int) -> None:
-        """Note so many of `counts` that no message tells of."""
+        """Increase `counts` by events without messages."""
         self._counts.update({name: number for name, number in numbers.items() if number})
 
     def _begin(self, record: Begin) -> None:

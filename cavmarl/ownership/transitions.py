@@ -1,10 +1,10 @@
-"""The states of the protocol. Everything that may happen stands in `TABLE`.
+"""The state machines of the protocol. `TABLE` has all transitions.
 
-Rule 1: what is not in the table does not happen: `after` raises.
-Rule 2: a message that comes late is dropped and counted before it gets here.
+Rule 1: a transition that is not in the table is an error: `after` raises.
+Rule 2: the receiver drops and counts late messages before they get here.
 
-A vehicle has two slots at a host, which never touch each other: its ROW, which the host may
-advance while it is AUTHORITATIVE, and its REPLICA, which is never advanced.
+A host has two independent slots for a vehicle: its ROW, which the host may advance while it is
+AUTHORITATIVE, and its REPLICA, which is never advanced.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from cavmarl.core.errors import ProtocolError
 
 
 class _Word(StrEnum):
-    # Tables of words are looked up in every tick: an enumeration's own hash is a call in Python.
+    # The hash of Enum is a Python function, which is too slow for the lookups of each tick.
     __hash__ = str.__hash__
 
 
 class Party(_Word):
-    """Whose state it is."""
+    """The owners of states."""
 
     VEHICLE = "a vehicle, at the coordinator"
     ZONE = "a zone, at the coordinator"
@@ -29,7 +29,7 @@ class Party(_Word):
 
 
 class State(_Word):
-    """States of all parties."""
+    """The states of all parties."""
 
     UNKNOWN = "UNKNOWN"
     OWNED = "OWNED"
@@ -46,7 +46,7 @@ class State(_Word):
 
 
 class Event(_Word):
-    """What moves them."""
+    """The events that cause transitions."""
 
     SPAWN = "SPAWN"
     SWITCH = "SWITCH"
@@ -68,17 +68,17 @@ P, S, E = Party, State, Event
 # fmt: off
 TABLE: dict[tuple[Party, State, Event], State] = {
     (P.VEHICLE, S.UNKNOWN, E.SPAWN): S.OWNED,             # BEGIN names it for the first time
-    (P.VEHICLE, S.OWNED, E.SWITCH): S.SWITCHING,          # BEGIN with IN and OUT: forward only
+    (P.VEHICLE, S.OWNED, E.SWITCH): S.SWITCHING,          # BEGIN with IN and OUT; irrevocable
     (P.VEHICLE, S.SWITCHING, E.COMMIT): S.OWNED,          # the target has confirmed; epoch + 1
     (P.VEHICLE, S.OWNED, E.REMOVE): S.REMOVED,            # final
     (P.VEHICLE, S.SWITCHING, E.REMOVE): S.REMOVED,        # the new owner saw it leave the world
 
     (P.ZONE, S.UNHOSTED, E.HOST): S.HOSTED,               # incarnation 1
-    (P.ZONE, S.HOSTED, E.FENCE): S.FENCED,                # nothing of that process counts any more
+    (P.ZONE, S.HOSTED, E.FENCE): S.FENCED,                # messages of that process are dropped
     (P.ZONE, S.FENCED, E.HOST): S.HOSTED,                 # incarnation + 1, loaded from the store
     (P.ZONE, S.HOSTED, E.HOST): S.HOSTED,                 # a planned move, between two ticks
 
-    (P.ROW, S.NONE, E.LOAD): S.AUTHORITATIVE,             # a new host; it waits for its first lease
+    (P.ROW, S.NONE, E.LOAD): S.AUTHORITATIVE,             # a new host, before its first lease
     (P.ROW, S.NONE, E.SPAWN): S.AUTHORITATIVE,
     (P.ROW, S.NONE, E.IN): S.AUTHORITATIVE,               # from the replica or the attached state
     (P.ROW, S.AUTHORITATIVE, E.OUT): S.RETAINED,          # frozen, in case the switch is repeated
@@ -88,16 +88,16 @@ TABLE: dict[tuple[Party, State, Event], State] = {
     (P.REPLICA, S.EMPTY, E.PREPARE): S.PREPARED,
     (P.REPLICA, S.PREPARED, E.PREPARE): S.PREPARED,       # a newer state
     (P.REPLICA, S.PREPARED, E.ABORT): S.EMPTY,            # the fence stays
-    (P.REPLICA, S.EMPTY, E.ABORT): S.EMPTY,               # it came before the PREPARE: only a fence
+    (P.REPLICA, S.EMPTY, E.ABORT): S.EMPTY,               # arrived before the PREPARE: a fence only
     (P.REPLICA, S.PREPARED, E.EXPIRE): S.EMPTY,           # K ticks without a refresh
     (P.REPLICA, S.PREPARED, E.IN): S.EMPTY,               # promoted to the row
-    (P.REPLICA, S.EMPTY, E.IN): S.EMPTY,                  # the state came attached
+    (P.REPLICA, S.EMPTY, E.IN): S.EMPTY,                  # the state was attached
 }
 # fmt: on
 
 
 def after(party: Party, state: State, event: Event) -> State:
-    """The state that follows."""
+    """Return the next state. Raises ProtocolError if there is no such transition."""
     following = TABLE.get((party, state, event))
     if following is None:
         raise ProtocolError(f"{event} of {party.value}, which is {state}")
@@ -105,7 +105,7 @@ def after(party: Party, state: State, event: Event) -> State:
 
 
 def mermaid(party: Party) -> str:
-    """The diagram of one party, in Mermaid's language."""
+    """Return the state diagram of one party, in Mermaid's language."""
     lines = [
         f"    {state} --> {following}: {event}"
         for (whose, state, event), following in TABLE.items()

@@ -1,4 +1,4 @@
-"""Builds the library of compiled kernels that a wheel brings.
+"""Builds the library of compiled kernels for a wheel.
 
-Stands on `core`.
+Builds on `core`.
 """

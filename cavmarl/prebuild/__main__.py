@@ -1,10 +1,10 @@
-"""`python -m cavmarl.prebuild`: compile the kernels of the package, and keep their list.
+"""`python -m cavmarl.prebuild`: compile the kernels of the package, and maintain their list.
 
-compile         compile kernels for this machine, and keep them: those of a plain world, or --all
-build FOLDER    compile all kernels for the wheel's processor, link them into a library
-record FOLDER   add the calls that programs have left there with `CAVMARL_KERNEL_CALLS=FOLDER` to
-                the list of kernels, and remove those that cannot be made any more
-check FOLDER    exit with 1 if such a call, or a kernel that Python calls, is not in the list
+compile         compile the kernels of a plain world, or all with --all, for this machine's cache
+build FOLDER    compile all kernels for the wheel's processor, and link them into a library
+record FOLDER   add the calls in FOLDER, from programs with `CAVMARL_KERNEL_CALLS=FOLDER`, to the
+                list of kernels, and remove calls that are no longer possible
+check FOLDER    exit with 1 if such a call, or a kernel called from Python, is not in the list
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def build(folder: Path, processes: int) -> None:
     """Compile each call of the list for the wheel's processor, and link the library."""
     from cavmarl.prebuild.linking import FEATURES, PROCESSOR, link
 
-    # Numba reads these when it is imported, here and in the processes that compile.
+    # Numba reads these variables on import, in this process and in those that compile.
     os.environ["NUMBA_CPU_NAME"] = PROCESSOR
     os.environ["NUMBA_CPU_FEATURES"] = FEATURES
     from cavmarl.prebuild.compile_calls import compile_into_cache, kernel_file, usable_processes
@@ -53,8 +53,8 @@ def build(folder: Path, processes: int) -> None:
     count = compile_into_cache(calls, processes or usable_processes())
     found = [kernel_file(call).load() for call in calls]
     if None in found:
-        raise KernelError(f"{cache_dir()} does not keep compiled kernels: set CAVMARL_CACHE_DIR")
-    # Code for arrays of any layout serves calls with contiguous arrays, too.
+        raise KernelError(f"{cache_dir()} does not store compiled kernels: set CAVMARL_CACHE_DIR")
+    # Code for arrays of any layout also serves calls with contiguous arrays.
     kernels = list({kernel.symbol: kernel for kernel in found if kernel is not None}.values())
     link(kernels, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
@@ -73,7 +73,7 @@ def compile_here(processes: int, is_all: bool) -> None:
 
 
 def record(folder: Path) -> None:
-    """Write the list anew: recorded calls, and those of the old list that can still be made."""
+    """Write the list again: recorded calls, and calls of the old list that are still possible."""
     known = called_kernels()
     plain = _calls_of_plain_worlds()
     found = {*recorded_calls(folder), *plain, *filter(can_be_made, read_manifest())}
@@ -93,7 +93,7 @@ env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 
 
 def _calls_of_plain_worlds() -> set[KernelCall]:
-    """Return what the first step of each plain world calls, with its map read anew and not."""
+    """Return the calls in the first step of each plain world, with a new and a cached map."""
     with TemporaryDirectory() as folder:
         calls, cache = Path(folder, "calls"), Path(folder, "cache")
         calls.mkdir()
@@ -109,9 +109,9 @@ def _calls_of_plain_worlds() -> set[KernelCall]:
 
 
 def check(folder: Path) -> int:
-    """Say which recorded calls and which kernels are not in the list."""
+    """Report recorded calls and kernels that are not in the list; return the exit code."""
     calls = marked(read_manifest(), set())
-    # A call that is covered leaves the merged list as it is.
+    # A call that is covered does not change the merged list.
     unknown = {call.name for call in merged(calls | recorded_calls(folder)) - calls}
     unknown |= called_kernels() - {call.name for call in calls}
     for name in sorted(unknown):
@@ -130,8 +130,13 @@ def main() -> int:
     )
     parser.add_argument("command", choices=("compile", "build", "record", "check"))
     parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--all", action="store_true", help="each kernel of the list")
-    parser.add_argument("--processes", type=int, default=0, help="0: two, or one on a single core")
+    parser.add_argument("--all", action="store_true", help="compile all kernels in the list")
+    parser.add_argument(
+        "--processes",
+        type=int,
+        default=0,
+        help="number of processes; 0: two, or one on a single core",
+    )
     given = parser.parse_args()
     try:
         if given.command == "compile":

@@ -1,7 +1,8 @@
 """`kernel_calls.json`: each kernel that Python calls, with the argument types of these calls.
 
-The file is recorded: programs and tests run with `CAVMARL_KERNEL_CALLS`, and what they have called
-is merged (`python -m cavmarl.prebuild record FOLDER`). Bundles that occur in many calls are written
+The calls are recorded: programs and tests run with `CAVMARL_KERNEL_CALLS`, and their calls are
+    merged
+into the file (`python -m cavmarl.prebuild record FOLDER`). Bundles in several calls are written
 once.
 """
 
@@ -19,15 +20,15 @@ from cavmarl.core.compiled.signatures import example_arguments, signature_of
 
 MANIFEST = Path(__file__).with_name("kernel_calls.json")
 _READONLY = " readonly"
-_BUNDLE = "#"  # before the number of a bundle
+_BUNDLE = "#"  # precedes the number of a bundle
 
 
 class KernelCall(NamedTuple):
-    """A kernel and one list of argument types, see `core.compiled.signatures`."""
+    """A kernel and one list of argument types; see `core.compiled.signatures`."""
 
     name: str
     signature: str  # as JSON
-    is_plain: bool = False  # needed until the end of the first step of a plain world
+    is_plain: bool = False  # called in the first step of a plain world
 
     @property
     def kinds(self) -> list[Any]:
@@ -37,7 +38,7 @@ class KernelCall(NamedTuple):
 
 
 def read_manifest(path: Path = MANIFEST) -> list[KernelCall]:
-    """Return all calls of the file."""
+    """Return all calls in the file."""
     if not path.exists():
         return []  # nothing has been recorded yet
     document = json.loads(path.read_text("utf-8"))
@@ -52,7 +53,7 @@ def read_manifest(path: Path = MANIFEST) -> list[KernelCall]:
 
 
 def write_manifest(calls: Iterable[KernelCall], path: Path = MANIFEST) -> None:
-    """Write calls in an order that does not depend on how they were found."""
+    """Write calls in an order that does not depend on their input order."""
     bundles: dict[str, int] = {}
     kernels: dict[str, list[Any]] = {}
     for call in sorted(set(calls)):
@@ -72,7 +73,7 @@ def write_manifest(calls: Iterable[KernelCall], path: Path = MANIFEST) -> None:
 
 
 def recorded_calls(folder: Path) -> set[KernelCall]:
-    """Return what processes have recorded in a folder."""
+    """Return the calls that processes have recorded in a folder."""
     found = set()
     for path in folder.glob("*.jsonl"):
         for line in path.read_text("utf-8").splitlines():
@@ -82,7 +83,7 @@ def recorded_calls(folder: Path) -> set[KernelCall]:
 
 
 def can_be_made(call: KernelCall) -> bool:
-    """Return whether a kernel still takes such arguments, and their types are as described."""
+    """Return whether a kernel still accepts these arguments, and their types are up to date."""
     module, _, name = call.name.rpartition(".")
     try:
         kernel = getattr(importlib.import_module(module), name)
@@ -97,16 +98,16 @@ def can_be_made(call: KernelCall) -> bool:
 
 
 def _fits(annotation: str, kind: Any) -> bool:
-    """Return whether a parameter may take a bundle of this kind; other kinds are not compared."""
+    """Return whether a parameter may accept a bundle of this kind; other kinds pass."""
     is_bundle = isinstance(kind, dict) and "bundle" in kind
     is_named = annotation != str(inspect.Parameter.empty)
     return not (is_bundle and is_named) or kind["bundle"].rpartition(":")[2] in annotation
 
 
 def merged(calls: Iterable[KernelCall]) -> set[KernelCall]:
-    """Return one call in the place of several that differ in arrays that are read only.
+    """Merge calls that differ only in which arrays are read-only.
 
-    Code for an array that is read only takes others, too; see `arguments.accepts`.
+    Code for a read-only array also accepts other arrays; see `arguments.accepts`.
     """
     groups: dict[tuple[str, str], list[KernelCall]] = {}
     for call in calls:
@@ -131,13 +132,13 @@ def _merge(one: Any, other: Any) -> Any:
 
 
 def marked(calls: Iterable[KernelCall], plain: Set[KernelCall]) -> set[KernelCall]:
-    """Return the calls, marked by whether plain worlds make them."""
+    """Return the calls with a flag for those that plain worlds make."""
     unmarked = {call._replace(is_plain=False) for call in calls}
     return {call._replace(is_plain=call in plain) for call in unmarked}
 
 
 def _fold(kind: Any, bundles: dict[str, int]) -> Any:
-    """Replace each bundle by its number; `bundles` gets those that are new."""
+    """Replace each bundle by its number; new bundles are added to `bundles`."""
     if isinstance(kind, list):
         return [_fold(item, bundles) for item in kind]
     if not isinstance(kind, Mapping):

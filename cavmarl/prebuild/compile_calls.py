@@ -1,4 +1,4 @@
-"""Compiles kernels in several processes, and says how far it is."""
+"""Compiles kernels in several processes, and reports the progress."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from cavmarl.core.compiled.kernel_files import CompiledKernel, KernelFile
 from cavmarl.core.compiled.signatures import example_arguments
 from cavmarl.prebuild.call_list import KernelCall
 
-_LINE_S = 5.0  # between two lines where the output is no terminal
+_LINE_S = 5.0  # between two lines if the output is not a terminal
 
 
 def kernel_file(call: KernelCall) -> KernelFile:
-    """Return where the code for a call is kept on this machine."""
+    """Return the file for the code of a call on this machine."""
     types = ";".join(type_of(argument).text for argument in example_arguments(call.kinds))
     return KernelFile(_function_of(call), types)
 
@@ -29,7 +29,7 @@ def kernel_file(call: KernelCall) -> KernelFile:
 def compile_into_cache(
     calls: Iterable[KernelCall], processes: int, output: TextIO = sys.stderr
 ) -> int:
-    """Compile the kernels that are not kept on this machine yet, and keep them; return how many."""
+    """Compile the kernels that are not in this machine's cache; return their number."""
     missing = [call for call in calls if kernel_file(call).load() is None]
     if not missing:
         return 0
@@ -38,7 +38,7 @@ def compile_into_cache(
         _Progress(longest_first, output) as progress,
         ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
     ):
-        running = {pool.submit(_compile_and_keep, call): call for call in longest_first}
+        running = {pool.submit(_compile_and_store, call): call for call in longest_first}
         for done in as_completed(running):
             done.result()
             progress.advance(running[done])
@@ -53,7 +53,7 @@ def compile_call(call: KernelCall) -> CompiledKernel:
     return CompiledKernel(file.name, file.types, result, file.symbol, code)
 
 
-def _compile_and_keep(call: KernelCall) -> None:
+def _compile_and_store(call: KernelCall) -> None:
     file = kernel_file(call)
     with file.locked():
         if file.load() is None:
@@ -66,12 +66,12 @@ def _function_of(call: KernelCall) -> Any:
 
 
 def _weight(call: KernelCall) -> int:
-    """Return a measure of how long a kernel takes: one that takes many arrays does much."""
+    """Return an estimate of the compile time of a kernel: it grows with its arguments."""
     return len(call.signature) ** 2
 
 
 class _Progress:
-    """A line about kernels that are done; the time left follows from the time they took."""
+    """A line about compiled kernels, with the remaining time estimated from the time so far."""
 
     def __init__(self, calls: Sequence[KernelCall], output: TextIO) -> None:
         self._count = len(calls)
@@ -89,7 +89,7 @@ class _Progress:
             print("\r\x1b[K", end="", file=self._output, flush=True)
 
     def advance(self, call: KernelCall) -> None:
-        """Count a kernel that is done."""
+        """Count a finished kernel."""
         self._done += 1
         self._done_weight += _weight(call)
         now = time.monotonic()
@@ -108,6 +108,6 @@ class _Progress:
 
 
 def usable_processes() -> int:
-    """Return how many processes compile at the same time: two, or one on a single core."""
+    """Return the number of processes that compile: two, or one on a single core."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return min(2, cores or 1)

@@ -1,4 +1,4 @@
-"""Which kernels Python calls: they are entry points; the others are compiled into these."""
+"""The kernels that Python calls. They are entry points; other kernels are compiled into them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ _PACKAGE = Path(__file__).parents[1]
 _DECORATORS = {"kernel", "inlined_kernel"}
 # Functions and classes that make kernels, or collect kernels for other kernels.
 _FACTORIES = {"for_each_zone", "acceleration_model", "CarFollowingModel"}
-_CORE = ("core.math", "core.records")  # folders of kernels beside those named `kernels`
+_CORE = ("core.math", "core.records")  # folders of kernels besides those named `kernels`
 
 
 def called_kernels() -> frozenset[str]:
-    """Return the names of all kernels that some module of the package calls from Python.
+    """Return the names of all kernels that modules of the package call from Python.
 
     They are found in the sources: kernels that a module outside of the folders of kernels imports
-    or defines, and functions beside kernels that call them (`roads.kernels.plans.plan_goal`).
+        or
+    defines, and kernels called by plain functions beside them (`roads.kernels.plans.plan_goal`).
     """
     trees = {_module_of(path): ast.parse(path.read_bytes()) for path in _PACKAGE.rglob("*.py")}
     defined = {module: set(_defined(tree)) for module, tree in trees.items()}
@@ -80,7 +81,7 @@ def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
 
 
 def _called_by_plain(tree: ast.Module, kernels: set[str]) -> Iterator[str]:
-    """Yield kernels that the same file names outside of kernels and of what makes kernels."""
+    """Yield kernels that the same file uses outside of kernels and factories."""
     for statement in tree.body:
         is_of_kernels = _is_made(statement) or (
             isinstance(statement, ast.FunctionDef)

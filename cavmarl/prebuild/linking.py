@@ -1,4 +1,4 @@
-"""Links the objects of compiled kernels into the library that a wheel brings."""
+"""Links the objects of compiled kernels into the library for a wheel."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from cavmarl.core.compiled.library import (
 from cavmarl.core.compiled.sources import module_digest
 from cavmarl.core.errors import KernelError
 
-# The target of a wheel: an Intel or AMD processor since about 2013 (Haswell, Excavator).
+# The target of a wheel: Intel or AMD processors since about 2013 (Haswell, Excavator).
 PROCESSOR = "x86-64-v3" if platform.machine() in ("x86_64", "AMD64") else "generic"
 FEATURES = {
     "x86-64-v3": "+sse3,+ssse3,+sse4.1,+sse4.2,+popcnt,+cx16,+sahf,+avx,+avx2,+bmi,+bmi2,+f16c,"
@@ -40,7 +40,7 @@ FEATURES = {
 
 
 def find_linker() -> list[str]:
-    """Return the command of a C compiler, which links.
+    """Return the command of a C compiler that can link.
 
     Raises:
         KernelError: this machine has none.
@@ -61,17 +61,20 @@ def link(kernels: Sequence[CompiledKernel], folder: Path) -> None:
     Raises:
         KernelError: there is no linker, or it failed.
     """
-    for kernel in kernels:  # tables of addresses are defined by the modules that use them
+    for kernel in kernels:  # modules that use tables of addresses define them
         importlib.import_module(kernel.name.rpartition(".")[0])
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / LIBRARY_FILE
-    with TemporaryDirectory() as room:
-        objects = [Path(room, "common.o"), *(Path(room, f"{k}.o") for k in range(len(kernels)))]
+    with TemporaryDirectory() as scratch:
+        objects = [
+            Path(scratch, "common.o"),
+            *(Path(scratch, f"{k}.o") for k in range(len(kernels))),
+        ]
         for path, code in zip(objects, [_common_object(), *(k.code for k in kernels)], strict=True):
             path.write_bytes(code)
-        exported = Path(room, "exported")
+        exported = Path(scratch, "exported")
         exported.write_text("{ global: cavmarl_*; local: *; };\n")
-        listed = Path(room, "objects")
+        listed = Path(scratch, "objects")
         listed.write_text("\n".join(map(str, objects)))
         command = [
             *find_linker(), "-shared", f"-Wl,--version-script={exported}", "-Wl,--gc-sections",
@@ -102,9 +105,9 @@ def _index_of(kernels: Iterable[CompiledKernel]) -> dict[str, Any]:
 
 
 def _common_object() -> bytes:
-    """Return what all kernels share: tables of addresses, and a function that asks the processor.
+    """Return the common object: tables of addresses, and a function that queries the processor.
 
-    It is for the oldest x86-64, as it has to run before one knows which processor this is.
+    It targets the oldest x86-64, as it runs before the processor is known.
     """
     module = ir.Module("common")
     module.triple = binding.get_process_triple()
@@ -141,7 +144,7 @@ def _add_level_function(module: ir.Module) -> None:
 
     first = ask(1, 2)
     values = [first, ask(7, 1), ask(0x80000001, 2)]
-    # Without OSXSAVE the instruction `xgetbv` does not exist.
+    # Without OSXSAVE, the instruction `xgetbv` does not exist.
     pair = ir.LiteralStructType([word, word])
     saved = ir.InlineAsm(
         ir.FunctionType(pair, [word]),

@@ -1,4 +1,4 @@
-"""Road networks: immutable arrays, read from SUMO networks, and routing over them.
+"""Road networks: immutable arrays, a reader for SUMO networks, and routing.
 
-Stands on `core`; every domain above reads it.
+Builds on `core`; all folders above use it.
 """

@@ -1,4 +1,4 @@
-"""Networks kept between runs: one file a source, named after the hash of what went into it."""
+"""A cache of networks on disk: one file per source, named after the hash of its content."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from cavmarl.roads.network import (
 )
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
-# Raise this when the reader gives other rows for the same file; record types count by themselves.
+# Increase this if the reader returns other rows for the same file; record types are hashed, too.
 FORMAT = 49
 
-_DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: of a broken one nothing is read
-_ALIGNED = 64  # arrays begin at multiples of so many bytes
+_DIGEST_BYTES = 32  # each entry begins with the SHA-256 of the rest; damaged entries are not read
+_ALIGNED = 64  # arrays begin at multiples of this number of bytes
 
 _DTYPES = {
     "points": POINT,
@@ -63,24 +63,24 @@ _IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "ju
 
 
 def load_network(path: str | Path) -> RoadNetwork:
-    """`read_network` with a cache beside the compiled kernels; a broken cache entry is built again.
+    """Read a network through a cache beside the compiled kernels; rebuild damaged entries.
 
     Raises MapError: see `read_network`.
     """
-    return _kept(Path(path), "", read_network)
+    return _cached(Path(path), "", read_network)
 
 
 def derived_network(
     path: str | Path, what: str, derive: Callable[[RoadNetwork], RoadNetwork]
 ) -> RoadNetwork:
-    """What is made of the network of a map file, in the same cache; `what` names it.
+    """Return a network derived from that of a map file, cached under the name `what`.
 
     Raises MapError: see `read_network`.
     """
-    return _kept(Path(path), f"-{what}", lambda source: derive(load_network(source)))
+    return _cached(Path(path), f"-{what}", lambda source: derive(load_network(source)))
 
 
-def _kept(path: Path, what: str, make: Callable[[Path], RoadNetwork]) -> RoadNetwork:
+def _cached(path: Path, what: str, make: Callable[[Path], RoadNetwork]) -> RoadNetwork:
     digest = source_hash(path)
     entry = _entry(f"{digest}{what}")
     network = _restore(entry, map_name(path), digest)
@@ -94,23 +94,23 @@ def _kept(path: Path, what: str, make: Callable[[Path], RoadNetwork]) -> RoadNet
 
 
 def network_layout() -> str:
-    """Short hash of the records of a packed network: another layout cannot be read."""
+    """Return a short hash of the record types of a packed network; other layouts cannot be read."""
     columns = [dtype.descr for dtype in _DTYPES.values()]
     return hashlib.sha256(repr((FORMAT, columns)).encode()).hexdigest()[:12]
 
 
 def pack_network(network: RoadNetwork) -> bytes:
-    """All of a network but its name and the hash of its source, for `unpack_network`."""
+    """Return a network as bytes for `unpack_network`, without its name and the source's hash."""
     pieces: list[bytes] = []
     sizes: dict[str, int] = {}
     for name in _DTYPES:
         content = getattr(network, name).tobytes()
         sizes[name] = len(content)
         pieces += [content, bytes(-len(content) % _ALIGNED)]
-    told: dict[str, Any] = {name: getattr(network, name) for name in _IDS}
-    told["left_hand"] = network.left_hand
-    told["geo"] = None if network.geo is None else asdict(network.geo)
-    head = json.dumps({"sizes": sizes, "told": told}).encode()
+    facts: dict[str, Any] = {name: getattr(network, name) for name in _IDS}
+    facts["left_hand"] = network.left_hand
+    facts["geo"] = None if network.geo is None else asdict(network.geo)
+    head = json.dumps({"sizes": sizes, "told": facts}).encode()
     start = len(head).to_bytes(8, "little") + head
     start += bytes(-(_DIGEST_BYTES + len(start)) % _ALIGNED)
     content = b"".join([start, *pieces])
@@ -118,13 +118,13 @@ def pack_network(network: RoadNetwork) -> bytes:
 
 
 def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadNetwork | None:
-    """The network that `pack_network` of the same layout has packed, or None if it is damaged.
+    """Return a network that `pack_network` packed with the same layout, or None if damaged.
 
-    Its arrays are views of what was packed.
+    Its arrays are views of the packed bytes.
 
     Args:
-        content: what was packed.
-        name: of the network.
+        content: the packed bytes.
+        name: name of the network.
         digest: SHA-256 of its source, hex.
     """
     view = memoryview(content)
@@ -137,14 +137,14 @@ def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadN
     for key, kind in _DTYPES.items():
         at += -at % _ALIGNED
         size = head["sizes"][key]
-        # No array copy: it would leave the padding of the records undefined, and hashes read it.
+        # Do not copy arrays: padding of records would be undefined, and hashes include it.
         values[key] = np.frombuffer(view[at : at + size], dtype=kind)
         at += size
-    told = head["told"]
-    values |= {key: tuple(told[key]) for key in _IDS}
+    facts = head["told"]
+    values |= {key: tuple(facts[key]) for key in _IDS}
     values["roofs"] = values["roofs"].reshape(-1, 4, 2)
-    values["geo"] = None if told["geo"] is None else GeoReference(**told["geo"])
-    return RoadNetwork(name=name, source_hash=digest, left_hand=told["left_hand"], **values)
+    values["geo"] = None if facts["geo"] is None else GeoReference(**facts["geo"])
+    return RoadNetwork(name=name, source_hash=digest, left_hand=facts["left_hand"], **values)
 
 
 def _entry(digest: str) -> Path:
@@ -152,10 +152,10 @@ def _entry(digest: str) -> Path:
 
 
 def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
-    """The network of a cache entry, or None if there is no whole one."""
+    """Return the network of a cache entry, or None if it is missing or damaged."""
     try:
         content = mapped(entry)
-    except (OSError, ValueError):  # it is not there, or empty
+    except (OSError, ValueError):  # the entry is missing or empty
         return None
     return unpack_network(memoryview(content), name, digest)
 

@@ -1,4 +1,4 @@
-"""How long an episode lasts that no configuration bounds: long enough for trips over the map."""
+"""The default duration of an episode: long enough for trips across the map."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import numpy as np
 
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
-CROSSINGS = 3.0  # times the free-flow time of a trip across the map: others are in the way
+CROSSINGS = 3.0  # times the free-flow time of a trip across the map, as others slow it down
 LEAST_S, MOST_S, ROUND_S = 60.0, 900.0, 10.0
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 def horizon_of(network: RoadNetwork) -> float:
-    """Seconds for three trips across a map at its limits: its width and then its height.
+    """Return the duration in s of three trips across a map: its width plus its height.
 
-    The speed is that of a car that drives over each lane once. Whole tens from 60 to 900. Of
-    several maps it is that of the longest.
+    The speed is that of a car that drives every lane once at its limit. The result is rounded to
+    tens and limited to [60, 900]. Of several maps, the longest duration counts.
     """
     return max(_horizon_on(network, number) for number in range(len(network.maps)))
 

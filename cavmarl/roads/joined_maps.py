@@ -1,7 +1,7 @@
-"""Several maps as one network: an episode drives on one of them, and no road leads to another.
+"""Several maps as one network: an episode uses one map, and no road leads to another.
 
-Maps lie side by side, far enough apart that nothing which looks at roads sees two of them. Ids are
-those of the source with `NAME/` before them.
+Maps are placed side by side, so far apart that no search for roads reaches two of them. Ids are
+those of the source with the prefix `NAME/`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import MAP, RoadNetwork
 
-APART_M = 1000.0  # between the lanes of two maps
-WHOLE_M = 1000.0  # maps are moved by multiples of it
+APART_M = 1000.0  # distance between the lanes of two maps
+WHOLE_M = 1000.0  # maps are moved by multiples of this length
 
-# Which rows the fields of an array point to. -1 stays what it is.
+# The arrays to which index fields refer. -1 does not change.
 POINTERS: dict[str, dict[str, str]] = {
     "lanes": {
         "left": "lanes", "right": "lanes", "successor": "lanes", "link": "links",
@@ -55,19 +55,19 @@ _IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids")
 
 
 def join(networks: Sequence[RoadNetwork]) -> RoadNetwork:
-    """One network of several; of one it is that one.
+    """Return several networks as one; a single network is returned as it is.
 
-    Raises MapError: on some one drives on the left and on others on the right.
+    Raises MapError: some maps have left-hand traffic and others right-hand traffic.
     """
     if len(networks) == 1:
         return networks[0]
     first = networks[0]
-    strange = [other.name for other in networks if other.left_hand != first.left_hand]
-    if strange:
+    others = [other.name for other in networks if other.left_hand != first.left_hand]
+    if others:
         sides = ("right", "left")
         raise MapError(
-            f"maps on which one drives on the {sides[not first.left_hand]}: {', '.join(strange)}; "
-            f"on '{first.name}' it is the {sides[first.left_hand]}: an entry has either"
+            f"maps with {sides[not first.left_hand]}-hand traffic: {', '.join(others)}; "
+            f"'{first.name}' has {sides[first.left_hand]}-hand traffic: an entry needs one kind"
         )
     names = _names(networks)
     starts = {
@@ -115,7 +115,7 @@ def _map_rows(networks: Sequence[RoadNetwork], starts: dict[str, list[int]]) -> 
 
 
 def _names(networks: Sequence[RoadNetwork]) -> tuple[str, ...]:
-    """Names of the maps; those that several have get a number."""
+    """Return the names of the maps; repeated names get a number."""
     names: list[str] = []
     for one in networks:
         count = sum(other.name == one.name for other in networks[: len(names)])
@@ -124,7 +124,7 @@ def _names(networks: Sequence[RoadNetwork]) -> tuple[str, ...]:
 
 
 def _places(networks: Sequence[RoadNetwork]) -> list[tuple[float, float]]:
-    """By how much each map is moved: onto a square of squares, each as large as the largest."""
+    """Return the offset of each map in a square grid, whose cells are as large as the largest."""
     extents = np.array([one.extent_m for one in networks])
     side = float((extents[:, 2:] - extents[:, :2]).max()) + APART_M
     pitch = WHOLE_M * math.ceil(side / WHOLE_M + 1.0)
@@ -154,7 +154,7 @@ def _moved(network: RoadNetwork, place: tuple[float, float]) -> RoadNetwork:
 def _pointed(
     array: NDArray[Any], key: str, starts: dict[str, list[int]], number: int
 ) -> NDArray[Any]:
-    """An array of one map whose fields point into those of all."""
+    """Return an array of one map whose indices refer to the joined arrays."""
     found = array.copy()
     for field, target in POINTERS[key].items():
         column = found[field] if field else found
@@ -163,7 +163,7 @@ def _pointed(
 
 
 def _controllers(networks: Sequence[RoadNetwork]) -> NDArray[np.int32]:
-    """The places of all actuated programs, map after map."""
+    """Return controller numbers of all actuated programs, map after map."""
     own = np.concatenate([one.programs["controller"] for one in networks])
     found: NDArray[np.int32] = np.where(own >= 0, np.cumsum(own >= 0) - 1, -1).astype(np.int32)
     return found

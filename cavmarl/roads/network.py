@@ -1,14 +1,14 @@
-"""`RoadNetwork`: a road map as a handful of immutable record arrays.
+"""`RoadNetwork`: a road map as a set of immutable record arrays.
 
-Frames and units: metres, radians, metres a second; x east, y north, z up, right-handed; headings
+Frames and units: metres, radians, metres per second; x east, y north, z up, right-handed; headings
 are counter-clockwise from east. A lane is a polyline along its centre in driving direction; `s` is
-the arc length on it and `d` the lateral offset, positive to the left.
+the arc length along it and `d` the lateral offset, positive to the left.
 
-Every lane has one row, junction-internal lanes included. A *link* is one permitted movement over a
+Every lane has one row, including junction-internal lanes. A *link* is one permitted movement over a
 junction: from the end of a lane, along a chain of internal lanes, to the start of an outgoing lane.
-Records instead of many plain arrays: a kernel takes one argument where it would take ten.
+Records are used instead of plain arrays so that a kernel takes one argument instead of ten.
 
-Indices that point at nothing are -1.
+An index of -1 means "none".
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.kernels.signal_phases import DETECTOR_REACH_M
 
-# The permission bits of LANE["permissions"], SUMO's abstract vehicle classes that drive on roads.
+# Permission bits of LANE["permissions"]: SUMO's abstract vehicle classes that drive on roads.
 VEHICLE_CLASSES = (
     "passenger",
     "truck",
@@ -50,40 +50,40 @@ POINT = record(
     ("y", np.float64),  # m
     ("z", np.float64),  # m
     ("s", np.float64),  # m from the start of its lane, in the plane
-    # direction of the segment that starts here (the last point repeats the one before)
+    # direction of the segment that starts here (the last point repeats the previous one)
     ("cos", np.float64),
     ("sin", np.float64),
     ("slope", np.float64),  # dz/ds of that segment
     ("heading", np.float64),  # of that segment, rad
-    ("left_s", np.float64),  # where on the left neighbour of its lane the point lies, m
+    ("left_s", np.float64),  # position of the point on the left neighbour of its lane, m
     ("right_s", np.float64),
 )
 
-# What drivers ask all the time comes first and shares a cache line.
+# Fields that drivers read often come first and share a cache line.
 LANE = record(
     # arc length of the polyline in the plane: the `s` of its last point
     ("length_m", np.float64),
     ("speed_mps", np.float64),  # speed limit
     ("width_m", np.float64),
-    ("internal", np.bool_),  # lies inside a junction
-    # at its end others give way that turn into its road: they look `MERGES_M` before it
+    ("internal", np.bool_),  # inside a junction
+    # vehicles that turn into its road yield at its end, from `MERGES_M` before it on
     ("merges", np.bool_),
     ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
     ("right", np.int32),
-    ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
+    ("successor", np.int32),  # internal lanes: the LANE that follows (internal or normal)
     ("link", np.int32),  # internal lanes: the LINK that this lane is part of
-    # LINK rows of the movements that leave this lane's end, sorted by from-lane; 0 of them for
-    # internal lanes (see `successor`)
+    # LINK rows of the movements from this lane's end, sorted by from-lane; none for internal lanes
+    # (see `successor`)
     ("first_link", np.int32),
     ("num_links", np.int32),
     ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
     ("num_points", np.int32),  # at least 2
-    ("edge", np.int32),  # EDGE row; internal lanes too
-    # internal lanes: path length of the link before this lane starts
+    ("edge", np.int32),  # EDGE row; also for internal lanes
+    # internal lanes: path length of the link before this lane
     ("link_offset_m", np.float64),
-    ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
-    # into[first_into : first_into + num_into]: LANE rows whose ends lead here (internal lanes where
-    # the map has them)
+    ("stop_back_m", np.float64),  # from the stop line to the end, where other paths sweep
+    # into[first_into : first_into + num_into]: LANE rows that lead here (internal lanes if the map
+    # has them)
     ("first_into", np.int32),
     ("num_into", np.int32),
     ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
@@ -100,52 +100,52 @@ EDGE = record(
     ("first_lane", np.int32),
     ("num_lanes", np.int32),
     ("internal", np.bool_),
-    ("from_junction", np.int32),  # JUNCTION rows; both the same for internal edges
+    ("from_junction", np.int32),  # JUNCTION rows; the same for internal edges
     ("to_junction", np.int32),
     ("length_m", np.float64),
     ("speed_mps", np.float64),
 )
 
 LINK = record(
-    ("from_lane", np.int32),  # LANE it leaves; its end is the stop line
-    ("to_lane", np.int32),  # LANE it reaches
+    ("from_lane", np.int32),  # LANE that it leaves; the lane's end is the stop line
+    ("to_lane", np.int32),  # LANE that it reaches
     ("first_internal", np.int32),  # first LANE of the chain inside the junction
-    # where a vehicle is after the end of from_lane: first_internal, or to_lane
+    # lane after the end of from_lane: first_internal, or to_lane
     ("next_lane", np.int32),
-    ("length_m", np.float64),  # of the chain of internal lanes
-    ("fork_m", np.float64),  # of its path that others from the same lane come near
+    ("length_m", np.float64),  # length of the chain of internal lanes
+    ("fork_m", np.float64),  # part of its path that is near paths from the same lane
     ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
     ("junction", np.int32),
     ("index", np.int32),  # the link's bit in its junction's request, response and foes
     ("signal", np.int32),  # SIGNAL row
-    ("signal_index", np.int32),  # which letter of the signal's state
+    ("signal_index", np.int32),  # index of the letter in the signal's state
     ("direction", np.uint8),  # ord of SUMO's dir: s t l r L R
     ("state", np.uint8),  # ord of SUMO's link state without a signal: M m = s w Z o …
     ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
     ("num_conflicts", np.int32),
     ("first_sweep", np.int32),  # SWEEP rows, sorted by the foe's LINK row and sizes
     ("num_sweeps", np.int32),
-    ("swept_by", np.int32),  # the least size class of those that sweep over its cars
-    ("swept_m", np.float64),  # up to where a rear, m from the stop line, is minded by others
+    ("swept_by", np.int32),  # the smallest size class of vehicles that sweep over its cars
+    ("swept_m", np.float64),  # rears up to here, in m from the stop line, are watched by others
 )
 
 CONFLICT = record(
     ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
-    ("merging", np.bool_),  # both lead into one lane
-    ("must_yield", np.bool_),  # this link has to give way to the foe (a `response` bit)
-    ("near", np.bool_),  # False: a foe by the map's rules only, the paths keep apart
-    ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
-    ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge
+    ("merging", np.bool_),  # both links lead into one lane
+    ("must_yield", np.bool_),  # this link must yield to the foe (a `response` bit)
+    ("near", np.bool_),  # False: a foe only by the map's rules; the paths stay apart
+    ("enter_m", np.float64),  # start and end of the shared area on this link's path,
+    ("leave_m", np.float64),  # from the stop line; leave = the whole length if both merge
     ("foe_enter_m", np.float64),  # the same area on the foe's path
     ("foe_leave_m", np.float64),
 )
 
 SWEEP = record(
-    ("foe", np.int32),  # LINK of the same junction, other than from one lane
+    ("foe", np.int32),  # LINK of the same junction, but from another lane
     ("own", np.int32),  # size class (`SIZE_LENGTHS_M`) of the vehicle on this link,
-    ("other", np.int32),  # and of the one on the foe's
+    ("other", np.int32),  # and of the vehicle on the foe
     ("enter_m", np.float64),  # from the stop line to where a front begins to be in the way,
-    ("leave_m", np.float64),  # and where a rear ceases to be; both may lie outside the junction,
+    ("leave_m", np.float64),  # and where a rear no longer is; both may be outside the junction,
     ("foe_enter_m", np.float64),  # and a body longer than the shared area leaves before it enters
     ("foe_leave_m", np.float64),
 )
@@ -155,14 +155,14 @@ JUNCTION = record(
     ("y", np.float64),
     ("z", np.float64),
     ("kind", np.int32),  # index into RoadNetwork.junction_kinds
-    ("signal", np.int32),  # SIGNAL row of a traffic light here
-    ("unruled", np.bool_),  # the map has no rule for ways that end in one lane here
+    ("signal", np.int32),  # SIGNAL row of the traffic light here
+    ("unruled", np.bool_),  # the map has no rule for movements that end in one lane here
 )
 
 SIGNAL = record(
-    ("program", np.int32),  # PROGRAM that is on at the beginning
+    ("program", np.int32),  # PROGRAM that runs at the beginning
     ("num_links", np.int32),  # letters in a state
-    ("first_switch", np.int32),  # SWITCH rows, by rising time
+    ("first_switch", np.int32),  # SWITCH rows, in order of time
     ("num_switches", np.int32),
 )
 
@@ -170,18 +170,18 @@ PROGRAM = record(
     ("signal", np.int32),
     ("first_phase", np.int32),  # PHASE rows [first_phase, first_phase + num_phases)
     ("num_phases", np.int32),
-    ("offset_s", np.float64),  # by which all phases are late
+    ("offset_s", np.float64),  # delay of all phases
     ("cycle_s", np.float64),  # sum of the phases' durations
-    ("controller", np.int32),  # actuated: its place in a world's controllers
+    ("controller", np.int32),  # actuated: its index in a world's controllers
     ("detector_gap_s", np.float64),  # actuated: from a detector to the stop line, at the limit
-    ("simplified", np.bool_),  # SUMO has rules for it that are not run here
+    ("simplified", np.bool_),  # SUMO has rules for it that are not implemented
 )
 
 PHASE = record(
     ("duration_s", np.float64),
     ("min_ms", np.int64),  # actuated: bounds of the duration, in SUMO's unit of time
     ("max_ms", np.int64),
-    ("following", np.int32),  # actuated: PHASE that comes next
+    ("following", np.int32),  # actuated: the next PHASE
     ("green", np.bool_),  # some letter is green and none is yellow: it may be prolonged
     ("first_state", np.int32),  # phase_states[first_state : first_state + num_links]
     ("first_detector", np.int32),  # phase_detectors that prolong it
@@ -191,22 +191,22 @@ PHASE = record(
 SWITCH = record(
     ("signal", np.int32),
     ("at_s", np.float64),  # since the beginning
-    ("program", np.int32),  # PROGRAM that is on from then
+    ("program", np.int32),  # PROGRAM that runs from then on
 )
 
 DETECTOR = record(
-    ("lane", np.int32),  # LANE on which it lies; its signal may be one lane farther on
-    ("s_m", np.float64),  # where on that lane
-    ("max_gap_s", np.float64),  # between two vehicles of which the second prolongs the green
+    ("lane", np.int32),  # LANE of the detector; its signal may be one lane farther on
+    ("s_m", np.float64),  # position on that lane
+    ("max_gap_s", np.float64),  # maximum time between two vehicles if the second prolongs the green
 )
 
 PLACE = record(
     ("next", np.int32),  # the next PLACE of the same lane
     ("detector", np.int32),
-    ("s_m", np.float64),  # of the detector in the lane's s; beyond its ends on lanes beside it
+    ("s_m", np.float64),  # of the detector in the lane's s; outside of its ends for adjacent lanes
 )
 
-# Rows of one map lie together; of several maps in one network a world drives on one.
+# Rows of one map are contiguous; in a network of several maps, a world uses one.
 MAP = record(
     ("first_lane", np.int32),  # LANE rows [first_lane, first_lane + num_lanes)
     ("num_lanes", np.int32),
@@ -216,11 +216,11 @@ MAP = record(
     ("num_programs", np.int32),
 )
 
-# At most so many bytes of a map's file are copied. A tick reads many places of a map: in the small
-# pages of a file it takes a tenth longer, but processes of one machine share that memory.
+# Maps with smaller files are copied to memory. A tick reads many places of a map: from the small
+# pages of a file, it takes a tenth longer, but the processes of a machine share that memory.
 COPIED = 1 << 27
 
-# Fields of a network that kernels take, in the order of `RoadArrays`.
+# Fields of a network for kernels, in the order of `RoadArrays`.
 _TABLES = (
     "points", "lanes", "edges", "links", "conflicts", "sweeps", "into", "signals", "programs",
     "phases", "phase_states", "switches", "detectors", "phase_detectors",
@@ -229,21 +229,21 @@ _TABLES = (
 
 @dataclass(frozen=True)
 class GeoReference:
-    """Where a map lies on the earth: a place projected, plus the offset, is its x and y."""
+    """The position of a map on the earth: x and y are projected coordinates plus the offset."""
 
-    projection: str  # parameters of PROJ
-    offset_x_m: float  # added to the east of the projection
-    offset_y_m: float  # added to its north
+    projection: str  # PROJ parameters
+    offset_x_m: float  # added to the projected easting
+    offset_y_m: float  # added to the projected northing
 
 
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
-    """An immutable road map; see the module's docstring for frames and the dtypes for fields.
+    """An immutable road map; see the module for frames, and the dtypes for fields.
 
-    Arrays are read-only; ids are the names of the source, by row.
+    Arrays are read-only; ids are the names in the source, by row.
     """
 
-    name: str  # the source file's name without its endings
+    name: str  # name of the source file without its suffixes
     source_hash: str  # SHA-256 of the source, hex; part of every manifest and cache key
     points: NDArray[np.void]
     lanes: NDArray[np.void]
@@ -265,16 +265,16 @@ class RoadNetwork:
     junction_ids: tuple[str, ...]
     signal_ids: tuple[str, ...]
     program_ids: tuple[str, ...]
-    junction_kinds: tuple[str, ...]  # SUMO's types that occur, by `JUNCTION["kind"]`
-    geo: GeoReference | None = None  # where it lies on the earth; None: the map does not say
-    left_hand: bool = False  # whether one drives on the left
-    joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # MAP of several
-    map_names: tuple[str, ...] = ()  # of several
-    # WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`
+    junction_kinds: tuple[str, ...]  # SUMO's junction types, by `JUNCTION["kind"]`
+    geo: GeoReference | None = None  # position on the earth; None: the map does not say
+    left_hand: bool = False  # whether the map has left-hand traffic
+    joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # MAP, if several
+    map_names: tuple[str, ...] = ()  # if several
+    # WALL (num_walls,) of the buildings, if they were requested; see `maps.buildings`
     walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))
     # (num_roofs, 4, 2) corners in m of the convex parts of their footprints
     roofs: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 2)))
-    # (num_roofs,) m over the ground
+    # (num_roofs,) m above the ground
     roof_height: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
@@ -285,9 +285,9 @@ class RoadNetwork:
 
     @cached_property
     def arrays(self) -> RoadArrays:
-        """The tables as kernels take them; from then on the fields are these.
+        """The tables for kernels; after the first access, the fields are the same arrays.
 
-        They are in huge pages; those of a large map stay where the cache's file is mapped.
+        They are in huge pages; those of a large map stay in the memory-mapped cache file.
         """
         file = file_of(self.lanes)
         is_copied = file is not None and len(file) <= COPIED
@@ -300,14 +300,14 @@ class RoadNetwork:
         return RoadArrays(*found)
 
     def let_go(self) -> None:
-        """Have only those parts of a cached map in memory that are used from now on."""
+        """Release the memory of a cached map; parts that are used again are read again."""
         file = file_of(self.lanes)
         if file is not None:
             let_go(file)
 
     @cached_property
     def maps(self) -> NDArray[np.void]:
-        """MAP (M,): the maps that lie in it, one or, as `joined_maps.join` makes it, several."""
+        """MAP (M,): the maps of the network: one, or several from `joined_maps.join`."""
         if len(self.joined):
             return self.joined
         rows = np.zeros(1, MAP)
@@ -317,17 +317,17 @@ class RoadNetwork:
         return rows
 
     def name_of(self, number: int) -> str:
-        """What a map of it, by its MAP row, is called."""
+        """Return the name of a map, given by its MAP row."""
         return self.map_names[number] if self.map_names else self.name
 
     def extent_of(self, number: int) -> tuple[float, float, float, float]:
-        """`extent_m` of one of its maps."""
+        """Return the `extent_m` of one of the maps."""
         row = self.maps[number]
         return _extent(self.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]])
 
     @cached_property
     def room_m(self) -> tuple[float, float, float, float]:
-        """(min_x, min_y, max_x, max_y) that any one of its maps fits in, moved if need be."""
+        """(min_x, min_y, max_x, max_y) of an area in which each of the maps fits, if moved."""
         if len(self.maps) == 1:
             return self.extent_m
         extents = np.array([self.extent_of(number) for number in range(len(self.maps))])
@@ -336,15 +336,15 @@ class RoadNetwork:
 
     @property
     def num_controllers(self) -> int:
-        """Actuated programs: each keeps a state in every world."""
+        """Number of actuated programs; each has a state in every world."""
         return int((self.programs["controller"] >= 0).sum())
 
     @cached_property
     def _places(self) -> tuple[NDArray[np.int32], NDArray[np.void]]:
         """The first PLACE of every lane, (num_lanes,), and the PLACE rows.
 
-        A vehicle belongs to the lane of its centre while its ends reach onto others: so a detector
-        is listed with the internal lanes before and behind its own, too.
+        A vehicle belongs to the lane of its centre, but its ends may extend onto other lanes. So a
+        detector is also listed for the internal lanes before and after its own lane.
         """
         found: list[tuple[int, int, float]] = []
         for number, detector in enumerate(self.detectors):
@@ -371,32 +371,32 @@ class RoadNetwork:
 
     @cached_property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """(min_x, min_y, max_x, max_y) over all lanes: roads, not stray nodes."""
+        """(min_x, min_y, max_x, max_y) of all lanes; other nodes do not count."""
         return _extent(self.lanes)
 
     def lane_polyline(self, lane: int) -> NDArray[np.float64]:
-        """The centre line of a lane as (num_points, 3) x, y, z in metres."""
+        """Return the centre line of a lane as (num_points, 3) x, y, z in metres."""
         points = self.lane_points(lane)
         return np.stack([points["x"], points["y"], points["z"]], axis=1)
 
     def lane_points(self, lane: int) -> NDArray[np.void]:
-        """POINT (num_points,) of a lane."""
+        """Return POINT (num_points,) of a lane."""
         row = self.lanes[lane]
         return self.points[row["first_point"] : row["first_point"] + row["num_points"]]
 
     def pose_on(self, lane: int, s: float) -> tuple[float, float, float, float, float, float]:
-        """X, y and z of a place on a lane, and cosine, sine and slope of its direction there."""
+        """Return x, y, z of a position on a lane, and cosine, sine and slope of its direction."""
         row = self.lanes[lane]
         return lane_pose(self.points, row["first_point"], row["num_points"], s)
 
     def beside(self, lane: int, x: float, y: float) -> tuple[float, float, float, float]:
-        """S and d of a place beside a lane, and cosine and sine of the lane's direction there."""
+        """Return s and d of a point beside a lane, and cosine and sine of the lane's direction."""
         row = self.lanes[lane]
         return project(self.points, row["first_point"], row["num_points"], x, y)
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 over all arrays and ids, hex: two equal networks have equal hashes."""
+        """SHA-256 of all arrays and ids, hex: equal networks have equal hashes."""
         digest = hashlib.sha256()
         for item in fields(self):
             value = getattr(self, item.name)
@@ -421,7 +421,7 @@ def _extent(lanes: NDArray[np.void]) -> tuple[float, float, float, float]:
 
 
 def content_of(array: NDArray[Any]) -> bytes:
-    """The bytes of an array, of records field by field: what lies between these is anything."""
+    """Return the bytes of an array, of records field by field, as their padding is undefined."""
     names = array.dtype.names
     if names is None:
         return array.tobytes()

@@ -1,4 +1,4 @@
-"""Lane shapes as POINT rows: no repeated points, no segment without a direction."""
+"""Lane shapes as POINT rows, without repeated points and segments of zero length."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from cavmarl.roads.network import POINT
 
 Shape = NDArray[np.float64]
 
-# SUMO writes centimetres: two points nearer than a tenth of that are one.
+# SUMO writes centimetres: two points closer than a tenth of that are the same.
 SAME_POINT_M = 1e-3
-# The length of an internal lane whose two ends are the same point (SUMO joins lanes that meet).
+# Length of an internal lane whose ends coincide (SUMO joins lanes that meet).
 STUB_M = 0.01
-UNLIKE_M = 3.0  # a neighbour that begins or ends so far from the ends of a lane makes a point of it
+UNLIKE_M = 3.0  # a neighbour's end this far from the ends of a lane adds a point to the lane
 
 
 def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
-    """Drop points that repeat the one before in the plane; (n, 3) metres, n ≥ 1.
+    """Drop points that repeat the previous point in the plane; (n, 3) metres, n ≥ 1.
 
     Raises MapError: the shape has no points.
     """
@@ -34,9 +34,9 @@ def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
 
 
 def refuse_points(shapes: Sequence[Shape], names: Sequence[str]) -> None:
-    """Check that normal lanes, with their ids for the message, have a length.
+    """Check that normal lanes have a length; their ids are for the message.
 
-    Raises MapError: one has none.
+    Raises MapError: a lane has no length.
     """
     for shape, name in zip(shapes, names, strict=True):
         if len(shape) < 2:
@@ -47,11 +47,11 @@ def refuse_points(shapes: Sequence[Shape], names: Sequence[str]) -> None:
 
 
 def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
-    """Stretch internal lanes of one point to `STUB_M`, in the direction they are entered.
+    """Extend internal lanes of one point to `STUB_M`, in the direction of the lane before.
 
     Args:
-        shapes: one (n, 3) array a lane row; changed in place.
-        before: the row that leads into an internal row; rows of a chain in driving order.
+        shapes: one (n, 3) array per lane row; changed in place.
+        before: the row that leads into each internal row; rows of a chain in driving order.
     """
     for row, source in before.items():
         if len(shapes[row]) < 2:
@@ -62,13 +62,13 @@ def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
 
 
 def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
-    """Add a point where a neighbour lane begins or ends beside a lane, far from its own ends.
+    """Add a point where an adjacent lane begins or ends, if it is far from the lane's own ends.
 
-    So places between two points lie in proportion on the neighbour.
+    So positions between two points correspond linearly to positions on the neighbour.
 
     Args:
-        shapes: one (n, 3) array a lane row; changed in place.
-        outer: rows of lanes whose neighbour has the next row.
+        shapes: one (n, 3) array per lane row; changed in place.
+        outer: rows of lanes whose neighbour is the next row.
     """
     for row, beside in ((row + own, row + 1 - own) for row in outer for own in (0, 1)):
         for end in (shapes[beside][0], shapes[beside][-1]):
@@ -85,7 +85,7 @@ def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
 
 
 def point_rows(shapes: Sequence[Shape]) -> tuple[NDArray[np.void], NDArray[np.int32]]:
-    """All lanes' points as POINT rows, and each lane's first row with the end as last entry."""
+    """Return all lanes' points as POINT rows, and each lane's first row, with the end appended."""
     counts = np.array([len(shape) for shape in shapes])
     first = np.concatenate([[0], np.cumsum(counts)])
     xyz = np.concatenate(shapes)

@@ -1,7 +1,7 @@
-"""Plans: for each goal, the lane-level way from everywhere.
+"""Plans: for each goal, the lane-level way from every lane.
 
-A plan is a table over all lanes and not a list of edges: a vehicle that misses a turn, or is made
-to change lanes, has a new way at once, and a record that migrates carries its way as one number.
+A plan is a table over all lanes, not a list of edges. A vehicle that misses a turn, or must change
+lanes, has a new way at once. A record that moves to another zone carries its way as one number.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 PLAN = record(
-    ("next", np.int32),  # LANE after this lane's end; -1: the goal's own lane, or no way
+    ("next", np.int32),  # LANE after this lane's end; -1: lane of the goal, or no way
     ("link", np.int32),  # LINK that leads there; -1 inside junctions
-    ("shift", np.int32),  # what to add to a vehicle's way there, see `lanes.route_following`
-    ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0 this one is best
+    ("shift", np.int32),  # value to add to a vehicle's way there, see `lanes.route_following`
+    ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0: this lane is best
     ("changes", np.int16),  # lane changes to the best lane of this edge
-    ("turnarounds", np.int16),  # U-turns on the way: where a road ends, plans turn round
-    # m from the lane's start that can be driven before a change is needed
+    ("turnarounds", np.int16),  # U-turns on the way: plans turn round where a road ends
+    # distance from the lane's start before a lane change is needed, m
     ("room", np.float64),
     ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
 )
@@ -39,10 +39,10 @@ def make_plans(
     vehicle_class: str = "passenger",
     roads: RoadArrays | None = None,
 ) -> NDArray[np.void]:
-    """The plans of several goals.
+    """Return the plans of several goals.
 
-    `goal_edges`: EDGE rows to plan for. `vehicle_class`: one of `VEHICLE_CLASSES`; lanes that
-    forbid it are not used. `roads`: in the place of the network's.
+    `goal_edges`: EDGE rows of the goals. `vehicle_class`: one of `VEHICLE_CLASSES`; lanes that
+    forbid it are not used. `roads`: arrays to use instead of the network's.
 
     Returns PLAN (len(goal_edges), num_lanes), read-only.
     """
@@ -57,9 +57,9 @@ def make_plans(
 
 
 def way(network: RoadNetwork, plan: NDArray[np.void], lane: int) -> list[int]:
-    """The lanes from `lane` to the goal of one plan (L,), both included, with lane changes.
+    """Return the lanes from `lane` to the goal of a plan (L,), both included, with lane changes.
 
-    Raises RouteError: the goal cannot be reached from there.
+    Raises RouteError: the goal cannot be reached from `lane`.
     """
     if not np.isfinite(plan[lane]["to_go"]):
         raise RouteError(
@@ -78,9 +78,9 @@ def way(network: RoadNetwork, plan: NDArray[np.void], lane: int) -> list[int]:
             return lanes
 
 
-@lru_cache(maxsize=1)  # the shards of a world are made one after the other, of one network
+@lru_cache(maxsize=1)  # the shards of a world are created one after another from the same network
 def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
-    """Cells of `cell_m` over the map with the lanes whose surface may reach into each."""
+    """Return a grid of `cell_m` over the map with the lanes whose surface may reach each cell."""
     min_x, min_y, max_x, max_y = (float(bound) for bound in network.extent_m)
     margin = float(network.lanes["width_m"].max()) + 2.0
     min_x, min_y = min_x - margin, min_y - margin
@@ -107,9 +107,9 @@ def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
 def _pieces(
     network: RoadNetwork, most_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """The centre lines in straight pieces no longer than `most_m`: LANE row, x and y of both ends.
+    """Return straight pieces of centre lines up to `most_m`: LANE row, x and y of both ends.
 
-    Boxes around long diagonal segments would cover the map.
+    Bounding boxes of long diagonal segments would cover the map.
     """
     rows = network.lanes
     owner, first = _counted(rows["first_point"], rows["first_point"] + rows["num_points"] - 2)
@@ -128,7 +128,7 @@ def _pieces(
 def _cells_along(
     ends: NDArray[np.float64], reach: NDArray[np.float64], least: float, cell_m: float, most: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The first and the last cell of an axis that pieces (N, 2) reach into, to both sides."""
+    """Return the first and last cell on an axis within `reach` of pieces (N, 2)."""
     first = ((ends.min(axis=1) - reach - least) // cell_m).astype(np.int64)
     last = ((ends.max(axis=1) + reach - least) // cell_m).astype(np.int64)
     return np.maximum(first, 0), np.minimum(last, most - 1)
@@ -137,7 +137,7 @@ def _cells_along(
 def _counted(
     first: NDArray[Any], last: NDArray[Any]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Each number of each range, both ends included: the range's row, and the number."""
+    """Return each number of each range, both ends included: the range's row, and the number."""
     counts = np.maximum(last - first + 1, 0).astype(np.int64)
     owner = np.repeat(np.arange(len(counts)), counts)
     before = np.cumsum(counts) - counts

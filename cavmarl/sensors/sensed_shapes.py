@@ -162,8 +162,8 @@ def sampled_shapes(name: str, settings: MountedConfig, data: NDArray[Any]) -> li
         return [_grid(name, rgba, _in_vehicle(settings, corners))]
     numbers = np.nan_to_num(data.astype(np.float64)).ravel()
     units = GNSS_UNITS if settings.type == "gnss" else getattr(settings, "units", ())  # type: ignore[attr-defined]
-    rows = [[unit, round(float(value), 4)] for unit, value in zip(units, numbers, strict=False)]
-    return [{"name": name, "kind": "numbers", "rows": rows}]
+    lines = [[unit, round(float(value), 4)] for unit, value in zip(units, numbers, strict=False)]
+    return [{"name": name, "kind": "numbers", "rows": lines}]
 
 
 def _lidar(name: str, settings: LidarRigConfig, distances: Floats) -> Shape:

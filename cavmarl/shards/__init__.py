@@ -1,4 +1,4 @@
-"""One zone's sub-worlds: vehicles, sensors, and the phases of a tick.
+"""Shards: the vehicles and sensors of one zone in W worlds, and the phases of a tick.
 
-Calls the kernels of `driving`, `traffic` and `sensors`; `engine` orders its phases.
+Shards call the kernels of `driving`, `traffic` and `sensors`; `engine` orders the phases.
 """

@@ -1,4 +1,4 @@
-"""How the phases of a tick reach the shards."""
+"""Executors, which run the phases of a tick on the shards."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from cavmarl.shards.shard import Commands
 
 
 class Executor(Protocol):
-    """Runs each phase on all shards and returns when all have run it; see `ShardGroup`."""
+    """Runs each phase on all shards, and returns when all shards have run it.
+
+    `ShardGroup` describes the phases.
+    """
 
     def begin_step(self, commands: Commands) -> None: ...
     def advance(self, commands: Commands) -> None: ...
@@ -36,7 +39,7 @@ class Executor(Protocol):
 
 
 class TeamExecutor(Executor, Protocol):
-    """Runs phases in several processes; after some phases the first process does not wait."""
+    """Runs phases in several processes. Some phases return before all shards have run them."""
 
     def meet(self) -> None:
         """Wait until all shards have run the last phase."""
@@ -44,7 +47,7 @@ class TeamExecutor(Executor, Protocol):
 
 
 class PhaseExecutor(ABC):
-    """An executor that treats all phases alike: it runs, measures, or notes them in `run`."""
+    """An executor that treats all phases alike: `run` runs, measures or records each phase."""
 
     @abstractmethod
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:

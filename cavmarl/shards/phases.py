@@ -1,4 +1,4 @@
-"""The phases of a tick that shards run, and how several processes may run each of them."""
+"""The phases of a tick that shards run, and how several processes may run each phase."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ class PhaseRule(NamedTuple):
     """How a phase may be run."""
 
     method: Callable[..., None]  # of `ShardGroup`; it calls the kernel of the phase
-    is_shared: bool = False  # the workers of one world run it side by side; if not, one runs it all
-    is_late: bool = False  # the next phase only needs this one on the same zone, so none waits
-    is_early: bool = False  # needs nothing that other zones write in the phase before
-    is_beside: bool = False  # not part of a tick, so not part of what a zone costs
+    is_shared: bool = False  # whether workers share its zones; if not, one process runs all zones
+    is_late: bool = False  # whether the next phase needs its results of the same zone only
+    is_early: bool = False  # whether it needs no results of other zones from the phase before
+    is_beside: bool = False  # whether it is outside of a tick, and so outside of a zone's cost
 
 
 class Phase(Enum):
-    """The phases in the order of a tick; `engine/tick.py` says when each of them is run."""
+    """The phases in the order of a tick; `engine/tick.py` runs them."""
 
     BEGIN_STEP = PhaseRule(ShardGroup.begin_step, is_shared=True, is_late=True)
     ADVANCE = PhaseRule(ShardGroup.advance)
@@ -42,5 +42,5 @@ class Phase(Enum):
     FORGET = PhaseRule(ShardGroup.forget)
 
     def run(self, executor: Any, arguments: tuple[Any, ...]) -> None:
-        """Call the method of this phase; an executor may override that of `ShardGroup`."""
+        """Call the executor's method of this phase."""
         getattr(executor, self.value.method.__name__)(*arguments)

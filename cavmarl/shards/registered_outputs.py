@@ -1,4 +1,4 @@
-"""What agents get from sensors and terms that are registered from outside of the package."""
+"""Outputs of sensors and terms that are registered outside of the package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.sensors.observed import layout
 
 
 class RegisteredOutputs:
-    """Asks the registered sensors and terms of a configuration."""
+    """Caller of the registered sensors and terms of a configuration."""
 
     def __init__(self, config: EnvConfig, network: RoadNetwork) -> None:
         self._network = network
@@ -38,11 +38,11 @@ class RegisteredOutputs:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing is registered."""
+        """Whether the configuration has no registered sensors or terms."""
         return not self._sensors and not self._terms
 
     def write(self, worlds: Worlds, chosen: NDArray[np.bool_], outputs: Outputs) -> None:
-        """Write those of every owned agent of the chosen worlds (W,), after `sense`."""
+        """Write the outputs of all owned agents in the chosen worlds (W,), after `sense`."""
         if self.is_empty:
             return
         for w in np.flatnonzero(chosen).tolist():
@@ -54,7 +54,7 @@ class RegisteredOutputs:
     def _write_agents(
         self, rows: NDArray[np.void], agent_arrays: NDArray[np.int64], w: int, outputs: Outputs
     ) -> None:
-        """Write those of the agents whose vehicles are these rows."""
+        """Write the outputs of the agents whose vehicles are the rows `agent_arrays`."""
         agents = rows["agent"][agent_arrays]
         for call, reach_m, place in self._sensors:
             numbers = call(self._view(rows, agent_arrays, reach_m))

@@ -1,8 +1,7 @@
-"""Checks vehicles that come from outside before a kernel goes by their indices.
+"""Checks of vehicle rows from outside before kernels use their indices.
 
-Rows come in saved states, in states that nodes keep, and with vehicles that change their zone.
-Kernels follow their indices into the tables of the network and of the ways without a look at how
-long these are.
+Rows come from saved states, from states that nodes keep, and from vehicles that change their zone.
+Kernels use their indices into the tables of the network and of the routes without bounds checks.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from cavmarl.traffic.native import NativeTraffic
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
-_LARGEST = 1e12  # of any number in metres or seconds
+_LARGEST = 1e12  # limit of all numbers in metres or seconds
 _LONGEST_WAY = 200_000  # lanes
-_ENDLESS = ("to_go", "step_to_go")  # infinite where there is no way
+_ENDLESS = ("to_go", "step_to_go")  # fields that are infinite without a route
 _FLOATS = tuple(name for name in VEHICLE.names or () if VEHICLE[name].kind == "f")
 _INT32 = tuple(name for name in VEHICLE.names or () if VEHICLE[name] == np.int32)
 MOST = int(np.iinfo(np.int32).max)
@@ -34,16 +33,16 @@ MOST_IDS = 1 << 62  # of vehicles in a run
 
 
 class RowCheck:
-    """Says what is wrong with vehicles of worlds, if anything is.
+    """A check of the vehicle rows of worlds.
 
     Args:
         roads: the network.
-        traffic: types of vehicles and ways.
-        num_agents: that an episode of a world can have.
+        traffic: the types and routes of vehicles.
+        num_agents: the largest number of agents in an episode of a world.
 
     Attributes:
-        indices: values of the fields by which kernels index tables, but for `way`.
-        steps: the number of rows that `way` can point at, once the lane is added to it.
+        indices: ranges of the fields by which kernels index tables, except `way`.
+        steps: number of rows that `way` can point at after the lane is added to it.
     """
 
     def __init__(self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int) -> None:
@@ -90,10 +89,10 @@ class RowCheck:
     def wrong(
         self,
         rows: NDArray[np.void],  # VEHICLE (n,)
-        tail: NDArray[np.void] | None = None,  # PLAN (n,) the last ways; None: those of now
+        tail: NDArray[np.void] | None = None,  # PLAN (n,) the last steps; None: the present ones
         num_orders: int = MOST,  # of the world's demand
     ) -> str:
-        """What is wrong with some of these vehicles of one world; empty: nothing."""
+        """Return what is wrong with one of these vehicles of one world; empty if nothing."""
         if not len(rows):
             return ""
         rows = np.ascontiguousarray(rows)
@@ -112,7 +111,7 @@ class RowCheck:
             return ""
         row, column = np.argwhere(outside)[0].tolist()
         low, high = self._low.item(column), self._high.item(column)
-        return _of(rows[row], _INT32[column], f"out of {low} to {high}")
+        return _of(rows[row], _INT32[column], f"not in {low} to {high}")
 
     def _wrong_floats(self, rows: NDArray[np.void]) -> str:
         floats = np.stack([rows[name] for name in _FLOATS], axis=1)
@@ -120,17 +119,17 @@ class RowCheck:
         usual[:, _ENDLESS_COLUMNS] |= floats[:, _ENDLESS_COLUMNS] == np.inf
         if not usual.all():
             row, column = np.argwhere(~usual)[0].tolist()
-            return _of(rows[row], _FLOATS[column], "no number of a vehicle")
+            return _of(rows[row], _FLOATS[column], f"not a number up to ±{_LARGEST:g}")
         radii_m = 0.5 * _diagonals_m(rows)
         sizes = np.stack([rows["length"], rows["width"], rows["height"]])
         wrong = (sizes <= 0.0).any(axis=0) | (radii_m > self._radius_m)
         wrong |= rows["height"] > self._height_m
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "length", "with width and height the size of no type")
+        return _of(rows[np.argmax(wrong)], "length", "and with width and height fits no type")
 
     def _wrong_goals(self, rows: NDArray[np.void]) -> str:
-        """`goal` names a plan of an agent, a plan or detour of others, or a frame of a script."""
+        """Check that `goal` names a plan, a detour or a frame of a script, as the driver needs."""
         travel, driver = self._travel, rows["driver"]
         detours = self._num_goals
         if travel.first_detour:
@@ -142,20 +141,22 @@ class RowCheck:
         wrong |= rows["stop"] > rows["stops_end"]
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "goal", "or its driver, agent or stop, do not fit")
+        return _of(rows[np.argmax(wrong)], "goal", "which does not fit its driver, agent or stops")
 
     def _wrong_identity(self, rows: NDArray[np.void], num_orders: int) -> str:
-        for what, numbers in (
+        for name, numbers in (
             ("id", rows["id"]),
             ("agent", rows["agent"][rows["agent"] >= 0]),
         ):
             if len(np.unique(numbers)) < len(numbers):
-                return f"two vehicles have the same {what}"
+                return f"two vehicles have the same {name}"
         wrong = (rows["id"] < 0) | (rows["tick"] < 0) | (rows["order"] >= num_orders)
-        return _of(rows[np.argmax(wrong)], "order", "or id or tick, is none") if wrong.any() else ""
+        if not wrong.any():
+            return ""
+        return _of(rows[np.argmax(wrong)], "order", "which is invalid, or its id or tick is")
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
-        """See that a way begins at a step of its lane; follow it where lanes are not known."""
+        """Check that a route begins with a step of its lane. Follow it if its lanes may differ."""
         lane, way = self._own_lanes(rows["lane"]), rows["way"]
         at = way + lane
         if wrong := self._wrong_places(rows, lane, way):
@@ -171,7 +172,7 @@ class RowCheck:
             planned |= (behind >= 0) & (at < travel.num_fixed) & (behind % lanes == lane)
         drives = (rows["driver"] == DRIVER_BACKGROUND) | (rows["driver"] == DRIVER_AGENT)
         follow = drives & ~planned
-        if self._is_moved:  # SUMO tells the routes again after the load
+        if self._is_moved:  # SUMO sends the routes again after the load
             follow &= at < travel.num_fixed
         rows, lane, way = rows[follow], lane[follow], way[follow]
         for _ in range(_LONGEST_WAY):
@@ -181,11 +182,11 @@ class RowCheck:
             goes_on = step["next"] >= 0
             rows, step, way = rows[goes_on], step[goes_on], way[goes_on] + step["shift"][goes_on]
             if (step["next"] >= lanes).any():
-                return _of(rows[np.argmax(step["next"] >= lanes)], "way", "leads to no lane")
+                return _of(rows[np.argmax(step["next"] >= lanes)], "way", "which leads to no lane")
             lane = self._own_lanes(step["next"])
             if wrong := self._wrong_places(rows, lane, way):
                 return wrong
-        return _of(rows[0], "way", "does not end")
+        return _of(rows[0], "way", "which does not end")
 
     def _steps(self, at: Numbers, tail: NDArray[np.void] | None) -> NDArray[np.void]:
         steps = self._travel.steps
@@ -196,14 +197,16 @@ class RowCheck:
         return found
 
     def _wrong_places(self, rows: NDArray[np.void], lane: Numbers, way: Numbers) -> str:
-        """All lanes of an edge have a step there: a vehicle may change to any of them."""
+        """Check that all lanes of the edges have steps: a vehicle may change to any of them."""
         edges = self._roads.edges[self._roads.lanes["edge"][lane]]
         first = way + edges["first_lane"]
         wrong = (first < 0) | (first + edges["num_lanes"] > len(self._travel.steps))
-        return _of(rows[np.argmax(wrong)], "way", "leads out of all ways") if wrong.any() else ""
+        if not wrong.any():
+            return ""
+        return _of(rows[np.argmax(wrong)], "way", "which leads out of the table of routes")
 
     def _own_lanes(self, lane: NDArray[np.int32]) -> Numbers:
-        """The lanes whose steps count: inside a junction that of the lane behind it."""
+        """Return the lanes whose steps apply: inside a junction, the lane after it."""
         lanes = self._roads.lanes
         behind = self._roads.links["to_lane"][lanes["link"][lane]]
         return np.where(lanes["internal"][lane], behind, lane).astype(np.int64)
@@ -217,5 +220,5 @@ def _diagonals_m(bodies: NDArray[np.void]) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(length * length + width * width), dtype=np.float64)
 
 
-def _of(row: np.void, name: str, what: str) -> str:
-    return f"vehicle {int(row['id'])} has {name} = {row[name].item()}, {what}"
+def _of(row: np.void, name: str, problem: str) -> str:
+    return f"vehicle {int(row['id'])} has {name} = {row[name].item()}, {problem}"

@@ -1,8 +1,7 @@
-"""`Shard`: the running sub-worlds of one zone, W of them side by side.
+"""`Shard`: the vehicles of one zone in W worlds.
 
-It owns the arrays of its vehicles and knows its part of the map, its sensors and its terms, and
-neither the coordinator nor another shard. Its ticks are run by a `ShardGroup`, alone or with others
-of its process.
+A shard has the arrays of its vehicles, its part of the map, its sensors and its terms. It knows
+neither the coordinator nor another shard. A `ShardGroup` runs the ticks of one or more shards.
 """
 
 from __future__ import annotations
@@ -40,15 +39,15 @@ from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
 
 CELL_M = 25.0  # of the spatial index over vehicles
 COMMON = SharedState._fields
-TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
-SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
+TICKS_IN_ORDER = 32  # ticks between two sorts of the rows by lane
+SUGGESTED_HORIZON_S = 1.0  # time in which a suggested target speed is to be reached
 
-# What a world knows of one actuated signal program.
+# The state of one actuated signal program in a world.
 CONTROLLER = np.dtype(
     [
-        ("phase", np.int64),  # PHASE row that is on
-        ("since_ms", np.int64),  # when it began, since reset
-        ("next_ms", np.int64),  # when to look whether it goes on
+        ("phase", np.int64),  # the present PHASE row
+        ("since_ms", np.int64),  # when the phase began, since reset
+        ("next_ms", np.int64),  # when to decide whether the phase continues
     ],
     align=True,
 )
@@ -61,10 +60,10 @@ class Commands:
     # (W, A, 2) throttle in m/s² and steering in rad; continuous actions
     controls: NDArray[np.float64]
     meta_actions: NDArray[np.int64]  # (W, A) ACTION_* codes; discrete actions
-    # (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages
+    # (W, A) CAUSE_* of events that agents report to others, 0: none; (0, 0): no messages
     declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
-    # (W, I, 3) INSERT_* code, LANE and m on it of vehicles that are put into a world; (0, 0, 3):
-    # there is no room for any
+    # (W, I, 3) INSERT_* code, LANE and position in m of inserted vehicles; (0, 0, 3): insertions
+    # are not configured
     inserted: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
 
@@ -72,11 +71,12 @@ COMMANDS = tuple(entry.name for entry in fields(Commands))
 
 
 class Shard:
-    """The sub-worlds of one zone.
+    """The vehicles of one zone in W worlds.
 
     Attributes:
-        sides: VEHICLE (W, C), the two buffers that rows are kept in, swapped each tick.
-        next_side: where the next ones come; the same, but in ticks that put rows in order.
+        sides: VEHICLE (W, C), the two buffers for rows.
+        side: index of the buffer with the committed rows.
+        next_side: index of the buffer for the next rows; it differs in ticks that sort rows.
     """
 
     def __init__(
@@ -84,18 +84,17 @@ class Shard:
         config: EnvConfig,
         network: RoadNetwork,
         *,
-        plans: NDArray[np.void],  # PLAN (G, L), the ways of agents
+        plans: NDArray[np.void],  # PLAN (G, L), the routes of agents
         travel: TripTables,
         zoned: ZoneState,  # the rows of all zones
-        # where the agents of all shards get what they sense, each at its own index
-        outputs: Outputs,
+        outputs: Outputs,  # of the agents of all shards, by agent index
         zone: int,
         zones: ZoneArrays,
-        halo: Halo,  # how far it sees over its borders
-        # the first shard of this process, whose clock, keys, signals and scratch memory this one
-        # shares; None: this is it
+        halo: Halo,  # how far zones see beyond their borders
+        # the first shard of this process, whose clock, keys, signals and scratch memory this shard
+        # shares; None: this is the first shard
         first: Shard | None = None,
-        zeros: Zeros = np.zeros,  # makes what all zones have in common
+        zeros: Zeros = np.zeros,  # allocates the state that all zones share
     ) -> None:
         self.zone = zone
         self.zoned = zoned
@@ -112,7 +111,7 @@ class Shard:
         self._floating = len(network.maps) > 1
         self._extent_m = network.room_m
         self.cut(zones, halo)
-        # One after the other works in it: what the last one has left is still near in memory.
+        # Shards run one after the other and share this memory, so that it stays in the cache.
         self.scratch: Scratch = (
             make_shard_scratch(network, capacity, travel.scripts.room)
             if first is None
@@ -131,20 +130,20 @@ class Shard:
             num_cues=len(travel.scripts.cues),
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
-        self.side = self.next_side = 0  # in which of them the committed rows are
-        # The same for kernels: (2,), one array for all shards of this process.
+        self.side = self.next_side = 0
+        # `side` and `next_side` for kernels: (2,), one array for all shards of this process.
         self.row_sides: NDArray[np.int64] = (
             np.zeros(2, dtype=np.int64) if first is None else first.row_sides
         )
         self.outputs = outputs
-        self.mail: Mail | None = None  # what agents have been told over the air; None: no messages
+        self.mail: Mail | None = None  # messages that agents have received; None: no messages
         self.untold = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)
         self.messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
 
     def cut(self, zones: ZoneArrays, halo: Halo) -> None:
-        """Say where its zone and the others are; a group has to be made anew after it."""
+        """Set the zones. Groups of this shard must be made anew afterwards."""
         self.zones = zones
         self.halo = halo
         seen = self._extent_m
@@ -153,7 +152,7 @@ class Shard:
         self.grid = make_grid(seen, CELL_M, self.zoned.rows.shape[3], self._floating)
 
     def align(self) -> None:
-        """Keep the rows on the first side, wherever a tick that is given up has them."""
+        """Use the first buffer for all rows, after a tick that was abandoned."""
         self.face(0, 0)
 
     def face(self, side: int, next_side: int) -> None:
@@ -162,7 +161,7 @@ class Shard:
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
     def suggest(self, out: NDArray[np.float64]) -> None:
-        """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
+        """Write the actions that the built-in driver would take for agents to `out` (W, A, 2)."""
         suggest(
             self.roads,
             self.plans,
@@ -189,12 +188,11 @@ def make_worlds(
     zeros: Zeros = np.zeros,
     num_cues: int = 0,
 ) -> Worlds:
-    """Arrays of W worlds that hold `capacity` vehicles each, all of them empty.
+    """Return the arrays of W empty worlds with room for `capacity` vehicles each.
 
-    Agents' commands take effect `latency_ticks` later, scripts wait for `num_cues` cues. The rows
-    are those of a zone of `zoned`, if it is given. What all zones of a world have in common (ticks,
-    keys, signals, what detectors saw, cues) are the arrays of `common`, if it is given; if not,
-    `zeros` makes them.
+    Agents' commands take effect `latency_ticks` later; scripts wait for `num_cues` cues. The rows
+    are those of a zone of `zoned`, if given. The state that all zones share (ticks, keys, signals,
+    detections, cues) is that of `common`, if given; otherwise `zeros` allocates it.
     """
     if zoned is None:
         zoned = make_zone_state(1, num_worlds, capacity)
@@ -226,31 +224,31 @@ def make_worlds(
 
 
 def common_of(worlds: Worlds) -> SharedState:
-    """What all shards have in common, of any of them."""
+    """Return the state that all shards share, from the worlds of any of them."""
     return SharedState(**{name: getattr(worlds, name) for name in COMMON})
 
 
 def make_zone_state(
     num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np.zeros
 ) -> ZoneState:
-    """Room for the rows of k zones of W worlds that hold `capacity` vehicles each."""
-    # Memory that is never written is never taken.
+    """Return empty rows of all zones in W worlds, with room for `capacity` vehicles each."""
+    # Memory that is never written takes no physical pages.
     numbers = zeros((8, num_zones, num_worlds), dtype=np.int64)
     numbers[7] = -1
-    everybody = (num_zones, num_worlds, capacity)
+    shape = (num_zones, num_worlds, capacity)
     return ZoneState(
-        rows=zeros((2, *everybody), dtype=VEHICLE),
+        rows=zeros((2, *shape), dtype=VEHICLE),
         num_owned=numbers[0],
         num_rows=numbers[1],
         num_near=numbers[2],
         num_through=numbers[3],
         num_touching=numbers[4],
         num_contacts=numbers[5],
-        step=zeros(everybody, dtype=PLAN),
-        step_at=zeros(everybody, dtype=np.int64),
-        outer=zeros(everybody, dtype=OUTER),
+        step=zeros(shape, dtype=PLAN),
+        step_at=zeros(shape, dtype=np.int64),
+        outer=zeros(shape, dtype=OUTER),
         num_outer=numbers[7],
-        border=zeros(everybody, dtype=np.int32),
+        border=zeros(shape, dtype=np.int32),
         num_border=numbers[6],
         spare=np.zeros(1, dtype=VEHICLE),
     )
@@ -259,7 +257,7 @@ def make_zone_state(
 def _seen(
     extent_m: tuple[float, float, float, float], zones: ZoneArrays, zone: int, halo_m: float
 ) -> tuple[float, float, float, float]:
-    """The part of the map where a zone has vehicles or ghosts."""
+    """Return the part of the map in which a zone has vehicles or ghosts."""
     min_x, min_y, max_x, max_y = extent_m
     left, low, right, high = zones.rects[zone].tolist()
     return (

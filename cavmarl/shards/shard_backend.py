@@ -1,11 +1,11 @@
-"""`ShardBackend`: what a simulator has to do to run the vehicles of one zone.
+"""`ShardBackend`: the interface of a simulator that runs the vehicles of one zone.
 
-A tick of a zone has two halves, between which zones tell each other where their vehicles are:
+A tick of a zone has two halves. Between them, zones exchange the positions of their vehicles:
 
     apply_controls → advance → (owned vehicles are read, ghosts are renewed) → commit
 
-`engine.kinematic_shard` does it with cavmarl's own vehicles, and `engine.backend_world` runs one
-world over several backends, of one kind or of more.
+`engine.kinematic_shard` is a backend with cavmarl's own vehicles. `engine.backend_world` runs one
+world over several backends of one or several kinds.
 """
 
 from __future__ import annotations
@@ -18,73 +18,74 @@ from numpy.typing import NDArray
 
 
 class VehicleControl(NamedTuple):
-    """What a vehicle does until the next step."""
+    """The controls of a vehicle until the next step."""
 
     acceleration_mps2: float  # negative brakes
     steering_rad: float  # of the front wheels, positive to the left
 
 
 class ShardBackend(Protocol):
-    """Runs the vehicles of one zone of one world.
+    """A simulator that runs the vehicles of one zone of one world.
 
-    Vehicles are records `driving.vehicles.VEHICLE`; frames and units are those of that page. What
-    cannot be done is a `CavmarlError` that names the vehicle, and changes nothing.
+    Vehicles are records `driving.vehicles.VEHICLE`, with the coordinate frames and units of that
+    module. A call that cannot be carried out raises a `CavmarlError` that names the vehicle, and
+    changes nothing.
 
     Attributes:
-        zone: its number.
-        reach_m: how far over its border it asks for ghosts.
+        zone: the number of the zone.
+        reach_m: the distance beyond its border in which it needs ghosts.
     """
 
     zone: int
     reach_m: float
 
     def reset(self, seed: int) -> None:
-        """Go to tick 0, without vehicles."""
+        """Return to tick 0, without vehicles."""
         ...
 
     def spawn(self, vehicles: NDArray[np.void]) -> None:
-        """Own the vehicles VEHICLE (n,) from the present tick on, in just this state."""
+        """Add owned vehicles VEHICLE (n,), in exactly this state."""
         ...
 
     def destroy(self, vehicles: Sequence[int]) -> None:
-        """Forget owned vehicles, by their ids: they have arrived, or are another zone's."""
+        """Remove owned vehicles, by id, that have arrived or changed their zone."""
         ...
 
     def apply_controls(self, controls: Mapping[int, VehicleControl]) -> None:
-        """What owned vehicles of agents do, by their ids, until they are told otherwise."""
+        """Set the controls of agents' owned vehicles, by vehicle id, until the next call."""
         ...
 
     def advance(self) -> None:
-        """Move the owned vehicles to the next tick, by what all vehicles were at this one."""
+        """Move the owned vehicles to the next tick, from the present state of all vehicles."""
         ...
 
     def upsert_ghosts(self, vehicles: NDArray[np.void]) -> None:
-        """Show other zones' vehicles VEHICLE (n,), new ones or known ones, as they are now."""
+        """Add or update ghosts: the present rows VEHICLE (n,) of other zones' vehicles."""
         ...
 
     def remove_ghosts(self, vehicles: Sequence[int]) -> None:
-        """Show ghosts no more, by their ids."""
+        """Remove ghosts, by id."""
         ...
 
     def commit(self) -> int:
-        """End the tick: contacts, signals, what sensors see; its number."""
+        """End the tick with contacts, signals and sensors. Return the number of the new tick."""
         ...
 
     def read_vehicles(self) -> NDArray[np.void]:
-        """VEHICLE (n,), a copy: owned vehicles as `advance`, `commit` or `spawn` has left them."""
+        """Return a copy of the owned vehicles, VEHICLE (n,), after the latest call."""
         ...
 
     def read_sensors(self) -> dict[int, NDArray[np.float32]]:
-        """What the owned vehicles of agents have sensed last, by their ids: (D,) each.
+        """Return the latest observation (D,) of each owned vehicle of an agent, by vehicle id.
 
-        Those that have not sensed yet, or not here, are left out.
+        Vehicles that have not sensed in this zone yet are absent.
         """
         ...
 
     def snapshot(self) -> bytes:
-        """All that the next tick depends on; between two ticks."""
+        """Return the state that the next tick depends on. Call between two ticks."""
         ...
 
     def restore(self, data: bytes) -> None:
-        """Go on from a snapshot of a backend of the same kind, zone and world."""
+        """Resume from a snapshot of a backend of the same kind, zone and world."""
         ...

@@ -1,4 +1,4 @@
-"""`ShardGroup`: the shards of one process, which runs each phase of a tick on all of them."""
+"""`ShardGroup`: an executor that runs each phase of a tick on some shards of one process."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard, common_of
 
 
 class ShardGroup:
-    """Runs the phases of some shards, whichever they are: one, those of a worker, or all.
+    """An executor of one shard, the shards of a worker, or all shards.
 
-    Each phase is one call for all shards, whose arguments are put together at the first call.
+    Each phase is one kernel call for all shards. Its arguments are bound at the first call.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class ShardGroup:
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Where the rows are, and the next ones."""
+        """The buffers of the committed and of the next rows."""
         return self.first.side, self.first.next_side
 
     def begin_step(self, commands: Commands) -> None:
-        """Open the accounts of a step, take its actions, let barriers drive on."""
+        """Clear the sums of a step, take its actions, and let opened barriers drive on."""
         inserted = commands.inserted
         if inserted.size and (inserted[..., 0] == INSERT_OPEN).any():
             np.copyto(self.calls.inserted, inserted)
@@ -70,37 +70,37 @@ class ShardGroup:
             self.calls.begin_step()
 
     def advance(self, commands: Commands) -> None:
-        """Decide every control from the committed rows and move the owned ones into next ones."""
+        """Decide all controls from the committed rows, and move owned rows into the next rows."""
         self.turn()
         self.move(commands)
 
     def turn(self) -> None:
-        """Let the next rows be on the other side, in a tick that puts rows in order."""
+        """Put the next rows into the other buffer, in a tick that sorts rows by lane."""
         if self.first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
             self.face(self.first.side, 1 - self.first.side)
 
     def face(self, side: int, next_side: int) -> None:
-        """Say on which side the committed rows are, and on which the next ones."""
+        """Set the buffers of the committed and of the next rows."""
         if self.sides != (side, next_side):
             for shard in self.shards:
                 shard.face(side, next_side)
 
     def move(self, commands: Commands) -> None:
-        """`advance`, where the sides of the rows are known."""
+        """Run `advance` without `turn`."""
         if self.calls.has_agents:
             np.copyto(self.calls.controls, commands.controls)
         self.calls.advance()
 
     def choose_goals(self, demand: Demand, num_goals: int, departures: DepartureQueue) -> None:
-        """Give the vehicles of the next rows that need it another goal."""
+        """Give new goals to vehicles of the next rows that need one."""
         self.departure_calls(departures).choose_goals(demand, num_goals)()
 
     def leave(self, departures: DepartureQueue) -> None:
-        """Move background vehicles of the next rows that have arrived to the departure queue."""
+        """Move arrived background vehicles of the next rows to the departure queue."""
         self.departure_calls(departures).leave()
 
     def dismiss(self, departures: DepartureQueue) -> None:
-        """Hand the vehicles of the next rows that SUMO has removed to the departure queue."""
+        """Move vehicles of the next rows that SUMO has removed to the departure queue."""
         self.departure_calls(departures).dismiss()
 
     def gather(self, touching_m: float, border_m: float) -> None:
@@ -112,15 +112,15 @@ class ShardGroup:
         self.calls.resolve()
 
     def rank_lanes(self, departures: DepartureQueue) -> None:
-        """Count vehicles around the places of these zones where departures may enter."""
+        """Count vehicles around the places in these zones where departures may enter."""
         self.departure_calls(departures).rank_lanes()
 
     def propose(self, demand: Demand, departures: DepartureQueue) -> None:
-        """Tell the departure queue which departures find a safe gap in these zones."""
+        """Report to the departure queue which departures find a safe gap in these zones."""
         self.departure_calls(departures).propose(demand)()
 
     def admit(self, departures: DepartureQueue) -> None:
-        """Take in departures that the departure queue has accepted, as owned or as ghosts."""
+        """Add departures that the departure queue has accepted, as owned rows or ghosts."""
         self.departure_calls(departures).admit()
 
     def commit(self) -> None:
@@ -128,12 +128,12 @@ class ShardGroup:
         self.face(self.first.next_side, self.first.next_side)
 
     def detect(self) -> None:
-        """Note when owned bodies were over the detectors of actuated signals."""
+        """Record when owned vehicles cover the detectors of actuated signals."""
         if self.calls.has_detectors:
             self.calls.detect()
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
-        """Write observations and terms of the chosen worlds' owned agents into the outputs."""
+        """Write observations and terms of owned agents in the chosen worlds to the outputs."""
         calls = self.calls
         np.copyto(calls.chosen, chosen)
         calls.sense()
@@ -147,12 +147,12 @@ class ShardGroup:
             calls.fill_stacks()
 
     def credit(self, chosen: NDArray[np.bool_]) -> None:
-        """Add the step's rewards to the episode's of the chosen worlds' owned agents."""
+        """Add the step's rewards to the episode returns of owned agents in the chosen worlds."""
         np.copyto(self.calls.chosen, chosen)
         self.calls.credit()
 
     def suggest(self, out: NDArray[np.float64]) -> None:
-        """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
+        """Write the actions that the built-in driver would take for agents to `out` (W, A, 2)."""
         for shard in self.shards:
             shard.suggest(out)
 
@@ -169,9 +169,9 @@ class GroupCalls:
     """The kernel calls of a group, each with its arguments.
 
     Attributes:
-        controls: (W, A, 2) that `advance` reads.
-        meta_actions: (W, A) that `begin_step` reads.
-        chosen: (W,) that `sense` and `credit` read.
+        controls: (W, A, 2), which `advance` reads.
+        meta_actions: (W, A), which `begin_step` reads.
+        chosen: (W,), which `sense` and `credit` read.
     """
 
     def __init__(self, shards: Sequence[Shard]) -> None:
@@ -204,12 +204,12 @@ class GroupCalls:
 
     @property
     def has_messages(self) -> bool:
-        """Whether agents observe what they were told over the air."""
+        """Whether agents observe the messages that they receive."""
         return self._first.mail is not None and self._first.messages_at is not None
 
     @property
     def has_registered(self) -> bool:
-        """Whether sensors or terms from outside of the package are asked."""
+        """Whether there are sensors or terms from outside of the package."""
         return not self._first.registered.is_empty
 
     @cached_property

@@ -1,7 +1,7 @@
-"""The state of worlds: which arrays outlive a tick, and which part keeps which, in one table.
+"""The table of arrays that are the state of worlds, because they outlive a tick.
 
-What saves, moves or digests worlds takes its arrays from here. Beside these there
-are the owned rows, the arrays of rerouting, and those of attached parts (`Component.arrays`).
+Code that saves, moves or digests worlds takes the arrays from this table. The state also includes
+the owned rows, the arrays of rerouting and those of components (`Component.arrays`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cavmarl.core.records.arrays import DepartureQueue, Outputs, SharedState
 
 
 class Use(Enum):
-    """What is done with an array of the state."""
+    """The uses of an array of the state."""
 
     SAVED = auto()  # in checkpoints, and with a world that changes its worker
     DIGESTED = auto()  # in the hash of a world's state
@@ -27,12 +27,12 @@ S, D = Use.SAVED, Use.DIGESTED
 
 
 class StateArray(NamedTuple):
-    """An array, and what is done with it."""
+    """An array of the state and its uses."""
 
     bundle: type[tuple[Any, ...]]
     name: str
     uses: tuple[Use, ...]
-    place: int = 0  # in the digest
+    place: int = 0  # position in the digest
 
 
 STATE = (
@@ -62,11 +62,14 @@ STATE = (
 
 @cache
 def names_of(bundle: type[tuple[Any, ...]], use: Use) -> tuple[str, ...]:
-    """The fields of a bundle that are put to a use, in the order of the table or the digest."""
+    """Return the fields of a bundle with a use, in the order of the table or of the digest."""
     kept = (entry for entry in STATE if entry.bundle is bundle and use in entry.uses)
     return tuple(entry.name for entry in sorted(kept, key=lambda entry: entry.place * (use is D)))
 
 
 def arrays_of(source: Any, bundle: type[tuple[Any, ...]], use: Use) -> Iterator[NDArray[Any]]:
-    """Those of an object with the fields of a bundle; all shards have those of `SharedState`."""
+    """Return the arrays of an object with the fields of a bundle that have a use.
+
+    Any shard's worlds have the fields of `SharedState`.
+    """
     return (getattr(source, name) for name in names_of(bundle, use))

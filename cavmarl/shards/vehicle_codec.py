@@ -1,18 +1,19 @@
-"""`TransferCodec`: the whole state of one vehicle as bytes: unpacked, it goes on bit for bit.
+"""`TransferCodec`: encodes the complete state of one vehicle as bytes, without loss.
 
     4 bytes  "CVMV"      2 × 2 bytes  version, major and minor
     8 bytes  tick of the state          8 bytes  the vehicle's id
     8 bytes  digest of the record's layout
-    3 × 4 bytes  lengths of what follows: the record, its agent's delayed commands, the frames that
-                 its agent's next observation repeats; the last two are 0 without an agent
+    3 × 4 bytes  lengths of the following parts: the record, its agent's delayed commands, the
+                 frames that its agent's next observation repeats; the last two are 0 without an
+                 agent
 
-All is little-endian. The map, the types of vehicles and the table of ways are the same wherever a
-world is run, so the record names their rows; readings of sensors are made anew.
+All numbers are little-endian. The map, the vehicle types and the table of routes are the same in
+all processes of a world, so the record contains indices into them. Sensors read anew.
 
-A record is understood only by a reader with the same fields at the same places: its layout has a
-digest, and a change of it is a new major version (`RECORD_VERSION`). A minor version may put more
-behind the frames, nothing that a next tick reads: a reader that does not know it skips it, one that
-misses it does without. So every minor version reads every other.
+Reader and writer must have the same layout of the record. The header has a digest of the layout,
+and a change of it needs a new major version (`RECORD_VERSION`). A minor version may append data
+after the frames that no tick reads. A reader skips unknown data and tolerates missing data, so all
+minor versions can read each other.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from cavmarl.driving.vehicles import RECORD_VERSION
 MAGIC = b"CVMV"
 MINOR_VERSION = 0
 
-# The groups of the contract of a transfer, and the fields of VEHICLE that each consists of.
+# The groups of state that a transfer must carry, and the fields of VEHICLE in each group.
 GROUPS: dict[str, tuple[str, ...]] = {
     group: tuple(fields.split())
     for group, fields in {
@@ -54,7 +55,7 @@ _INT = struct.Struct("<i")
 
 
 class TransferHeader(NamedTuple):
-    """What stands before a state; lengths are in bytes."""
+    """The header of a state; lengths are in bytes."""
 
     magic: bytes
     major: int
@@ -68,10 +69,10 @@ class TransferHeader(NamedTuple):
 
 
 class TransferCodec:
-    """Packs and unpacks the vehicles of one set of worlds.
+    """Packs and unpacks the vehicles of W worlds.
 
     Attributes:
-        schema: a number in [0, 2^63) that is the same where the other's states can be unpacked.
+        schema: a number in [0, 2^63); codecs with equal numbers can unpack each other's states.
     """
 
     def __init__(
@@ -79,9 +80,9 @@ class TransferCodec:
         record: np.dtype[np.void],  # dtype of a vehicle's record
         # (W, A, …) float64, the delayed commands of agents: `Worlds.pending`
         commands: NDArray[np.float64],
-        # (W, A, F) float32, what the next observation of an agent takes from the last one
+        # (W, A, F) float32, the part of an agent's observation that the next one repeats
         frames: NDArray[np.float32],
-        # VEHICLE (1,) → what is wrong with it, empty: nothing; None: nothing ever is
+        # returns what is wrong with VEHICLE (1,), empty if nothing; None: no check
         check: Callable[[NDArray[np.void]], str] | None = None,
     ) -> None:
         self._check = check
@@ -112,7 +113,7 @@ class TransferCodec:
         carried_from: int,
         check: Callable[[NDArray[np.void]], str] | None = None,
     ) -> TransferCodec:
-        """The codec of a shard's worlds; `carried_from` is that of `sensors.observed`."""
+        """Return the codec of a shard's worlds; see `sensors.observed` for `carried_from`."""
         frames = outputs.observations[:, :, carried_from:]
         return cls(worlds.rows.dtype, worlds.pending, frames, check)
 
@@ -121,11 +122,11 @@ class TransferCodec:
         rows: NDArray[np.void],  # VEHICLE (W, C)
         world: int,
         i: int,
-        # of the state, as `unpack` will be asked for it. `VEHICLE["tick"]` is one less in vehicles
-        # that entered after the reset
+        # of the state, as `unpack` expects it. `VEHICLE["tick"]` is lower by one in vehicles that
+        # entered after the reset
         tick: int,
     ) -> bytes:
-        """The state of a vehicle."""
+        """Return the state of a vehicle."""
         record: bytes = rows[world, i : i + 1].tobytes()
         (vehicle,) = _LONG.unpack_from(record, self._id_at)
         (agent,) = _INT.unpack_from(record, self._agent_at)
@@ -139,12 +140,16 @@ class TransferCodec:
     def unpack(
         self, data: bytes, vehicle: int, tick: int, rows: NDArray[np.void], world: int, i: int
     ) -> None:
-        """Write a state to `rows[world, i]`, and what its agent keeps; nothing if it is refused."""
+        """Write a state to `rows[world, i]` and to the arrays of its agent.
+
+        Raises:
+            MessageError: the state is damaged or not the expected one; nothing is written.
+        """
         header = self.header(data)
         if (header.vehicle, header.tick) != (vehicle, tick):
             raise MessageError(
-                f"the state is that of vehicle {header.vehicle} at tick {header.tick}; "
-                f"expected is vehicle {vehicle} at tick {tick}"
+                f"the state is of vehicle {header.vehicle} at tick {header.tick}, not of the "
+                f"expected vehicle {vehicle} at tick {tick}"
             )
         first = _HEADER.size
         end = first + self._size
@@ -162,37 +167,38 @@ class TransferCodec:
         frames[:] = np.frombuffer(data, frames.dtype, frames.size, end + header.commands)
 
     def header(self, data: bytes) -> TransferHeader:
-        """What stands before a state, once the state is seen to be whole and of this layout."""
+        """Return the header of a state, after checking the layout and the length of the state."""
         if len(data) < _HEADER.size:
             raise MessageError(
-                f"a state of {len(data)} bytes has no room for its header of {_HEADER.size}"
+                f"a state of {len(data)} bytes is shorter than a header of {_HEADER.size} bytes"
             )
         header = TransferHeader._make(_HEADER.unpack_from(data))
         if header.magic != MAGIC:
             raise MessageError(f"a state begins with {MAGIC!r}, not with {header.magic!r}")
         if header.major != RECORD_VERSION:
             raise MessageError(
-                f"a state of version {header.major}.{header.minor}; this build reads "
-                f"{RECORD_VERSION}.*: run the same cavmarl everywhere"
+                f"the state has version {header.major}.{header.minor}, but this build reads "
+                f"{RECORD_VERSION}.*; run the same version of cavmarl on all machines"
             )
         more = len(data) - _HEADER.size - header.record - header.commands - header.frames
         if more < 0 or (more > 0 and header.minor <= MINOR_VERSION):
             raise MessageError(
-                f"a state of {len(data)} bytes: its header tells of {len(data) - more}"
+                f"a state has {len(data)} bytes, but {len(data) - more} according to its header"
             )
         if header.layout != self._layout or header.record != self._size:
             raise MessageError(
-                f"a record of {header.record} bytes and layout {header.layout.hex()}; here it has "
-                f"{self._size} and {self._layout.hex()}: run the same cavmarl everywhere"
+                f"the record has {header.record} bytes and layout {header.layout.hex()}, but here "
+                f"{self._size} and {self._layout.hex()}; run the same version of cavmarl on all "
+                "machines"
             )
         return header
 
     def record(self, data: bytes, vehicle: int) -> bytes:
-        """The record of a vehicle's state, once that is seen to be whole and of this layout."""
+        """Return the record in a vehicle's state, after checking layout, length and vehicle."""
         header = self.header(data)
         self._check_record(header, data)
         if header.vehicle != vehicle:
-            raise MessageError(f"the state of vehicle {vehicle} is that of {header.vehicle}")
+            raise MessageError(f"the state is of vehicle {header.vehicle}, not of {vehicle}")
         return data[_HEADER.size : _HEADER.size + self._size]
 
     def _check_record(self, header: TransferHeader, data: bytes) -> int:
@@ -208,20 +214,21 @@ class TransferCodec:
         (agent,) = _INT.unpack_from(data, first + self._agent_at)
         if agent >= self._slots[1]:
             raise MessageError(
-                f"vehicle {vehicle} is driven by agent {agent}; here are {self._slots[1]}"
+                f"vehicle {vehicle} is driven by agent {agent}, but there are {self._slots[1]} "
+                "agents here"
             )
         expected = self._lengths[1:] if agent >= 0 else (0, 0)
         if (header.commands, header.frames) != expected:
             raise MessageError(
                 f"vehicle {vehicle} has {header.commands} bytes of delayed commands and "
-                f"{header.frames} of frames; here these are {expected[0]} and {expected[1]}: "
-                "clock.control_latency_ticks or sensors differ"
+                f"{header.frames} of frames, but {expected[0]} and {expected[1]} are expected; use "
+                "the same clock.control_latency_ticks and sensors"
             )
         return int(agent)
 
 
 def layout_text(record: np.dtype[np.void]) -> str:
-    """Names, formats and places of a record's fields, one after the other."""
+    """Return the names, formats and offsets of a record's fields as one text."""
     named = (f"{name}:{kind.str}@{place}" for name, kind, place in _fields(record))
     return f"{record.itemsize} {' '.join(named)}"
 

@@ -1,4 +1,4 @@
-"""Whether results are bit for bit the same: determinism, divisions, faults, kills.
+"""Checks that results are bit for bit the same: determinism, divisions, faults, kills.
 
-Stands on `evaluate`; `cli` runs it.
+It builds on `evaluate`; `cli` runs it.
 """

@@ -1,9 +1,8 @@
-"""Checks that the same scenario gives the same bits: three fresh interpreters, step by step.
+"""Check that the same scenario gives the same bits in three fresh interpreters, step by step.
 
-They differ in `PYTHONHASHSEED` and run at once, with a fourth process beside them that does nothing
-but use the processor. After each step their hashes are compared; at the first difference the three
-are stopped where they are and leave their states, so that a difference that would not come again is
-found too.
+The interpreters have different `PYTHONHASHSEED` and run at the same time, while a fourth process
+keeps a processor busy. Their hashes are compared after each step. At the first difference, the
+interpreters stop and save their states. So a difference that cannot be reproduced is found, too.
 """
 
 from __future__ import annotations
@@ -33,20 +32,20 @@ MAX_STEPS = 10_000_000
 
 @dataclass(frozen=True)
 class FirstDifference(Difference):
-    """Where two processes first differ."""
+    """The first difference of two processes."""
 
-    processes: tuple[int, int]  # the numbers of the two; the tick is that of the first
+    processes: tuple[int, int]  # the numbers of the processes; the tick is that of the first one
 
 
 @dataclass(frozen=True)
 class Determinism:
-    """What was found."""
+    """The result of `verify_determinism`."""
 
-    steps: int  # that were compared
+    steps: int  # number of compared steps
     ticks: int  # of the world at the end
     hash_seeds: tuple[str, ...]  # `PYTHONHASHSEED` of the processes
     state_hash: str  # of the first process at the end
-    difference: FirstDifference | None  # None if all were equal
+    difference: FirstDifference | None  # None if all processes were equal
 
 
 def verify_determinism(
@@ -60,14 +59,14 @@ def verify_determinism(
     """Drive one world in three processes and compare everything after each step.
 
     Args:
-        env: as in `make_vec`, like the other keywords; the seed is the policy's, too.
+        env: as in `make_vec`, like the other keywords; the policy has the same seed.
         policy: as in `load_policy`.
-        steps: how many; episodes follow one another.
+        steps: number of steps; episodes follow one another.
         progress: called after each step with its number and `steps`.
         keys: of the world.
 
     Raises:
-        ConfigError: a number or a key that cannot work.
+        ConfigError: a number or a key is invalid.
         PolicyError: the policy cannot be loaded or does not fit.
         EvaluationError: a process died.
     """
@@ -77,13 +76,13 @@ def verify_determinism(
     with ExitStack() as stack:
         room = Path(stack.enter_context(TemporaryDirectory()))
         programs = [stack.enter_context(_Program(job, HASH_SEEDS[0]))]
-        # If kernels have to be compiled, one process does it for all.
+        # If kernels must be compiled, one process does it for all.
         programs[0].wait_for_line()
         stack.enter_context(_load_beside())
         programs += [stack.enter_context(_Program(job, key)) for key in HASH_SEEDS[1:]]
         for step in range(steps + 1):
-            told = [program.read() for program in programs]
-            odd = next((k for k, line in enumerate(told) if line != told[0]), None)
+            lines = [program.read() for program in programs]
+            odd = next((k for k, line in enumerate(lines) if line != lines[0]), None)
             if odd is not None or step == steps:
                 break
             for program in programs:
@@ -93,13 +92,13 @@ def verify_determinism(
         difference = None
         if odd is not None:
             states = [programs[k].dump(room / f"{k}.npz") for k in (0, odd)]
-            found = find_difference(step, told[0]["tick"], *states)
+            found = find_difference(step, lines[0]["tick"], *states)
             difference = FirstDifference(**vars(found), processes=(0, odd))
-        return Determinism(step, told[0]["tick"], HASH_SEEDS, told[0]["state"], difference)
+        return Determinism(step, lines[0]["tick"], HASH_SEEDS, lines[0]["state"], difference)
 
 
 class _Program:
-    """One of the processes, with a job for `lockstep`; a context manager that ends it."""
+    """A process that runs a job of `lockstep`; as a context manager, it ends the process."""
 
     def __init__(self, job: dict[str, Any], hash_seed: str) -> None:
         self._hash_seed = hash_seed
@@ -129,7 +128,7 @@ class _Program:
             raise self._died() from error
 
     def wait_for_line(self) -> None:
-        """Wait until it has told something that `read` returns next."""
+        """Wait for the next line, which `read` then returns."""
         assert self._process.stdout is not None
         self._line = self._process.stdout.readline()
         if not self._line:
@@ -139,10 +138,10 @@ class _Program:
         if not self._line:
             self.wait_for_line()
         line, self._line = self._line, ""
-        told: dict[str, Any] = json.loads(line)
-        if "error" in told:
-            raise told_error(told["error"], told["message"])
-        return told
+        content: dict[str, Any] = json.loads(line)
+        if "error" in content:
+            raise told_error(content["error"], content["message"])
+        return content
 
     def dump(self, path: Path) -> Arrays:
         self.write(str(path))
@@ -153,13 +152,13 @@ class _Program:
     def _died(self) -> EvaluationError:
         return EvaluationError(
             f"the process with PYTHONHASHSEED={self._hash_seed} ended with exit code "
-            f"{self._process.wait()}; its own message is above"
+            f"{self._process.wait()}; see its own message above"
         )
 
 
 @contextmanager
 def _load_beside() -> Iterator[None]:
-    """A process that uses a core and has nothing to do with the rest."""
+    """Keep a processor busy with an unrelated process."""
     busy = start_dying_with_process([sys.executable, "-c", "while True: pass"])
     try:
         yield

@@ -1,6 +1,6 @@
-"""Compares two runs of the same scenario, and finds the first place that differs.
+"""Comparison of two runs of the same scenario, and search for the first difference.
 
-What agents got is compared as bytes and not as numbers: -0.0 is not 0.0 here, and NaN is NaN.
+Results are compared as bytes and not as numbers: -0.0 differs from 0.0, and NaN equals NaN.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Difference:
-    """Where two runs first differ."""
+    """The first difference of two runs."""
 
-    step: int  # number of the step, 0 is the reset
-    tick: int  # the world's tick at its end
-    # `vehicle`, the name of another array, or `hidden state`: what hashes cover and neither has
-    # (queue and random keys)
+    step: int  # number of the step; 0 is the reset
+    tick: int  # the world's tick after the step
+    # `vehicle`, the name of another array, or `hidden state`: state that is hashed, but is in no
+    # array (queue and random keys)
     what: str
-    vehicle: int | None  # id of the vehicle, the smallest that differs; None where it is none
-    field: str  # of its record, the first that differs; or the place in the array
-    values: tuple[Any, Any]  # in the two; None where a vehicle is missing
+    vehicle: int | None  # least id of the vehicles that differ; None: it is not about a vehicle
+    field: str  # first field of the vehicle that differs, or the place in the array
+    values: tuple[Any, Any]  # in the two runs; None where a vehicle is missing
 
 
 def step_results(result: StepResult, actions: NDArray[Any]) -> Arrays:
-    """All that a step returned, by name, and the actions that it was given; W worlds first."""
+    """Return the arrays (W, …) that a step returned, and its actions, by name."""
     observations, rewards, terminations, truncations, infos = result
     return {
         "observations": observations,
@@ -53,7 +53,7 @@ def first_results(vec: CavVectorEnv, seed: int) -> Arrays:
 
 
 class DrivenRun:
-    """Some worlds and their driver, from the reset on; the seed is that of both."""
+    """W worlds and their driver, with the same seed, from the reset on."""
 
     def __init__(self, vec: CavVectorEnv, policy: str | Path, seed: int) -> None:
         self.vec = vec
@@ -69,7 +69,7 @@ class DrivenRun:
 
 
 def single_arrays(results: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The arrays of results, by name; observations that are named by sensor, one by one."""
+    """Yield the arrays of results with their names; observations by sensor one by one."""
     for name, found in results.items():
         if isinstance(found, Mapping):
             yield from ((f"{name} {sensor}", array) for sensor, array in found.items())
@@ -78,7 +78,7 @@ def single_arrays(results: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any
 
 
 def snapshot(vec: CavVectorEnv, results: Mapping[str, NDArray[Any]], world: int = 0) -> Arrays:
-    """One world's vehicles by rising id, its signals, and its part of what agents got in a step."""
+    """Return one world's vehicles by rising id, its signals, and its part of a step's results."""
     vehicles = vec.simulation.vehicles(world)
     return {
         "vehicles": vehicles[np.argsort(vehicles["id"])],
@@ -93,15 +93,16 @@ def snapshot(vec: CavVectorEnv, results: Mapping[str, NDArray[Any]], world: int 
 
 
 def same_bytes(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]]) -> bool:
-    """Whether all arrays of two results are the same."""
+    """Return whether all arrays of two results have the same bytes."""
     others = dict(single_arrays(other))
     return all(array.tobytes() == others[name].tobytes() for name, array in single_arrays(one))
 
 
 def find_difference(step: int, tick: int, one: Arrays, other: Arrays) -> Difference:
-    """Of two snapshots the smallest id that differs, and the first field of its record.
+    """Return the first difference of two snapshots.
 
-    Else the first other array and place.
+    This is the first field that differs of the vehicle with the least id; without such a vehicle,
+    the first place that differs in another array.
     """
 
     def found(what: str, vehicle: int | None, field: str, values: tuple[Any, Any]) -> Difference:

@@ -1,7 +1,7 @@
-"""Checks that divided worlds equal the undivided one, step by step.
+"""Check that divided worlds equal the undivided world, step by step.
 
-All of them go through the public interface: the same seed, a driver of its own for each, and after
-every step the hashes of all worlds and everything that `step` returned.
+All worlds use the public interface, with the same seed and a driver of their own. After every step,
+the hashes of all worlds and all results of `step` are compared.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ ZONES = (1, 2, 4, 9)
 
 @dataclass(frozen=True)
 class ZoneResult:
-    """What came of one number of zones."""
+    """The result for one number of zones."""
 
-    zones: int  # how many
-    steps: int  # that were compared
-    crossings: int  # how often a vehicle was in another zone than a step before, in all worlds
-    vehicles: float  # in all worlds, on average over the steps
-    world: int | None  # the first that differs; None if all were equal
-    difference: Difference | None  # in it; None if all were equal
+    zones: int  # number of zones
+    steps: int  # number of compared steps
+    crossings: int  # number of changes of zone from step to step, in all worlds
+    vehicles: float  # number in all worlds, averaged over the steps
+    world: int | None  # the first world that differs; None if all were equal
+    difference: Difference | None  # in this world; None if all were equal
 
 
 @dataclass(frozen=True)
 class Equivalence:
-    """What was found."""
+    """The result of `verify_zones`."""
 
-    env: str  # of which environment
-    worlds: int  # how many were stepped together
-    steps: int  # that were asked for
+    env: str  # name of the environment
+    worlds: int  # number of worlds stepped together
+    steps: int  # number of requested steps
     ticks: int  # of the first world's episode at the end
     state_hashes: tuple[str, ...]  # of the undivided worlds at the end
     results: tuple[ZoneResult, ...]  # one for each number of zones
@@ -71,24 +71,24 @@ def verify_zones(
     progress: Callable[[int, int], None] | None = None,
     **keys: Unpack[WorldKeys],
 ) -> Equivalence:
-    """Drive divided worlds beside the undivided ones and compare everything after each step.
+    """Compare divided worlds with undivided worlds after each step.
 
     Args:
         env: as in `make_vec`, like the other keywords that are not explained here.
-        zones: numbers of zones; default: as many as a zone file has, otherwise `ZONES`.
-        steps: how many; episodes follow one another.
-        layout: shadows zones.layout; a zone file is named from the working directory.
-        policy: as in `load_policy`; its random numbers have the root of the worlds'.
-        worlds: stepped together.
-        check: watch the invariants of ownership in the divided worlds.
+        zones: numbers of zones; default: that of the zone file, otherwise `ZONES`.
+        steps: number of steps; episodes follow one another.
+        layout: replaces zones.layout; the path of a zone file is relative to the working directory.
+        policy: as in `load_policy`; it has the same seed as the worlds.
+        worlds: number of worlds stepped together.
+        check: check the invariants of ownership in the divided worlds.
         journals: folder for the journals of the divided worlds, one for each number of zones.
         progress: called after each step with its number and `steps`.
-        keys: of the worlds; overrides of `zones` count for the divided ones.
+        keys: of the worlds; overrides of `zones` apply to the divided worlds only.
 
     Raises:
-        ConfigError: a number or a key that cannot work; more zones than the map can hold, or a zone
-            file of another number.
-        JournalError: a journal that cannot be begun.
+        ConfigError: a number or a key is invalid, the map cannot hold this many zones, or a zone
+            file has a different number of zones.
+        JournalError: a journal cannot be created.
         PolicyError: the policy cannot be loaded or does not fit.
     """
     check_count("steps", steps, MAX_STEPS)
@@ -126,7 +126,9 @@ def _divided(spec: WorldSpec, layout: str | Path | None, check: bool) -> dict[st
     settings = dict(spec.overrides)
     if layout is not None:
         if "zones.layout" in settings:
-            raise ConfigError("zones.layout stands in overrides and is given as layout; use one")
+            raise ConfigError(
+                "zones.layout is set both by overrides and by layout; use only one of them"
+            )
         settings["zones.layout"] = _layout(str(layout))
     return settings | ({"zones.check_invariants": True} if check else {})
 
@@ -142,7 +144,7 @@ def _layout(path: str) -> str:
 
 
 def _counts(zones: Sequence[int] | None, settings: Mapping[str, Any]) -> list[int]:
-    """The numbers of zones, each once; those that cannot be are refused."""
+    """Return the distinct numbers of zones. Raises ConfigError if one is invalid."""
     if zones is None:
         layout = str(settings.get("zones.layout", ""))
         zones = (read_zones(layout).count,) if layout.endswith(ZONE_FILE_SUFFIXES) else ZONES
@@ -150,12 +152,12 @@ def _counts(zones: Sequence[int] | None, settings: Mapping[str, Any]) -> list[in
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MAX_ZONES:
             raise ConfigError(f"zones = {count!r}: must be whole numbers from 1 to {MAX_ZONES}")
     if not zones:
-        raise ConfigError("zones: name at least one number of them")
+        raise ConfigError("zones is empty; use at least one number of zones")
     return list(dict.fromkeys(zones))
 
 
 class _Compared:
-    """One division beside the undivided worlds, up to the first difference."""
+    """Divided worlds that are compared with undivided worlds up to the first difference."""
 
     def __init__(self, run: DrivenRun) -> None:
         self._run = run
@@ -167,7 +169,7 @@ class _Compared:
         self.difference: Difference | None = None
 
     def follow(self, step: int, whole: DrivenRun) -> None:
-        """Take the step that the undivided worlds have taken, and compare."""
+        """Take the same step as the undivided worlds, and compare."""
         if self.difference is not None:
             return
         try:
@@ -205,7 +207,7 @@ class _Compared:
             if found.what == "hidden state" and (
                 mine.vec.state_hash(w) == theirs.vec.state_hash(w)
             ):
-                continue  # it is another world's results that differ
+                continue  # the results of another world differ
             self._world, self.difference = w, found
             return
 

@@ -1,4 +1,4 @@
-"""`FaultyNetwork`: carries connections, and does to them what bad networks do."""
+"""`FaultyNetwork`: a proxy for connections that injects network faults."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from typing import TypeAlias
 LOCAL = "127.0.0.1"
 CHUNK = 1 << 16
 LONGEST_DELAY_S = 0.05
-END_S = 2.0  # for a thread to end
+END_S = 2.0  # limit for the end of a thread
 
 Place: TypeAlias = tuple[str, int]
 
 
 class NetworkFault(StrEnum):
-    """What becomes of the bytes of one direction of a connection."""
+    """A fault in one direction of a connection."""
 
-    DELAY = "delay"  # the next ones come later
-    DAMAGE = "damage"  # one bit of the next ones is another
-    CUT = "cut"  # the connection ends, maybe in the middle of a frame
-    SILENCE = "silence"  # nothing comes any more, without notice
+    DELAY = "delay"  # the next bytes arrive late
+    DAMAGE = "damage"  # one bit of the next bytes flips
+    CUT = "cut"  # the connection ends, possibly within a frame
+    SILENCE = "silence"  # no further bytes arrive, without notice
 
 
 class _Connection:
-    """The two sockets of one connection, by direction: 0 from the caller, 1 to it."""
+    """The two sockets of one connection, by direction: 0 from the caller, 1 to the caller."""
 
     def __init__(self, ends: tuple[socket.socket, socket.socket]) -> None:
         self.ends = ends
         self.due: list[NetworkFault | None] = [None, None]
-        self.open = 2  # directions
+        self.open = 2  # number of open directions
 
     def cut(self) -> None:
         for end in self.ends:
@@ -46,16 +46,16 @@ class _Connection:
 
 
 class FaultyNetwork:
-    """Carries connections to places; `strike` does something to one of them.
+    """A proxy for connections; `strike` injects a fault into one of them.
 
     Attributes:
-        done: how often each fault has been done.
+        done: number of injected faults of each kind.
     """
 
     def __init__(
         self,
         seed: int,
-        latency_s: float = 0.0,  # by which all comes later
+        latency_s: float = 0.0,  # of all bytes
     ) -> None:
         self.done: Counter[NetworkFault] = Counter()
         self._random, self._latency_s = random.Random(seed), latency_s
@@ -66,7 +66,7 @@ class FaultyNetwork:
         self._is_closed = False
 
     def route(self, place: Place) -> Place:
-        """Where to call in order to reach a place through this network."""
+        """Return the place to call in order to reach `place` through this network."""
         listener = socket.create_server((LOCAL, 0))
         self._listeners.append(listener)
         self._start(partial(self._accept, listener, place))
@@ -74,7 +74,7 @@ class FaultyNetwork:
         return found
 
     def strike(self, kind: NetworkFault) -> None:
-        """Let a fault happen to a connection that is drawn."""
+        """Inject a fault into a random connection."""
         with self._lock:
             if not self._connections:
                 return
@@ -120,7 +120,7 @@ class FaultyNetwork:
                     self._start(partial(self._carry, connection, direction))
 
     def _late(self, source: socket.socket) -> Iterator[bytes]:
-        """What comes, each piece so much later than it has come."""
+        """Yield the received pieces, each after the latency."""
         due: deque[tuple[float, bytes]] = deque()
         while True:
             wait_s = max(due[0][0] - time.perf_counter(), 0.0) if due else None
@@ -135,7 +135,7 @@ class FaultyNetwork:
             yield data
 
     def _carry(self, connection: _Connection, direction: int) -> None:
-        """Carry the bytes of one direction until one end closes."""
+        """Forward the bytes of one direction until one end closes."""
         source, target = connection.ends[direction], connection.ends[1 - direction]
         is_mute = False
         with suppress(OSError):

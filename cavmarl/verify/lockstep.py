@@ -1,7 +1,8 @@
-"""The program that `verify-determinism` starts three times: one world, one hash a step, on demand.
+"""The program that `cavmarl verify determinism` starts three times: it steps one world on demand.
 
-Standard input brings a job as one line of JSON, then one line a step: an empty one to go on, or the
-path of a file to leave the state in before the end. Standard output tells the hashes of each step.
+Standard input has a job as one line of JSON, then one line per step: an empty line to continue, or
+the path of a file in which to save the state before the end. Standard output has the hashes after
+each step.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ def main() -> None:
     """Run the job that standard input describes."""
     job = json.loads(sys.stdin.readline())
     try:
-        for told in _steps(job):
-            print(json.dumps(told), flush=True)
+        for line in _steps(job):
+            print(json.dumps(line), flush=True)
     except errors.CavmarlError as error:
         print(json.dumps({"error": type(error).__name__, "message": str(error)}), flush=True)
     except Exception as error:
@@ -37,7 +38,7 @@ def main() -> None:
 
 
 def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Drive; what is told after the reset and after each step, until a dump is asked for."""
+    """Yield a line for the reset and for each step, until a dump is requested."""
     spec = WorldSpec(**job["spec"])
     vec = CavVectorEnv(LocalWorlds(load_world(spec.env, **spec.keywords), 1))
     run = DrivenRun(vec, job["policy"], spec.seed)
@@ -48,11 +49,11 @@ def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
             "state": vec.state_hash(),
             "seen": _digest(run.results),
         }
-        wanted = sys.stdin.readline().strip()
-        if wanted:
+        path = sys.stdin.readline().strip()
+        if path:
             arrays: dict[str, Any] = snapshot(vec, run.results)
-            np.savez(wanted, **arrays)
-            yield {"dumped": wanted}
+            np.savez(path, **arrays)
+            yield {"dumped": path}
             return
         run.step()
 

@@ -22,12 +22,12 @@ from cavmarl.verify.node_losses import FIRST_STEPS, ComparedWorlds
 KILL, STOP, ANY = "kill", "stop", "any"
 SIGNALS = {KILL: signal.SIGKILL, STOP: signal.SIGSTOP}
 FAULTS = (*map(str, NetworkFault), KILL, STOP)
-PER_RUN = {NetworkFault.DELAY: 10, KILL: 35, ANY: 5}  # faults of a run
-OTHERS = 2  # faults of a run, of all other kinds
-APART = 4  # steps between two faults that a node may be lost to, and after the last one
+PER_RUN = {NetworkFault.DELAY: 10, KILL: 35, ANY: 5}  # number of faults in a run, by kind
+OTHERS = 2  # number of faults in a run of any other kind
+APART = 4  # steps between two faults that may cost a node, and after the last of them
 WAIT_S = 0.05  # between two steps, while a lost node is replaced
-REPLACED_S = 60.0  # for a lost node to be replaced
-TIMEOUT_S = 1.0  # of silence, until a node is asked whether it lives
+REPLACED_S = 60.0  # limit for the replacement of a lost node
+TIMEOUT_S = 1.0  # time without a frame, after which a node gets a ping
 
 
 @dataclass
@@ -37,16 +37,16 @@ class FaultLine:
     nodes: int  # number of nodes at the beginning
     fault: str  # the kind
     runs: int = 0  # number of runs
-    injected: Counter[str] = field(default_factory=Counter)  # faults that have happened, by kind
-    lost: int = 0  # nodes that were given up
-    recoveries: int = 0  # how often the worlds went back to a kept state
+    injected: Counter[str] = field(default_factory=Counter)  # number of faults, by kind
+    lost: int = 0  # number of lost nodes
+    recoveries: int = 0  # number of rollbacks to a kept state
     equal: int = 0  # runs that were equal to the undivided world to the end
-    ended: int = 0  # runs that ended with `WorkerDeathError`: a state was kept by no living node
-    wrong_seeds: list[int] = field(default_factory=list)  # of runs in which anything differed
+    ended: int = 0  # runs that ended with `WorkerDeathError`: no living node kept some state
+    wrong_seeds: list[int] = field(default_factory=list)  # of runs with a difference
 
     @property
     def deaths(self) -> int:
-        """How many processes got SIGKILL."""
+        """The number of processes that got SIGKILL."""
         return self.injected[KILL]
 
     def to_dict(self) -> dict[str, Any]:
@@ -59,7 +59,7 @@ class NodeCampaign:
 
     env: str  # name of the environment
     zones: int  # of each world
-    steps: int  # of each run, at least
+    steps: int  # least number of steps of each run
     lines: tuple[FaultLine, ...]  # one for each number of nodes and kind of fault
 
     @property
@@ -68,7 +68,7 @@ class NodeCampaign:
 
     @property
     def injected(self) -> dict[str, int]:
-        """Kind of fault → how many have happened in all runs."""
+        """The number of faults in all runs, by kind."""
         total: Counter[str] = Counter()
         for line in self.lines:
             total += line.injected
@@ -107,36 +107,37 @@ def verify_node_faults(
     progress: Callable[[int, int], None] | None = None,
     **keys: Unpack[WorldKeys],
 ) -> NodeCampaign:
-    """Drive worlds over nodes beside undivided ones while connections and nodes fail.
+    """Compare worlds over nodes with undivided worlds, while connections and nodes fail.
 
     All connections, to the caller and between nodes, go through a network that delays, damages,
-    cuts or silences one of them at random times; processes are killed or stopped.
+    cuts or silences random connections at random times. Processes are killed or stopped.
 
     Args:
         env: as in `make_vec`, like the other keywords.
         nodes: numbers of nodes.
-        faults: kinds of faults; `ANY` draws among all.
-        seeds: runs for each number of nodes and kind of fault.
-        first_seed: seed of the faults of the first of these runs; that of the next is one higher.
-        zones: of each world; default: twice the most nodes.
-        steps: of each run, at least; a run goes on until all its faults have happened.
-        per_run: faults of a run; default: as `PER_RUN` says. A run with one node has one at most
-            that the node is lost to.
+        faults: kinds of faults; `ANY` draws each fault from all kinds.
+        seeds: number of runs for each number of nodes and kind of fault.
+        first_seed: seed of the faults of the first run; further runs have the next seeds.
+        zones: of each world; default: twice the largest number of nodes.
+        steps: least number of steps of each run; a run continues until all its faults have
+            happened.
+        per_run: number of faults in a run; default: see `PER_RUN`. A run with one node has at most
+            one fault that may cost the node.
         policy: as in `load_policy`.
-        progress: called with runs done and runs in all.
+        progress: called with the number of completed runs and of all runs.
         keys: of the worlds.
 
     Raises:
-        ConfigError: numbers that cannot be.
+        ConfigError: a number is invalid.
     """
     given = WorldSpec.of(env, **keys)
     check_count("steps", steps, MAX_STEPS)
     if not nodes or min(nodes) < 1:
-        raise ConfigError(f"nodes = {list(nodes)}: name at least one number from 1 on")
+        raise ConfigError(f"nodes = {list(nodes)}: must be one or more numbers from 1 on")
     if unknown := [fault for fault in faults if fault not in (*FAULTS, ANY)]:
         raise ConfigError(f"faults = {unknown}: must be among {', '.join((*FAULTS, ANY))}")
     if steps <= FIRST_STEPS:
-        raise ConfigError(f"steps = {steps}: a run needs {FIRST_STEPS + 1} or more")
+        raise ConfigError(f"steps = {steps}: must be at least {FIRST_STEPS + 1}")
     count = 2 * max(nodes) if zones is None else zones
     spec = replace(given, overrides={"workers.timeout_s": TIMEOUT_S, **given.overrides})
     lines = [FaultLine(number, fault) for number in nodes for fault in faults]
@@ -153,7 +154,7 @@ def _run(
     spec: WorldSpec,
     line: FaultLine,
     seed: int,
-    num: int,  # faults
+    num: int,  # number of faults
     zones: int,
     steps: int,
     policy: str | Path,
@@ -181,12 +182,12 @@ def _run(
 
 
 class _Strikes:
-    """The faults of a run: each happens when all nodes live, and some steps after the last one."""
+    """The faults of a run. Each happens while all nodes live, some steps after the one before."""
 
     def __init__(
         self,
         line: FaultLine,
-        num: int,  # faults
+        num: int,  # number of faults
         pair: ComparedWorlds,
         network: FaultyNetwork,
         drawn: random.Random,
@@ -198,15 +199,15 @@ class _Strikes:
         kinds = FAULTS if line.fault == ANY else (line.fault,)
         self._kinds = drawn.choices(kinds, k=num)
         self._next_step = FIRST_STEPS + drawn.randrange(APART)
-        self._waits_until_s = 0.0  # for a lost node to be replaced; 0: for none
-        self.signalled: Counter[str] = Counter()  # signals that were sent
+        self._waits_until_s = 0.0  # limit for the replacement of a lost node; 0: none is lost
+        self.signalled: Counter[str] = Counter()  # number of signals, by kind
 
     def are_left(self, step: int) -> bool:
-        """Whether the run has to go on after so many steps."""
+        """Return whether the run must continue after `step` steps."""
         return bool(self._kinds) or step < self._next_step
 
     def due(self, step: int) -> Callable[[], None] | None:
-        """Return what happens during a step."""
+        """Return the fault that happens during a step, or None."""
         if not self._kinds or self._is_replaced_later(step) or step < self._next_step:
             return None
         kind = self._kinds.pop()
@@ -216,9 +217,10 @@ class _Strikes:
         return partial(self._network.strike, NetworkFault(kind))
 
     def _is_replaced_later(self, step: int) -> bool:
-        """Wait a little for a lost node to be replaced; if none comes, go on in the end.
+        """Wait shortly if a lost node is not replaced yet. Return whether to wait more.
 
-        Some steps after that all states are kept by two nodes again.
+        After the replacement, `APART` steps follow, so that two nodes keep each state again. After
+        `REPLACED_S` without a replacement, the faults continue.
         """
         if len(self._pair.worlds.pool.pids) >= self._nodes:
             if self._waits_until_s:

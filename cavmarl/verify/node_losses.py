@@ -1,4 +1,4 @@
-"""Checks that worlds over nodes are the undivided ones, also when nodes are killed."""
+"""Check that worlds over nodes equal undivided worlds, also if nodes are killed."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from cavmarl.parallel.placement.backend_name import NODES, BackendName
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import DrivenRun, same_bytes
 
-FIRST_STEPS = 5  # before any is killed, to know how long a step takes
-LATEST = 1.5  # of a step's time: some are killed between two steps
+FIRST_STEPS = 5  # steps without kills, to measure the duration of a step
+LATEST = 1.5  # latest time of a kill, in durations of a step: some kills are between two steps
 
 
 @dataclass(frozen=True)
 class NodeRun:
-    """One number of nodes beside the undivided worlds."""
+    """The result for one number of nodes."""
 
-    nodes: int  # how many there were at the beginning
-    killed: int  # of them
-    migrations: int  # vehicles that changed their owner
+    nodes: int  # number of nodes at the beginning
+    killed: int  # number of lost nodes
+    migrations: int  # number of changes of owner
     different: int | None  # the first step after which anything differed; None: none
     step_ms: float  # median of the steps in which no node was lost
-    recovery_ms: tuple[float, ...]  # of the others, above that
+    recovery_ms: tuple[float, ...]  # time above this median of the steps in which a node was lost
 
 
 @dataclass(frozen=True)
 class NodeReport:
-    """What was found."""
+    """The result of `verify_nodes`."""
 
-    env: str  # of which environment
+    env: str  # name of the environment
     zones: int  # of each world
-    worlds: int  # stepped together
-    steps: int  # that were compared
+    worlds: int  # number of worlds stepped together
+    steps: int  # number of compared steps
     runs: tuple[NodeRun, ...]  # one for each number of nodes
 
     @property
@@ -73,30 +73,30 @@ def verify_nodes(
     progress: Callable[[int, int], None] | None = None,
     **keys: Unpack[WorldKeys],
 ) -> NodeReport:
-    """Drive worlds over nodes beside undivided ones and compare everything after each step.
+    """Compare worlds over nodes with undivided worlds after each step.
 
     Args:
-        env: as in `make_vec`, like the other keywords; the seed is that of the kills, too.
-        nodes: numbers of them, one run each.
-        kills: nodes that get a SIGKILL at random times in each run; at most all but one.
-        zones: of each world; default: twice the most nodes.
-        worlds: stepped together.
+        env: as in `make_vec`, like the other keywords; the kills have the same seed.
+        nodes: numbers of nodes, one run each.
+        kills: number of nodes that get a SIGKILL at random times in each run; at most all but one.
+        zones: of each world; default: twice the largest number of nodes.
+        worlds: number of worlds stepped together.
         steps: of each run.
         policy: as in `load_policy`.
-        progress: called with steps done and steps in all.
+        progress: called with the number of completed steps and of all steps.
         keys: of the worlds.
 
     Raises:
-        ConfigError: numbers that cannot be.
-        WorkerDeathError: a node and the one that kept its state were lost at about the same time.
+        ConfigError: a number is invalid.
+        WorkerDeathError: a node and the node that keeps its state were lost at about the same time.
     """
     spec = WorldSpec.of(env, **keys)
     check_count("steps", steps, MAX_STEPS)
     if not nodes or min(nodes) < 1:
-        raise ConfigError(f"nodes = {list(nodes)}: name at least one number from 1 on")
+        raise ConfigError(f"nodes = {list(nodes)}: must be one or more numbers from 1 on")
     most = max(steps - FIRST_STEPS, 0)
     if not 0 <= kills <= most:
-        raise ConfigError(f"kills = {kills}: {steps} steps can have up to {most}")
+        raise ConfigError(f"kills = {kills}: must be from 0 to {most} with {steps} steps")
     count = 2 * max(nodes) if zones is None else zones
     found = []
     for n, number in enumerate(nodes):
@@ -119,7 +119,7 @@ def _due(strikes: Mapping[int, Callable[[], object]], step: int) -> Callable[[],
 
 
 class ComparedWorlds:
-    """Worlds over nodes beside undivided ones, with the same driver."""
+    """Worlds over nodes, and undivided worlds with the same driver to compare them with."""
 
     def __init__(
         self,
@@ -128,10 +128,10 @@ class ComparedWorlds:
         zones: int,
         worlds: int,
         policy: str | Path,
-        route: Route = straight,  # where nodes call in order to reach a place
+        route: Route = straight,  # from a place to the place that nodes call to reach it
     ) -> None:
         self._nodes = nodes
-        self._struck: set[int] = set()  # processes that got a signal
+        self._struck: set[int] = set()  # processes that have got a signal
         whole = make_vec(spec.env, num_envs=worlds, **spec.keywords)
         config, base_dir = load_config(spec.env, zones=zones, **spec.keywords)
         world = make_world(config, base_dir)
@@ -146,11 +146,11 @@ class ComparedWorlds:
     def compare(
         self,
         steps: int,
-        due: Callable[[int], Callable[[], object] | None],  # step → what happens during it
-        note: Callable[[int], None],
-        goes_on: Callable[[int], bool] = lambda step: False,  # after more steps than `steps`
+        due: Callable[[int], Callable[[], object] | None],  # step → fault during it, or None
+        note: Callable[[int], None],  # called with the number of completed steps
+        goes_on: Callable[[int], bool] = lambda step: False,  # whether to run more than `steps`
     ) -> NodeRun:
-        """Drive both, and close the nodes."""
+        """Drive and compare the worlds, then close the nodes."""
         different: int | None = None
         calm_ms: list[float] = []
         recovery_ms: list[float] = []
@@ -160,7 +160,7 @@ class ComparedWorlds:
             step = -1
             while (step := step + 1) < steps or goes_on(step):
                 first = self._runs[0].step()
-                if strike := due(step):  # some time in the next step, or soon after it
+                if strike := due(step):  # at a random time in the next step or soon after it
                     latest_s = 1e-3 * LATEST * statistics.median(calm_ms)
                     timers.append(Timer(drawn.uniform(0.0, latest_s), strike))
                     timers[-1].start()
@@ -176,7 +176,7 @@ class ComparedWorlds:
                 note(step + 1)
             for timer in timers:
                 timer.join()
-            one, other = self._hashes()  # a node that was killed last is missed now
+            one, other = self._hashes()  # detects the loss of a node that was killed last
             different = step if different is None and one != other else different
             migrations = self.worlds.migrations
         finally:
@@ -188,7 +188,7 @@ class ComparedWorlds:
         )
 
     def strike(self, drawn: random.Random, number: signal.Signals) -> bool:
-        """Send a signal to a node that has got none yet; return whether there is one."""
+        """Send a signal to a random node that has not got one. Return whether there is one."""
         living = [pid for pid in self.worlds.pool.pids if pid not in self._struck]
         if living:
             pid = drawn.choice(living)

@@ -1,4 +1,4 @@
-"""`SimulatedFaults`: injects faults into the processes, the clocks and the network of a machine."""
+"""`SimulatedFaults`: faults in the processes, the clocks and the network of a simulated machine."""
 
 from __future__ import annotations
 
@@ -17,43 +17,43 @@ from cavmarl.verify.simulated_machine import (
     SimulatedSocket,
 )
 
-SKEW_S = 1e6  # between the clocks of two processes, at most
+SKEW_S = 1e6  # bound of the offset of a clock
 CLOCK_RATES = (0.8, 1.25)
-JUMP_S = 0.3  # of a clock, at most
+JUMP_S = 0.3  # longest jump of a clock
 
 NODE_KINDS = (FrameKind.REPORT, FrameKind.MESSAGES, FrameKind.SHARE, FrameKind.KEEP)
 RECOVERY_KINDS = (FrameKind.SYNC, FrameKind.REPORT, FrameKind.GIVE, FrameKind.MISSED)
 CALLER_KINDS = (FrameKind.COMMAND, FrameKind.RECOVER)
-LATER_FRAMES = 4  # a process dies at one of so many next frames of a kind
+LATER_FRAMES = 4  # a process dies at one of this number of next frames of a kind
 
 
 class Fault(StrEnum):
     """A kind of fault."""
 
-    DELAY = "delay"  # a frame, and what follows it on its connection, arrives up to 0.5 s late
+    DELAY = "delay"  # a frame and its successors on the connection arrive up to 0.5 s late
     SPLIT = "split"  # a frame arrives in two pieces
     OVERTAKE = "overtake"  # a frame arrives after frames that were sent later over other links
     SLOW = "slow"  # the zones of a node take longer
-    CLOCK_SKEW = "clock_skew"  # a clock jumps forward, and goes on at another rate
-    STALE_HEARTBEAT = "stale_heartbeat"  # a node answers late whether it lives, but in time
-    LOST_HEARTBEAT = "lost_heartbeat"  # a node answers too late, and is given up though it lives
-    LOSE = "lose"  # a frame never arrives; those after it do
+    CLOCK_SKEW = "clock_skew"  # a clock jumps forward, and continues at another rate
+    STALE_HEARTBEAT = "stale_heartbeat"  # a node answers a ping late, but within the time limit
+    LOST_HEARTBEAT = "lost_heartbeat"  # a living node answers a ping too late, and is replaced
+    LOSE = "lose"  # a frame never arrives, but its successors do
     DUPLICATE = "duplicate"  # a frame arrives twice
     REORDER = "reorder"  # a frame arrives after the next one of its connection
     DAMAGE = "damage"  # one bit of a frame flips
-    SILENCE = "silence"  # nothing more arrives in one direction of a connection
-    PARTITION = "partition"  # a node and all other processes do not hear each other any more
+    SILENCE = "silence"  # no further bytes arrive in one direction of a connection
+    PARTITION = "partition"  # no further bytes arrive between a node and all other processes
     CUT = "cut"  # a connection ends
-    STOP = "stop"  # a node stops for up to 60 s, and goes on
-    STOP_CALLER = "stop_caller"  # the caller does
+    STOP = "stop"  # a node stops for up to 60 s, and continues
+    STOP_CALLER = "stop_caller"  # the caller stops for up to 30 s, and continues
     KILL = "kill"  # a node dies at any time
-    KILL_AT_POINT = "kill_at_point"  # a node dies while it sends a frame of a kind that is drawn
-    KILL_IN_RECOVERY = "kill_in_recovery"  # a node dies, and one more while it recovers from that
-    END_CALLER = "end_caller"  # the caller dies at any time; all nodes have to end
+    KILL_AT_POINT = "kill_at_point"  # a node dies while it sends a frame of a random kind
+    KILL_IN_RECOVERY = "kill_in_recovery"  # a node dies, and another node dies in the recovery
+    END_CALLER = "end_caller"  # the caller dies at any time; all nodes must end
     END_CALLER_AT_POINT = "end_caller_at_point"  # the caller dies while it sends a frame
 
 
-# No node may be lost to these: the transport and the time limits have to bear them.
+# These faults must not cost a node: the transport and the time limits tolerate them.
 TOLERATED = (
     Fault.DELAY, Fault.SPLIT, Fault.OVERTAKE, Fault.SLOW, Fault.CLOCK_SKEW, Fault.STALE_HEARTBEAT,
     Fault.STOP_CALLER,
@@ -62,73 +62,73 @@ CALLER_DEATHS = (Fault.END_CALLER, Fault.END_CALLER_AT_POINT)
 NODE_DEATHS = (Fault.KILL, Fault.KILL_AT_POINT, Fault.KILL_IN_RECOVERY)
 DEATHS = (*NODE_DEATHS, *CALLER_DEATHS)
 FAULTS = tuple(fault for fault in Fault if fault not in CALLER_DEATHS)
-SEVERE = tuple(fault for fault in FAULTS if fault not in TOLERATED)  # a node may be lost to each
+SEVERE = tuple(fault for fault in FAULTS if fault not in TOLERATED)  # each may cost a node
 
-# Of each frame that is sent: the probability of a fault.
+# The probability of a fault for each frame that is sent.
 TOLERATED_RATES: Mapping[Fault, float] = {
     Fault.DELAY: 0.15,
     Fault.SPLIT: 0.15,
     Fault.OVERTAKE: 0.15,
     Fault.SLOW: 0.08,
     Fault.CLOCK_SKEW: 0.03,
-    Fault.STALE_HEARTBEAT: 0.01,  # that the next report of a node is late
+    Fault.STALE_HEARTBEAT: 0.01,  # the probability that the next report of a node is late
 }
 SEVERE_RATES: Mapping[Fault, float] = dict.fromkeys(SEVERE, 3e-4) | dict.fromkeys(
     NODE_DEATHS, 1.5e-3
 )
-# Where a fault has a rate, severe ones are so far apart that most are recovered from, and a
-# tolerated one is so short that many of them together stay below the time limits.
+# With rates, severe faults have a distance, so that worlds recover from most of them. Tolerated
+# faults are short, so that many of them together stay below the time limits.
 SEVERE_APART_S = (0.0, 1.0)
 SHORT_DELAY_S = 0.01
 SHORT_LAG_S = 0.005
 SHORT_JUMP_S = 0.002
-# A report that is so late is missed by the fastest clock and by the slowest; the answer to the
-# question whether its node lives, which follows it, is in time for both.
+# With this delay of a report, both the fastest and the slowest clock of a caller send a ping, and
+# get the answer, which follows the report, in time.
 STALE_S = (1.28, 1.45)
 
 
 def random_clock(drawn: random.Random) -> tuple[float, float]:
-    """Return what a clock shows at time 0, and its rate."""
+    """Return the offset of a clock at time 0, and its rate."""
     return drawn.uniform(-SKEW_S, SKEW_S), drawn.uniform(*CLOCK_RATES)
 
 
 class SimulatedFaults:
-    """Injects faults, and counts those that have happened.
+    """Injects faults, and counts them.
 
-    A fault that finds nothing to happen to, such as a frame of a connection that sends none, is
-    not counted.
+    A fault without effect, such as a fault in a connection that sends no more frames, is not
+    counted.
 
     Attributes:
-        injected: how many faults of each kind have happened.
+        injected: number of faults that have happened, by kind.
     """
 
     def __init__(
         self,
         machine: SimulatedMachine,
         drawn: random.Random,
-        rates: Mapping[Fault, float],  # of each frame that is sent
+        rates: Mapping[Fault, float],  # probabilities for each frame that is sent
     ) -> None:
         self._machine, self._drawn = machine, drawn
         self.injected: Counter[Fault] = Counter()
         self._rates = tuple(rates.items())
-        self._calm_until_s = math.inf  # no severe fault is drawn for a frame before
+        self._calm_until_s = math.inf  # earliest time of the next severe fault by rate
         self._stale: set[SimulatedProcess] = set()  # nodes whose next report is late
         machine.before_send = self._before_send
 
     @property
     def deaths(self) -> int:
-        """How many processes a fault has ended."""
+        """The number of processes that faults have ended."""
         return sum(self.injected[fault] for fault in DEATHS)
 
     def begin_severe(self) -> None:
-        """From now on draw severe faults, too, for the frames that are sent.
+        """Draw severe faults for sent frames from now on.
 
-        A node that is lost before the worlds begin is the business of what starts the nodes.
+        Before the worlds begin, the starter of the nodes would have to handle lost nodes.
         """
         self._calm_until_s = self._machine.now_s
 
     def happen(self, fault: Fault) -> None:
-        """Let a fault happen to a process or a connection that is drawn, now or soon."""
+        """Inject a fault into a random process or connection, now or soon."""
         drawn = self._drawn
         match fault:
             case Fault.STOP_CALLER:
@@ -176,7 +176,7 @@ class SimulatedFaults:
                 if other := self._node():
                     self._end_at_point(fault, other, RECOVERY_KINDS, later=1)
             case _:
-                raise AssertionError(f"{fault} happens to no node")
+                raise AssertionError(f"{fault} is not a fault of nodes")
 
     # Processes
 
@@ -197,12 +197,12 @@ class SimulatedFaults:
         kinds: Sequence[FrameKind],
         later: int = LATER_FRAMES,
     ) -> None:
-        """End a process as it sends one of the next frames of a kind, or a part of that frame."""
+        """End a process while it sends one of the next frames of a kind."""
         kind, share = self._drawn.choice(kinds), self._drawn.choice((0.0, 0.5, 1.0))
         self._end_at_frame(fault, process, kind, share, self._drawn.randrange(later))
 
     def _end_caller_at_point(self) -> None:
-        """End the caller at a command, or as it orders a recovery from the death of a node."""
+        """End the caller while it sends a command, or orders the recovery from a node's death."""
         drawn, kind = self._drawn, self._drawn.choice(CALLER_KINDS)
         if kind is FrameKind.RECOVER:
             self.happen(Fault.KILL)
@@ -214,8 +214,8 @@ class SimulatedFaults:
         fault: Fault,
         process: SimulatedProcess,
         kind: FrameKind,
-        share: float,  # of the frame, which still goes out
-        left: int,  # frames of the kind that go out before
+        share: float,  # share of the frame that is still sent
+        left: int,  # number of frames of the kind that are sent before
     ) -> None:
         def sent(data: bytes) -> int | None:
             nonlocal left
@@ -243,7 +243,7 @@ class SimulatedFaults:
         return self._drawn.choice(self._drawn.choice(open_ones)) if open_ones else None
 
     def _to_caller(self, node: SimulatedProcess) -> SimulatedSocket | None:
-        """The connection of a node to the caller."""
+        """Return a node's end of its connection to the caller."""
         for pair in self._machine.connections:
             if {node, self._machine.caller} == {pair[0].owner, pair[1].owner}:
                 return pair[0] if pair[0].owner is node else pair[1]
@@ -255,7 +255,7 @@ class SimulatedFaults:
         end: SimulatedSocket | None,
         delay_s: float = 0.5,
     ) -> None:
-        """Let a fault happen to the next frame that one end of a connection sends."""
+        """Inject a fault into the next frame that one end of a connection sends."""
         if end is None or end.other is None:
             return
         drawn = self._drawn
@@ -312,7 +312,7 @@ class SimulatedFaults:
     def _count_overtaken(self, is_overtaken: bool) -> None:
         self.injected[Fault.OVERTAKE] += is_overtaken
 
-    # Faults that are drawn for each frame
+    # Faults by rate
 
     def _before_send(self, end: SimulatedSocket, data: bytes) -> None:
         self._hold_report(end, data)
@@ -346,7 +346,7 @@ class SimulatedFaults:
             self._change_next_frame(fault, end, SHORT_DELAY_S)
 
     def _hold_report(self, end: SimulatedSocket, data: bytes) -> None:
-        """Let a report of a stale node be late, and count the late answers that follow it."""
+        """Delay a report of a stale node, and count the late answer that follows it."""
         machine, node = self._machine, end.owner
         if node not in self._stale or end.other is None or end.other.owner is not machine.caller:
             return
@@ -359,7 +359,7 @@ class SimulatedFaults:
 
 
 def kind_of(data: bytes) -> FrameKind | None:
-    """Return the kind of a frame; None if the bytes do not begin one."""
+    """Return the kind of a frame; None if the bytes are not the start of a frame."""
     if data[: len(MAGIC)] != MAGIC:
         return None
     return FrameKind(int.from_bytes(data[len(MAGIC) + 2 : len(MAGIC) + 4], "little"))
@@ -371,7 +371,8 @@ def counts_by_name(counts: Iterable[tuple[Fault, int]]) -> dict[str, int]:
     return {str(fault): found[fault] for fault in Fault if found.get(fault)}
 
 
-# The place of a change is drawn as a share: how long a frame is does not change what is drawn next.
+# The place of a change is drawn as a share, so that the length of a frame does not affect further
+# random numbers.
 
 
 def _damaged(drawn: random.Random, data: bytes) -> list[bytes]:

@@ -1,9 +1,8 @@
 """`SimulatedMachine`: simulated processes and a simulated network in one real process.
 
-Each simulated process is a thread; one thread runs at a time. A seed determines everything: which
-process runs next, how long bytes are on their way, and which faults happen to them. Time is a
-number that advances when all processes wait. A process can be ended or stopped at each place where
-it sends or waits.
+Each simulated process is a thread; one thread runs at a time. A seed determines the order of
+processes, the delays of bytes, and the faults. Time is a number that advances when all processes
+wait. A process can be ended or stopped wherever it sends or waits.
 """
 
 from __future__ import annotations
@@ -32,25 +31,25 @@ from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 ADDRESS = "node"
-ALIVE_S = 25.0  # until a system ends a connection over which no answer comes
-LATEST_S = 0.002  # that bytes are on their way
-JOIN_S = 5.0  # for a thread to end
-MAX_MOVES = 2_000_000  # of all processes in a run
+ALIVE_S = 25.0  # time without an answer, after which the system ends a connection
+LATEST_S = 0.002  # longest delay of bytes
+JOIN_S = 5.0  # limit for the end of a thread
+MAX_MOVES = 2_000_000  # largest number of turns of all processes in a run
 
 
 class ProcessEndedError(BaseException):
-    """Unwinds the thread of a process that has been ended from outside."""
+    """Unwinds the thread of a process that was ended from outside."""
 
 
 class SimulatedProcess:
     """A process of a simulated machine.
 
     Attributes:
-        slowness_s: by how much each turn of the process is longer, at most.
-        lag_s: by how much its next turn alone is longer.
-        clock: what its clock shows at time 0 of the machine, and the clock's rate.
-        on_send: called with each frame before it is sent; returns how many bytes still go out
-            before the process dies, or None: the process lives on.
+        slowness_s: longest extra delay of each turn of the process.
+        lag_s: extra delay of the next turn only.
+        clock: offset of its clock at time 0 of the machine, and rate of its clock.
+        on_send: called with each frame before it is sent; returns the number of bytes that are
+            sent before the process dies, or None if it does not die.
     """
 
     def __init__(self, machine: SimulatedMachine, name: str) -> None:
@@ -66,7 +65,7 @@ class SimulatedProcess:
         self.sockets: list[SimulatedSocket | SimulatedListener] = []
         self.on_send: Callable[[bytes], int | None] = lambda data: None
         self.failure: BaseException | None = None
-        self.newest_come = -1  # the number of the latest frame that has come, as sent
+        self.newest_come = -1  # largest number of the received frames, in the order of sending
         self._machine = machine
 
     def clock_s(self) -> float:
@@ -78,7 +77,7 @@ class SimulatedProcess:
         self.clock = self.clock_s() + jump_s - rate * self._machine.now_s, rate
 
     def runs_at_s(self, now_s: float) -> float | None:
-        """When it goes on; None: not by itself."""
+        """Return the time when the process continues; None: only after an event."""
         first_s = max(self.stopped_until_s, self.not_before_s, now_s)
         if self.is_ended or self.ready():
             return now_s if self.is_ended else first_s
@@ -86,13 +85,13 @@ class SimulatedProcess:
 
 
 class SimulatedMachine:
-    """Some processes, and what time it is.
+    """Simulated processes, their connections and the simulated time.
 
     Attributes:
-        caller: the process of the thread that made this.
-        now_s: the time.
+        caller: the process of the thread that made the machine.
+        now_s: the present time.
         before_send: called with a socket and a frame before the socket sends the frame.
-        stuck: why the processes cannot go on; empty: they can.
+        stuck: the reason why the processes cannot continue; empty if they can.
     """
 
     def __init__(self, seed: int, world: World) -> None:
@@ -104,13 +103,13 @@ class SimulatedMachine:
         self.numbers = count(100)  # of sockets
         self.connections: list[tuple[SimulatedSocket, SimulatedSocket]] = []
         self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._moves = count()  # of processes, in all
-        self._event_numbers = count()  # of two events at the same time the first one comes first
+        self._moves = count()  # turns of all processes
+        self._event_numbers = count()  # keep the order of events at the same time
         self._threads: list[threading.Thread] = []
         self.frames = count()
         self.before_send: Callable[[SimulatedSocket, bytes], None] = lambda end, data: None
         self.stuck = ""
-        self.caller = self.running = self._new("caller")  # the thread that made this
+        self.caller = self.running = self._new("caller")
 
     def _new(self, name: str) -> SimulatedProcess:
         process = SimulatedProcess(self, name)
@@ -121,7 +120,7 @@ class SimulatedMachine:
         return _System(self, process)
 
     def start(self, name: str, run: Callable[[NodeSystem], None]) -> SimulatedProcess:
-        """Begin a process; it runs when others wait."""
+        """Start a process. It runs when other processes wait."""
         process = self._new(name)
 
         def whole() -> None:
@@ -159,7 +158,7 @@ class SimulatedMachine:
         heapq.heappush(self._events, (time_s, next(self._event_numbers), act))
 
     def end(self, process: SimulatedProcess) -> None:
-        """As SIGKILL: it does nothing more, and its connections end."""
+        """End a process and its connections, like SIGKILL."""
         if not process.is_done:
             process.is_ended = True
             for one in process.sockets:
@@ -168,7 +167,7 @@ class SimulatedMachine:
     def wait(
         self, process: SimulatedProcess, ready: Callable[[], bool], until_s: float | None
     ) -> None:
-        """Let others run until something is so, or until a time."""
+        """Let other processes run until `ready` returns true, or until a time."""
         if process.is_ended:
             raise ProcessEndedError
         process.ready, process.until_s = ready, until_s
@@ -185,10 +184,10 @@ class SimulatedMachine:
             raise ProcessEndedError
 
     def _next(self) -> SimulatedProcess:
-        """The process that runs next, when its time has come; the caller, if none ever will."""
+        """Advance the time and return the next process; the caller, if no process can run."""
         while True:
             if next(self._moves) > MAX_MOVES:
-                self.stuck = "the processes do not come to an end"
+                self.stuck = f"the processes have not ended after {MAX_MOVES} turns"
                 return self.caller
             times = [(one.runs_at_s(self.now_s), one) for one in self.processes]
             due = [one for at_s, one in times if at_s is not None and at_s <= self.now_s]
@@ -198,14 +197,14 @@ class SimulatedMachine:
             if self._events:
                 coming.append(self._events[0][0])
             if not coming:
-                self.stuck = "all processes wait for ever"
+                self.stuck = "all processes wait forever"
                 return self.caller
             self.now_s = max(self.now_s, min(coming))
             while self._events and self._events[0][0] <= self.now_s:
                 heapq.heappop(self._events)[2]()
 
     def outlived(self, patience_s: float) -> list[str]:
-        """The processes that have not ended by themselves so long after the caller, by name."""
+        """Return the names of processes that still run a time after the end of the caller."""
         caller, until_s = self.caller, self.now_s + patience_s
         caller.is_ended = False
         for one in caller.sockets:
@@ -214,7 +213,7 @@ class SimulatedMachine:
         return [process.name for process in self.processes if process is not caller]
 
     def close(self) -> None:
-        """End all processes but the caller."""
+        """End all processes except the caller."""
         self.stuck, self._moves = "", count()
         for process in list(self.processes):
             if process is not self.caller:
@@ -229,14 +228,14 @@ class SimulatedMachine:
 class SimulatedSocket:
     """A `Connection` in memory.
 
-    `Link` sends a whole frame with each call of `sendmsg`.
+    `Link` sends a complete frame with each call of `send`.
 
     Attributes:
-        due: what the network does to the next frame; it returns the pieces that are delivered.
-        on_arrival: called when the next frame arrives, with whether the receiver has got a frame
-            before it that was sent later, over another connection.
-        held_until_s: before this time nothing of this direction arrives.
-        is_mute: whether nothing that is sent arrives, and the sender does not notice.
+        due: the fault of the next frame; it returns the pieces that are delivered.
+        on_arrival: called when the next frame arrives, with whether the receiver already has a
+            frame that was sent later over another connection.
+        held_until_s: no bytes of this direction arrive before this time.
+        is_mute: whether no sent bytes arrive, without notice to the sender.
     """
 
     address, keeps_bytes = ADDRESS, False
@@ -268,7 +267,7 @@ class SimulatedSocket:
             raise BrokenPipeError
         machine.before_send(self, data)
         sent = self.owner.on_send(data)
-        if self.is_closed or self.has_ended:  # a fault has ended it
+        if self.is_closed or self.has_ended:  # by a fault
             raise BrokenPipeError
         change, self.due = self.due, None
         arrived, self.on_arrival = self.on_arrival, None
@@ -284,7 +283,7 @@ class SimulatedSocket:
         return len(data)
 
     def fall_silent(self) -> None:
-        """Let nothing of this direction arrive; the system ends the connection after a while."""
+        """Deliver no more bytes of this direction. Both ends break off after `ALIVE_S`."""
         assert self.other is not None
         self.is_mute = True
         for end in (self, self.other):
@@ -299,7 +298,7 @@ class SimulatedSocket:
         number: int = -1,  # of the frame
         arrived: Callable[[bool], None] | None = None,  # see `on_arrival`
     ) -> None:
-        """Let bytes arrive later, after those that were sent before them."""
+        """Deliver bytes after a delay, and after all bytes sent before."""
         machine, other = self._machine, self.other
         assert other is not None
         at_s = max(machine.now_s, self.held_until_s) + machine.random.uniform(0.0, LATEST_S)
@@ -339,7 +338,7 @@ class SimulatedSocket:
 
 
 class SimulatedListener:
-    """As `Listener`, for callers that have proved that they know the secret."""
+    """A simulated `Listener`, for callers that have proved that they know the secret."""
 
     def __init__(self, machine: SimulatedMachine, owner: SimulatedProcess) -> None:
         self.place: Place = (ADDRESS, next(machine.numbers))
@@ -366,7 +365,7 @@ class SimulatedListener:
 
 
 class _Poll:
-    """As `select.poll`; what is sent never has to wait."""
+    """A simulated `select.poll` that only waits for input; output never waits."""
 
     def __init__(self, machine: SimulatedMachine, process: SimulatedProcess) -> None:
         self._machine, self._process = machine, process
@@ -392,9 +391,9 @@ class _Poll:
 
 
 class _System:
-    """What a process of the machine sees of it; a `NodeSystem`."""
+    """The `NodeSystem` of a process."""
 
-    looks = 0  # it costs nothing to sleep
+    looks = 0  # no busy waiting, because sleep costs no simulated time
 
     def __init__(self, machine: SimulatedMachine, process: SimulatedProcess) -> None:
         self._machine, self._process = machine, process
@@ -414,7 +413,7 @@ class _System:
         if listener is None or listener.owner.is_ended:
             raise ConnectionRefusedError(f"nothing listens at {place}")
         if secret != listener.secret:
-            raise MessageError(f"the process at {place} does not know the secret")
+            raise MessageError(f"the listener at {place} has a different secret")
         here, there = (SimulatedSocket(machine, each) for each in (self._process, listener.owner))
         here.other, there.other = there, here
         machine.connections.append((here, there))

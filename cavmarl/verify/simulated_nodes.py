@@ -1,7 +1,8 @@
-"""A campaign of faults on a simulated machine: thousands of runs, each reproduced from its seed.
+"""A campaign of faults on a simulated machine: many runs, each reproducible from its seed.
 
-The caller and the nodes run the code that real processes run; only the sockets, the clocks and the
-processes are those of `SimulatedMachine`. The clocks of all processes differ in time and in rate.
+The caller and the nodes run the code of real processes; only the sockets, the clocks and the
+processes are those of `SimulatedMachine`. The clocks of the processes have different offsets and
+rates.
 """
 
 from __future__ import annotations
@@ -49,22 +50,22 @@ from cavmarl.verify.simulated_machine import (
     SimulatedProcess,
 )
 
-TIMEOUT_S = 1.0  # of silence, until a node is asked whether it lives
-STARTED = (-2.0, 0.5)  # decimal logarithm of the seconds that the start of a node takes
-THOUGHT_S = 0.15  # that the caller takes between two steps, at most
-WITHIN_S = 0.03  # after the beginning of a step: when a planned fault happens
+TIMEOUT_S = 1.0  # time without a frame, after which a node gets a ping
+STARTED = (-2.0, 0.5)  # range of the decimal logarithm of a node's start in s
+THOUGHT_S = 0.15  # longest pause of the caller between two steps
+WITHIN_S = 0.03  # latest time of a planned fault after the begin of its step
 MAX_SEEDS = 1_000_000
-PATIENCE_S = 100.0  # for nodes to notice that the caller has ended
-FIRST_STEPS = 2  # without planned faults
-HASHED = 4  # in one of so many steps the hash of the state is compared, too
+PATIENCE_S = 100.0  # limit for nodes to notice the end of the caller
+FIRST_STEPS = 2  # number of steps without planned faults
+HASHED = 4  # the hash of the state is also compared, in one step of this number
 
 NONE, TWO, FOUR = "none", "two_at_once", "any_four"
-MANY_TOLERATED, MANY = "many_tolerated", "many"  # faults that are drawn for each frame
+MANY_TOLERATED, MANY = "many_tolerated", "many"  # faults by rate, drawn for each frame
 MIXES = (NONE, *map(str, FAULTS), TWO, FOUR, MANY_TOLERATED, MANY, *map(str, CALLER_DEATHS))
 RATES = {MANY_TOLERATED: TOLERATED_RATES, MANY: {**TOLERATED_RATES, **SEVERE_RATES}}
 
 
-# A world in which many vehicles change their zone, for campaigns that name none.
+# A world in which many vehicles change their zone, for campaigns without an environment.
 BUSY = WorldSpec(
     env="grid4x4",
     overrides={
@@ -87,7 +88,7 @@ class SimulatedNodes:
     ) -> None:
         self.count = nodes
         self._machine, self._drawn = machine, drawn
-        self._ghosts = ghosts  # whether processes that are given up may go on
+        self._ghosts = ghosts  # whether replaced processes may continue to run
         self.listener = SimulatedListener(machine, machine.caller)
         self._processes = [self._start(number) for number in range(nodes)]
 
@@ -115,7 +116,7 @@ class SimulatedNodes:
         self._processes[number] = self._start(number)
 
     def stopped(self) -> set[int]:
-        return set()  # a machine elsewhere does not tell
+        return set()  # unknown, as on another machine
 
     def close(self) -> None:
         """Do nothing: simulated nodes end by themselves."""
@@ -129,19 +130,19 @@ class SimulatedLine:
     mix: str  # of MIXES
     runs: int = 0  # number of runs
     injected: Counter[Fault] = field(default_factory=Counter)  # faults that have happened
-    lost: int = 0  # nodes that were given up
-    recoveries: int = 0  # how often the worlds went back to a kept state
-    replacements: int = 0  # nodes that took the zones of lost ones over during a run
-    migrations: int = 0  # vehicles that changed their owner
+    lost: int = 0  # number of lost nodes
+    recoveries: int = 0  # number of rollbacks to a kept state
+    replacements: int = 0  # number of nodes that replaced lost nodes during a run
+    migrations: int = 0  # number of changes of owner
     equal: int = 0  # runs that were equal to the undivided world to the end
-    ended: int = 0  # runs that ended with `WorkerDeathError`: a state was kept by no living node
+    ended: int = 0  # runs that ended with `WorkerDeathError`: no living node kept some state
     caller_ended: int = 0  # runs in which the caller died, and all nodes ended by themselves
-    wrong: list[str] = field(default_factory=list)  # of each other run: what happened
-    wrong_seeds: list[int] = field(default_factory=list)  # of the same runs
+    wrong: list[str] = field(default_factory=list)  # descriptions of all other runs
+    wrong_seeds: list[int] = field(default_factory=list)  # of these other runs
 
     @property
     def deaths(self) -> int:
-        """How many processes faults have ended."""
+        """The number of processes that faults have ended."""
         return sum(self.injected[fault] for fault in DEATHS)
 
     def to_dict(self) -> dict[str, Any]:
@@ -164,7 +165,7 @@ class SimulatedCampaign:
 
     @property
     def injected(self) -> dict[str, int]:
-        """Kind of fault → how many have happened in all runs."""
+        """The number of faults in all runs, by kind."""
         total: Counter[Fault] = Counter()
         for line in self.lines:
             total += line.injected
@@ -193,7 +194,7 @@ class SimulatedCampaign:
 
 
 class _Reference:
-    """What the undivided world gives, and the actions that drive it."""
+    """The results and the actions of the undivided world."""
 
     def __init__(self, spec: WorldSpec, steps: int, policy: str | Path) -> None:
         vec = make_vec(spec.env, num_envs=1, **spec.keywords)
@@ -228,17 +229,17 @@ def verify_simulated_nodes(
     Args:
         env: as in `make_vec`, like the other keywords.
         nodes: numbers of nodes.
-        mixes: which faults happen, of MIXES.
-        seeds: runs for each number of nodes and mix.
-        first_seed: seed of the faults of the first of these runs; that of the next is one higher.
-        zones: of each world; default: twice the most nodes.
+        mixes: mixes of faults, of MIXES.
+        seeds: number of runs for each number of nodes and mix.
+        first_seed: seed of the faults of the first run; further runs have the next seeds.
+        zones: of each world; default: twice the largest number of nodes.
         steps: of each run.
         policy: as in `load_policy`.
-        progress: called with runs done and runs in all.
+        progress: called with the number of completed runs and of all runs.
         keys: of the worlds.
 
     Raises:
-        ConfigError: numbers that cannot be.
+        ConfigError: a number is invalid.
     """
     given = WorldSpec.of(env, **keys)
     check_count("steps", steps, MAX_STEPS)
@@ -246,9 +247,9 @@ def verify_simulated_nodes(
     if first_seed < 0:
         raise ConfigError(f"first_seed = {first_seed}: must be a whole number from 0 on")
     if not nodes or min(nodes) < 1:
-        raise ConfigError(f"nodes = {list(nodes)}: name at least one number from 1 on")
+        raise ConfigError(f"nodes = {list(nodes)}: must be one or more numbers from 1 on")
     if steps < 2 * FIRST_STEPS:
-        raise ConfigError(f"steps = {steps}: a run needs {2 * FIRST_STEPS} or more")
+        raise ConfigError(f"steps = {steps}: must be at least {2 * FIRST_STEPS}")
     if unknown := [mix for mix in mixes if mix not in MIXES]:
         raise ConfigError(f"mixes = {unknown}: must be among {', '.join(MIXES)}")
     count = 2 * max(nodes) if zones is None else zones
@@ -279,12 +280,12 @@ class _Run:
         self._machine = SimulatedMachine(self._drawn.randrange(1 << 32), world)
         self._machine.caller.clock = random_clock(self._drawn)
         self._faults = SimulatedFaults(self._machine, self._drawn, RATES.get(line.mix, {}))
-        self._losses = 0  # nodes that are lost
-        # nodes lost before, and living when, all nodes kept the state that they can go back to
+        self._losses = 0  # number of lost nodes
+        # numbers of lost and of living nodes at the last state that all nodes have kept
         self._losses_before, self._living = 0, line.nodes
 
     def whole(self) -> None:
-        """Do the run, and note its result in its line."""
+        """Do the run, and add its result to its line."""
         line, machine = self._line, self._machine
         line.runs += 1
         wrong = ""
@@ -298,7 +299,7 @@ class _Run:
             machine.close()
             line.injected += self._faults.injected
         if not wrong and self._losses and self._bears_all:
-            wrong = f"{self._losses} nodes were lost to faults that have to be tolerated"
+            wrong = f"{self._losses} nodes were lost to faults that must be tolerated"
         if wrong:
             line.wrong.append(f"{counts_by_name(self._faults.injected.items())}: {wrong}")
             line.wrong_seeds.append(self._seed)
@@ -306,17 +307,17 @@ class _Run:
             setattr(line, result, getattr(line, result) + 1)
 
     def _result(self) -> str:
-        """Drive the worlds; return how the run came to its end.
+        """Drive the worlds. Return the kind of end: "equal", "ended" or "caller_ended".
 
         Raises:
-            AssertionError: the worlds differ from the reference, or gave up too soon.
+            AssertionError: the worlds differ from the reference, or ended too soon.
         """
         try:
             self._drive()
         except WorkerDeathError as error:
             lost = self._losses - self._losses_before
             if lost < min(2, self._living):  # the state of a lost node is kept by the next one
-                raise AssertionError(f"given up after {lost} losses in a row: {error}") from error
+                raise AssertionError(f"ended after {lost} losses in a row: {error}") from error
             return "ended"
         except ProcessEndedError:
             if not self._machine.caller.is_ended:
@@ -330,7 +331,7 @@ class _Run:
         return self._line.mix in (NONE, MANY_TOLERATED, *TOLERATED)
 
     def _planned(self) -> dict[int, list[Fault]]:
-        """Return the planned faults by the steps in which they happen."""
+        """Return the planned faults by step."""
         drawn, mix, steps = self._drawn, self._line.mix, len(self._reference.results)
         if mix == NONE or mix in RATES:
             return {}
@@ -395,7 +396,7 @@ class _Run:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Log nothing of nodes, which are lost on purpose."""
+    """Disable the log of nodes, which are lost on purpose."""
     log = logging.getLogger("cavmarl.nodes")
     before, log.disabled = log.disabled, True
     try:

@@ -1,4 +1,4 @@
-"""Checks that killed workers change no result: worlds whose workers are killed, beside others."""
+"""Check that killed workers change no result, by comparison with undisturbed worlds."""
 
 from __future__ import annotations
 
@@ -23,41 +23,41 @@ from cavmarl.parallel.processes.worker_pool import Death, Pool
 from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.verify.differences import Arrays, DrivenRun, same_bytes
 
-FIRST_STEPS = 10  # before any is killed, to know how long a step takes
+FIRST_STEPS = 10  # steps without kills, to measure the duration of a step
 PINGS = 500
-LATEST = 1.5  # of a step's time: some are killed when they are already waiting for the next one
-STOPS = 0.25  # share of those that are not killed but stopped
+LATEST = 1.5  # latest time of a kill, in durations of a step: some workers are idle then
+STOPS = 0.25  # share of workers that are stopped instead of killed
 
 
 @dataclass(frozen=True)
 class Kill:
-    """One signal and what became of it."""
+    """One signal to a worker, and the recovery from it."""
 
-    signal: str  # its name
-    worker: int  # that got it
-    step: int  # after which it was noticed
-    idle: bool  # the worker had nothing to do; it was missed when it was to work again
-    cause: str  # of the death, as the pool saw it
-    # from the signal, or from the next command to one that was idle, until the pool knew
+    signal: str  # name of the signal
+    worker: int  # index of the worker
+    step: int  # after which the death was noticed
+    idle: bool  # whether the worker was idle; then the next command to it noticed the death
+    cause: str  # of the death, according to the pool
+    # from the signal, or from the next command to an idle worker, until the pool noticed the death
     noticed_ms: float
-    replaced_ms: float  # from then until the successor had its order
-    recovered_ms: float  # from when the pool knew until the successor had done what was asked for
+    replaced_ms: float  # from then until the successor had its command
+    recovered_ms: float  # from the notice until the successor had completed the command
 
 
 @dataclass(frozen=True)
 class KillReport:
-    """What was found."""
+    """The result of `verify_kills`."""
 
-    env: str  # of which environment
-    worlds: int  # that were stepped together
-    workers: int  # over which they were shared out
-    steps: int  # that were compared
+    env: str  # name of the environment
+    worlds: int  # number of worlds stepped together
+    workers: int  # number of workers
+    steps: int  # number of compared steps
     different: int | None  # the first step after which anything differed; None: none
-    kills: tuple[Kill, ...]  # all of them
+    kills: tuple[Kill, ...]
     step_ms: float  # median of the steps without a death
     ping_us: float  # median of an empty command to all workers, before the first death
     state_hashes: tuple[str, ...]  # of the undisturbed worlds at the end
-    hardware: dict[str, Any]  # that it ran on
+    hardware: dict[str, Any]  # of this machine
 
     @property
     def holds(self) -> bool:
@@ -83,20 +83,20 @@ def verify_kills(
     """Kill and stop workers at random times and compare everything with undisturbed worlds.
 
     Args:
-        env: as in `make_vec`, like the other keywords; the seed is that of the kills, too.
-        kills: how many signals; three in four are SIGKILL, the others SIGSTOP.
+        env: as in `make_vec`, like the other keywords; the kills have the same seed.
+        kills: number of signals; three in four are SIGKILL, the others SIGSTOP.
         backend: where the worlds run, `processes:N`; default: `processes:2`.
         workers: short form: N for `processes:N`.
-        worlds: stepped together; default: two a worker.
-        steps: how many; default: three a kill.
+        worlds: number of worlds stepped together; default: two per worker.
+        steps: number of steps; default: three per kill, and the first steps without kills.
         policy: as in `load_policy`.
-        zones: shadows zones.count.
-        progress: called with steps done and steps in all.
+        zones: replaces zones.count.
+        progress: called with the number of completed steps and of all steps.
         keys: of the worlds.
 
     Raises:
-        ConfigError: numbers that cannot be.
-        WorkerError: workers died that were not killed.
+        ConfigError: a number is invalid.
+        WorkerError: a worker died without a signal.
     """
     spec = WorldSpec.of(env, **keys)
     seed = spec.seed
@@ -106,13 +106,15 @@ def verify_kills(
         where = BackendName(PROCESSES, 2)
     if where.kind != PROCESSES or where.count is None:
         raise ConfigError(
-            f"backend = '{where}': workers are killed of 'processes:N'; nodes by "
+            f"backend = '{where}': use 'processes:N' to kill workers; to kill nodes, run "
             "cavmarl verify nodes --nodes N --kill K"
         )
     if kills < 1:
-        raise ConfigError(f"{kills} kills: must be at least 1")
+        raise ConfigError(f"kills = {kills}: must be at least 1")
     if steps < kills + FIRST_STEPS:
-        raise ConfigError(f"{steps} steps: {kills} kills need at least {kills + FIRST_STEPS}")
+        raise ConfigError(
+            f"steps = {steps}: must be at least {kills + FIRST_STEPS} for {kills} kills"
+        )
     worlds = 2 * where.count if worlds is None else worlds
     wanted = {"num_envs": worlds, "zones": zones, **spec.keywords}
     whole = make_vec(spec.env, **wanted)
@@ -151,7 +153,7 @@ def _pool(vec: CavVectorEnv) -> Pool:
 
 
 def _ping_us(pool: Pool) -> float:
-    """What an empty command to all workers takes, at the median."""
+    """Return the median duration of an empty command to all workers, in µs."""
     found = []
     for _ in range(PINGS):
         began = time.perf_counter()
@@ -161,18 +163,18 @@ def _ping_us(pool: Pool) -> float:
 
 
 class _Killer:
-    """Sends the signals to workers of a pool and finds out what became of them."""
+    """Sends signals to workers of a pool, and matches the deaths with the signals."""
 
     def __init__(self, pool: Pool, random: random.Random) -> None:
         self.random = random
         self.found: list[Kill] = []
         self.pool = pool
-        self._sent: dict[int, tuple[signal.Signals, float]] = {}  # worker → what and when
+        self._sent: dict[int, tuple[signal.Signals, float]] = {}  # worker → signal and its time
         self._seen = 0
         self._calm_s: list[float] = []
 
     def step_ms(self) -> float:
-        """Median of the steps without a death, ms."""
+        """Return the median duration of the steps without a death, in ms."""
         return 1000.0 * statistics.median(self._calm_s)
 
     def watch(self, run: Callable[[], Arrays], step: int, strikes: bool) -> Arrays:
@@ -205,18 +207,18 @@ class _Killer:
         os.kill(self.pool.pids[worker], how)
 
     def _match(self, step: int) -> None:
-        """Say of each new death what it was; one of itself is an error."""
+        """Match each new death with its signal. Raises EvaluationError for a death without one."""
         deaths = self.pool.deaths
         for death in deaths[self._seen :]:
             if death.worker not in self._sent:
                 raise EvaluationError(
-                    f"worker {death.worker} died of itself in step {step}: {death.cause}"
+                    f"worker {death.worker} died without a signal in step {step}: {death.cause}"
                 )
             how, sent_s = self._sent.pop(death.worker)
             self.found.append(_kill(death, how, sent_s, step))
             for worker in self.pool.team_of(death.worker):
                 if worker in self._sent and self._sent[worker][1] < death.replaced_s:
-                    del self._sent[worker]  # it was replaced with the other one
+                    del self._sent[worker]  # it was replaced together with the dead worker
         self._seen = len(deaths)
 
 

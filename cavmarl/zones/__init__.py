@@ -1,4 +1,4 @@
-"""The geometry of a division: zones of a map, their borders, and visibility over them.
+"""The geometry of a division: zones of a map, their borders, and visibility across borders.
 
-Reads `roads` and `driving`; `shards` and `handoff` use it.
+It depends on `roads` and `driving`; `shards` and `handoff` use it.
 """

@@ -1,7 +1,7 @@
-"""How far a shard has to see over its borders: the farthest look of drivers, the longest move.
+"""Distances that a shard must see beyond its borders: drivers' reach and the longest move.
 
-Distances are between centres, in the plane. What is measured along a road is at least as long,
-except over junctions without lanes inside, where vehicles jump.
+Distances are between centres, in the plane. Distances along a road are at least as long, except
+over junctions without internal lanes, where vehicles jump.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import APPROACH_M
 from cavmarl.driving.kernels.motion.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.network import RoadNetwork
 
-ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside them
+ASIDE_M = 10.0  # between the centres of adjacent lanes, and of vehicles beside them
 
 
 def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
-    """The farthest vehicle that a driver's decision can depend on.
+    """Return the distance of the farthest vehicle on which a driver's decision can depend.
 
-    A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks about
-    vehicles that come to it, within `APPROACH_M` of the ends of the lanes that lead to it or are on
-    it, or `MERGES_M` where others turn into a lane, or stand behind it, within `EXIT_LOOK_M`.
+    A driver looks `view_m` ahead. On a junction, or with a stop line within `see_m`, it also
+    considers vehicles that approach the junction and vehicles after it. The approach is within
+    `APPROACH_M` of the end of a lane that leads to the junction or is on it, or within `MERGES_M`
+    where vehicles turn into a lane. After the junction the limit is `EXIT_LOOK_M`.
     """
     longest_m = float(network.links["length_m"].max(initial=0.0))
     junction_m = max(travel.see_m, longest_m)
@@ -39,11 +40,11 @@ def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
 
 
 def longest_move_m(network: RoadNetwork, travel: TripTables, dt: float) -> float:
-    """So far, in m, a vehicle moves in a tick of `dt` seconds, and no further.
+    """Return an upper bound, in m, of a vehicle's move in a tick of `dt` seconds.
 
-    Along its lane at the speed that the dynamics do not exceed, sideways as a lane change goes,
-    over the kinks between the pieces of the map's lines, and over its junctions. In a hairpin the
-    centre of a body leaves the lane for the chord between the bumpers, half its length away.
+    It includes the motion along the lane at the greatest possible speed, the lateral motion of a
+    lane change, and jumps at kinks of the map's lines and at junctions. In a hairpin, the centre of
+    a body is on the chord between its bumpers, up to half its length off the lane.
     """
     _, jump_m = _jumps(network)
     shortest_m = float(network.lanes["length_m"].min())
@@ -54,11 +55,11 @@ def longest_move_m(network: RoadNetwork, travel: TripTables, dt: float) -> float
 
 
 def off_lane_m(network: RoadNetwork, travel: TripTables) -> float:
-    """So far, in m, the centre of a body is from its place in the middle of its lane at most.
+    """Return an upper bound, in m, of the distance of a body's centre from its lane's centre line.
 
-    Beside it by a lane's width while it changes, off it by half its length where its bumpers are
-    round a bend, and with the way of a jump between them on a junction without lanes inside. Agents
-    may be further away, but not than `LOST_M`.
+    It includes a lane's width during a lane change, half a body's length in a bend, and a jump
+    between the bumpers on a junction without internal lanes. Agents may be farther away, but at
+    most `LOST_M`.
     """
     _, jump_m = _jumps(network)
     half_m = 0.5 * float(travel.types["length"].max())
@@ -66,13 +67,13 @@ def off_lane_m(network: RoadNetwork, travel: TripTables) -> float:
 
 
 def _kink_m(network: RoadNetwork) -> float:
-    """The longest way that a place a lane's width aside jumps where a lane turns at once."""
+    """Return the longest jump of a point a lane's width aside, at a kink of a lane's line."""
     lanes, links = network.lanes, network.links
     direction = np.stack([network.points["cos"], network.points["sin"]], axis=1)
     first = lanes["first_point"]
-    last = first + lanes["num_points"] - 2  # of its last piece
+    last = first + lanes["num_points"] - 2  # first point of the last segment
     within = np.ones(len(direction), dtype=bool)
-    within[last + 1] = False  # from there on it is another lane
+    within[last + 1] = False  # the next point belongs to another lane
     within = np.flatnonzero(within)
     before = [direction[within], direction[last[links["from_lane"]]]]
     after = [direction[within + 1], direction[first[links["next_lane"]]]]
@@ -87,14 +88,14 @@ def _kink_m(network: RoadNetwork) -> float:
 
 
 def _ends(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(L, 2) places where each lane starts and where it ends."""
+    """Return the start and the end of each lane, (L, 2) each."""
     first = network.lanes["first_point"]
     points = np.stack([network.points["x"], network.points["y"]], axis=1)
     return points[first], points[first + network.lanes["num_points"] - 1]
 
 
 def _across_m(network: RoadNetwork) -> float:
-    """The farthest from the end of a lane at a junction: a foe's lane, or where a way leads out."""
+    """Return the greatest distance from a lane's end to its exit or to a foe's lane."""
     links = network.links
     starts, ends = _ends(network)
     leaves = ends[links["from_lane"]]
@@ -112,7 +113,7 @@ def _across_m(network: RoadNetwork) -> float:
 
 
 def _jumps(network: RoadNetwork) -> tuple[float, float]:
-    """How many times the way along a road the way in the plane can be, and the longest jump."""
+    """Return the greatest ratio of plane to road distance, and the longest jump in m."""
     links = network.links[network.links["first_internal"] < 0]
     starts, ends = _ends(network)
     jump = ends[links["from_lane"]] - starts[links["to_lane"]]

@@ -1,4 +1,4 @@
-"""`Visibility` says which vehicles zones see over their borders, however the map is cut."""
+"""`Visibility` computes which vehicles zones see beyond their borders, for any partition."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from cavmarl.zones.reach import off_lane_m
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The distances that sight goes by, and what tells on which roads it ends earlier."""
+    """The distances and the roads that limit how far zones see."""
 
     network: RoadNetwork
-    travel: TripTables  # the types of vehicles, and how far they look
-    halo_m: float  # vehicles further away are not seen
-    sure_m: float  # all nearer vehicles are seen; from `halo_m` on, roads are not asked
-    outside_m: float  # how far outside of its zone a vehicle can be whose transfer is late
+    travel: TripTables  # the types of vehicles, and how far drivers look
+    halo_m: float  # vehicles farther away are not seen
+    sure_m: float  # all nearer vehicles are seen; if it is `halo_m`, roads set no limit
+    outside_m: float  # distance outside of its zone of a vehicle whose transfer is late
 
     def halo(self, partition: ZonePartition) -> Halo:
         halo = zone_halo(partition, self.halo_m)
@@ -35,7 +35,7 @@ class Visibility:
         scratch = make_scratch(len(roads.lanes), len(roads.links))
         half_m = 0.5 * float(self.travel.types["length"].max())
         aside_m = off_lane_m(self.network, self.travel)
-        wide_m = self.outside_m + aside_m  # its place on its lane is not further away
+        wide_m = self.outside_m + aside_m  # of a vehicle's position along its lane
         rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
         looks = np.zeros((partition.count, len(roads.lanes)), dtype=LOOK)
         seen_m = self.sure_m

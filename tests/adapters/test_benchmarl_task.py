@@ -84,7 +84,7 @@ def test_every_entry_is_a_task() -> None:
 def test_what_benchmarl_decides_is_refused() -> None:
     from cavmarl.adapters.benchmarl_task import CavTaskClass
 
-    with pytest.raises(ConfigError, match=r"^num_envs: this view decides it"):
+    with pytest.raises(ConfigError, match=r"^num_envs: this view sets it"):
         CavTaskClass("merge", {"num_envs": 2})
-    with pytest.raises(ConfigError, match=r"^action\.kind: this view decides it"):
+    with pytest.raises(ConfigError, match=r"^action\.kind: this view sets it"):
         CavTaskClass("merge", {"overrides": {"action.kind": "discrete"}})

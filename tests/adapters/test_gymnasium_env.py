@@ -69,7 +69,7 @@ def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
     ],
 )
 def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
+    with pytest.raises(ConfigError, match=f"^{key}: this view sets it"):
         gymnasium.make("cavmarl/ring-v5", **arguments)
 
 
@@ -120,5 +120,5 @@ def test_config_holds_nested_keys_of_the_entry() -> None:
     assert made.terms.weights == {**entry.terms.weights, "collision": -9.0}
     with pytest.raises(ConfigError, match="lanes_count"):
         gymnasium.make("cavmarl/merge-v6", config={"lanes_count": 4})
-    with pytest.raises(ConfigError, match="must be a mapping of keys"):
+    with pytest.raises(ConfigError, match="must be a mapping from keys"):
         gymnasium.make("cavmarl/merge-v6", config=[1])

@@ -176,7 +176,7 @@ def test_the_same_seed_gives_the_same_rows() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"agents": 2}, "^agents: this view decides it"),
+        ({"agents": 2}, "^agents: this view sets it"),
         ({"overrides": {"population.agents": 2}}, r"^population\.agents: this view"),
         ({"overrides": {"population.budget": 9}}, r"^population\.budget: this view"),
         ({"num_worlds": 3}, "num_envs = 8: must be a multiple of num_worlds = 3"),
@@ -214,9 +214,9 @@ def test_rows_of_a_world_begin_anew_together() -> None:
     rows = make(autoreset_mode="Disabled")
     rows.reset(seed=5)
     first = np.arange(ROWS) == 0
-    with pytest.raises(ConfigError, match="row 0, which has not ended: its world goes on"):
+    with pytest.raises(ConfigError, match="row 0, which has not ended: its world continues"):
         rows.reset(options={"reset_mask": first})
-    with pytest.raises(ConfigError, match=r"must be \(8,\) and bool, one a row"):
+    with pytest.raises(ConfigError, match=r"must be \(8,\) and bool, one value per row"):
         rows.reset(options={"reset_mask": first[:WORLDS]})
     rng = np.random.default_rng(0)
     whole = waiting = 0

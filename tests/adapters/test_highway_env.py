@@ -128,12 +128,12 @@ def test_faster_drives_faster_and_is_rewarded(make: Any) -> None:
 @pytest.mark.parametrize(
     ("config", "told"),
     [
-        ({"observation": {"type": "Grayscale"}}, "there are Kinematics"),
-        ({"action": {"type": "Meta"}}, "there are DiscreteMetaAction"),
+        ({"observation": {"type": "Grayscale"}}, "must be one of Kinematics"),
+        ({"action": {"type": "Meta"}}, "must be one of DiscreteMetaAction"),
         ({"vehicle_count": 5}, "vehicle_count: no such key"),
         ({"controlled_vehicles": 2}, "drives many"),
         ({"lanes_count": 7}, "maps of 3, 4 lanes"),
-        ({"policy_frequency": 20}, "not below the first"),
+        ({"policy_frequency": 20}, "not be below the first"),
         ({"duration": -1}, "duration = -1: must be above 0"),
         ({"action": {"type": "ContinuousAction", "steering_range": [-1, 2]}}, "symmetric"),
     ],

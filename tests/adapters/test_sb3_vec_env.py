@@ -197,7 +197,7 @@ def test_wrong_use_is_refused(rows: Any) -> None:
     from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
     for key, value in {"autoreset_mode": "NextStep", "copy": False}.items():
-        with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
+        with pytest.raises(ConfigError, match=f"^{key}: this view sets it"):
             CavSb3VecEnv("merge", **{key: value})
     rows.reset()
     with pytest.raises(ActionError, match="must be finite"):

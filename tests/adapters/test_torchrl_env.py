@@ -165,7 +165,7 @@ def test_wrong_use_is_refused() -> None:
     from cavmarl.adapters.torchrl_env import CavTorchRLEnv
 
     for key, value in {"autoreset_mode": "SameStep", "copy": False}.items():
-        with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
+        with pytest.raises(ConfigError, match=f"^{key}: this view sets it"):
             CavTorchRLEnv("merge", **{key: value})
     with pytest.raises(ConfigError, match="seed"):
         make().set_seed(-1)

@@ -63,6 +63,6 @@ def test_damage_and_unknown_ticks_are_one_line(
     lines = written.read_bytes().splitlines(keepends=True)
     written.write_bytes(b"".join(lines[:2] + lines[3:]))
     said = refusal(capsys, "journal", str(written))
-    assert f"error: {written}: line 3 of the log has number 3: lines are missing" in said
+    assert f"error: {written}: line 3 of the log has number 3, so lines are missing" in said
     said = refusal(capsys, "journal", str(written.parent / "none.journal"))
     assert "none.journal" in "".join(said.replace("│", "").split()), "in a box, broken anywhere"

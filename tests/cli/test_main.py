@@ -234,7 +234,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("verify", "zones", "merge", "--layout", "none.json"), "none.json"),
         (
             ("verify", "zones", "merge", "--layout", "grid", "--set", "zones.layout=strips"),
-            "zones.layout stands in overrides and is given as layout",
+            "zones.layout is set both by overrides and by layout",
         ),
         (("evaluate", "merge", "--agents", "-1"), "population.agents = -1"),
         (("evaluate", "merge", "--seed", "-1"), "seed = -1"),

@@ -112,7 +112,7 @@ def test_what_is_no_map_is_told_what_is_one(tmp_path: Path, command: str) -> Non
     path.write_text("# A text\n")
     error = runner.invoke(app, [command, str(path)]).exception
     assert isinstance(error, MapError)
-    assert all(word in str(error) for word in ("is no map", ".net.xml", ".osm", ".xodr"))
+    assert all(word in str(error) for word in ("not a map", ".net.xml", ".osm", ".xodr"))
 
 
 @pytest.mark.parametrize(

@@ -97,14 +97,16 @@ def test_drivers_with_different_forms_are_told_the_keys() -> None:
     said = str(caught.value)
     assert said.startswith("The drivers cities_residual, merge_ippo need different sensors")
     assert "sensors.history.steps is 3 for cities_residual, 0 for merge_ippo" in said
-    assert said.endswith("Run each of these drivers by itself")
+    assert said.endswith("Run each of these drivers in a run of its own")
     with pytest.raises(PolicyError, match="need different sensors"):
         form_of_driver("cities_residual+merge_ippo")
 
 
 @pytest.mark.parametrize("name", ["idm", "idm+random_actions", "shielded:never_yield"])
 def test_scripts_bring_no_sensors(name: str) -> None:
-    with pytest.raises(PolicyError, match=r"is a script.*fits those of the env.*cities_residual"):
+    with pytest.raises(
+        PolicyError, match=r"is a script.*accepts those of the env.*cities_residual"
+    ):
         form_of_driver(name)
 
 
@@ -184,7 +186,7 @@ def test_a_section_that_is_overridden_still_gets_the_form() -> None:
 
 @pytest.mark.parametrize("overrides", [3, "sensors.lidar.rays=3"])
 def test_overrides_are_a_mapping(overrides: Any) -> None:
-    with pytest.raises(ConfigError, match="must be a mapping"):
+    with pytest.raises(ConfigError, match="must map dotted keys to values"):
         with_sensors_of(overrides, "merge_ippo")
 
 

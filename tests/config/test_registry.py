@@ -77,7 +77,7 @@ def test_a_bare_map_file_gets_a_default_environment(here: Path, suffix: str) -> 
 def test_an_unknown_name_is_told_the_nearest_and_all(here: Path) -> None:
     with pytest.raises(UnknownEnvironmentError, match=r"'twon'; did you mean town\?") as told:
         load_config("twon")
-    assert str(told.value).split("There are: ")[1].split(", ") == sorted(entries())
+    assert str(told.value).split("Environments: ")[1].split(", ") == sorted(entries())
 
 
 def test_a_file_that_is_no_map_is_told_which_are(here: Path) -> None:
@@ -88,7 +88,7 @@ def test_a_file_that_is_no_map_is_told_which_are(here: Path) -> None:
 
 def test_a_folder_that_is_no_entry_is_told_what_it_lacks(here: Path) -> None:
     (here / "empty").mkdir()
-    with pytest.raises(UnknownEnvironmentError, match=r"empty: a folder without an env\.yaml"):
+    with pytest.raises(UnknownEnvironmentError, match=r"empty: a folder without env\.yaml"):
         load_config("empty")
 
 
@@ -118,14 +118,14 @@ def test_max_cycles_is_exactly_that_many_steps(ctrl_dt_s: float, max_cycles: int
 
 @pytest.mark.parametrize("max_cycles", [0, -1, True, 2.0, "3"])
 def test_max_cycles_must_be_a_count(max_cycles: object) -> None:
-    with pytest.raises(ConfigError, match=r"max_cycles = .*whole number from 1"):
+    with pytest.raises(ConfigError, match=r"max_cycles = .*whole number, at least 1"):
         load_config("ring", max_cycles=max_cycles)  # type: ignore[arg-type]
 
 
 def test_a_key_cannot_be_given_twice() -> None:
-    with pytest.raises(ConfigError, match=r"population\.agents stands in overrides"):
+    with pytest.raises(ConfigError, match=r"population\.agents is given in overrides"):
         load_config("ring", agents=3, overrides={"population.agents": 4})
-    with pytest.raises(ConfigError, match=r"horizon_s stands in overrides"):
+    with pytest.raises(ConfigError, match=r"horizon_s is given in overrides"):
         load_config("ring", max_cycles=3, overrides={"horizon_s": 4})
 
 

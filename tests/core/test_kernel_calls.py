@@ -111,9 +111,9 @@ def test_arguments_may_be_named_and_left_out() -> None:
 
 @compiled_only
 def test_what_a_kernel_cannot_take_is_a_type_error() -> None:
-    with pytest.raises(TypeError, match=r"argument of builtins\.str: pass NumPy arrays"):
+    with pytest.raises(TypeError, match=r"is a builtins\.str: pass NumPy arrays"):
         same_number("word")
-    with pytest.raises(TypeError, match=r"argument of builtins\.list"):
+    with pytest.raises(TypeError, match=r"is a builtins\.list"):
         same_number([1])
 
 

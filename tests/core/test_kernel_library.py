@@ -113,7 +113,7 @@ def test_a_missing_library_is_refused(copied: Path) -> None:
     with pytest.raises(UnusableLibraryError, match="cannot be read"):
         Library(copied)
     (copied / INDEX_FILE).unlink()
-    with pytest.raises(UnusableLibraryError, match="this installation brings no library"):
+    with pytest.raises(UnusableLibraryError, match="this installation contains no library"):
         Library(copied)
 
 
@@ -131,7 +131,7 @@ def test_a_library_for_another_interpreter_or_of_another_format_is_refused(copie
     with pytest.raises(UnusableLibraryError, match="is for cpython-399"):
         Library(copied)
     _change_index(copied, format=0)
-    with pytest.raises(UnusableLibraryError, match="has format 0, not 1"):
+    with pytest.raises(UnusableLibraryError, match="has format 0, must be 1"):
         Library(copied)
 
 

@@ -198,15 +198,15 @@ def test_what_cannot_be_put_there_is_refused_with_its_cure() -> None:
         inside = vec.network.lane_ids[int(np.flatnonzero(vec.network.lanes["internal"])[0])]
         with pytest.raises(ActionError, match="no such lane; give the id of one"):
             vec.insert_vehicle("nowhere", 1.0)
-        with pytest.raises(ActionError, match="give one of a road"):
+        with pytest.raises(ActionError, match="give a car lane of a road"):
             vec.insert_vehicle(inside, 1.0)
-        with pytest.raises(ActionError, match="m long; give a place on it"):
+        with pytest.raises(ActionError, match="m long; give a position on it"):
             vec.insert_vehicle(lane, float("nan"))
-        with pytest.raises(ActionError, match="there are the worlds 0 to 1"):
+        with pytest.raises(ActionError, match="must be from 0 to 1"):
             vec.insert_vehicle(lane, 1.0, world=2)
         with pytest.raises(ActionError, match="no such edge"):
             vec.close_road("nowhere")
-        with pytest.raises(ActionError, match="not closed; give the id of one that is"):
+        with pytest.raises(ActionError, match="not closed; give the id of a closed edge"):
             vec.open_road(vec.network.edge_ids[0])
         for _ in range(2):
             vec.insert_vehicle(lane, 10.0, world=1)
@@ -215,7 +215,7 @@ def test_what_cannot_be_put_there_is_refused_with_its_cure() -> None:
         vec.insert_vehicle(lane, 10.0, world=0)
         vec.reset()
         vec.insert_vehicle(lane, 10.0, world=1)
-    with pytest.raises(ConfigError, match=r"population\.insertions = 3: .*of one map"):
+    with pytest.raises(ConfigError, match=r"population\.insertions = 3: .*needs a single map"):
         parallel_env("cities", overrides={"population.insertions": 3})
 
 

@@ -72,8 +72,8 @@ def test_what_cannot_be_saved_or_loaded_is_refused() -> None:
     vec.reset(seed=0)
     saved = vec.save_state()
     for other in (make(num_envs=3), make_vec("merge", num_envs=WORLDS, agents=3, background=4)):
-        with pytest.raises(ConfigError, match="the state is one of other worlds, or of another"):
+        with pytest.raises(ConfigError, match="belongs to other worlds, or to another"):
             other.load_state(saved)
     for damaged in (saved[:-1], saved[:50] + b"x" + saved[51:], b""):
-        with pytest.raises(ConfigError, match="the state of worlds is damaged"):
+        with pytest.raises(ConfigError, match="the saved state is damaged"):
             vec.load_state(damaged)

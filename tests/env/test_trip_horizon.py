@@ -71,5 +71,5 @@ def test_it_has_as_long_as_its_way_takes_and_a_cycle_of_each_signal() -> None:
 
 
 def test_a_horizon_that_no_vehicle_can_keep_is_refused() -> None:
-    with pytest.raises(ConfigError, match="1 or more: no vehicle"):
+    with pytest.raises(ConfigError, match="at least 1: no vehicle"):
         cavmarl.make_vec("grid4x4", overrides={"traffic.trip_horizon": 0.5})

@@ -87,7 +87,7 @@ def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
     for shard in simulation.shards:
         shard.worlds.num_rows[:] = shard.worlds.num_owned
     division = simulation.division
-    with pytest.raises(ConfigError, match=f"vehicle {here} entered zone 3, which has not seen"):
+    with pytest.raises(ConfigError, match=f"vehicle {here} entered zone 3, which has no ghost"):
         division.changes.hand_over(0, Switch(here, 0, 3, 1, False))
     with pytest.raises(ConfigError, match=f"zone 0 does not own vehicle {there}"):
         division.changes.hand_over(0, Switch(there, 0, 3, 1, False))

@@ -94,7 +94,7 @@ def test_only_with_fsync_an_append_is_written_out(
 
 def test_a_file_that_exists_is_not_begun_anew(written: Path) -> None:
     before = written.read_bytes()
-    with pytest.raises(JournalError, match=re.escape(f"{written}: exists; go on with it")):
+    with pytest.raises(JournalError, match=re.escape(f"{written}: the journal exists already")):
         Journal(written)
     assert written.read_bytes() == before
 
@@ -201,7 +201,7 @@ def test_paths_that_cannot_be_are_refused_with_a_cure(tmp_path: Path, written: P
         with pytest.raises(JournalError, match=f"{where}.*choose another path"):
             Journal(path)
     for path in (tmp_path / "none.journal", tmp_path, Path("/dev/full")):
-        with pytest.raises(JournalError, match=re.escape(f"{path}: is no file to go on with")):
+        with pytest.raises(JournalError, match=re.escape(f"{path}: there is no such journal")):
             Journal(path, resume=True)
     with pytest.raises(ConfigError, match="sync is 'often'"):
         Journal(tmp_path / "run2.journal", sync="often")  # type: ignore[arg-type]
@@ -226,7 +226,7 @@ def test_a_full_disk_is_an_error_that_leaves_a_journal_to_go_on_with(tmp_path: P
     journal = Journal(path)
     journal.append(log[:2])
     with files_of_at_most(path.stat().st_size + 30):
-        with pytest.raises(JournalError, match=re.escape(f"{path}: ") + ".*make room there"):
+        with pytest.raises(JournalError, match=re.escape(f"{path}: ") + ".*free disk space there"):
             journal.append(log[2:4])
         with pytest.raises(JournalError, match="is closed"):
             journal.append(log[2:4])
@@ -305,8 +305,8 @@ def test_what_no_coordinator_writes_is_refused_with_its_line(tmp_path: Path) -> 
         return str(said.value)
 
     log = eventful().log
-    assert "begins with a RESET" in refused(log[1:])
-    assert "no whole line" in refused([])
+    assert "not begin with a RESET" in refused(log[1:])
+    assert "no complete line" in refused([])
     assert "line 5 of the log: BEGIN of tick 1" in refused([*log[:4], log[3]])
 
 

@@ -25,7 +25,7 @@ def test_a_wider_halo_is_taken_and_a_narrower_one_refused_with_the_numbers() -> 
     narrow = load_config("grid4x4", overrides=SETTINGS | {"zones.halo_m": 120.0})[0]
     with pytest.raises(
         ConfigError,
-        match=r"120 m is too narrow: 121 m = reach 100 m \+ hysteresis 3 m \+ \(2 \+ 1\) ticks",
+        match=r"120 m is too narrow; .* 121 m = reach 100 m \+ hysteresis 3 m \+ \(2 \+ 1\) ticks",
     ):
         halo_m(narrow, 100.0, 4, late_ticks=2)
     assert halo_m(narrow, 99.0, 4, late_ticks=2) == 120.0

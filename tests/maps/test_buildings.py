@@ -113,10 +113,18 @@ def test_polygons_of_sumo_are_read_in_the_frame_of_the_map(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("text", "geo", "words"),
     [
-        (OSM, None, "does not say where it lies"),
+        (OSM, None, "has no georeference"),
         (POLYGONS, GEO, "line 2: <location> has the offset 0.00,0.00"),
-        (POLYGONS.replace("0,0 10,0", "0,nan 10,0"), None, "line 3: <poly> holds no numbers"),
-        (POLYGONS.replace("10,8 0,8 0,0", "10"), None, "line 3: <poly> holds no numbers"),
+        (
+            POLYGONS.replace("0,0 10,0", "0,nan 10,0"),
+            None,
+            "line 3: <poly> has a value that is not a number",
+        ),
+        (
+            POLYGONS.replace("10,8 0,8 0,0", "10"),
+            None,
+            "line 3: <poly> has a value that is not a number",
+        ),
         (OSM.replace(' lon="11.1500"', ""), GEO, "line 2: <node> has no attribute 'lon'"),
         ("<net/>", None, "<net> is the root of no file of buildings"),
         (OSM[:-20], GEO, "broken XML"),

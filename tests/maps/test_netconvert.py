@@ -136,11 +136,11 @@ def test_a_box_elsewhere_is_refused(town: Path, tmp_path: Path) -> None:
         (TOWN.replace("KIND", "footway"), "No edges loaded"),
         ('<osm version="0.6"/>', "No nodes loaded"),
         (TOWN.replace("48.001", "nan").replace("KIND", "residential"), "town.osm: "),
-        ("<html/>", "root of no map"),
+        ("<html/>", "not the root of a map"),
         (TOWN[:200], "line 4: broken XML"),
         ("", "broken XML"),
-        ('<!DOCTYPE o [<!ENTITY a "aa">]><osm>&a;</osm>', "no entities"),
-        ('<!DOCTYPE o SYSTEM "http://example.org/x.dtd"><osm/>', "no document type"),
+        ('<!DOCTYPE o [<!ENTITY a "aa">]><osm>&a;</osm>', "document type or entities"),
+        ('<!DOCTYPE o SYSTEM "http://example.org/x.dtd"><osm/>', "document type or entities"),
     ],
 )
 def test_useless_and_hostile_sources_are_refused(

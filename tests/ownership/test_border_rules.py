@@ -58,11 +58,11 @@ def test_r30_an_overlap_that_does_not_cover_is_refused_with_the_numbers() -> Non
     assert needed_overlap_m(100.0, 2.0, limits, 40.0, 0.05) == 108.0
     fits = Distances(approach_m=10.0, hysteresis_m=2.0, overlap_m=108.0)
     check_coverage(fits, limits, reach_m=100.0, v_max_mps=40.0, dt_s=0.05)
-    with pytest.raises(ConfigError, match=r"107\.9 m is too narrow: 108 m = reach 100 m"):
+    with pytest.raises(ConfigError, match=r"107\.9 m is too narrow; .* 108 m = reach 100 m"):
         check_coverage(
             replace(fits, overlap_m=107.9), limits, reach_m=100.0, v_max_mps=40.0, dt_s=0.05
         )
-    with pytest.raises(ConfigError, match="approach of 1 m is shorter than the way of a tick"):
+    with pytest.raises(ConfigError, match="approach of 1 m is too short"):
         check_coverage(
             replace(fits, approach_m=1.0), limits, reach_m=100.0, v_max_mps=40.0, dt_s=0.05
         )
@@ -96,7 +96,7 @@ def test_r36_a_change_to_a_zone_that_is_no_neighbour_is_refused() -> None:
             assert [switch.vehicle for switch in begun.switches] == [7, 8]
             assert begun.teleports == (7,)
             continue
-        with pytest.raises(ProtocolError, match=r"vehicle 7 of zone 0 .* zone 2, .* to zones 1 in"):
+        with pytest.raises(ProtocolError, match=r"vehicle 7 of zone 0 .* zone 2, .* only zones 1;"):
             bench.begin([(7, 2)])
         bench.begin([(8, 2)])
         checker = TraceChecker(2, 16, near=in_a_row)

@@ -16,7 +16,7 @@ RUN = bytes(range(16))
 
 
 @pytest.mark.parametrize(
-    ("change", "why"), [({"deferral": -1}, "deferral is -1"), ({"attempts": 0}, "attempts is 0")]
+    ("change", "why"), [({"deferral": -1}, "deferral = -1"), ({"attempts": 0}, "attempts = 0")]
 )
 def test_deadlines_that_cannot_work_are_refused(change: dict[str, Any], why: str) -> None:
     with pytest.raises(ConfigError, match=why):
@@ -24,9 +24,9 @@ def test_deadlines_that_cannot_work_are_refused(change: dict[str, Any], why: str
 
 
 def test_distances_that_cannot_work_are_refused() -> None:
-    with pytest.raises(ConfigError, match="not below 0"):
+    with pytest.raises(ConfigError, match="distance below 0"):
         Distances(approach_m=-1.0, hysteresis_m=0.0, overlap_m=10.0)
-    with pytest.raises(ConfigError, match="has to be wider"):
+    with pytest.raises(ConfigError, match="must be wider"):
         Distances(approach_m=10.0, hysteresis_m=0.0, overlap_m=10.0)
 
 

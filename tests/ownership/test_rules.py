@@ -88,7 +88,7 @@ def test_r04_a_logged_decision_is_not_taken_anew() -> None:
     with pytest.raises(ProtocolError, match="not committed"):
         again.begin([])
     for log in ([], bench.log[1:]):
-        with pytest.raises(JournalError, match="begins with a RESET"):
+        with pytest.raises(JournalError, match="not begin with a RESET"):
             Directory.restore(log, range(2), bench)
 
 
@@ -97,7 +97,7 @@ def test_r05_a_tick_is_begun_when_the_one_before_is_committed() -> None:
     bench.begin()
     with pytest.raises(ProtocolError, match="tick 1 is not committed"):
         bench.begin()
-    with pytest.raises(ProtocolError, match="zones \\[0, 1\\] are at work"):
+    with pytest.raises(ProtocolError, match="zones \\[0, 1\\] have not answered"):
         bench.directory.commit({})
 
 
@@ -173,7 +173,7 @@ def test_r12_the_ledger_is_exact_or_the_tick_is_not_committed() -> None:
     assert isinstance(done, Done)
     bench.give(replace(done, removed=(Removed(7, 0),)))
     with pytest.raises(
-        ProtocolError, match="zone 1 at tick 2 removed vehicle 7, which zone 0 owns"
+        ProtocolError, match="zone 1 at tick 2 removed vehicle 7, but zone 0 owns it"
     ):
         bench.commit()
 

@@ -200,7 +200,7 @@ def test_the_judge_refuses_another_switch(
         (Done, "has not said DONE"),
         (Begin, "was sent before it was logged"),
         (Commit, "a tick is decided twice"),
-        (Host, "tells of zones"),
+        (Host, "has the zones"),
         (Reset, "has not said DONE"),
     ],
 )
@@ -255,7 +255,7 @@ def test_the_judge_refuses_a_wrong_ledger(entries: tuple[TraceEntry, ...]) -> No
     lie = replace(
         commit, zones=(zone._replace(owned=zone.owned._replace(digest=1)), *commit.zones[1:])
     )
-    with pytest.raises(ProtocolError, match="does not own what it should"):
+    with pytest.raises(ProtocolError, match="does not own the expected vehicles"):
         judge([*entries[:k], TraceEntry(LOG, lie), *entries[k + 1 :]])
 
 

@@ -103,7 +103,7 @@ NOT_OVER_NODES = "not supported over nodes"
 REFUSED = {
     ("a network simulator", "workers"): OF_THE_CALLER,
     ("a network simulator", "zones over workers"): OF_THE_CALLER,
-    ("repartitions", "zones over workers"): "needs zones that stay",
+    ("repartitions", "zones over workers"): "needs zones that do not change",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
     ("sensor workers", "worlds over nodes"): NOT_OVER_NODES,
     ("balance by LoadScore", "worlds over nodes"): BY_COSTS,

@@ -125,7 +125,7 @@ def test_a_vehicle_that_crosses_before_it_has_a_record_is_offered_in_a_lease_of_
 def test_an_offer_before_the_lease_of_its_episode_is_answered_after_the_lease() -> None:
     hosts, coordinator, division, wires = begun()
     hosts.report()
-    table, row = coordinator._worlds[0].directory.table, division.owned(0, 0)[0]
+    table, row = coordinator.worlds[0].directory.table, division.owned(0, 0)[0]
     before, row["id"] = int(row["id"]), 10**6
     state = division.changes.state(0, 0, 0)
     row["id"] = before

@@ -18,7 +18,10 @@ class Caller:
     """The end that listens: accepts one connection, in a thread."""
 
     def __init__(self, busy_s: float = 0.0) -> None:
-        self.door = Listener("127.0.0.1")
+        self.secret = b"of this test"
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self._server.setblocking(False)
+        self.place: tuple[str, int] = self._server.getsockname()
         self.found: list[Any] = []
         self._busy_s = busy_s
         self._thread = threading.Thread(target=self._run)
@@ -32,7 +35,7 @@ class Caller:
             time.sleep(0.005)
             try:
                 if caller is None:
-                    caller = PendingConnection(self.door._listener.accept()[0], self.door.secret)
+                    caller = PendingConnection(self._server.accept()[0], self.secret)
                 connection = caller.listen()
             except BlockingIOError:
                 continue
@@ -45,7 +48,7 @@ class Caller:
 
     def join(self) -> Any:
         self._thread.join()
-        self.door.close()
+        self._server.close()
         return self.found[0] if self.found else None
 
 
@@ -55,7 +58,7 @@ def test_a_caller_with_the_secret_is_admitted(
 ) -> None:
     monkeypatch.setattr(listener_module, "CALL_S", 0.1)
     caller = Caller(busy_s)
-    wire = call(caller.door.place, caller.door.secret, 5)
+    wire = call(caller.place, caller.secret, 5)
     number, connection = caller.join()
     assert number == 5
     wire.sendall(b"ready")
@@ -68,7 +71,7 @@ def test_a_caller_with_the_secret_is_admitted(
 def test_a_listener_with_another_secret_is_refused() -> None:
     caller = Caller()
     with pytest.raises(MessageError, match="does not know the secret"):
-        call(caller.door.place, b"another", 5)
+        call(caller.place, b"another", 5)
     assert isinstance(caller.join(), EOFError)
 
 
@@ -76,14 +79,14 @@ def test_a_listener_with_another_secret_is_refused() -> None:
     ("said", "error"),
     [
         (b"GET / HTTP/1.1\r\nHost: a\r\n\r\n", MessageError),
-        (listener_module._HELLO.pack(MAGIC, VERSION + 1, 0, bytes(16)), MessageError),
-        (listener_module._HELLO.pack(MAGIC, VERSION, 0, bytes(16)) + bytes(32), MessageError),
+        (listener_module.HELLO.pack(MAGIC, VERSION + 1, 0, bytes(16)), MessageError),
+        (listener_module.HELLO.pack(MAGIC, VERSION, 0, bytes(16)) + bytes(32), MessageError),
         (b"ca", EOFError),
     ],
 )
 def test_strangers_are_refused(said: bytes, error: type[Exception]) -> None:
     caller = Caller()
-    stranger = socket.create_connection(caller.door.place)
+    stranger = socket.create_connection(caller.place)
     stranger.sendall(said)
     stranger.shutdown(socket.SHUT_WR)
     assert isinstance(caller.join(), error)

@@ -107,13 +107,13 @@ def test_repeatedly_killed_nodes_end_the_run(make: Make) -> None:
     vec = make(backend="nodes:2", overrides={"workers.max_retries": 1}, **WANTED)
     drive(vec, steps=2)
     pool = groups_of(vec)[0].pool
-    tell = pool._send_zones
+    tell = pool.send_zones
 
     def strike_and_tell(*told: Any, **more: Any) -> None:
         tell(*told, **more)
         os.kill(pool.pids[0], signal.SIGKILL)
 
-    pool._send_zones = strike_and_tell  # type: ignore[method-assign]
+    pool.send_zones = strike_and_tell  # type: ignore[method-assign]
     os.kill(pool.pids[0], signal.SIGKILL)
     with pytest.raises(WorkerDeathError, match=r"zones 0"):
         drive(vec, steps=2)
@@ -243,15 +243,15 @@ def test_an_interrupted_move_is_undone(
     for each in (whole, vec):
         each.reset(seed=3)
     group, calls = groups_of(vec)[1], [0]
-    become = group.become
+    set_worlds = group.set_worlds
 
     def interrupt(*worlds: Any) -> None:
         calls[0] += 1
         if calls[0] in (1, 4):
             raise KeyboardInterrupt
-        become(*worlds)
+        set_worlds(*worlds)
 
-    monkeypatch.setattr(group, "become", interrupt)
+    monkeypatch.setattr(group, "set_worlds", interrupt)
     for _ in range(20):
         actions = whole.suggest_actions()
         whole.step(actions)

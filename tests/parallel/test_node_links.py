@@ -83,7 +83,7 @@ def test_a_node_sends_for_its_own_zones_only() -> None:
     coordinator = NodeCoordinator([bytes(16)], [0, 0, 1], Limits(), links, [None])
     coordinator.host(Neighbours((frozenset((1,)), frozenset((0, 2)), frozenset((1,)))))
     links.urgent = coordinator.receive
-    table = coordinator._worlds[0].directory.table
+    table = coordinator.worlds[0].directory.table
     done = {
         zone: Done(bytes(16), table.episode, table.tick, zone=zone, incarnation=1)
         for zone in (1, 2, 9)

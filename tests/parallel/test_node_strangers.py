@@ -105,7 +105,7 @@ def test_another_version_of_the_handshake_is_refused() -> None:
     ("code", "room", "words"),
     [
         ("cavmarl of another day", 1, "runs cavmarl of another day.*install the same versions"),
-        ("", 0, "no more nodes are wanted"),
+        ("", 0, "no more nodes are needed"),
     ],
 )
 def test_nodes_that_are_not_needed_are_refused(

@@ -258,7 +258,7 @@ def test_nodes_that_are_lost_while_states_are_kept(
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     worlds = over_nodes(vec)
     doomed = {5: worlds.pool.pids[0], 6: worlds.pool.pids[2]}
-    commit, steps = worlds.pool._commit, [0]
+    commit, steps = worlds.pool.commit, [0]
 
     def strike_and_commit() -> list[memoryview]:
         if steps[0] in doomed:  # all nodes have orders to keep a state, and are in the step
@@ -268,7 +268,7 @@ def test_nodes_that_are_lost_while_states_are_kept(
     def note(step: int) -> None:
         steps[0] = step
 
-    monkeypatch.setattr(worlds.pool, "_commit", strike_and_commit)
+    monkeypatch.setattr(worlds.pool, "commit", strike_and_commit)
     assert same(drive(vec, before=note), whole)
     assert (worlds.pool.losses, worlds.pool.recoveries) == (2, 2)
 
@@ -330,7 +330,7 @@ def test_one_environment_of_pettingzoo() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"nodes": 5, "zones": 4}, "hosted by 1 to 4 nodes"),
+        ({"nodes": 5, "zones": 4}, "needs 1 to 4 nodes"),
         ({"nodes": 0}, "nodes = 0"),
         ({"nodes": 2, "workers": 2}, "leave out workers, or nodes"),
         ({"backend": "nodes:2@here"}, "must be HOST:PORT"),
@@ -354,7 +354,7 @@ def test_calls_that_need_the_worlds_in_this_process_are_refused(make: Make) -> N
     with pytest.raises(ConfigError, match="cannot be copied"):
         vec.worlds.__reduce__()
     vec.reset(seed=0)
-    with pytest.raises(ConfigError, match="the state is one of other worlds"):
+    with pytest.raises(ConfigError, match="the saved state belongs to other worlds"):
         vec.worlds.load_worlds([b"nothing"])
     vec.step(vec.suggest_actions())
 
@@ -370,7 +370,7 @@ def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
     make: Make, monkeypatch: pytest.MonkeyPatch, how: signal.Signals
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
-    start, started = LocalNodes._start, []
+    start, started = LocalNodes.start, []
 
     def start_and_strike(self: LocalNodes, number: int) -> Any:
         process = start(self, number)
@@ -379,7 +379,7 @@ def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
             os.kill(process.pid, how)
         return process
 
-    monkeypatch.setattr(LocalNodes, "_start", start_and_strike)
+    monkeypatch.setattr(LocalNodes, "start", start_and_strike)
     vec = make("grid4x4", zones=4, nodes=2, overrides={"workers.join_timeout_s": 60.0}, **WANTED)
     assert sorted(started) == [0, 0, 1, 1]
     assert same(drive(vec), whole)
@@ -401,7 +401,7 @@ def test_a_node_that_is_lost_while_zones_are_assigned_is_replaced(
     make: Make, monkeypatch: pytest.MonkeyPatch, nodes: int, how: signal.Signals, is_told: bool
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
-    tell, struck = NodePool._send_zones, list[int]()  # processes
+    tell, struck = NodePool.send_zones, list[int]()  # processes
 
     def tell_and_strike(self: NodePool, *told: Any, **more: Any) -> None:
         process = psutil.Process(self.pids[-1 if struck else 0])
@@ -418,7 +418,7 @@ def test_a_node_that_is_lost_while_zones_are_assigned_is_replaced(
         if not is_told:
             tell(self, *told, **more)
 
-    monkeypatch.setattr(NodePool, "_send_zones", tell_and_strike)
+    monkeypatch.setattr(NodePool, "send_zones", tell_and_strike)
     vec = make("grid4x4", zones=4, nodes=nodes, **WANTED)
     assert len(set(struck)) == 2
     assert same(drive(vec), whole)

@@ -174,9 +174,7 @@ def test_a_pool_without_compiled_loops() -> None:
 
 def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> None:
     pool = make(workers=1)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(os, "getpid", lambda: 1)
-        pool._processes.release()
+    assert said_in_fork(pool.close) == ""
     pool.run(ADD)
     assert totals(pool) == [[3.0, MORE]]
 

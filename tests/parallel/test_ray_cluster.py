@@ -41,7 +41,7 @@ def test_more_workers_than_cpus() -> None:
         ({"backend": "ray:5", "zones": 4}, "nodes = 5: a world of 4 zone"),
         (
             {"backend": "ray", "sensor_workers": 1, "overrides": {"rig": "ten_sensors"}},
-            "workers.sensors = 1: worlds over nodes",
+            "workers.sensors = 1: not supported over nodes",
         ),
         ({"backend": "ray", "overrides": {"workers.monitor_cpu": True}}, "workers.monitor_cpu"),
     ],

@@ -346,7 +346,7 @@ def test_parallel_env_has_sensor_workers_too() -> None:
 @pytest.mark.parametrize(
     ("keywords", "said"),
     [
-        ({"overrides": {"rig": {}}, "sensor_workers": 1}, "there is no rig"),
+        ({"overrides": {"rig": {}}, "sensor_workers": 1}, "needs sensors under rig"),
         ({"sensor_workers": -1}, r"workers\.sensors"),
         ({"sensor_workers": 1000}, r"workers\.sensors"),
         ({"sensor_workers": 1, "overrides": {"workers.sensor_placement": "best"}}, "placement"),

@@ -50,7 +50,7 @@ def test_arrays_of_any_size(size: int) -> None:
 @pytest.mark.parametrize("can", [True, False])
 def test_a_fork_writes_the_same_array(can: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not can:  # as on a system without MADV_COLLAPSE
-        monkeypatch.setattr(shared_huge_pages, "_COLLAPSE", -1)
+        monkeypatch.setattr(shared_huge_pages, "COLLAPSE", -1)
     array = huge_shared_zeros(HUGE_BYTES, np.int64)
     pid = os.fork()
     if pid == 0:

@@ -94,6 +94,6 @@ def test_a_changed_image_is_noticed() -> None:
     image = Image(segment)
     image.write(arrays([30], 0))
     np.frombuffer(segment.map(), dtype=np.int64)[20] += 1
-    with pytest.raises(WorkerError, match="not what it wrote"):
+    with pytest.raises(WorkerError, match="is damaged"):
         list(image.read([RECORD]))
     segment.close()

@@ -33,11 +33,11 @@ def test_older_states_are_dropped_when_the_newest_has_arrived_everywhere() -> No
         kept.receive(0, NodeFrame(FrameKind.KEEP, state, memoryview(b"theirs")))
         kept.keep(state, [0, 1, 4])
     assert wires.sent == [(4, 1), (4, 2), (4, 3)]
-    assert (list(kept._own), list(kept._others[0])) == ([2, 3], [2, 3])
+    assert (list(kept.own), list(kept.others[0])) == ([2, 3], [2, 3])
     kept.settle()
     kept.receive(0, NodeFrame(FrameKind.KEEP, 4, memoryview(b"theirs")))  # ahead of this node
     kept.settle()
-    assert (list(kept._own), list(kept._others[0])) == ([3], [3, 4]), "all may go back to 3"
+    assert (list(kept.own), list(kept.others[0])) == ([3], [3, 4]), "all may go back to 3"
 
 
 def test_arrays_have_the_format_of_numpy() -> None:

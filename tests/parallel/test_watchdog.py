@@ -49,8 +49,8 @@ def test_a_child_that_waits_for_the_processor_is_at_work(
     monkeypatch: pytest.MonkeyPatch, state: str, is_at_work: bool
 ) -> None:
     """Other programs may take the processor for seconds, but the child does not sleep."""
-    monkeypatch.setattr(watchdog, "_look", lambda pid: ("S" if pid == 1 else state, 7))
-    monkeypatch.setattr(watchdog, "_started_by", lambda pid: [2])
+    monkeypatch.setattr(watchdog, "read_state", lambda pid: ("S" if pid == 1 else state, 7))
+    monkeypatch.setattr(watchdog, "descendants", lambda pid: [2])
     dog = Watchdog(1, 60.0)
     found = [dog.verdict() for _ in range(3 * STILL_CHECKS)]
     assert (found[-1] is None) == is_at_work

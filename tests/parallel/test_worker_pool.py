@@ -24,6 +24,7 @@ from tests.support.pools import (
     MORE,
     Make,
     alive,
+    committed_image,
     gone,
     gone_soon,
     in_time,
@@ -107,10 +108,10 @@ def test_a_worker_that_dies_at_a_point_of_a_command(make: Make, point: int, tmp_
 def test_a_damaged_image_is_refused(make: Make) -> None:
     pool = make(workers=1)
     pool.run(ADD)
-    image = pool._processes._resources.segments[2 + pool._committed].map()
+    image = committed_image(pool)
     image[200] ^= 1
     os.kill(pool.pids[0], signal.SIGKILL)
-    with pytest.raises(WorkerFailureError, match="not what it wrote"):
+    with pytest.raises(WorkerFailureError, match="is damaged"):
         pool.run(ADD)
 
 
@@ -237,7 +238,7 @@ def test_a_server_whose_pool_has_gone_prints_nothing() -> None:
     """Ctrl-C ends the pool while the server starts, which shows no traceback."""
     pool, server = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     pool.close()
-    worker_loop._send(server, {"ready": 1})
+    worker_loop.send_to_pool(server, {"ready": 1})
     assert server.recv(10) == b""  # then the server ends
     server.close()
 
@@ -278,7 +279,7 @@ def test_a_stopped_start_is_repeated(tmp_path: Path) -> None:
 def test_no_wake_up_is_missed(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(barrier, "SHORT_S", 0.0)
     monkeypatch.setattr(barrier, "LONG_S", 0.0)
-    monkeypatch.setattr(barrier, "_look", lambda theirs, number, yields: False)
+    monkeypatch.setattr(barrier, "look", lambda theirs, number, yields: False)
     pool = make(workers=2)
     rng = random.Random(0)
     for _ in range(400):

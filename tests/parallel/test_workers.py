@@ -179,13 +179,13 @@ def test_a_step_that_kills_all_workers(make: Make, monkeypatch: pytest.MonkeyPat
     vec.reset(seed=0)
     actions = vec.suggest_actions()
     pool = pool_of(vec)
-    fork = WorkerProcesses._fork
+    fork = WorkerProcesses.fork
 
     def fork_and_kill(self: WorkerProcesses, k: int) -> None:
         fork(self, k)
         os.kill(self.processes[k].pid, signal.SIGKILL)
 
-    monkeypatch.setattr(WorkerProcesses, "_fork", fork_and_kill)
+    monkeypatch.setattr(WorkerProcesses, "fork", fork_and_kill)
     os.kill(pool.pids[1], signal.SIGKILL)
     with pytest.raises(
         WorkerDeathError, match=r"worker 1 \(world 1\).*step.*2 .*SIGKILL"

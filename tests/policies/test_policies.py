@@ -144,7 +144,7 @@ def test_only_our_environments_are_taken(wrong: Any) -> None:
 
 
 def test_an_unknown_name_is_told_the_nearest_and_all() -> None:
-    with pytest.raises(PolicyError, match=r"'idn'; did you mean idm\? There are: .*random_actions"):
+    with pytest.raises(PolicyError, match=r"'idn'; did you mean idm\? Drivers: .*random_actions"):
         load_policy("idn", small_vec())
 
 
@@ -306,7 +306,7 @@ def test_code_of_the_working_directory_runs_by_its_path_alone(
         (tmp_path / "agents" / name).write_text(trap)
     monkeypatch.chdir(tmp_path)
     env = parallel_env("ring", agents=1)
-    with pytest.raises(PolicyError, match=r"'idm': is a driver of cavmarl, and .*agents/idm\.py"):
+    with pytest.raises(PolicyError, match=r"'idm': both a driver of cavmarl and .*agents/idm\.py"):
         load_policy("idm", env)
     with pytest.raises(PolicyError, match=r"'mine': .*agents/mine\.py is code.*give its path"):
         load_policy("mine", env)
@@ -314,7 +314,7 @@ def test_code_of_the_working_directory_runs_by_its_path_alone(
         load_policy("agents/mine.py", env)
     (tmp_path / "agents" / "merge_ippo").mkdir()
     (tmp_path / "agents" / "merge_ippo" / "model.safetensors").touch()
-    with pytest.raises(PolicyError, match=r"'merge_ippo': is a driver of cavmarl, and"):
+    with pytest.raises(PolicyError, match=r"'merge_ippo': both a driver of cavmarl and"):
         load_policy("merge_ippo", env)
 
 

@@ -352,7 +352,7 @@ def _pages() -> Iterator[ScoreTable]:
     """Tables of other pages."""
     yield ScoreTable("README.md", "environments", (WORLDS,), worlds_table, tuple(WORLD_TEXTS))
     yield ScoreTable("envs/ring22/README.md", "mean speed", (RING22,), ring_page)
-    page = "docs/figures/README.md"
+    tasks, learning = "docs/figures/tasks.md", "docs/figures/learning.md"
     columns: list[tuple[str, str, str, Figure]] = [
         ("trips of `idm`", SCRIPTED, "idm", trips),
         *(
@@ -363,7 +363,7 @@ def _pages() -> Iterator[ScoreTable]:
         ("`random_actions`: collision", SCRIPTED, "random_actions", figure("collision")),
     ]
     write = partial(names_table, "task", SCRIPTED_TASKS, columns)
-    yield ScoreTable(page, "tasks", (SCRIPTED,), write, SCRIPTED_TASKS)
+    yield ScoreTable(tasks, "tasks", (SCRIPTED,), write, SCRIPTED_TASKS)
     columns = [
         ("trips", TRAINED, "NAME_ippo", trips),
         ("success", TRAINED, "NAME_ippo", figure("success", interval="[]")),
@@ -375,8 +375,10 @@ def _pages() -> Iterator[ScoreTable]:
         ("ceiling", TRAINED_ALONE, "idm", figure("success")),
     ]
     write = partial(names_table, "task", TASKS, columns)
-    yield ScoreTable(page, "trained drivers", (TRAINED, TRAINED_ALONE), write, TASKS)
-    yield ScoreTable(page, "messages", (MESSAGES,), messages_table, tuple(LOSSES.values()))
+    yield ScoreTable(tasks, "trained drivers", (TRAINED, TRAINED_ALONE), write, TASKS)
+    yield ScoreTable(
+        "docs/figures/messages.md", "messages", (MESSAGES,), messages_table, tuple(LOSSES.values())
+    )
     rows: Rows = [
         *shares("arrived", "collision", "off_road", "unfinished", "red_light", "wrong_way"),
         (
@@ -387,17 +389,17 @@ def _pages() -> Iterator[ScoreTable]:
         DELAY,
     ]
     heads = [(f"`{name}`", MERGE_240, name) for name in drivers_of(MERGE_240)]
-    yield ScoreTable(page, "merge in 240 s", (MERGE_240,), partial(drivers_table, heads, rows))
+    yield ScoreTable(learning, "merge in 240 s", (MERGE_240,), partial(drivers_table, heads, rows))
     heads = [(f"`{name}`", CITIES_1000, name) for name in drivers_of(CITIES_1000)]
     write = partial(drivers_table, heads, RESIDUAL_ROWS)
-    yield ScoreTable(page, "cities of seed 1000", (CITIES_1000,), write)
+    yield ScoreTable(learning, "cities of seed 1000", (CITIES_1000,), write)
     heads = [
         (title, filled(RESIDUAL, seed), driver)
         for seed in SEEDS
         for title, driver in ((f"seed {seed}", "cities_residual"), ("`idm`", "idm"))
     ]
     write = partial(drivers_table, heads, RESIDUAL_ROWS)
-    yield ScoreTable(page, "cities of other seeds", (RESIDUAL,), write, SEEDS)
+    yield ScoreTable(learning, "cities of other seeds", (RESIDUAL,), write, SEEDS)
 
 
 TABLES: tuple[ScoreTable, ...] = (*_cards(), *_pages())

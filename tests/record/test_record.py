@@ -85,7 +85,7 @@ def test_commands_of_a_table_have_jobs(table: Any) -> None:
 
 def test_a_driver_that_several_tables_show_is_driven_once() -> None:
     (card,) = tables_named(["agents/exit_ippo/README.md"])
-    (all_tasks,) = tables_named(["docs/figures/README.md:trained drivers"])
+    (all_tasks,) = tables_named(["docs/figures/tasks.md:trained drivers"])
     assert {job.key for job in card.jobs} < {job.key for job in all_tasks.jobs}
 
 
@@ -162,7 +162,7 @@ def test_results_that_are_there_are_not_driven_again(tmp_path: Path) -> None:
 
 def test_a_page_without_scores_is_refused_with_those_that_have_some() -> None:
     page = "docs/guides/bring_a_map.md"
-    with pytest.raises(CavmarlError, match=rf"{page}.*(?s:.*)docs/figures/README\.md:tasks"):
+    with pytest.raises(CavmarlError, match=rf"{page}.*(?s:.*)docs/figures/tasks\.md:tasks"):
         tables_named([page])
 
 

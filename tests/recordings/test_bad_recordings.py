@@ -158,7 +158,7 @@ def test_a_recording_takes_no_others_place(good: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot record there"):
         make_vec("ring", record=tmp_path / "file")
     env = parallel_env("ring", record=tmp_path / "one")
-    with pytest.raises(EpisodeError, match="recorded already"):
+    with pytest.raises(EpisodeError, match="is being recorded"):
         env.record(tmp_path / "two")
     env.close()
 

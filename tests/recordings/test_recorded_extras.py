@@ -117,7 +117,7 @@ def test_messages_are_all_that_were_sent(tmp_path: Path) -> None:
     [
         (("pictures",), {}, "must be of observations, samples, messages"),
         (("samples",), {}, "no vehicle carries sensors: set rig"),
-        (("messages",), {}, "none are sent: set v2x.enabled"),
+        (("messages",), {}, "no messages are sent: set v2x.enabled"),
         (("messages",), {"workers": 2, "zones": 2}, "use backend='local'"),
         (
             ("observations",),

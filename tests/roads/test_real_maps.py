@@ -206,7 +206,7 @@ def test_a_generated_network_is_read_whole(tmp_path: Path, options: list[str]) -
 
 @pytest.mark.parametrize("name", NOT_FOR_CARS)
 def test_a_network_without_roads_is_refused(name: str) -> None:
-    with pytest.raises(MapError, match="no lane that a road vehicle may use"):
+    with pytest.raises(MapError, match="no lane that road vehicles may use"):
         read_network(game(name))
 
 

@@ -164,8 +164,8 @@ BROKEN = {
     "name taken": ("", ('programID="night"', 'programID="0"'), "two programs '0'"),
     "no duration": ("", ('<phase duration="5"', "<phase"), "line 4: <phase> has no attribute"),
     "no number": ("", ('duration="5"', 'duration="inf"'), "duration='inf'"),
-    "no phase": ("", ('state="Grr"', 'state="Grr" next="7"'), "leads to phase 7"),
-    "unknown program": (WEEK, ('to="night"', 'to="day"'), "no program 'day'; there are 0, night"),
+    "no phase": ("", ('state="Grr"', 'state="Grr" next="7"'), "leads to the missing phase 7"),
+    "unknown program": (WEEK, ('to="night"', 'to="day"'), "no program 'day'; use one of 0, night"),
     "unknown timetable": (WEEK, ('wautID="week"', 'wautID="year"'), "unknown WAUT 'year'"),
 }
 

@@ -115,7 +115,7 @@ def test_every_class_of_vehicles_has_a_semantic_class() -> None:
     [
         ({"type": "semantic_camera", "noise": [0.1]}, r"rig\.wrong\.noise = .*must be 0"),
         ({"type": "bev_grid", "bias": [0.1]}, r"rig\.wrong\.bias = .*must be 0"),
-        ({"type": "bev_grid", "roll_deg": 1.0}, r"rig\.wrong\.roll_deg = 1.*straight down"),
+        ({"type": "bev_grid", "roll_deg": 1.0}, r"rig\.wrong\.roll_deg = 1.*is horizontal"),
         ({"type": "depth_camera", "fov_deg": 180.0}, r"rig\.wrong\.fov_deg"),
         ({"type": "depth_camera", "width": 4096, "height": 4096}, "more than"),
         ({"type": "lidar", "rays": 0}, r"rig\.wrong\.rays"),

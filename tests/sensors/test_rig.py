@@ -163,7 +163,9 @@ def test_a_rig_has_a_name_or_a_file(tmp_path: Path) -> None:
     entry.write_text("{name: mine, map: {source: a.net.xml}, rig: own.yaml}", encoding="utf-8")
     assert list(load_config(tmp_path)[0].rig) == ["wheels"]
     assert list(load_config("merge", overrides={"rig": str(own)})[0].rig) == ["wheels"]
-    with pytest.raises(ConfigError, match=r"rig = 'eleven': no such rig; there are .*ten_sensors"):
+    with pytest.raises(
+        ConfigError, match=r"rig = 'eleven': no such rig; give one of .*ten_sensors"
+    ):
         load_config("merge", overrides={"rig": "eleven"})
     with pytest.raises(ConfigError, match="No such file"):
         load_config("merge", overrides={"rig": "nowhere.yaml"})

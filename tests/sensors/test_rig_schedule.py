@@ -85,10 +85,10 @@ def test_a_minute_has_as_many_samples_as_the_rate_says(
         ({"type": "gnss", "rate_hz": 0}, "must be a number from 0.001"),
         ({"type": "gnss", "rate_hz": 5, "phase_ticks": 4}, "phase_ticks = 4: must be from 0 to 3"),
         ({"type": "imu", "rate_hz": 100, "phase_ticks": 1}, "must be from 0 to 0"),
-        ({"type": "gnss", "rate_hz": 5, "noise": [1.0, 2.0]}, "must be one number or 3"),
+        ({"type": "gnss", "rate_hz": 5, "noise": [1.0, 2.0]}, "must be one number, or 3"),
         ({"type": "gnss", "rate_hz": 5, "dropout": 1.5}, "dropout = 1.5"),
         ({"type": "depth_camera", "rate_hz": 5, "width": 4000, "height": 4000}, "fewer pixels"),
-        ({"type": "lidr", "rate_hz": 5}, r"rig\.a\.type = 'lidr': no such type; there are lidar"),
+        ({"type": "lidr", "rate_hz": 5}, r"rig\.a\.type = 'lidr': must be one of lidar"),
         ({"rate_hz": 5}, "a mapping of keys with a type, one of lidar"),
         ({"type": "lidar", "rate_hz": 5, "rayz": 9}, r"did you mean rig\.a\.rays"),
         ({"type": "lidar", "rate_hz": 5, "range_km": 9}, "use range_m"),
@@ -106,5 +106,5 @@ def test_rates_that_are_proposed_are_taken(rate: float) -> None:
 
 @pytest.mark.parametrize("name", ["Roof", "a.b", "", "9a", "a" * 65])
 def test_names_are_plain(name: str) -> None:
-    with pytest.raises(ConfigError, match="the name of a sensor"):
+    with pytest.raises(ConfigError, match="a sensor's name"):
         load_config("merge", overrides={"rig": {name: {"type": "collision"}}})

@@ -277,9 +277,9 @@ def test_refusals_have_their_types() -> None:
         unpacked(state + b"\0", vehicle, TICK)
     with pytest.raises(MessageError, match="begins with"):
         unpacked(b"CVMO" + state[4:], vehicle, TICK)
-    with pytest.raises(MessageError, match=r"version 3\.0; this build reads 2\."):
+    with pytest.raises(MessageError, match=r"version 3\.0, but this build reads 2\."):
         unpacked(state[:4] + struct.pack("<H", 3) + state[6:], vehicle, TICK)
-    with pytest.raises(MessageError, match=f"expected is vehicle {vehicle + 1}"):
+    with pytest.raises(MessageError, match=f"expected vehicle {vehicle + 1}"):
         unpacked(state, vehicle + 1, TICK)
     with pytest.raises(MessageError, match=f"at tick {TICK + 1}"):
         unpacked(state, vehicle, TICK + 1)
@@ -298,9 +298,9 @@ def test_an_unknown_status_and_a_foreign_agent_are_refused() -> None:
     state, vehicle = a_state()
     with pytest.raises(MessageError, match="unknown transfer status 7"):
         unpacked(patched(state, "transfer", 7), vehicle, TICK)
-    with pytest.raises(MessageError, match=f"agent {AGENTS}; here are {AGENTS}"):
+    with pytest.raises(MessageError, match=f"agent {AGENTS}, but there are {AGENTS}"):
         unpacked(patched(state, "agent", AGENTS), vehicle, TICK)
-    with pytest.raises(MessageError, match="control_latency_ticks or sensors"):
+    with pytest.raises(MessageError, match="control_latency_ticks and sensors"):
         unpacked(patched(state, "agent", -1), vehicle, TICK)
 
 
@@ -310,7 +310,7 @@ def test_another_record_or_environment_is_refused() -> None:
                         for name, kind in VEHICLE.descr])  # fmt: skip
     codec, rows, _, _ = arrays(renamed)
     assert codec.schema != arrays()[0].schema
-    with pytest.raises(MessageError, match="the same cavmarl"):
+    with pytest.raises(MessageError, match="the same version of cavmarl"):
         codec.unpack(state, vehicle, TICK, rows, 0, 0)
     _, rows, commands, frames = arrays()
     for codec in (
@@ -318,7 +318,7 @@ def test_another_record_or_environment_is_refused() -> None:
         TransferCodec(VEHICLE, commands, frames[:, :, 1:]),
     ):
         assert codec.schema != arrays()[0].schema
-        with pytest.raises(MessageError, match="frames; here these are"):
+        with pytest.raises(MessageError, match="of frames, but"):
             codec.unpack(state, vehicle, TICK, rows, 0, 0)
     padded = np.dtype([("id", "i8"), ("agent", "i4"), ("tick", "i8")], align=True)
     with pytest.raises(MessageError, match="padding"):

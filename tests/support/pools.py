@@ -51,6 +51,11 @@ def totals(pool: Pool) -> list[list[float]]:
     return pool.run(TOTAL, commits=False)
 
 
+def committed_image(pool: Pool) -> memoryview:
+    """Return the memory in which the last state of the workers was committed, to damage it."""
+    return pool._processes._resources.segments[2 + pool._committed].map()
+
+
 def alive(pids: list[int]) -> list[int]:
     """Those that are there, and be it as a zombie of ours."""
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]

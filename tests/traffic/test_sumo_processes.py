@@ -219,7 +219,7 @@ def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
         ({"traffic.demand": []}, "traffic.source"),
         ({"sensors.signal.timing": True}, "sensors.signal.timing"),
         ({"clock.sim_dt_s": 0.0125, "clock.ctrl_dt_s": 0.1}, "whole milliseconds"),
-        ({"map.program": {"A0": "1"}}, "SUMO has the signals"),
+        ({"map.program": {"A0": "1"}}, "SUMO runs the signals"),
         ({"sumo.interface": "telnet"}, "sumo.interface"),
         ({"sumo.max_vehicles": 0}, "sumo.max_vehicles"),
         ({"sumo.replay_mib": -1}, "sumo.replay_mib"),

@@ -138,5 +138,5 @@ def test_what_is_no_array_is_refused_and_so_is_a_missing_simulator() -> None:
     world.bus.connect(Wordy())
     with pytest.raises(MessageError, match="dtype RECEPTION"):
         world.tick()
-    with pytest.raises(ConfigError, match="our own"):
+    with pytest.raises(ConfigError, match="external is off"):
         Standing(2).bus.connect(Wordy())

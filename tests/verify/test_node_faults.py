@@ -167,8 +167,8 @@ def test_the_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("nodes", "keys", "words"),
     [
-        ([0], {}, "name at least one number from 1 on"),
-        ([], {}, "name at least one number from 1 on"),
+        ([0], {}, "must be one or more numbers from 1 on"),
+        ([], {}, "must be one or more numbers from 1 on"),
         ([2], {"steps": 5}, "steps = 5"),
         ([2], {"faults": ["flood"]}, "must be among delay"),
     ],

@@ -34,9 +34,9 @@ def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"nodes": ()}, "name at least one"),
+        ({"nodes": ()}, "must be one or more"),
         ({"nodes": (0,)}, "from 1 on"),
-        ({"nodes": (2,), "kills": 30, "steps": 20}, "can have up to 15"),
+        ({"nodes": (2,), "kills": 30, "steps": 20}, "must be from 0 to 15"),
         ({"nodes": (3,), "zones": 2}, "hosted by 1 to 2 nodes"),
     ],
 )

@@ -112,7 +112,7 @@ def test_a_connection_without_answers_ends(world: World) -> None:
 
 def test_processes_that_wait_for_each_other_are_noticed(world: World) -> None:
     machine = SimulatedMachine(0, world)
-    with pytest.raises(AssertionError, match="wait for ever"):
+    with pytest.raises(AssertionError, match="wait forever"):
         machine.wait(machine.caller, lambda: False, None)
 
 
@@ -190,14 +190,14 @@ def test_a_world_that_is_given_up_too_soon(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.moves_of", give_up)
     line = one_line("kill")
-    assert "given up after 1 losses in a row" in line.wrong[0]
+    assert "ended after 1 losses in a row" in line.wrong[0]
 
 
 def test_a_node_that_is_given_up_without_need(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: a late answer is an answer."""
     monkeypatch.setattr("cavmarl.parallel.nodes.node_watch.PONG_S", 0.01)
     line = one_line("stale_heartbeat")
-    assert "nodes were lost to faults that have to be tolerated" in line.wrong[0]
+    assert "nodes were lost to faults that must be tolerated" in line.wrong[0]
 
 
 def test_nodes_that_do_not_heed_an_order_to_go_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,7 +273,7 @@ def test_a_silent_connection_between_two_nodes(
     (line,) = found.lines
     assert len(seen) >= nth
     assert line.lost >= 1
-    assert [text for text in line.wrong if "have to be tolerated" not in text] == []
+    assert [text for text in line.wrong if "must be tolerated" not in text] == []
 
 
 def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -289,7 +289,7 @@ def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(OwnerChanges, "take_over", later)
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **checked)
-    assert "on record are" in found.lines[0].wrong[0]
+    assert "the records have" in found.lines[0].wrong[0]
     unchecked = {**checked, "overrides": {}}
     assert verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **unchecked).holds
 
@@ -321,7 +321,7 @@ def test_a_node_that_says_what_cannot_be_is_lost(
     assert FrameKind.MISSED in kinds
     assert FrameKind.FAILED not in kinds
     assert (line.lost, line.recoveries) == (1, 1)
-    assert "1 nodes were lost to faults that have to be tolerated" in line.wrong[0]
+    assert "1 nodes were lost to faults that must be tolerated" in line.wrong[0]
 
 
 @pytest.mark.slow
@@ -345,8 +345,8 @@ def test_many_runs(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("nodes", "keys", "words"),
     [
-        ([0], {}, "name at least one number"),
-        ([2], {"steps": 3}, "steps = 3: a run needs 4 or more"),
+        ([0], {}, "must be one or more numbers"),
+        ([2], {"steps": 3}, "steps = 3: must be at least 4"),
         ([2], {"mixes": ["flood"]}, "must be among none, delay"),
     ],
 )

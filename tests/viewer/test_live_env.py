@@ -113,7 +113,7 @@ def test_no_such_world_is_told(vec: CavVectorEnv) -> None:
         for world in (3, -1, True, "0", None):
             with connect(shown.address.replace("http", "ws") + "live") as client:
                 client.send(json.dumps({"kind": "hello", "world": world}))
-                assert ended_with(client) == (1003, "no such world: there are 0 to 2")
+                assert ended_with(client) == (1003, "no such world: must be from 0 to 2")
 
 
 def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVectorEnv) -> None:

@@ -57,8 +57,8 @@ def test_shapes_of_a_replay_are_those_of_the_live_page(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("include", "note"),
     [
-        ((), "observations and samples of sensors; --record-also observations,samples"),
-        (("observations",), "recording: samples of sensors; --record-also samples records"),
+        ((), "has no observations and no samples of sensors; --record-also observations,samples"),
+        (("observations",), "recording has no samples of sensors; --record-also samples records"),
     ],
 )
 def test_what_was_not_recorded_is_said(tmp_path: Path, include: tuple[str, ...], note: str) -> None:
@@ -75,5 +75,5 @@ def test_settings_of_another_version_are_said(tmp_path: Path) -> None:
     recording.manifest["world"]["config"]["sensors"]["sonar"] = {"rays": 4}
     found = RecordedSensors(recording, 0, 0).of(tick, vehicle, sensors=True)
     assert found["shapes"] == []
-    assert "another version" in found["note"]
+    assert "that this version can read" in found["note"]
     assert found["observation"]

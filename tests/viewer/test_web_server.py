@@ -221,14 +221,16 @@ def test_a_token_to_watch_gives_no_control(serve: Serve) -> None:
 
 
 def test_other_machines_are_only_served_with_a_token() -> None:
-    with pytest.raises(ServiceError, match=r"--host 0\.0\.0\.0: others can reach it; give a --to"):
+    with pytest.raises(
+        ServiceError, match=r"--host 0\.0\.0\.0: reachable from outside; give a --to"
+    ):
         WebServer(WebOptions(host="0.0.0.0", port=0), [])
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("nonsense", "no JSON"),
+        ("nonsense", "not valid JSON"),
         ("[1]", "a list"),
         ('{"kind": "fly"}', "'fly'"),
         ('{"kind": "watch", "number": -1}', "whole number"),

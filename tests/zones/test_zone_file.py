@@ -72,7 +72,7 @@ def document() -> dict[str, Any]:
             lambda it: it["zones"][4].update(rect_m=[10, 10, 20, 19]),
             r"no zone covers x 10 to 20, y 19 to 20",
         ),
-        (lambda it: it["zones"][1]["rect_m"].__setitem__(2, 31), r"zone 1: .* leaves bounds_m"),
+        (lambda it: it["zones"][1]["rect_m"].__setitem__(2, 31), r"zone 1: .* exceeds bounds_m"),
         (lambda it: it.update(zones=[]), r"there are no zones"),
         (
             lambda it: it.update(zones=[{"id": 0, "rect_m": [0, 0, 1, 1]}] * 300),
@@ -119,5 +119,7 @@ def test_a_file_must_be_of_this_map_and_number(
     write_zones(path, four())
     with pytest.raises(ConfigError, match=r"zones\.count = 2: .*zones\.json has 4 zones; use 4"):
         zones_for(network, path, 2)
-    with pytest.raises(ConfigError, match=r"do not hold the roads of 'crossing', which reach from"):
+    with pytest.raises(
+        ConfigError, match=r"does not contain the roads of 'crossing', which extend from"
+    ):
         zones_for(network, path, 4)

@@ -78,14 +78,16 @@ def test_a_density_is_shared_out_instead_of_lanes(cross: RoadNetwork) -> None:
     crowd = np.array([[x, 0.0, 1.0] for x in range(40)] + [[-90.0, 0.0, 40.0], [70.0, 0.0, 0.0]])
     zones = cut_map(cross, "bisection", 2, density=crowd)
     assert -90.0 < zones.arrays.cuts_x[0] <= 0.0
-    with pytest.raises(ConfigError, match="density: must be rows of x, y and weight"):
+    with pytest.raises(ConfigError, match="density: must be rows of finite x, y and weight"):
         cut_map(cross, "bisection", 2, density=crowd[:, :2])
     with pytest.raises(ConfigError, match="density"):
         cut_map(cross, "bisection", 2, density=crowd * np.nan)
 
 
 def test_no_other_weight_is_known(cross: RoadNetwork) -> None:
-    with pytest.raises(ConfigError, match="weight 'speed': there are lane_length, uniform"):
+    with pytest.raises(
+        ConfigError, match="weight 'speed' does not exist; use lane_length, uniform"
+    ):
         cut_map(cross, "bisection", 2, weight="speed")
 
 
@@ -99,10 +101,10 @@ def test_area_is_shared_out_on_request(cross: RoadNetwork) -> None:
     [
         ("grid", 0, "0 zones: must be a whole number from 1 to 256"),
         ("grid", 257, "257 zones: must be .* to 256"),
-        ("rings", 4, "layout 'rings': there are grid, strips, bisection"),
+        ("rings", 4, "layout 'rings' does not exist; use grid, strips, bisection"),
         ("strips", 50, r"1 rows and 50 columns of a map of 210 m x 210 m .* 210\.00 m x 4\.20 m"),
-        ("grid", 53, r"53 zones: .* at least 5 m: use fewer"),
-        ("bisection", 256, r"more zones than the map can hold: \d+ are left for x .*, y .*"),
+        ("grid", 53, r"53 zones: .* at least 5 m, so use fewer"),
+        ("bisection", 256, r"no cut divides x .*, y .* into \d+ zones"),
     ],
 )
 def test_more_than_the_map_can_hold_is_refused(

@@ -66,9 +66,9 @@ def test_arrays_cannot_be_written() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ((0, 2, 11.0), r"zones 0 and 1 overlap in x 10 to 11, y -30 to 20: take it"),
+        ((0, 2, 11.0), r"zones 0 and 1 overlap in x 10 to 11, y -30 to 20; make one"),
         ((0, 2, 9.0), r"no zone covers x 9 to 10, y -30 to 20"),
-        ((1, 2, 61.0), r"zone 1: .* leaves bounds_m"),
+        ((1, 2, 61.0), r"zone 1: .* exceeds bounds_m"),
         ((1, 2, 10.0), r"zone 1: .* is empty"),
         ((3, 0, np.nan), r"zone 3: .* must be finite"),
         ((3, 3, np.inf), r"zone 3: .* must be finite"),

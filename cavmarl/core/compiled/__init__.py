@@ -1,9 +1,9 @@
-"""Compiled kernels: arrays and scalars in, numbers out. They know no object and no setting.
+"""Compiled kernels: functions of arrays and scalars that use no objects and no settings.
 
-`kernel` is the one place for compiler flags: no fastmath (results must not depend on how a world is
-divided), serial (processes give the parallelism), GIL released, kept on disk.
+`kernel` is the only place with compiler flags: no fastmath (results must not depend on the division
+of a world), serial (processes provide the parallelism), GIL released, code cached on disk.
 
-With `NUMBA_DISABLE_JIT=1` every kernel is plain Python.
+With `NUMBA_DISABLE_JIT=1`, every kernel is plain Python.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ R = TypeVar("R")
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` with the flags that all kernels share, when it is first called.
+    """Compile `function` at its first call, with the flags that all kernels share.
 
-    Its arrays are borrowed from the caller and never counted: with Numba's reference counts, an
-    atomic addition for every access to a bundle of arrays, a tick takes ten times as long
-    (decision 002). So it can neither make an array nor return one.
+    The function borrows its arrays from the caller, and no references are counted. With Numba's
+    reference counts, an atomic addition for every access to a bundle of arrays, a tick takes ten
+    times as long (decision 002). So a kernel can neither create an array nor return one.
     """
     return _make(function, is_inlined=False)
 
 
 def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile as `kernel` does, but always into the callers of the function.
+    """Compile as `kernel` does, but always inline the function into its callers.
 
-    For functions that are called for every vehicle: a call hands over each array of a bundle as
+    For functions that are called for every vehicle: a call would pass each array of a bundle as
     seven numbers.
     """
     return _make(function, is_inlined=True)
 
 
 def inlined_function(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile as `inlined_kernel` does, but only into kernels: Python runs the function itself.
+    """Inline the function into kernels as `inlined_kernel` does, but leave it plain in Python.
 
-    For small functions of numbers that must give Python the same bits as kernels.
+    For small functions of numbers that must return the same bits in Python and in kernels.
     """
     if IS_PLAIN:
         return function

@@ -1,4 +1,4 @@
-"""Tables of addresses that compiled kernels read by name, and that Python fills."""
+"""Tables of addresses that Python fills and compiled kernels read by name."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 class AddressTable:
     """A table that kernels know by its symbol.
 
-    Each place from which kernels are loaded has a copy of its own: LLVM's loader of objects takes
-    the one of this class, and a shared library brings its own.
+    Each place from which kernels are loaded has its own copy: LLVM's loader of objects uses the
+    copy of this class, and each shared library contains one.
     """
 
     def __init__(self, symbol: str, size: int) -> None:
@@ -29,7 +29,7 @@ class AddressTable:
             copy[row] = address
 
     def add_copy(self, library: ctypes.CDLL) -> None:
-        """Fill the copy of a library, if it has one, now and from now on."""
+        """Fill the copy of a library, if it has one, and keep it up to date."""
         if not hasattr(library, self.symbol):
             return
         copy = (ctypes.c_int64 * self.size).in_dll(library, self.symbol)
@@ -42,7 +42,7 @@ _libraries: list[ctypes.CDLL] = []
 
 
 def define_table(symbol: str, size: int) -> AddressTable:
-    """Make a table of 64-bit addresses, all zero."""
+    """Return a new table of 64-bit addresses, all zero."""
     table = AddressTable(symbol, size)
     tables.append(table)
     for library in _libraries:
@@ -51,7 +51,7 @@ def define_table(symbol: str, size: int) -> AddressTable:
 
 
 def attach_library(library: ctypes.CDLL) -> None:
-    """Fill the tables of a library of kernels, now and whenever one of them changes."""
+    """Fill the tables of a library of kernels, and keep them up to date."""
     _libraries.append(library)
     for table in tables:
         table.add_copy(library)

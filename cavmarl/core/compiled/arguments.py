@@ -1,9 +1,9 @@
-"""The arguments of a compiled kernel: their types as text, and the 64-bit words that carry them.
+"""The arguments of a compiled kernel: their types as text, and the 64-bit words that store them.
 
-A compiled kernel is entered with the address of an array of words (`entry_point.py`). A number
+The caller passes the address of an array of words to a compiled kernel (`entry_point.py`). A number
 takes one word, an array the address of its Python object, a record the address of its data, a
-tuple or a bundle the words of its items in order, and `None` no word. The result follows in the
-words behind the arguments.
+tuple or a bundle the words of its items in order, and `None` no word. The words of the result
+follow those of the arguments.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ import numpy as np
 # Bits of `flags.num` that are part of the type of an array.
 _C, _F, _ALIGNED, _WRITEABLE = 0x1, 0x2, 0x100, 0x400
 _TYPED = _C | _F | _ALIGNED | _WRITEABLE
-# Of an array that is contiguous in both orders, as one with a single item, the first order counts.
+# An array that is contiguous in both orders, such as one with a single item, counts as C order.
 _FLAGS = {bits: bits & ~_F if bits & _C else bits for bits in range(_TYPED + 1)}
 _SIGNED_LIMIT = 1 << 63
-_VOID_DATA = tuple.__basicsize__  # offset of the data pointer in a NumPy record: after its head
+_VOID_DATA = tuple.__basicsize__  # offset of the data pointer in a NumPy record, after its header
 
 
 class Words:
@@ -38,7 +38,7 @@ class Words:
         as_bytes = self.signed.cast("B")
         self.floats = as_bytes.cast("d")
         self.unsigned = as_bytes.cast("Q")
-        self.last: tuple[Any, ...] = ()  # the arguments that these words hold
+        self.last: tuple[Any, ...] = ()  # the arguments in these words
 
 
 class ArgumentType:
@@ -46,18 +46,18 @@ class ArgumentType:
 
     Attributes:
         text: the type as text, the same in each process.
-        count: words that an argument takes.
+        count: number of words of an argument.
     """
 
     __slots__ = ("count", "key", "text")
 
     def __init__(self, key: Any, text: str, count: int = 1) -> None:
-        self.key = key  # what `type_key` returns for arguments of this type
+        self.key = key  # the value of `type_key` for arguments of this type
         self.text = text
         self.count = count
 
     def fits(self, new: Any, last: Any = None) -> bool:
-        """Return whether an argument has this type; of `last`, if there is one, it is known."""
+        """Return whether an argument has this type; `last`, if given, is known to have it."""
         return bool(type_of(new).text == self.text)
 
     def write(self, words: Words, at: int, new: Any) -> None:
@@ -65,7 +65,7 @@ class ArgumentType:
         raise NotImplementedError
 
     def update(self, words: Words, at: int, new: Any, last: Any) -> None:
-        """Store an argument in words that hold `last`."""
+        """Store an argument in words that contain `last`."""
         self.write(words, at, new)
 
 
@@ -157,7 +157,7 @@ class _Tuple(ArgumentType):
 
 
 def offsets_of(types: tuple[ArgumentType, ...]) -> tuple[int, ...]:
-    """Return the first word of each argument."""
+    """Return the index of the first word of each argument."""
     offsets, at = [], 0
     for kind in types:
         offsets.append(at)
@@ -172,7 +172,7 @@ _NUMBERS: dict[type[Any], tuple[type[ArgumentType], str]] = {
     np.float64: (_Float, "float64"),
     np.float32: (_Float, "float32"),
     np.uint64: (_Unsigned, "uint64"),
-    # Shorter integers are widened, so that a kernel is not compiled for each length.
+    # Shorter integers are widened, so that no kernel is compiled for each length.
     **dict.fromkeys(
         (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32), (_Signed, "int64")
     ),
@@ -181,7 +181,7 @@ _LAYOUT = re.compile(r"\[(\d+)([CFA])( readonly)?( unaligned)?\]")
 
 
 def type_key(argument: Any) -> Any:
-    """Return a value that is equal for two arguments exactly if their types are."""
+    """Return a value that is equal for two arguments if and only if their types are."""
     python = type(argument)
     if python is np.ndarray:
         return argument.dtype, argument.ndim, _FLAGS[argument.flags.num & _TYPED]
@@ -201,7 +201,7 @@ def type_of(argument: Any) -> ArgumentType:
     """Return the type of an argument.
 
     Raises:
-        TypeError: kernels take no such argument.
+        TypeError: kernels do not accept the argument.
     """
     key = type_key(argument)
     found = _TYPES.get(key)
@@ -226,13 +226,13 @@ def _make_type(argument: Any, key: Any) -> ArgumentType:
         kind, text = _NUMBERS[python]
         return kind(key, text)
     raise TypeError(
-        f"a kernel got an argument of {python.__module__}.{python.__qualname__}: pass NumPy "
+        f"an argument of a kernel is a {python.__module__}.{python.__qualname__}: pass NumPy "
         "arrays, numbers, None, or tuples of these"
     )
 
 
 def _array_text(dtype: np.dtype[Any], ndim: int, flags: int) -> str:
-    """Describe the type of an array: items, dimensions, layout in memory."""
+    """Return the type of an array as text: dtype, dimensions, memory layout."""
     layout = "C" if flags & _C else "F" if flags & _F else "A"
     extra = "" if flags & _WRITEABLE else " readonly"
     extra += "" if flags & _ALIGNED else " unaligned"
@@ -240,13 +240,13 @@ def _array_text(dtype: np.dtype[Any], ndim: int, flags: int) -> str:
 
 
 def accepts(compiled: str, called: str) -> bool:
-    """Return whether code that was compiled for some types can be called with others.
+    """Return whether code that was compiled for some types can be called with other types.
 
-    Code for arrays that are read only never writes to them, and code for any layout (`A`) follows
-    the strides, so both take other arrays, too.
+    Code for read-only arrays never writes to them, and code for any layout (`A`) follows the
+    strides. Both also accept other arrays.
 
     Args:
-        compiled: types that the code was compiled for, as text.
+        compiled: types for which the code was compiled, as text.
         called: types of the arguments of a call, as text.
     """
     if compiled == called:
@@ -277,12 +277,12 @@ def _dtype_text(dtype: np.dtype[Any]) -> str:
 
 
 def result_reader(text: str, at: int) -> tuple[int, Callable[[Words], Any]]:
-    """Return how many words a result takes, and a function that reads it.
+    """Return the number of words of a result, and a function that reads it.
 
     Args:
-        text: the type of the result, as `entry_point.result_text` describes it: `none`, `bool`,
-            `signed`, `unsigned`, `float`, or several of these, each with a comma, for a tuple.
-        at: the first word of the result.
+        text: type of the result, as described by `entry_point.result_text`: `none`, `bool`,
+            `signed`, `unsigned`, `float`; for a tuple several of these, each followed by a comma.
+        at: index of the first word of the result.
     """
     if text == "none":
         return 0, lambda words: None

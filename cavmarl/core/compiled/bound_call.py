@@ -1,9 +1,9 @@
-"""Kernel calls with fixed arguments, and sequences of such calls that run without Python between.
+"""Kernel calls with fixed arguments, and sequences of such calls that run without Python.
 
-A kernel call from Python costs one to three microseconds: the arguments are looked at, a lock is
-released, a result becomes a Python object. In a small world that is most of the time of a tick. A
-`BoundCall` has looked at its arguments once. A `CallSequence` enters many bound calls from one
-compiled loop, which can skip calls by the results of others.
+A kernel call from Python costs one to three microseconds: the arguments are inspected, a lock is
+released, and a result becomes a Python object. In a small world, this is most of the time of a
+tick. A `BoundCall` inspects its arguments once. A `CallSequence` makes many bound calls from one
+compiled loop, and can skip calls depending on earlier results.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ R = TypeVar("R")
 
 
 class BoundCall(Generic[R]):
-    """A kernel with its arguments. The arrays may change, but not be replaced.
+    """A kernel with fixed arguments. Arrays may change their content, but cannot be replaced.
 
-    Only one thread at a time may make the call.
+    Only one thread at a time may call it.
     """
 
     __slots__ = ("_arguments", "_call", "_enter", "_kernel", "_read", "_result", "words")
 
     def __init__(self, kernel: Callable[..., R], arguments: tuple[Any, ...]) -> None:
-        self._arguments = arguments  # kept alive: the words hold their addresses
+        self._arguments = arguments  # kept alive, because the words contain their addresses
         self._kernel = kernel
-        self._result: Any = None  # of the last call without the compiler
+        self._result: Any = None  # of the last call, if the kernel is plain Python
         self._call: Any = None
         self.words = Words(0)
         if isinstance(kernel, Kernel):
@@ -62,26 +62,26 @@ class BoundCall(Generic[R]):
         return int(self._call.address)
 
     def error(self, status: int) -> Exception:
-        """Return the error that a status of the compiled code stands for."""
+        """Return the error for a status of the compiled code."""
         return cast(Exception, self._call.error(status))
 
     def result_address(self, item: int) -> int:
-        """Return the address of the word that holds an item of the last result."""
+        """Return the address of the word with an item of the last result."""
         results = sum(kind.count for kind in self._call.types)
         return int(self.words.address + 8 * (results + item))
 
     def is_set(self, item: int) -> bool:
-        """Return whether an item of the last result, without the compiler, is true."""
+        """Return whether an item of the last result is true, if the kernel is plain Python."""
         result = self._result
         return bool(result[item] if isinstance(result, tuple) else result)
 
 
 def bind(kernel: Callable[P, R], *arguments: P.args, **named: P.kwargs) -> BoundCall[R]:
-    """Return a call of a kernel with these arguments, which `BoundCall` keeps.
+    """Return a call of a kernel with these arguments; the `BoundCall` keeps them alive.
 
     Raises:
-        TypeError: a kernel takes no such arguments.
-        KernelError: the kernel has to be compiled, and may or can not be.
+        TypeError: kernels do not accept one of the arguments.
+        KernelError: the kernel must be compiled, which is not allowed or not possible.
     """
     if isinstance(kernel, Kernel):
         return BoundCall(kernel, kernel.in_order(arguments, named))
@@ -93,7 +93,7 @@ def bind(kernel: Callable[P, R], *arguments: P.args, **named: P.kwargs) -> Bound
 
 
 def keep_last(make: Callable[P, R]) -> Callable[P, R]:
-    """Return a function that calls `make` only if an argument is not the one of the last call."""
+    """Return a function that calls `make` only if an argument differs from the last call's."""
     last: list[Any] = [None, None]
 
     def find(*arguments: P.args, **named: P.kwargs) -> R:
@@ -110,11 +110,11 @@ def _is_same(one: Any, other: Any) -> bool:
 
 
 class CallSequence:
-    """Bound calls in their order; some only if the result of an earlier call is true."""
+    """Bound calls in order; some run only if the result of an earlier call is true."""
 
     def __init__(self) -> None:
         self._rows: list[list[int]] = []
-        self._steps: list[tuple[BoundCall[Any], int]] = []  # a call, and -1 or the tested item
+        self._steps: list[tuple[BoundCall[Any], int]] = []  # a call, with -1 or the tested item
         self._ops: Any = None
 
     def __len__(self) -> int:
@@ -127,10 +127,10 @@ class CallSequence:
 
     @contextmanager
     def only_if(self, bound: BoundCall[Any], item: int = 0) -> Iterator[None]:
-        """Skip what is appended within, unless the last result of a call is true.
+        """Skip the calls appended within the block unless the last result of a call is true.
 
-        Args:
-            bound: a call that comes earlier in the sequence.
+        bound: a call that is earlier in the sequence.
+        item: index of the item, if the result is a tuple.
             item: the item of a result that is a tuple.
         """
         address = bound.result_address(item) if bound.is_compiled else 0
@@ -148,7 +148,7 @@ class CallSequence:
         """Make the calls.
 
         Raises:
-            IndexError: a kernel that checks its indices has found one out of bounds.
+            IndexError: a kernel that checks its indices found one out of bounds.
         """
         if not self._steps:
             return

@@ -1,19 +1,19 @@
-"""The compiler of kernels: Numba's, except for what follows.
+"""The compiler of kernels: Numba's, with the following changes.
 
-An index counts from the front only. In Python `a[-1]` is the last item, so Numba compares every
-signed index with zero before it reads. In kernels -1 means nothing and is asked about before;
-leaving that comparison out makes a tick of traffic a tenth faster (decision 008). A negative index
-that is written out, as in `a[-1]`, keeps its meaning. With `NUMBA_BOUNDSCHECK=1` every index
-outside of its array, negative ones included, is an `IndexError`: `make bounds` runs the tests so.
+Indices count from the front only. In Python, `a[-1]` is the last item, so Numba compares every
+signed index with zero before it reads. In kernels, -1 means "none" and is checked beforehand.
+Without that comparison, a tick of traffic is a tenth faster (decision 008). A negative literal
+index, as in `a[-1]`, keeps its meaning. With `NUMBA_BOUNDSCHECK=1`, every index outside of its
+array, including negative ones, is an `IndexError`; `make bounds` runs the tests with it.
 
-What is kept of a kernel on disk is machine code without LLVM's, which a process would keep in
-memory. Three changes shorten the first compilation (decision 002):
+The cache has only the machine code of a kernel, not its LLVM code, which would stay in memory.
+Three changes shorten the first compilation (decision 002):
 
-- A kernel that is called by another one is a part of it: it is not made callable from Python, not
-  kept on disk, and optimised once, together with its caller. Numba does all of that for each.
-- A bundle of arrays is handed over as one address and read where it lies. Numba hands over each
-  array as seven numbers and puts the bundle together again on the other side.
-- Where nothing is counted, nothing is done when a variable is no longer needed.
+- A kernel that is called by another kernel is compiled as a part of it: it is not callable from
+  Python, not cached, and optimised once, together with its caller. Numba does all of this for each.
+- A bundle of arrays is passed as one address and read in place. Numba passes each array as seven
+  numbers, and rebuilds the bundle in the called function.
+- Without reference counts, no code is generated for the end of a variable's life.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from numba.np import arrayobj
 
 from cavmarl.core.compiled.entry_point import EntryPoint, result_text
 
-# Passes that look for what no kernel without arrays of its own has: array expressions, ...
+# Passes for features that no kernel uses, as it creates no arrays: array expressions and more.
 _NEEDLESS = {InlineClosureLikes, InlineInlinables, InlineOverloads, NopythonRewrites}
 
 
@@ -55,9 +55,9 @@ _field: Any = gep_inbounds
 
 @contextmanager
 def _from_the_front() -> Iterator[None]:
-    """While this is open, array accesses are made without the comparison.
+    """Compile array accesses without the comparison while this context is open.
 
-    Numba compiles under one lock, so no other function is being lowered meanwhile.
+    Numba compiles under one lock, so no other function is lowered at the same time.
     """
     usual: Any = arrayobj.fix_integer_index
 
@@ -78,14 +78,14 @@ def _is_bundle(kind: Any) -> bool:
 
 
 def _borrow(builder: Any, address: Any) -> Any:
-    """What lies at an address and stays there; what is not used of it is never read."""
+    """Load the value at an address as borrowed; LLVM reads only the parts that are used."""
     value = builder.load(address)
     value.borrowed = True
     return value
 
 
 def _read_apart(builder: Any, address: Any) -> Any:
-    """What lies at an address, number by number."""
+    """Load the value at an address, number by number."""
     kind = address.type.pointee
     if not isinstance(kind, (ir.LiteralStructType, ir.ArrayType)):
         return builder.load(address)
@@ -104,7 +104,7 @@ _Model: Any = TupleModel
 
 
 class _BundleModel(_Model):  # type: ignore[misc]
-    """How Numba hands over a named tuple: ours as an address, all others as they were."""
+    """How Numba passes a named tuple: bundles by address, others unchanged."""
 
     def get_argument_type(self) -> Any:
         if _is_bundle(self._fe_type):
@@ -112,13 +112,13 @@ class _BundleModel(_Model):  # type: ignore[misc]
         return super().get_argument_type()
 
     def as_argument(self, builder: Any, value: Any) -> Any:
-        """Where the bundle lies, or a copy of it that is made for the call."""
+        """Return the address of the bundle, or of a copy that is made for the call."""
         if not _is_bundle(self._fe_type):
             return super().as_argument(builder, value)
         return value.operands[0] if _is_borrowed(value) else _copy(builder, value)
 
     def from_argument(self, builder: Any, value: Any) -> Any:
-        """The bundle that lies there."""
+        """Return the bundle at that address."""
         if not _is_bundle(self._fe_type):
             return super().from_argument(builder, value)
         return _borrow(builder, value)
@@ -131,13 +131,13 @@ _Lower: Any = Lower
 
 
 class _KernelLower(_Lower):  # type: ignore[misc]
-    """Reads the fields of bundles where they lie, and generates nothing for variables that end.
+    """Reads the fields of bundles in place, and generates no code for the end of variables.
 
-    In functions that count references all is as usual.
+    Functions that count references are lowered as usual.
     """
 
     def init(self) -> None:
-        """Look which variables are assigned once."""
+        """Count the assignments of each variable."""
         super().init()
         self._bundles: dict[str, Any] = {}
         self._fields: dict[tuple[Any, int], Any] = {}
@@ -147,7 +147,7 @@ class _KernelLower(_Lower):  # type: ignore[misc]
         )
 
     def setup_function(self, fndesc: Any) -> None:
-        """Say that a bundle is never written to: what is read of it need not be read again."""
+        """Declare bundles as never written, so that LLVM need not read a field again."""
         super().setup_function(fndesc)
         for argument in self.call_conv.get_arguments(self.function):
             kind = argument.type
@@ -156,7 +156,7 @@ class _KernelLower(_Lower):  # type: ignore[misc]
                 argument.attributes.dereferenceable = self.context.get_abi_sizeof(kind.pointee)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """A field of a bundle lies at an address of its own."""
+        """Read a field of a bundle from its own address."""
         if expr.op == "getattr" and not self.context.enable_nrt:
             kind = self.typeof(expr.value.name)
             bundle: Any = self.loadvar(expr.value.name) if _is_bundle(kind) else None
@@ -165,11 +165,11 @@ class _KernelLower(_Lower):  # type: ignore[misc]
         return super().lower_expr(resty, expr)
 
     def create_cpython_wrapper(self, release_gil: bool = False) -> None:
-        """Make the entry point for calls from Python, in the place of Numba's wrapper."""
+        """Create the entry point for calls from Python, in place of Numba's wrapper."""
         self.library.add_ir_module(EntryPoint(self.context, self.fndesc, _ENTRY).module)
 
     def _read(self, address: Any, place: int, kind: Any) -> Any:
-        """A field of a bundle, once for all its uses, when the function begins."""
+        """Read a field of a bundle at the start of the function, once for all its uses."""
         if (address, place) not in self._fields:
             with self.builder.goto_entry_block():
                 field = _field(self.builder, address, 0, place)
@@ -183,11 +183,11 @@ class _KernelLower(_Lower):  # type: ignore[misc]
             super()._alloca_var(name, fetype)
 
     def loadvar(self, name: str) -> Any:
-        """A bundle that lies elsewhere is not copied into a variable."""
+        """Return a borrowed bundle without copying it into a variable."""
         return self._bundles[name] if name in self._bundles else super().loadvar(name)
 
     def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
-        """Without a look at what the variable was before."""
+        """Store a value without reading the variable's previous one."""
         if self.context.enable_nrt or name in self._singly_assigned_vars:
             super().storevar(value, name, argidx)
         elif _is_bundle(self.typeof(name)) and _is_borrowed(value) and self._assigned[name] == 1:
@@ -197,20 +197,20 @@ class _KernelLower(_Lower):  # type: ignore[misc]
             self.builder.store(value, self.getvar(name))
 
     def delvar(self, name: str) -> None:
-        """Only what is counted is released."""
+        """Release the variable only if references are counted."""
         if self.context.enable_nrt:
             super().delvar(name)
 
 
 _Library: Any = JITCodeLibrary
-_ENTRY = "cavmarl_entry"  # the entry point of a kernel, until its object is written
+_ENTRY = "cavmarl_entry"  # name of a kernel's entry point until its object is written
 
 
 class _Whole(_Library):  # type: ignore[misc]
-    """A kernel that Python calls, linked with all kernels below it into one module."""
+    """A kernel that Python calls, linked into one module with all kernels that it calls."""
 
     def add_linking_library(self, library: CodeLibrary) -> None:
-        """Link a library; for a part, also the libraries that it calls."""
+        """Link a library; if it is a part, also link the libraries that it calls."""
         if not isinstance(library, _Part):
             super().add_linking_library(library)
         elif library not in self._linking_libraries:
@@ -228,7 +228,7 @@ class _Whole(_Library):  # type: ignore[misc]
         super()._optimize_final_module()
 
     def _finalize_final_module(self) -> None:
-        """Leave the module out of Numba's engine, which runs it: only its object code is needed."""
+        """Keep the module out of Numba's execution engine: only its object code is needed."""
         self._finalized = True
 
     def emit_object(self, symbol: str) -> bytes:
@@ -241,7 +241,7 @@ class _Whole(_Library):  # type: ignore[misc]
 
 @cache
 def _position_independent(codegen: Any) -> Any:
-    """Return a target machine whose code can lie anywhere, and so in a shared library."""
+    """Return a target machine for position-independent code, as in a shared library."""
     return Target.from_triple(get_process_triple()).create_target_machine(
         cpu=codegen._get_host_cpu_name(),
         features=codegen._tm_features,
@@ -252,17 +252,17 @@ def _position_independent(codegen: Any) -> Any:
 
 
 class _Part(_Library):  # type: ignore[misc]
-    """The code of a kernel as others call it: never optimised on its own."""
+    """The code of a kernel for other kernels; it is never optimised on its own."""
 
     def add_linking_library(self, library: CodeLibrary) -> None:
-        """Keep what is called for those that this is linked into."""
+        """Remember the called libraries for the kernels into which this part is linked."""
         self._linking_libraries.append(library)
 
     def _optimize_functions(self, module: ModuleRef) -> None:
         module.data_layout = self._codegen._data_layout
 
     def _get_module_for_linking(self) -> ModuleRef:
-        """With its function in it even where no call is known yet: one may be linked later."""
+        """Return the module even if no call is known: it may be linked later."""
         return self._final_module
 
 
@@ -278,7 +278,7 @@ class _KernelLowering(NativeLowering):
         return _KernelLower
 
     def run_pass(self, state: Any) -> bool:
-        """Lower to LLVM; a part is then known by a key instead of an address."""
+        """Lower to LLVM; other kernels then find a part by a key instead of an address."""
         flags = state.flags
         is_part = flags.no_cpython_wrapper
         library = _Part if is_part else _Whole
@@ -295,16 +295,16 @@ class _KernelLowering(NativeLowering):
 
 
 _Flags: Any = Flags
-_HASH = hash(_Flags())  # of all: Numba takes it of the names of the options
+_HASH = hash(_Flags())  # shared by all: Numba hashes the names of the options
 
 
 class _QuickFlags(_Flags):  # type: ignore[misc]
-    """Numba's flags, which it compares some 100,000 times."""
+    """Numba's flags with a fast comparison: Numba compares them about 100,000 times."""
 
     __slots__ = ()
 
     def copy(self) -> Any:
-        """For what is compiled meanwhile: how its caller is kept and inlined is not inherited."""
+        """Return flags for a called function, without its caller's inlining and storage."""
         flags = super().copy()
         for name in ("forceinline", "no_compile", "no_cpython_wrapper"):
             flags.discard(name)
@@ -323,14 +323,14 @@ _Compiler: Any = CompilerBase
 
 
 class KernelCompiler(_Compiler):  # type: ignore[misc]
-    """Numba's usual pipeline with `_KernelLowering` in it, without needless passes."""
+    """Numba's usual pipeline with `_KernelLowering`, and without needless passes."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.state.flags = _QuickFlags(self.state.flags)
 
     def compile_extra(self, func: Any) -> Any:
-        """Without the garbage collector, which would go through all that Numba keeps."""
+        """Compile without the garbage collector, which would visit all objects that Numba keeps."""
         collects = gc.isenabled()
         gc.disable()
         try:
@@ -357,7 +357,7 @@ _compiler_lock: Any = global_compiler_lock
 
 
 def _widened(kind: Any) -> Any:
-    """One type for all whole numbers, whether written out or read from a field of 32 bits."""
+    """Return one type for all whole numbers, whether literals or read from 32-bit fields."""
     if isinstance(kind, IntegerLiteral):
         kind = kind.literal_type
     return intp if kind is int32 else kind
@@ -367,12 +367,12 @@ class _PartDispatcher(_Dispatcher):  # type: ignore[misc]
     """Compiles a kernel for the kernels that call it."""
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Do not compile it once more for another kind of whole number."""
+        """Return the template without compiling again for another kind of whole number."""
         wide = {name: _widened(kind) for name, kind in kws.items()}
         return super().get_call_template([_widened(kind) for kind in args], wide)
 
     def add_overload(self, result: Any) -> None:
-        """Keep it for kernels, not for calls from Python."""
+        """Add the overload for kernels, but not for calls from Python."""
         self.overloads[tuple(result.signature.args)] = result
 
 
@@ -380,7 +380,7 @@ _Integer: Any = Integer
 
 
 def _as_called(kind: Any) -> Any:
-    """Return the type of a number or an array as `arguments` hands it over."""
+    """Return the type of a number or an array as it is passed by `arguments`."""
     is_short = isinstance(kind, _Integer) and kind.bitwidth < 64
     return intp if is_short else kind
 
@@ -397,7 +397,7 @@ _OPTIONS = {
 
 
 def make_part(function: Callable[..., Any], is_inlined: bool) -> Any:
-    """Return what Numba takes for a kernel that is called in other kernels."""
+    """Return Numba's representation of a kernel that is called by other kernels."""
     options = {**_OPTIONS, "no_cpython_wrapper": True, "forceinline": is_inlined}
     return _PartDispatcher(function, targetoptions=options, pipeline_class=KernelCompiler)
 
@@ -409,7 +409,7 @@ def compile_kernel(
 
     Args:
         function: the Python function.
-        arguments: only their types count.
+        arguments: example arguments; only their types count.
         symbol: name of the entry point, see `entry_point`.
 
     Returns:
@@ -430,10 +430,10 @@ def compile_kernel(
 
 
 def compile_callback(function: Callable[..., Any], num_numbers: int) -> Any:
-    """Compile a function that takes and returns float64, for kernels that call it by address.
+    """Compile a function from float64 to float64, for kernels that call it by address.
 
     Returns:
-        An object with an `address`, which holds as long as the object lives.
+        An object with an `address`, which is valid as long as the object lives.
 
     Raises:
         numba.core.errors.NumbaError: Numba cannot compile the function.

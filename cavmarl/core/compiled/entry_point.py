@@ -1,9 +1,9 @@
-"""The entry point of a compiled kernel: it makes Numba's arguments of words and calls the kernel.
+"""The entry point of a compiled kernel: it converts words to Numba's arguments.
 
-The function `int32 entry(int64 *words)` reads each argument as `arguments.py` has stored it. Of an
-array it reads address, shape and strides where NumPy's C interface has them (`PyArrayObject`), so
-the words of an array need no update when the array changes in place. The result is written to the
-words behind the arguments. The value that is returned is Numba's status: 0, or an exception.
+The function `int32 entry(int64 *words)` reads each argument as `arguments.py` has stored it. For an
+array, it reads address, shape and strides from NumPy's C structure (`PyArrayObject`), so the words
+of an array need no update if the array changes in place. The result is written to the words after
+the arguments. The function returns Numba's status: 0, or the number of an exception.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ _BYTE = ir.IntType(8)
 _DOUBLE = ir.DoubleType()
 _allocate: Any = alloca_once
 _field: Any = gep_inbounds
-types: Any = numba_types  # not all of it is typed
+types: Any = numba_types  # partly untyped
 
-# Offsets in `PyArrayObject`, in bytes behind the head of a Python object.
+# Offsets in `PyArrayObject`, in bytes after the header of a Python object.
 _DATA, _SHAPE, _STRIDES = 0, 16, 24
 
 
 class EntryPoint:
-    """Builds the entry point of one kernel in a module of its own."""
+    """Builds the entry point of one kernel in its own module."""
 
     def __init__(self, context: Any, fndesc: Any, symbol: str) -> None:
         self._context = context
@@ -66,12 +66,12 @@ class EntryPoint:
             place = _allocate(self._builder, self._context.get_value_type(kind))
             self._fill(place, kind)
             value = self._builder.load(place)
-            value.borrowed = True  # handed over by its address, see `compiler._BundleModel`
+            value.borrowed = True  # passed by address, see `compiler._BundleModel`
             return value
         return self._read(kind)
 
     def _fill(self, place: Any, kind: Any) -> None:
-        """Store a value of a type at an address."""
+        """Store the next value of a type at an address."""
         if isinstance(kind, types.BaseTuple):
             for k, item in enumerate(kind.types):
                 self._fill(_field(self._builder, place, 0, k), item)
@@ -95,10 +95,10 @@ class EntryPoint:
             return value if value_type == _DOUBLE else builder.fptrunc(value, value_type)
         if isinstance(kind, types.Record):
             return builder.inttoptr(word, value_type)
-        raise TypeError(f"a kernel takes no argument of Numba's type {kind}")
+        raise TypeError(f"a kernel cannot take an argument of Numba's type {kind}")
 
     def _read_array(self, kind: Any) -> Any:
-        """Describe an array to Numba as its Python object does; it has no owner."""
+        """Build Numba's description of an array from its Python object; it has no owner."""
         context, builder = self._context, self._builder
         array = context.make_array(kind)(context, builder)
         python = self._next_word()
@@ -118,7 +118,7 @@ class EntryPoint:
         return array._getvalue()
 
     def _load(self, python: Any, offset: int) -> Any:
-        """Read a word of a Python object."""
+        """Read a word of a Python object at an offset after its header."""
         place = self._builder.add(python, _WORD(object.__basicsize__ + offset))
         return self._builder.load(self._builder.inttoptr(place, _WORD.as_pointer()))
 
@@ -149,10 +149,10 @@ def _size_of(context: Any, dtype: Any) -> int:
 
 
 def result_text(result: Any) -> str:
-    """Describe the type of a result, as `arguments.result_reader` reads it.
+    """Return the type of a result as text, as `arguments.result_reader` reads it.
 
     Raises:
-        TypeError: a kernel can return numbers only.
+        TypeError: the result is not a number or a tuple of numbers.
     """
     if isinstance(result, types.NoneType):
         return "none"
@@ -168,4 +168,4 @@ def _number_text(kind: Any) -> str:
         return "signed" if kind.signed else "unsigned"
     if isinstance(kind, types.Float):
         return "float"
-    raise TypeError(f"a kernel cannot return Numba's type {kind}: numbers only, or a tuple of them")
+    raise TypeError(f"a kernel cannot return Numba's type {kind}: return a number or several")

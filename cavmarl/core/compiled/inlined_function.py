@@ -1,4 +1,4 @@
-"""`InlinedFunction`: a small function, compiled into kernels; for Python it stays plain Python."""
+"""`InlinedFunction`: a small function that kernels inline and Python runs as it is."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 
 class InlinedFunction:
-    """A function that is compiled into the kernels that call it, and plain Python for Python.
+    """A function that is compiled into the kernels that call it, and plain Python in Python.
 
-    A call from Python therefore needs no machine code of the function.
+    A call from Python therefore needs no machine code.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -28,5 +28,5 @@ class InlinedFunction:
 
     @property
     def _numba_type_(self) -> Any:
-        """The function as Numba sees it while it compiles a kernel that calls it."""
+        """The type of the function for Numba, which compiles a kernel that calls it."""
         return self._part._numba_type_

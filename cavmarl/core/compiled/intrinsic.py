@@ -1,4 +1,4 @@
-"""Functions that kernels call and that are written in LLVM's instructions, not in Python."""
+"""Functions for kernels that are written in LLVM's instructions instead of Python."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ R = TypeVar("R")
 
 
 class Intrinsic:
-    """A function that is plain Python for Python, and generated code for compiled kernels.
+    """A function that is plain Python in Python, and generated code in compiled kernels.
 
-    Numba asks a global value for `_numba_type_`; so Numba is imported only to compile.
+    Numba asks a global value for its `_numba_type_`, so Numba is imported only to compile.
     """
 
     def __init__(self, plain: Callable[..., Any], generate: Callable[..., Any]) -> None:
@@ -38,12 +38,12 @@ class Intrinsic:
 
 
 def intrinsic(generate: Callable[..., Any]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate the plain Python form of an intrinsic.
+    """Return a decorator for the plain Python form of an intrinsic.
 
     Args:
         generate: called with Numba's typing context and the types of the arguments; returns the
             signature and a function that generates code, as for `numba.extending.intrinsic`. It
-            imports what it needs of Numba and llvmlite itself.
+            imports its dependencies from Numba and llvmlite itself.
     """
 
     def decorate(plain: Callable[P, R]) -> Callable[P, R]:

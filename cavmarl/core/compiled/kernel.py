@@ -25,7 +25,7 @@ R = TypeVar("R")
 
 
 def is_on(name: str) -> bool:
-    """Return whether an environment variable of Numba's is switched on."""
+    """Return whether an environment variable of Numba is switched on."""
     return os.environ.get(name, "0") not in ("", "0")
 
 
@@ -36,7 +36,7 @@ CHECKS_INDICES = is_on("NUMBA_BOUNDSCHECK")
 class Kernel:
     """A compiled function, for any argument types.
 
-    Each call finds out the types of all arguments; `specialized` saves that.
+    Each call determines the types of all arguments; `specialized` avoids that.
     """
 
     def __init__(self, function: Callable[..., Any], is_inlined: bool) -> None:
@@ -49,8 +49,8 @@ class Kernel:
         """Call the kernel.
 
         Raises:
-            TypeError: a kernel takes no such arguments.
-            KernelError: the kernel has to be compiled, and may or can not be.
+            TypeError: kernels do not accept one of the arguments.
+            KernelError: the kernel must be compiled, which is not allowed or not possible.
         """
         arguments = self.in_order(arguments, named)
         return self.call_for(arguments)(arguments)
@@ -64,7 +64,7 @@ class Kernel:
         return bound.args
 
     def call_for(self, arguments: tuple[Any, ...]) -> TypedKernel:
-        """Return the kernel for the types of some arguments; it is compiled if need be."""
+        """Return the kernel for the types of some arguments; compile it if necessary."""
         key = tuple(map(type_key, arguments))
         call = self._calls.get(key)
         if call is None:
@@ -87,7 +87,7 @@ class Kernel:
 
     @property
     def _numba_type_(self) -> Any:
-        """The kernel as Numba sees it while it compiles a kernel that calls this one."""
+        """The type of the kernel for Numba, which compiles a kernel that calls it."""
         return self._part._numba_type_
 
 
@@ -109,10 +109,10 @@ class TypedKernel:
         count = sum(kind.count for kind in self.types)
         results, self.read_result = result_reader(code.result, count)
         self.num_words = count + results
-        self.words: list[Words] = []  # that no call uses now; each thread takes its own
+        self.words: list[Words] = []  # not used by a call now; each thread takes its own
 
     def __call__(self, arguments: tuple[Any, ...]) -> Any:
-        """Call with arguments that have these types; nothing refers to them afterwards."""
+        """Call with arguments of these types; no reference to them is kept."""
         try:
             words = self.words.pop()
         except IndexError:
@@ -126,7 +126,7 @@ class TypedKernel:
         return result
 
     def check(self, kind: ArgumentType, new: Any, last: Any = None) -> None:
-        """Raise TypeError for an argument of another type than `last`, which has `kind`."""
+        """Raise a TypeError if an argument does not have the type `kind`, which `last` has."""
         if not kind.fits(new, last):
             raise TypeError(
                 f"{self.name}: an argument has the type {type_of(new).text}, but had "
@@ -134,20 +134,20 @@ class TypedKernel:
             )
 
     def error(self, status: int) -> Exception:
-        """Return the error for a status: only kernels that check their indices have one."""
+        """Return the error for a status; only kernels that check their indices raise one."""
         return IndexError(f"{self.name}: an index is out of bounds (status {status})")
 
 
 def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
     """Return a kernel for one caller whose arguments have the same types in every call.
 
-    The types are those of the first call. A later call stores only the arguments, and items of
-    bundles, that are not the same objects as in the call before; for that, a call keeps its
-    arguments until the next one. An argument of another type is a TypeError. Without `checks`,
-    types are not compared: for loops in which one process waits for another, and for frames, whose
-    few callers see to the types.
+    The first call determines the types. A later call stores only the arguments, and items of
+    bundles, that are other objects than in the previous call; for that, a call keeps its arguments
+    alive until the next one. An argument of another type is a TypeError. Without `checks`, types
+    are not compared: for loops in which one process waits for another, and for frames, whose few
+    callers ensure the types.
 
-    With `NUMBA_DISABLE_JIT=1` this is the kernel itself.
+    With `NUMBA_DISABLE_JIT=1`, this is the kernel itself.
     """
     if not isinstance(kernel, Kernel):
         return kernel
@@ -158,7 +158,7 @@ def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
 def unchecked(kernel: Callable[P, R]) -> Callable[P, R]:
     """Return a kernel for callers whose arguments always have the types of the first call.
 
-    Nothing is compared, and nothing refers to the arguments afterwards: for small kernels that all
+    Types are not compared, and no reference to the arguments is kept: for small kernels that all
     callers of a process share.
     """
     if not isinstance(kernel, Kernel):
@@ -205,7 +205,7 @@ class _Specialized:
         return result
 
     def _first_words(self, arguments: tuple[Any, ...]) -> Words:
-        """Return new words that hold these arguments."""
+        """Return new words with these arguments."""
         call = self._call
         if call is None:
             call = self._call = self._kernel.call_for(arguments)
@@ -218,7 +218,7 @@ class _Specialized:
         return words
 
     def _update(self, words: Words, arguments: tuple[Any, ...]) -> None:
-        """Store the arguments that have changed; on an error the words are not used again."""
+        """Store the arguments that have changed; after an error, the words are not used again."""
         call: Any = self._call
         for kind, at, new, last in zip(
             call.types, call.offsets, arguments, words.last, strict=True

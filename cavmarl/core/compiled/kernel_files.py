@@ -1,9 +1,8 @@
 """Compiled kernels on disk: one file for each kernel and list of argument types.
 
-A file's name holds a digest of everything that its machine code depends on, so a file is either
-right or never looked at. Its content is verified by a checksum before it is used; a damaged file
-is compiled again. Files are written whole, so processes that compile one kernel at the same time
-do no harm.
+A file's name has a digest of everything that its machine code depends on, so an outdated file is
+never found. Its content is verified by a checksum; a damaged file is compiled again. Files are
+written atomically, so processes may compile the same kernel at the same time.
 """
 
 from __future__ import annotations
@@ -36,8 +35,8 @@ _CONSTANTS = (bool, int, float, str, bytes, type(None))
 class CompiledKernel(NamedTuple):
     """The machine code of a kernel for one list of argument types."""
 
-    name: str  # of the function, with its module
-    types: str  # of the arguments, see `arguments.ArgumentType`
+    name: str  # the function, with its module
+    types: str  # types of the arguments, see `arguments.ArgumentType`
     result: str  # type of the result, see `arguments.result_reader`
     symbol: str  # name of the entry point, the only symbol that the code defines
     code: bytes  # a relocatable ELF object
@@ -47,9 +46,9 @@ class KernelFile:
     """The file of one kernel for one list of argument types.
 
     Attributes:
-        name: of the function, with its module.
-        types: of the arguments.
-        symbol: name for the entry point of this kernel.
+        name: name of the function, with its module.
+        types: types of the arguments.
+        symbol: name of this kernel's entry point.
     """
 
     def __init__(self, function: Callable[..., Any], types: str) -> None:
@@ -67,9 +66,9 @@ class KernelFile:
         self._pattern = f"{readable}.{kernel}.*{SUFFIX}"
 
     def load(self) -> CompiledKernel | None:
-        """Return the kernel for these types, or for others that take such arguments, too.
+        """Return the kernel for these types, or for other types that accept such arguments.
 
-        None: there is no such file, or only damaged ones.
+        Return None if there is no such file, or only damaged ones.
         """
         if self._frozen is None:
             return None
@@ -85,7 +84,7 @@ class KernelFile:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Let no other process compile this kernel meanwhile; its lock ends with the process."""
+        """Keep other processes from compiling this kernel; the lock ends with the process."""
         if self._frozen is None or sys.platform == "win32":
             yield
             return
@@ -93,7 +92,7 @@ class KernelFile:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError:  # `save` says so
+        except OSError:  # `save` reports it
             yield
             return
         try:
@@ -104,7 +103,7 @@ class KernelFile:
             os.close(lock)
 
     def save(self, kernel: CompiledKernel) -> None:
-        """Write the file; if that is impossible, say so once and go on."""
+        """Write the file; if that fails, report it once and continue."""
         if self._frozen is None:
             return
         try:
@@ -119,14 +118,14 @@ def _digest_of(*parts: str) -> str:
 
 
 def pack(kernel: CompiledKernel) -> bytes:
-    """Return the content of a kernel's file: a checksum, what the kernel is, its code."""
+    """Return the content of a kernel's file: a checksum, a description, the code."""
     about = json.dumps([kernel.name, kernel.types, kernel.result, kernel.symbol])
     body = about.encode() + b"\n" + kernel.code
     return hashlib.sha256(body).digest() + body
 
 
 def unpack(content: bytes) -> CompiledKernel | None:
-    """Return what `pack` has written, or None where the content is damaged."""
+    """Return the kernel in the content of a file, or None if the content is damaged."""
     body = content[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != content[:_DIGEST_BYTES]:
         return None
@@ -137,11 +136,11 @@ def unpack(content: bytes) -> CompiledKernel | None:
 
 @cache
 def _machine() -> tuple[str, ...]:
-    """Describe what the machine code depends on beside the sources: compiler and processor."""
+    """Return what the machine code depends on besides the sources: compiler and processor."""
     from llvmlite import binding
 
     processor = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
-    features = os.environ.get("NUMBA_CPU_FEATURES")  # empty: those of the processor by its name
+    features = os.environ.get("NUMBA_CPU_FEATURES")  # empty: by the processor's name
     if features is None:
         features = binding.get_host_cpu_features().flatten()
     settings = [f"{name}={os.environ.get(name, '')}" for name in ("NUMBA_BOUNDSCHECK", "NUMBA_OPT")]
@@ -150,13 +149,13 @@ def _machine() -> tuple[str, ...]:
 
 @cache
 def machine_digest() -> str:
-    """Return a short name for what code depends on beside the sources."""
+    """Return a digest of what the code depends on besides the sources."""
     return _digest_of(*_machine())
 
 
 @cache
 def numba_version() -> str:
-    """Return the version of Numba that is installed; empty: none."""
+    """Return the installed version of Numba, or an empty text."""
     try:
         return version("numba")
     except PackageNotFoundError:
@@ -164,16 +163,16 @@ def numba_version() -> str:
 
 
 def _frozen_values(function: Callable[..., Any]) -> str | None:
-    """Describe what a kernel of a module outside of the package was compiled with.
+    """Return a description of the constants of a kernel from outside of the package.
 
-    Numba turns closure variables into constants. None: one of them cannot be described, so this
-    kernel is not kept.
+    Numba turns closure variables into constants. Return None if one of them cannot be described;
+    such a kernel is not cached.
     """
     if function.__module__.startswith("cavmarl."):
         return ""
     try:
         source = Path(function.__code__.co_filename).read_bytes()
-    except OSError:  # a notebook, or a string that was run
+    except OSError:  # code in a notebook, or in a text passed to exec
         source = marshal.dumps(function.__code__)
     values = []
     for cell in function.__closure__ or ():

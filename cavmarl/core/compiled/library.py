@@ -1,7 +1,7 @@
-"""The library of compiled kernels that a wheel brings, and whether this machine can use it.
+"""The library of compiled kernels in a wheel, and the check whether this machine can use it.
 
-`prebuilt/kernels.so` defines an entry point for each kernel and list of argument types;
-`prebuilt/kernels.json` says which is which, what they were built from, and for which processor.
+`prebuilt/kernels.so` defines an entry point for each kernel and list of argument types.
+`prebuilt/kernels.json` lists them with the sources and the processor that they were built for.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ LIBRARY_FILE = "kernels.so"
 INDEX_FILE = "kernels.json"
 FORMAT = 1
 
-LEVEL_SYMBOL = "cavmarl_processor"  # writes what the instruction `cpuid` says
-# What x86-64-v3 needs beside x86-64: bits of the words that `LEVEL_SYMBOL` writes.
+LEVEL_SYMBOL = "cavmarl_processor"  # writes the result of the instruction `cpuid`
+# Features of x86-64-v3 beyond x86-64, as bits of the words that `LEVEL_SYMBOL` writes.
 _LEAF_1_ECX = {
     "SSE3": 0, "SSSE3": 9, "FMA": 12, "CMPXCHG16B": 13, "SSE4.1": 19, "SSE4.2": 20, "MOVBE": 22,
     "POPCNT": 23, "OSXSAVE": 27, "AVX": 28, "F16C": 29,
 }  # fmt: skip
 _LEAF_7_EBX = {"BMI1": 3, "AVX2": 5, "BMI2": 8}
 _EXTENDED_ECX = {"LAHF": 0, "LZCNT": 5}
-_SAVED = {"XMM state": 1, "YMM state": 2}  # that the system saves, by `xgetbv`
+_SAVED = {"XMM state": 1, "YMM state": 2}  # state that the system saves, from `xgetbv`
 # Required bits of each word that `LEVEL_SYMBOL` writes.
 LEVEL_WORDS = (_LEAF_1_ECX, _LEAF_7_EBX, _EXTENDED_ECX, _SAVED)
 
@@ -44,14 +44,14 @@ class Entry(NamedTuple):
 
 
 class UnusableLibraryError(Exception):
-    """The library cannot be used here; the text says why, as a clause."""
+    """The library cannot be used on this machine; the message is a clause that gives the reason."""
 
 
 class Library:
-    """The library, open.
+    """The opened library.
 
     Raises:
-        UnusableLibraryError: there is none, it is damaged, or it is for another machine.
+        UnusableLibraryError: there is no library, or it is damaged or for another machine.
     """
 
     def __init__(self, folder: Path = FOLDER) -> None:
@@ -59,7 +59,7 @@ class Library:
         here = python_tag()
         if index["python"] != here:
             raise UnusableLibraryError(
-                f"the library of compiled kernels is for {index['python']}, and this is {here}"
+                f"the library of compiled kernels is for {index['python']}, but this is {here}"
             )
         path = folder / LIBRARY_FILE
         try:
@@ -74,7 +74,7 @@ class Library:
             raise UnusableLibraryError(f"{path} cannot be loaded ({error})") from error
         if missing := missing_features(self._library, index["processor"]):
             raise UnusableLibraryError(
-                f"the library of compiled kernels is for {index['processor']}, and this processor "
+                f"the library of compiled kernels is for {index['processor']}, but this processor "
                 f"lacks {', '.join(missing)}"
             )
         attach_library(self._library)
@@ -83,15 +83,15 @@ class Library:
 
     @staticmethod
     def is_there() -> bool:
-        """Return whether this installation has brought a library, usable or not."""
+        """Return whether this installation contains a library, usable or not."""
         return (FOLDER / INDEX_FILE).exists()
 
     def has(self, name: str, digest: str) -> bool:
-        """Return whether the library has a kernel, for any types, of sources with this digest."""
+        """Return whether the library has a kernel, for any types, from sources with this digest."""
         return name in self._kernels and self._modules[name.rpartition(".")[0]] == digest
 
     def find(self, name: str, types: str, digest: str) -> Entry | None:
-        """Return a kernel's entry point for argument types; None: the library has none."""
+        """Return a kernel's entry point for some argument types, or None."""
         if not self.has(name, digest):
             return None
         found = self._kernels[name]
@@ -104,7 +104,7 @@ class Library:
 
 
 def python_tag() -> str:
-    """Return what an object looks like in memory for: the interpreter's tag for extensions."""
+    """Return the interpreter's tag for extensions, which fixes the memory layout of objects."""
     return str(sysconfig.get_config_var("SOABI") or sys.implementation.cache_tag)
 
 
@@ -113,12 +113,12 @@ def _read_index(path: Path) -> Mapping[str, Any]:
         content = path.read_bytes()
     except OSError as error:
         raise UnusableLibraryError(
-            "this installation brings no library of compiled kernels"
+            "this installation contains no library of compiled kernels"
         ) from error
     try:
         index: Mapping[str, Any] = json.loads(content)
         if index["format"] != FORMAT:
-            raise UnusableLibraryError(f"{path} has format {index['format']}, not {FORMAT}")
+            raise UnusableLibraryError(f"{path} has format {index['format']}, must be {FORMAT}")
         body = {key: value for key, value in index.items() if key != "index_sha256"}
         if index_digest(body) != index["index_sha256"]:
             raise UnusableLibraryError(f"{path} is damaged: install cavmarl again")
@@ -128,12 +128,12 @@ def _read_index(path: Path) -> Mapping[str, Any]:
 
 
 def index_digest(index: Mapping[str, Any]) -> str:
-    """Return the checksum of an index, which is written into it."""
+    """Return the checksum of an index; it is stored in the index."""
     return hashlib.sha256(json.dumps(index, sort_keys=True).encode()).hexdigest()
 
 
 def missing_features(library: ctypes.CDLL, processor: str) -> list[str]:
-    """Return what this processor lacks of x86-64-v3; nothing for another target."""
+    """Return the features of x86-64-v3 that this processor lacks; empty for other targets."""
     if processor != "x86-64-v3":
         return []
     words = (ctypes.c_uint64 * len(LEVEL_WORDS))()

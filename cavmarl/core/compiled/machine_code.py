@@ -1,8 +1,8 @@
 """The machine code of kernels in this process: from the wheel's library, the disk, or Numba.
 
-`CAVMARL_KERNELS` says where the code of the package's kernels may come from. `prebuilt`: only from
-the library, `native`: compiled for this processor, `auto` (the default): from the library where it
-can be used, else compiled. Compiled code is kept on disk. Kernels of modules outside of the package
+`CAVMARL_KERNELS` selects the source of code for the package's kernels. `prebuilt`: only the
+library; `native`: compiled for this processor; `auto` (the default): the library if it can be
+used, otherwise compiled. Compiled code is cached on disk. Kernels of modules outside of the package
 are always compiled.
 """
 
@@ -30,36 +30,36 @@ _INSTALL = "pip install '.[compile]' in a checkout of cavmarl"
 
 
 class Code(NamedTuple):
-    """A kernel that can be entered, for one list of argument types."""
+    """The code of a kernel for one list of argument types."""
 
-    address: int  # of the entry point
+    address: int  # entry point
     enter: Callable[[int], int]  # takes the address of `Words`, returns 0 or an error's number
     result: str
 
 
 class CompileListener:
-    """Is told when this process compiles a kernel."""
+    """Base of listeners for compilations in this process."""
 
     def on_compile(self, name: str) -> None:
-        """Called before the kernel of that name is compiled."""
+        """Handle the compilation of the kernel of that name, which begins now."""
 
 
 listeners: list[CompileListener] = []
 
 
 class Source(NamedTuple):
-    """Where the code of the package's kernels comes from."""
+    """The source of code for the package's kernels."""
 
-    choice: str  # of `CHOICES`
+    choice: str  # one of `CHOICES`
     library: Library | None
     reason: str  # why there is no library, as a clause
 
 
 @cache
 def kernel_source() -> Source:
-    """Return where code comes from, by `CAVMARL_KERNELS` and what this machine can use.
+    """Return the source of code, according to `CAVMARL_KERNELS` and this machine.
 
-    Raises:
+    KernelError: the setting has another value, or requires a library that cannot be used.
         KernelError: the setting has another value, or asks for a library that cannot be used.
     """
     choice = os.environ.get(SETTING) or "auto"
@@ -86,11 +86,11 @@ def find_code(
     """Return the code of a kernel for the types of some arguments.
 
     Raises:
-        KernelError: the kernel has to be compiled, and may not or cannot be.
+        KernelError: the kernel must be compiled, which is not allowed or not possible.
     """
     text = ";".join(kind.text for kind in types)
     name = f"{function.__module__}.{function.__qualname__}"
-    reason = "no wheel brings kernels of other packages"
+    reason = "wheels contain no kernels of other packages"
     if name.startswith("cavmarl."):
         source = kernel_source()
         reason = source.reason
@@ -98,7 +98,7 @@ def find_code(
             found = source.library.find(name, text, module_digest(function.__module__))
             if found is not None:
                 return Code(found.address, _ENTRY(found.address), found.result)
-            reason = f"the wheel does not bring it for arguments of the types {text}"
+            reason = f"the wheel does not contain it for arguments of the types {text}"
         if source.choice == "prebuilt":
             raise KernelError(
                 f"{SETTING}=prebuilt: the kernel {name} would have to be compiled, as {reason}; "
@@ -115,7 +115,7 @@ def find_code(
 def _compiled(
     file: KernelFile, function: Callable[..., Any], arguments: tuple[Any, ...], reason: str
 ) -> Code:
-    """Return the code of a kernel from the disk, or compile it and keep it there."""
+    """Return the code of a kernel from the disk, or compile and store it."""
     kernel = file.load()
     if kernel is None:
         with file.locked():  # another process may be compiling it
@@ -141,7 +141,7 @@ def _compile(
 
 @cache
 def explain(reason: str) -> None:
-    """Say once why something is compiled although a wheel brings compiled kernels."""
+    """Report once why a kernel is compiled although the wheel has compiled kernels."""
     if kernel_source().choice == "auto" and Library.is_there():
         print(
             f"cavmarl: a kernel is compiled on this machine, as {reason}",
@@ -162,12 +162,12 @@ def _engine() -> Any:
     binding.initialize_native_asmprinter()
     target = binding.Target.from_triple(binding.get_process_triple())
     machine = target.create_target_machine(opt=0, jit=True)
-    # Code refers to its data by 32-bit offsets, so both have to lie in one piece of memory.
+    # Code refers to its data by 32-bit offsets, so both must be in one piece of memory.
     return binding.create_mcjit_compiler(binding.parse_assembly(""), machine, use_lmm=True)
 
 
 def _load_object(kernel: CompiledKernel) -> int:
-    """Load an ELF object into this process, once, and return the address of its entry point."""
+    """Load an ELF object into this process once, and return the address of its entry point."""
     if kernel.symbol in _LOADED:
         return _LOADED[kernel.symbol]
     from llvmlite import binding

@@ -1,11 +1,11 @@
 """Software prefetch of memory that is needed soon.
 
-What a vehicle asks about lies scattered over the tables of a city: its lane, the lanes and links
-behind that, the row of its leader. Each look that misses the caches takes as long as a hundred
-operations. A loop that says some rounds before which records it is going to read has many of them
-under way at once.
+The records that a vehicle needs are scattered over the tables of a city: its lane, the next lanes
+and links, the row of its leader. An access that misses the caches takes as long as a hundred
+operations. A loop that announces its records some rounds ahead has many accesses under way at the
+same time.
 
-This never changes a result: nothing is read, and a place outside of an array does no harm.
+This never changes a result: nothing is read, and an address outside of an array does no harm.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled.intrinsic import intrinsic
 
-SOON = 8  # rounds of a loop over vehicles: about as long as memory takes to come
+SOON = 8  # rounds of a loop over vehicles, about as long as a memory access
 
 _FOR_READING, _INTO_ALL_CACHES, _DATA = 0, 3, 1
 _LINE = 64  # bytes

@@ -1,4 +1,4 @@
-"""The compiled loop of a `CallSequence`: it enters other kernels by the addresses of their code."""
+"""The compiled loop of a `CallSequence`: it calls other kernels by the addresses of their code."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ def _generate_load(typing: Any, address: Any) -> Any:
 
 @intrinsic(_generate_enter)
 def _enter(entry: int, words: int) -> int:
-    """Enter a compiled kernel with the address of its words, and return its status."""
-    raise NotImplementedError("only compiled code can enter a kernel by its address")
+    """Call a compiled kernel with the address of its words, and return its status."""
+    raise NotImplementedError("only compiled code can call a kernel by its address")
 
 
 @intrinsic(_generate_load)
 def _load(address: int) -> int:
     """Return the word at an address."""
-    raise NotImplementedError("only compiled code can read at an address")
+    raise NotImplementedError("only compiled code can read from an address")
 
 
 @kernel
 def run_calls(rows: NDArray[np.int64]) -> tuple[int, int]:
-    """Make the calls of a sequence in their order.
+    """Make the calls of a sequence in order.
 
     Args:
-        rows: (n, 3) for each step of the sequence the entry point of a kernel and the address of
-            its words; or 0, the address of a word, and the step to go on with if that word is 0.
+        rows: (n, 3) for each step of the sequence: the entry point of a kernel and the address of
+            its words; or 0, the address of a word, and the next step if that word is 0.
 
     Returns:
         The number of the step that failed and its status; the status is 0 if none failed.

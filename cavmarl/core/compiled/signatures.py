@@ -1,7 +1,7 @@
 """Argument types of kernels as JSON, and example arguments of such types.
 
-A signature names record types and bundles by where they are defined, so it stays right when a
-field is added to one of them.
+A signature refers to record types and bundles by the place of their definition, so it stays valid
+if a field is added to one of them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled.arguments import type_of
 
-CALLS_SETTING = "CAVMARL_KERNEL_CALLS"  # a folder: what Python code of the package calls goes there
+# A folder for the kernel calls of the package's Python code.
+CALLS_SETTING = "CAVMARL_KERNEL_CALLS"
 _PACKAGE = "cavmarl."
 _COMPILED = __name__.rpartition(".")[0]
 
@@ -31,7 +32,7 @@ def signature_of(arguments: tuple[Any, ...]) -> list[Any]:
 
 
 def example_arguments(signature: list[Any]) -> tuple[Any, ...]:
-    """Return arguments of these types; arrays are as small as can be."""
+    """Return arguments of these types; arrays have the smallest possible size."""
     return tuple(_example(kind) for kind in signature)
 
 
@@ -71,7 +72,7 @@ def _example(kind: Any) -> Any:
     return python(**{name: _example(item) for name, item in kind["fields"].items()})
 
 
-_PLAIN = ("int64", "float64", "bool")  # Python's own numbers
+_PLAIN = ("int64", "float64", "bool")  # Python's own types
 
 
 def _example_array(dtype: np.dtype[Any], layout: str) -> NDArray[Any]:
@@ -122,7 +123,7 @@ def _find(name: str) -> Any:
 
 @cache
 def _dtype_names(loaded: int) -> dict[np.dtype[Any], str]:
-    """Return where record types of the package are defined: constants of its modules."""
+    """Return the places in the package where record types are defined, by dtype."""
     found: dict[np.dtype[Any], str] = {}
     for module in sorted(name for name in sys.modules if name.startswith(_PACKAGE)):
         for name, value in vars(sys.modules[module]).items():
@@ -134,9 +135,9 @@ def _dtype_names(loaded: int) -> dict[np.dtype[Any], str]:
 
 
 def record_call(function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Append a call's types to a file of this process, if `CAVMARL_KERNEL_CALLS` names a folder.
+    """Append the types of a call to this process's file, if `CAVMARL_KERNEL_CALLS` names a folder.
 
-    Calls of modules outside of the package are left out.
+    Calls from modules outside of the package are left out.
     """
     folder = os.environ.get(CALLS_SETTING)
     if not folder or not function.__module__.startswith(_PACKAGE) or not _is_ours():
@@ -148,7 +149,7 @@ def record_call(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Non
 
 
 def _is_ours() -> bool:
-    """Return whether a module of the package has made the call that is under way."""
+    """Return whether a module of the package made the present call."""
     frame: Any = sys._getframe(1)
     while frame is not None:
         module = frame.f_globals.get("__name__", "")

@@ -1,7 +1,7 @@
 """The sources of compiled kernels: a kernel's code is valid for the content of these files.
 
-Numba watches only the file that defines a function. A kernel's code also holds the kernels that it
-calls, so its digest covers each file of kernels that its file imports, directly or not.
+Numba only watches the file that defines a function. But a kernel's code includes the kernels that
+it calls, so its digest covers all files of kernels that its file imports, directly or indirectly.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ import re
 from functools import cache
 from pathlib import Path
 
-# Every import of one file of kernels by another; a test holds that there is no other form of it.
+# Imports of one file of kernels by another; a test checks that imports have no other form.
 IMPORT_LINE = re.compile(rb"^from cavmarl\.([\w.]+) import ", re.MULTILINE)
 _PACKAGE = Path(__file__).parents[2]
 _COMPILED = "core.compiled"
-# Files of that folder that decide about the code of all kernels; the others call what is compiled.
+# Files of that folder that affect the code of all kernels; the other files only call it.
 COMPILER_FILES = tuple(f"{_COMPILED}.{name}" for name in ("arguments", "compiler", "entry_point"))
 _PARTS = (*COMPILER_FILES, f"{_COMPILED}.prefetch", f"{_COMPILED}.run_calls")
 
 
 @cache
 def kernel_sources() -> dict[str, bytes]:
-    """Return the content of each file of kernels, by its dotted name within the package."""
+    """Return the content of each file of kernels, by its dotted name in the package."""
     folders = (
         *_PACKAGE.rglob("kernels"),
         _PACKAGE / "core" / "math",
@@ -41,10 +41,10 @@ def sources_digest() -> str:
 
 @cache
 def module_digest(module: str) -> str:
-    """Return the digest of the sources that a module's kernels are made of.
+    """Return the digest of the sources of a module's kernels.
 
-    For a module outside of the package this is the digest of all kernel sources, with the content
-    of the module's own file.
+    For a module outside of the package, this is the digest of all kernel sources; `kernel_files`
+    adds the content of the module's own file.
     """
     sources = kernel_sources()
     name = module.removeprefix("cavmarl.")

@@ -1,1 +1,1 @@
-"""Kernels of plain geometry, random numbers, lists and searches that every domain uses."""
+"""Kernels for geometry, random numbers, lists and searches that all folders use."""

@@ -1,17 +1,17 @@
-"""Directions to within a known error, for bounds that need no accuracy."""
+"""Angles with a known maximum error, for bounds that need no accuracy."""
 
 from __future__ import annotations
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import PI
 
-# `rough_atan2` is off by less than this.
+# Maximum error of `rough_atan2`.
 ANGLE_ERROR_RAD = 0.005
 
 
 @kernel
 def rough_atan2(y: float, x: float) -> float:
-    """The angle of (x, y), not both zero, with an error below `ANGLE_ERROR_RAD`.
+    """Return the angle of (x, y), not both zero, with an error below `ANGLE_ERROR_RAD`.
 
     Rajan, Wang, Inkol, Joyal: "Efficient approximations for the arctangent function", IEEE Signal
     Processing Magazine 23(3), 2006, their equation for 0.0038 rad.

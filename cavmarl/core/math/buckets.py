@@ -1,8 +1,9 @@
-"""Lists by lane or by link, most of which are empty: only those in use are cleared and laid out.
+"""Lists by lane or by link. Most are empty, so only lists in use are cleared and laid out.
 
-List k is `[start[k], end[k])` of some array of records; an empty one has start = end. Lists are
-made in three steps: `forget` those of the last time, `add` each item, `lay_out`. Then every `end`
-is its list's start, which the caller raises as it puts items there.
+List k is `[start[k], end[k])` of some array of records; an empty list has start = end. Lists are
+built in three steps: `forget` the previous lists, `add` each item, `lay_out`. Then each `end`
+    equals
+its list's start, and the caller increments it for each item that it stores.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ WORD = 8 * BLOCK
 
 
 class Lists(NamedTuple):
-    """N lists, and which of them are in use."""
+    """N lists, and flags for the lists in use."""
 
     bounds: NDArray[np.int32]  # (N, 2) start and end
-    used: NDArray[np.bool_]  # (N / 8,) by blocks of 8
+    used: NDArray[np.bool_]  # (N / 8,) for blocks of 8 lists
     words: NDArray[np.uint64]  # (N / 64,) the same memory, 8 blocks at a time
 
 
 def make_lists(number: int, zeros: Callable[..., NDArray[Any]] = np.zeros) -> Lists:
-    """So many empty lists, and some more, in arrays that `zeros` makes."""
+    """Return at least `number` empty lists in arrays that `zeros` makes."""
     words = zeros(-(-number // WORD), dtype=np.uint64)
     return Lists(zeros((words.size * WORD, 2), dtype=np.int32), words.view(np.bool_), words)
 
@@ -46,14 +47,14 @@ def forget(lists: Lists) -> None:
 
 @inlined_kernel
 def add(lists: Lists, k: int) -> None:
-    """One item more in list k."""
+    """Count one more item for list k."""
     lists.bounds[k, 1] += 1
     lists.used[k >> BLOCK_BITS] = True
 
 
 @kernel
 def lay_out(lists: Lists) -> int:
-    """Give every list its place, in the order of lists; how many items there are."""
+    """Set the start of every list, in order, and return the number of items."""
     bounds = lists.bounds
     begin = 0
     for word in range(lists.words.size):

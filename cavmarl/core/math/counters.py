@@ -1,7 +1,7 @@
-"""Small sums over worlds that every tick asks for.
+"""Small sums over worlds that every tick needs.
 
-NumPy does each of them in a microsecond, but in ten where the kernels of a tick have emptied the
-caches: its functions are large.
+NumPy needs a microsecond for each of them, but ten if the kernels of a tick have displaced its
+large functions from the caches.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from cavmarl.core.compiled import kernel
 
 @kernel
 def begins_second(ticks: NDArray[np.int64], ticks_per_s: int) -> bool:
-    """Whether a second begins in some world with the present tick (W,)."""
+    """Return whether a second begins in any world with the present tick (W,)."""
     for tick in ticks:
         if tick % ticks_per_s == 0:
             return True
@@ -23,11 +23,11 @@ def begins_second(ticks: NDArray[np.int64], ticks_per_s: int) -> bool:
 
 @kernel
 def occasions(
-    ticks: NDArray[np.int64],  # (W,) the present tick
-    ticks_per_s: int,  # in a second
+    ticks: NDArray[np.int64],  # (W,) present ticks
+    ticks_per_s: int,  # ticks in a second
     num_through: NDArray[np.int64],  # (k, W) vehicles that have arrived in each zone
 ) -> tuple[bool, bool]:
-    """Whether a second begins in some world, and whether a vehicle has arrived."""
+    """Return whether a second begins in any world, and whether a vehicle has arrived."""
     has_arrived = False
     for zone in range(num_through.shape[0]):
         for w in range(num_through.shape[1]):
@@ -37,14 +37,14 @@ def occasions(
 
 @kernel
 def count_tick(ticks: NDArray[np.int64]) -> None:
-    """One more tick in all worlds (W,)."""
+    """Increment the tick of all worlds (W,)."""
     for w in range(ticks.size):
         ticks[w] += 1
 
 
 @kernel
 def totals(counts: NDArray[np.int64], out: NDArray[np.int64]) -> None:
-    """Add up (k, W) over zones into `out` (W,)."""
+    """Add up `counts` (k, W) over the zones into `out` (W,)."""
     for w in range(out.size):
         total = 0
         for zone in range(counts.shape[0]):
@@ -54,7 +54,7 @@ def totals(counts: NDArray[np.int64], out: NDArray[np.int64]) -> None:
 
 @kernel
 def any_positive(counts: NDArray[np.int64]) -> bool:
-    """Return whether one of the counts (W,) is above 0."""
+    """Return whether any of the counts (W,) is above 0."""
     for w in range(counts.size):
         if counts[w] > 0:
             return True

@@ -1,15 +1,15 @@
-"""Elementary functions of float64 that give the same bits on every processor.
+"""Elementary functions of float64 that return the same bits on every processor.
 
-They are built from IEEE 754 operations that every processor rounds in the same way: + - * / and
-sqrt, comparisons, remainders, conversions, and operations on bits. The functions of the C library
-and of NumPy differ between processors in the last bit.
+They consist of IEEE 754 operations that every processor rounds in the same way: + - * / and sqrt,
+comparisons, remainders, conversions, and operations on bits. The functions of the C library and of
+NumPy differ between processors in the last bit.
 
-A call in a kernel is compiled into the kernel. A call from Python runs the plain function, which
-gives the same bits. No argument raises an error. The sign of a NaN result is unspecified.
+A call in a kernel is compiled into the kernel. A call from Python runs the plain function, with the
+same bits. No argument raises an error. The sign of a NaN result is unspecified.
 
-Sources: the reductions, polynomials and constants of `cos_sin`, `log`, `log1p` and `exp` are
-those of fdlibm (Sun Microsystems, 1993), so is the polynomial of `atan2`. Errors are in units in
-the last place (ULP) of the exact result; `tests/core/test_elementary.py` measures them.
+Sources: the reductions, polynomials and constants of `cos_sin`, `log`, `log1p` and `exp`, and the
+polynomial of `atan2`, are from fdlibm (Sun Microsystems, 1993). Errors are in units in the last
+place (ULP) of the exact result; `tests/core/test_elementary.py` measures them.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _A8 = 4.97687799461593236017e-02
 _A9 = -3.65315727442169155270e-02
 _A10 = 1.62858201153657823623e-02
 
-# Between these, no operation of `atan2` overflows or loses bits to underflow.
+# Between these bounds, no operation of `atan2` overflows or loses bits to underflow.
 _SMALL = 1e-280
 _LARGE = 1e300
 _UP = 1.3407807929942597e154  # 2**512
@@ -144,8 +144,8 @@ def _reduce(angle: float) -> tuple[int, float, float]:
     """Subtract quarter turns from an angle.
 
     Returns:
-        The number of quarter turns, of which only the lowest two bits count; and the rest in two
-        parts, a number in about [-pi / 4, pi / 4] and a correction of it.
+        The number of quarter turns, of which only the lowest two bits are valid; and the remainder
+        in two parts, a number in about [-pi / 4, pi / 4] and a correction.
     """
     angle = float(angle)
     if not abs(angle) <= _FAR:
@@ -185,9 +185,9 @@ def cos_sin(angle: float) -> tuple[float, float]:
     """Return the cosine and the sine of an angle in radians.
 
     The error is below 0.8 ULP for angles up to 1e5, and below 1.2 ULP up to 1e6. Beyond, the
-    results lie in [-1, 1], and the error grows with the angle. The results for inf and NaN are NaN.
+    results are in [-1, 1], and the error grows with the angle. The results for inf and NaN are NaN.
     """
-    # Both polynomials are evaluated: a branch that is predicted wrongly takes longer than one.
+    # Both polynomials are evaluated: a mispredicted branch takes longer than a polynomial.
     quarters, high, low = _reduce(angle)
     near_sin = _near_sin(high, low)
     near_cos = _near_cos(high, low)
@@ -198,13 +198,13 @@ def cos_sin(angle: float) -> tuple[float, float]:
 
 @inlined_function
 def sine(angle: float) -> float:
-    """Return the sine of an angle in radians, see `cos_sin`."""
+    """Return the sine of an angle in radians; see `cos_sin`."""
     return cos_sin(angle)[1]
 
 
 @inlined_function
 def cosine(angle: float) -> float:
-    """Return the cosine of an angle in radians, see `cos_sin`."""
+    """Return the cosine of an angle in radians; see `cos_sin`."""
     return cos_sin(angle)[0]
 
 
@@ -222,8 +222,8 @@ def tangent(angle: float) -> float:
 def atan2(y: float, x: float) -> float:
     """Return the angle of the point (x, y) in [-pi, pi].
 
-    The error is below 1.4 ULP. Signs of zeros and infinite coordinates count as in C. The result
-    is NaN if a coordinate is.
+    The error is below 1.4 ULP. Signed zeros and infinite coordinates are treated as in C. The
+    result is NaN if a coordinate is NaN.
     """
     y = float(y)
     x = float(x)
@@ -278,7 +278,7 @@ def atan(slope: float) -> float:
 def asin(sine: float) -> float:
     """Return the arcsine in [-pi / 2, pi / 2], with an error below 2.5 ULP.
 
-    The result is NaN for NaN and beyond [-1, 1].
+    The result is NaN for NaN and for numbers outside of [-1, 1].
     """
     if not abs(sine) <= 1.0:
         return _NAN
@@ -289,7 +289,7 @@ def asin(sine: float) -> float:
 def acos(cosine: float) -> float:
     """Return the arccosine in [0, pi], with an error below 2.5 ULP.
 
-    The result is NaN for NaN and beyond [-1, 1].
+    The result is NaN for NaN and for numbers outside of [-1, 1].
     """
     if not abs(cosine) <= 1.0:
         return _NAN
@@ -335,7 +335,7 @@ def log(value: float) -> float:
 def log1p(value: float) -> float:
     """Return log(1 + value), with an error below 1 ULP.
 
-    The result is -inf for -1 and NaN for numbers below and NaN.
+    The result is -inf for -1, and NaN for smaller numbers and NaN.
     """
     value = float(value)
     if not value > -1.0:
@@ -343,7 +343,7 @@ def log1p(value: float) -> float:
     if value == _INFINITY or abs(value) < 1e-17:
         return value
     whole = 1.0 + value
-    # What the sum has lost; the larger of its terms comes first.
+    # The rounding error of the sum; its larger term comes first.
     lost = value - (whole - 1.0) if value < 1.0 else 1.0 - (whole - value)
     return _log_of_sum(whole, lost, 0)
 
@@ -358,7 +358,7 @@ def log10(value: float) -> float:
 def exp(power: float) -> float:
     """Return e**power, with an error below 1 ULP.
 
-    The result is inf or 0 where the exact value is too large or too small for a float64.
+    The result is inf or 0 if the exact value is too large or too small for a float64.
     """
     power = float(power)
     if power != power:
@@ -374,7 +374,7 @@ def exp(power: float) -> float:
     square = rest * rest
     shape = rest - square * (_E1 + square * (_E2 + square * (_E3 + square * (_E4 + square * _E5))))
     value = 1.0 - ((low - (rest * shape) / (2.0 - shape)) - high)
-    # Two factors, as 2**doublings may lie beyond the normal numbers.
+    # Two factors, as 2**doublings may be outside of the normal numbers.
     count = int(doublings)
     half = count >> 1
     return (
@@ -418,7 +418,7 @@ def erf(value: float) -> float:
 def hypot(x: float, y: float) -> float:
     """Return sqrt(x * x + y * y), with an error below 1.1 ULP.
 
-    Squares beyond the range of float64 are not avoided.
+    Overflow and underflow of the squares are not avoided.
     """
     x = float(x)
     y = float(y)

@@ -1,4 +1,4 @@
-"""The functions of `elementary` for arrays: the same bits as for single numbers."""
+"""The functions of `elementary` for arrays, with the same bits as for single numbers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def apply_atan2(values: Numbers, x: Numbers) -> None:
 
 
 def _mapped(apply: Callable[..., None], *arguments: Any) -> Numbers:
-    """Return what a kernel makes of copies of its arguments, which have the same shape."""
+    """Return the result of a kernel on copies of its arguments, which have the same shape."""
     copies = [np.array(argument, np.float64, order="C") for argument in arguments]
     apply(*(copy.reshape(-1) for copy in copies))
     return copies[0]

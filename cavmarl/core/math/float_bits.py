@@ -12,7 +12,7 @@ _FLOAT, _INT = struct.Struct("<d"), struct.Struct("<q")
 
 
 def _generate_cast(source: str, target: str) -> Callable[..., Any]:
-    """Return what generates the instruction that reads the bits of one type as another."""
+    """Return the generator of an instruction that reads the bits of one type as another."""
 
     def generate(typing: Any, value: Any) -> Any:
         from numba.core import types
@@ -30,13 +30,13 @@ def _generate_cast(source: str, target: str) -> Callable[..., Any]:
 
 @intrinsic(_generate_cast("float64", "int64"))
 def float_to_bits(value: float) -> int:
-    """Return the bits of a float64 as a signed integer: the sign is bit 63."""
+    """Return the bits of a float64 as a signed integer; bit 63 is the sign."""
     bits: int = _INT.unpack(_FLOAT.pack(value))[0]
     return bits
 
 
 @intrinsic(_generate_cast("int64", "float64"))
 def bits_to_float(bits: int) -> float:
-    """Return the float64 that has these bits."""
+    """Return the float64 with these bits."""
     value: float = _FLOAT.unpack(_INT.pack(bits))[0]
     return value

@@ -1,8 +1,8 @@
-"""Plane geometry: angles, places on polylines, overlap of oriented boxes.
+"""Plane geometry: angles, positions on polylines, overlap of oriented boxes.
 
 Polylines are POINT records `points[first : first + num]` of `roads.network`, at least two. The end
-segments count as infinitely long, so a place a little before the start or beyond the end has
-coordinates too. Metres and radians; `d` is positive to the left of the driving direction.
+segments count as infinitely long, so positions slightly before the start or beyond the end have
+coordinates, too. Metres and radians; `d` is positive to the left of the driving direction.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 
-STILL_MPS = 1e-9  # two shadows that approach no faster stay as they are
+STILL_MPS = 1e-9  # slower relative motion counts as none
 
 PI = math.pi
 TWO_PI = 2.0 * math.pi
@@ -22,7 +22,7 @@ TWO_PI = 2.0 * math.pi
 
 @kernel
 def wrap_angle(angle: float) -> float:
-    """The same direction in (-pi, pi], for any finite angle in radians."""
+    """Return the same direction in (-pi, pi], for any finite angle in radians."""
     if -PI < angle <= PI:
         return angle
     wrapped = angle % TWO_PI
@@ -31,7 +31,7 @@ def wrap_angle(angle: float) -> float:
 
 @kernel
 def segment_at(points: NDArray[np.void], first: int, num: int, s: float) -> int:
-    """The last segment that starts at or before `s`, as a POINT row; the first one for s < 0."""
+    """Return the POINT row of the last segment that starts at or before `s`; the first if s < 0."""
     low = first
     high = first + num - 2
     while low < high:
@@ -48,9 +48,9 @@ def lane_pose(
     points: NDArray[np.void],  # POINT (num_points,)
     first: int,  # row of the polyline's first point
     num: int,  # points of the polyline, at least 2
-    s: float,  # m; beyond the ends the end segments go on straight
+    s: float,  # m; the end segments extend straight on
 ) -> tuple[float, float, float, float, float, float]:
-    """The place and direction at arc length `s` of a polyline.
+    """Return the position and direction at arc length `s` of a polyline.
 
     Returns:
         x, y, z in metres, cos and sin of the direction, slope dz/ds.
@@ -71,7 +71,7 @@ def lane_pose(
 def _nearest_segment(
     points: NDArray[np.void], start: int, stop: int, x: float, y: float
 ) -> tuple[int, float]:
-    """The first of the nearest segments [start, stop), as a POINT row, and the squared distance."""
+    """Return the first of the nearest segments [start, stop), a POINT row, and distance²."""
     nearest = start
     smallest = np.inf
     for i in range(start, stop):
@@ -91,7 +91,7 @@ def _nearest_segment(
 
 @kernel
 def _left_of(point: np.void, x: float, y: float) -> float:
-    """Signed distance of a place to the line through a segment, positive to the left."""
+    """Return the signed distance of a point to a segment's line, positive to the left."""
     offset: float = (y - point["y"]) * point["cos"] - (x - point["x"]) * point["sin"]
     return offset
 
@@ -100,14 +100,14 @@ def _left_of(point: np.void, x: float, y: float) -> float:
 def _project_between(
     points: NDArray[np.void], first: int, num: int, start: int, stop: int, x: float, y: float
 ) -> tuple[float, float, float, float]:
-    """`project` with the search limited to the segments [start, stop)."""
+    """Return what `project` does, but search the segments [start, stop) only."""
     nearest, squared = _nearest_segment(points, start, stop, x, y)
     point = points[nearest]
     along = (x - point["x"]) * point["cos"] + (y - point["y"]) * point["sin"]
     length = points[nearest + 1]["s"] - point["s"]
     d = _left_of(point, x, y)
     if along < 0.0 and nearest > first:
-        # Nearest to a corner: in a sharp bend one segment alone cannot tell its outer side.
+        # Nearest to a corner: one segment of a sharp bend is not enough to find its outer side.
         side = d + _left_of(points[nearest - 1], x, y)
         along = 0.0
         d = math.copysign(math.sqrt(squared), side)
@@ -126,10 +126,11 @@ def project(
     x: float,  # m
     y: float,  # m
 ) -> tuple[float, float, float, float]:  # s and d in metres, cos and sin of the direction there
-    """The lane coordinates of a place: those of the nearest point of the polyline.
+    """Return the lane coordinates of a point: those of the nearest point of the polyline.
 
-    Of several nearest points the one with the smaller `s` counts. Where that point is an end of the
-    polyline, `s` and `d` are taken along the end segment's line, so `s` may leave [0, length].
+    Of several nearest points, the one with the smallest `s` counts. If it is an end of the
+    polyline, `s` and `d` are relative to the end segment's line, so `s` may be outside of [0,
+    length].
     """
     return _project_between(points, first, num, first, first + num - 1, x, y)
 
@@ -144,7 +145,7 @@ def project_near(
     s_hint: float,
     window_m: float,
 ) -> tuple[float, float, float, float]:
-    """`project`, looking only at segments that reach into [s_hint - window_m, s_hint + window_m].
+    """Project onto segments that overlap [s_hint - window_m, s_hint + window_m]; see `project`.
 
     Faster on long lanes, and it keeps a vehicle on its branch of a lane that returns to itself.
     """
@@ -157,21 +158,21 @@ def project_near(
 def boxes_overlap(
     x1: float,  # centre of the first box, m
     y1: float,  # centre of the first box, m
-    cos1: float,  # of its heading
-    sin1: float,  # of its heading
+    cos1: float,  # cos of the heading
+    sin1: float,  # sin of the heading
     half_length1: float,  # along its heading, m
     half_width1: float,  # across its heading, m
-    x2: float,  # the same of the second box
-    y2: float,  # see `x2`
-    cos2: float,  # see `x2`
-    sin2: float,  # see `x2`
-    half_length2: float,  # see `x2`
-    half_width2: float,  # see `x2`
+    x2: float,  # as above, for the second box
+    y2: float,  # as above
+    cos2: float,  # as above
+    sin2: float,  # as above
+    half_length2: float,  # as above
+    half_width2: float,  # as above
 ) -> bool:
-    """Whether two oriented rectangles share area; touching does not count.
+    """Return whether two oriented rectangles share area; touching does not count.
 
-    Separating axes (Gottschalk, Lin, Manocha: "OBBTree", SIGGRAPH 1996), in the plane. Written so
-    that swapping the boxes swaps the comparisons and changes no bit of them.
+    Separating axes (Gottschalk, Lin, Manocha: "OBBTree", SIGGRAPH 1996), in the plane. Swapping the
+    boxes swaps the comparisons and does not change a bit.
     """
     dx = x2 - x1
     dy = y2 - y1
@@ -187,9 +188,9 @@ def boxes_overlap(
 
 @kernel
 def _overlap_s(apart: float, rate: float, reach: float) -> tuple[float, float]:
-    """From when to when two shadows overlap on one axis, in s; inf and -inf if they never do.
+    """Return when two projections start and stop to overlap on one axis, in s; inf, -inf: never.
 
-    Their middles are `apart` m from each other, which grows by `rate` m/s.
+    Their centres are `apart` m apart, which changes by `rate` m/s.
     """
     if abs(rate) < STILL_MPS:
         return (-math.inf, math.inf) if abs(apart) < reach else (math.inf, -math.inf)
@@ -201,28 +202,28 @@ def _overlap_s(apart: float, rate: float, reach: float) -> tuple[float, float]:
 
 @kernel
 def time_to_collision_s(
-    dx: float,  # from the first box's centre to the second one's, m
+    dx: float,  # from the centre of the first box to that of the second box, m
     dy: float,  # see `dx`
-    vx: float,  # of the second box, seen from the first one, m/s
+    vx: float,  # velocity of the second box relative to the first box, m/s
     vy: float,  # see `vx`
     cos1: float,  # of the first box's heading
     sin1: float,  # see `cos1`
     half_length1: float,  # along its heading, m
     half_width1: float,  # across its heading, m
-    cos2: float,  # the same of the second box
-    sin2: float,  # see `cos2`
-    half_length2: float,  # see `cos2`
-    half_width2: float,  # see `cos2`
+    cos2: float,  # as above, for the second box
+    sin2: float,  # as above
+    half_length2: float,  # as above
+    half_width2: float,  # as above
 ) -> float:
-    """When two oriented rectangles touch if both keep their velocities, in s; inf: never, 0: now.
+    """Return the time in s until two oriented rectangles touch; inf: never, 0: now.
 
     Hayward's time to collision ("Near miss determination through use of a scale of danger", Highway
-    Research Record 384, 1972) for bodies that move and do not turn: they overlap while their
-    shadows do on each of the four separating axes of `boxes_overlap`.
+    Research Record 384, 1972) for bodies with constant velocities that do not turn: they overlap
+    while their projections do on each of the four separating axes of `boxes_overlap`.
     """
     cos = abs(cos1 * cos2 + sin1 * sin2)
     sin = abs(cos1 * sin2 - sin1 * cos2)
-    # Across the first box first: most that are near pass on another lane.
+    # Across the first box first: most nearby vehicles pass on another lane.
     reach = half_width1 + half_length2 * sin + half_width2 * cos
     begin, end = _overlap_s(dy * cos1 - dx * sin1, vy * cos1 - vx * sin1, reach)
     if end <= 0.0:

@@ -1,11 +1,11 @@
-"""Vehicles that are near: those of one world in square cells, and the nearest of them.
+"""A grid with the vehicles of one world in square cells, and searches for the nearest of them.
 
-`fill_grid` sorts the vehicles into cells once a tick and puts what others look at into `bodies`:
-small records that lie together in memory, with sine and cosine of the heading taken once. Within a
-cell they lie in row order; readers must not depend on it and break ties by id.
+`fill_grid` sorts the vehicles into cells once per tick. It copies the data that neighbours read
+into `bodies`: compact records with sine and cosine of the heading computed once. Within a cell they
+are in row order; readers must not depend on this and break ties by id.
 
-Cells reach to the ends of the plane: what lies outside the grid's area belongs to the border cells.
-Where worlds drive on one of several maps, the area floats: it begins where their vehicles do.
+The border cells extend to infinity: they contain everything outside of the grid's area. If worlds
+drive on one of several maps, the area floats: it begins where their vehicles are.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LEVEL_HEIGHT_M = (
     4.0  # vehicles further apart in z are on different levels and do not see each other
 )
 
-# Added to every search: a place at just the search distance must not depend on where cells begin.
+# Added to every search, so that a body at exactly the search distance is always found.
 _MARGIN_M = 1e-6
 
 BODY = np.dtype(
@@ -49,17 +49,17 @@ SPOT = np.dtype(
         ("x", np.float64),  # centre, m
         ("y", np.float64),
         ("radius", np.float64),  # half the diagonal, m
-        ("next", np.int32),  # VEHICLE row of another one in the same cell, or -1
+        ("next", np.int32),  # VEHICLE row of another vehicle in the same cell, or -1
     ],
     align=True,
 )
 
 
 class Grid(NamedTuple):
-    """Square cells over a map and the bodies in them; holds nothing between ticks."""
+    """Square cells over a map and the bodies in them; rebuilt in each tick."""
 
-    corner: NDArray[np.float64]  # (2,) m, of cell (0, 0)
-    floating: bool  # `aim` moves it
+    corner: NDArray[np.float64]  # (2,) m, corner of cell (0, 0)
+    floating: bool  # whether `aim` moves it
     cells_per_m: float
     num_x: int
     num_y: int
@@ -69,17 +69,17 @@ class Grid(NamedTuple):
     bodies: NDArray[np.void]  # BODY (capacity,)             c = j * num_x + i
     cell: NDArray[np.int32]  # (capacity,) the cell of each row
     largest: NDArray[np.float64]  # (1,) the largest radius of all bodies, m
-    newest: NDArray[np.int32]  # (num_x * num_y,) the VEHICLE row put last into each cell, or -1
-    spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; both only `contacts` uses
+    newest: NDArray[np.int32]  # (num_x * num_y,) the VEHICLE row last put into each cell, or -1
+    spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; only `contacts` uses these two
 
 
 def make_grid(
     bounds: tuple[float, float, float, float],  # min_x, min_y, max_x, max_y of the area in m
     cell_m: float,  # side of a cell in m; about half the usual search distance is fast
-    capacity: int,  # most vehicles that it can take
-    floating: bool = False,  # the area begins where the vehicles do
+    capacity: int,  # maximum number of vehicles
+    floating: bool = False,  # whether the area begins where the vehicles are
 ) -> Grid:
-    """An empty grid."""
+    """Return an empty grid."""
     min_x, min_y, max_x, max_y = bounds
     num_x = max(1, math.ceil((max_x - min_x) / cell_m))
     num_y = max(1, math.ceil((max_y - min_y) / cell_m))
@@ -100,9 +100,9 @@ def make_grid(
 
 @kernel
 def _slot(offset: float, cells_per_m: float, count: int) -> int:
-    """The cell along one axis; the first or last one outside of the area, the first one for NaN."""
+    """Return the cell along one axis; the border cell if outside, the first cell for NaN."""
     cells = offset * cells_per_m
-    cells = cells if cells > 0.0 else 0.0  # NaN, too
+    cells = cells if cells > 0.0 else 0.0  # also for NaN
     last = count - 1.0
     return int(cells if cells < last else last)
 
@@ -115,7 +115,7 @@ def cell_at(grid: Grid, x: float, y: float) -> int:
 
 @kernel
 def cell_columns(grid: Grid, x: float, distance_m: float) -> tuple[int, int]:
-    """The first and last column of cells that can hold a body within `distance_m` of `x`."""
+    """Return the first and last column of cells with bodies within `distance_m` of `x`."""
     return (
         _slot(x - distance_m - _MARGIN_M - grid.corner[0], grid.cells_per_m, grid.num_x),
         _slot(x + distance_m + _MARGIN_M - grid.corner[0], grid.cells_per_m, grid.num_x),
@@ -124,7 +124,7 @@ def cell_columns(grid: Grid, x: float, distance_m: float) -> tuple[int, int]:
 
 @kernel
 def cell_rows(grid: Grid, y: float, distance_m: float) -> tuple[int, int]:
-    """The first and last row of cells that can hold a body within `distance_m` of `y`."""
+    """Return the first and last row of cells with bodies within `distance_m` of `y`."""
     return (
         _slot(y - distance_m - _MARGIN_M - grid.corner[1], grid.cells_per_m, grid.num_y),
         _slot(y + distance_m + _MARGIN_M - grid.corner[1], grid.cells_per_m, grid.num_y),
@@ -133,7 +133,7 @@ def cell_rows(grid: Grid, y: float, distance_m: float) -> tuple[int, int]:
 
 @kernel
 def aim(grid: Grid, rows: NDArray[np.void], num: int) -> None:
-    """Let the area of a floating grid begin where VEHICLE rows[:num] do."""
+    """Move the area of a floating grid to where VEHICLE rows[:num] begin."""
     if not grid.floating or num == 0:
         return
     min_x = math.inf
@@ -147,7 +147,7 @@ def aim(grid: Grid, rows: NDArray[np.void], num: int) -> None:
 
 @kernel
 def _fill_body(body: np.void, vehicle: np.void, row: int) -> None:
-    """Copy what others see of a vehicle."""
+    """Copy the data of a vehicle that neighbours read."""
     half_length = 0.5 * vehicle["length"]
     half_width = 0.5 * vehicle["width"]
     heading = vehicle["heading"]
@@ -170,9 +170,9 @@ def _fill_body(body: np.void, vehicle: np.void, row: int) -> None:
 def fill_grid(
     rows: NDArray[np.void],  # VEHICLE (C,)
     num: int,  # live rows, `rows[:num]`; at most the grid's capacity
-    grid: Grid,  # from `make_grid`, overwritten
+    grid: Grid,  # overwritten
 ) -> None:
-    """Sort the vehicles of one world into the cells of `grid`, which forgets what it held."""
+    """Sort the vehicles of one world into the cells of `grid`, replacing its content."""
     start = grid.start
     cell = grid.cell
     start[:] = 0
@@ -183,7 +183,7 @@ def fill_grid(
         start[c] += 1
     for c in range(1, start.size):
         start[c] += start[c - 1]
-    # From the ends of the cells to their beginnings, hence the rows from last to first.
+    # Cells are filled from their ends, so rows are visited from last to first.
     largest = 0.0
     for i in range(num - 1, -1, -1):
         c = cell[i]
@@ -196,18 +196,18 @@ def fill_grid(
 
 @kernel
 def k_nearest(
-    grid: Grid,  # filled for this tick
+    grid: Grid,  # VEHICLE row to leave out, the searching vehicle; -1: none
     row: int,  # VEHICLE row to leave out, the one that asks; -1 for none
     x: float,  # m
     y: float,  # m
-    z: float,  # m; vehicles more than `LEVEL_HEIGHT_M` above or below are not seen
-    radius_m: float,  # centres further away than this are not seen, in the plane
-    k: int,  # how many to find at most
-    # (k,) int, VEHICLE rows of those found, overwritten up to the returned number
+    z: float,  # m; vehicles more than `LEVEL_HEIGHT_M` above or below are left out
+    radius_m: float,  # maximum distance of centres in the plane
+    k: int,  # maximum number of vehicles
+    # (k,) int, VEHICLE rows that were found, overwritten up to the returned number
     out_row: NDArray[np.int32],
-    out_squared: NDArray[np.float64],  # (k,) squared distances in m², likewise
-) -> int:  # how many were found
-    """The nearest vehicles around a place on the same level, sorted by distance, then by id."""
+    out_squared: NDArray[np.float64],  # (k,) their squared distances in m²
+) -> int:  # number of vehicles found
+    """Return the nearest vehicles on the same level, sorted by distance, then by id."""
     found = nearest_bodies(grid, row, x, y, z, radius_m, k, out_row, out_squared)
     for m in range(found):
         out_row[m] = grid.bodies[out_row[m]]["row"]
@@ -226,7 +226,7 @@ def nearest_bodies(
     out_body: NDArray[np.int32],
     out_squared: NDArray[np.float64],
 ) -> int:
-    """`k_nearest` as positions in `grid.bodies`, whose records hold what others see."""
+    """Find the `k_nearest` as positions in `grid.bodies`."""
     bodies = grid.bodies
     limit = radius_m * radius_m
     first_column, last_column = cell_columns(grid, x, radius_m)
@@ -242,7 +242,7 @@ def nearest_bodies(
             squared = dx * dx + dy * dy
             if not squared <= limit or body["row"] == row or abs(body["z"] - z) > LEVEL_HEIGHT_M:
                 continue
-            # Insertion from the end.
+            # Insertion sort from the end.
             place = found
             while place > 0 and (
                 squared < out_squared[place - 1]

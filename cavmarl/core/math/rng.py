@@ -1,7 +1,7 @@
-"""Random numbers as a pure function of the asking id, the time and the purpose: Philox4x32-10.
+"""Random numbers as a pure function of vehicle, time and purpose: Philox4x32-10.
 
-Salmon, Moraes, Dror, Shaw: "Parallel random numbers: as easy as 1, 2, 3", SC 2011. A generator
-without state gives a vehicle the same numbers in whichever shard it lives, and after any restart.
+Salmon, Moraes, Dror, Shaw: "Parallel random numbers: as easy as 1, 2, 3", SC 2011. A stateless
+generator gives a vehicle the same numbers in every shard, and after every restart.
 
     key      64 bits   `world_key(seed, world, episode)`
     counter  word 0    vehicle, bits 0-31
@@ -9,12 +9,12 @@ without state gives a vehicle the same numbers in whichever shard it lives, and 
              word 2    vehicle, bits 32-47, below tick, bits 32-47
              word 3    stream + draw index
 
-A caller that needs several numbers of one stream in one tick asks for `STREAM_X`, `STREAM_X + 1`,
-…: the ids below lie `DRAWS_PER_STREAM` apart. Every consumer of randomness has its own stream in
+A caller that needs several numbers of one stream in one tick uses `STREAM_X`, `STREAM_X + 1`, …:
+the streams below are `DRAWS_PER_STREAM` apart. Every use of random numbers has its own stream in
 this list.
 
-The words are kept in uint64, where the product of two 32-bit numbers cannot overflow. All operands
-are uint64: Numba turns a mix with int64 into float64.
+Words are stored as uint64, in which the product of two 32-bit numbers cannot overflow. All operands
+are uint64: Numba converts a mix with int64 to float64.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DRAWS_PER_STREAM = 1 << 16
 
 STREAM_WORLD = 0 * DRAWS_PER_STREAM  # keys of worlds and episodes
 STREAM_ROUTE = 1 * DRAWS_PER_STREAM  # destinations
-STREAM_ORIGIN = 2 * DRAWS_PER_STREAM  # where a vehicle enters
+STREAM_ORIGIN = 2 * DRAWS_PER_STREAM  # where vehicles enter
 STREAM_SPEED_FACTOR = 3 * DRAWS_PER_STREAM  # desired speed over the limit
 STREAM_PLACE = 4 * DRAWS_PER_STREAM  # positions at reset
 STREAM_DEPARTURE = 5 * DRAWS_PER_STREAM  # times between departures
@@ -36,8 +36,8 @@ STREAM_DRIVER = 9 * DRAWS_PER_STREAM  # decisions of background drivers
 STREAM_SENSOR = 10 * DRAWS_PER_STREAM  # noise and dropouts of sensors
 STREAM_V2X = 11 * DRAWS_PER_STREAM  # losses and delays of messages
 STREAM_DEMAND = 12 * DRAWS_PER_STREAM  # times, types and routes of a demand file
-STREAM_REROUTER = 13 * DRAWS_PER_STREAM  # which vehicles follow a rerouter, and where to
-STREAM_MAP = 14 * DRAWS_PER_STREAM  # the map of an episode, where there are several
+STREAM_REROUTER = 13 * DRAWS_PER_STREAM  # which vehicles follow a rerouter, and their new goals
+STREAM_MAP = 14 * DRAWS_PER_STREAM  # the map of an episode, if there are several
 
 _MASK_16 = np.uint64(0xFFFF)
 _MASK_32 = np.uint64(0xFFFFFFFF)
@@ -67,14 +67,14 @@ _ULP = 1.0 / (1 << 53)
 
 @kernel
 def philox4x32(
-    c0: np.uint64,  # lowest word of the counter, as all words a uint64 below 2**32
+    c0: np.uint64,  # lowest word of the counter; all words are uint64 below 2**32
     c1: np.uint64,  # second word of the counter
     c2: np.uint64,  # third word of the counter
     c3: np.uint64,  # highest word of the counter
     k0: np.uint64,  # low word of the key
     k1: np.uint64,  # high word of the key
 ) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """One block of Philox4x32-10: four 32-bit words from a 128-bit counter and a 64-bit key."""
+    """Return one block of Philox4x32-10: four 32-bit words from counter (128 bits) and key (64)."""
     for _ in range(_ROUNDS):
         product_0 = c0 * _MULTIPLIER_0
         product_1 = c2 * _MULTIPLIER_1
@@ -91,7 +91,7 @@ def philox4x32(
 def _block(
     key: int | np.uint64, vehicle: int, tick: int, stream: int
 ) -> tuple[np.uint64, np.uint64]:
-    """The first two words of the block at the module's counter layout."""
+    """Return the first two words of a block, with the counter layout of this module."""
     key_bits = np.uint64(key)
     vehicle_bits = np.uint64(vehicle)
     tick_bits = np.uint64(tick)
@@ -115,7 +115,7 @@ def world_key(
     world: int,  # number of the world, in [0, 2**48)
     episode: int,  # number of the episode in that world, in [0, 2**48)
 ) -> np.uint64:
-    """The key of one world in one episode, mixed from the run's seed."""
+    """Return the key of one world in one episode, derived from the run's seed."""
     word_0, word_1 = _block(seed, world, episode, STREAM_WORLD)
     return word_0 | (word_1 << _SHIFT_32)
 
@@ -127,7 +127,7 @@ def uniform(
     tick: int,  # of the world, in [0, 2**48)
     stream: int,  # one of `STREAM_*`, plus the index of the draw
 ) -> float:
-    """A number of 53 random bits, uniform in [0, 1)."""
+    """Return a number with 53 random bits, uniform in [0, 1)."""
     word_0, word_1 = _block(key, vehicle, tick, stream)
     return float(((word_0 >> _SHIFT_5) << _SHIFT_26) | (word_1 >> _SHIFT_6)) * _ULP
 
@@ -140,7 +140,7 @@ def fill_uniform(
     stream: int,
     numbers: NDArray[np.float64],
 ) -> None:
-    """`uniform` for each pair of `vehicles` (n,) and `ticks` (n,), written to `numbers` (n,)."""
+    """Write `uniform` of each pair of `vehicles` (n,) and `ticks` (n,) to `numbers` (n,)."""
     for i in range(len(numbers)):
         numbers[i] = uniform(key, vehicles[i], ticks[i], stream)
 
@@ -153,16 +153,16 @@ def below(
     stream: int,  # one of `STREAM_*`, plus the index of the draw
     n: int,  # number of values, in [1, 2**32)
 ) -> int:
-    """An integer uniform in [0, n); no value's chance is off by more than 2**-64."""
+    """Return an integer uniform in [0, n); no probability is off by more than 2**-64."""
     word_0, word_1 = _block(key, vehicle, tick, stream)
     count = np.uint64(n)
-    # floor(n * (word_0 * 2**32 + word_1) / 2**64), carried out in two halves that fit.
+    # floor(n * (word_0 * 2**32 + word_1) / 2**64), computed in two halves that fit.
     return int((word_0 * count + ((word_1 * count) >> _SHIFT_32)) >> _SHIFT_32)
 
 
 @kernel
 def mix(word: np.uint64) -> np.uint64:
-    """The finaliser of SplitMix64: each bit of the word changes about half of the bits."""
+    """Apply the finaliser of SplitMix64: each input bit affects about half of the output bits."""
     word = (word ^ (word >> _SHIFT_30)) * _MIX_0
     word = (word ^ (word >> _SHIFT_27)) * _MIX_1
     return word ^ (word >> _SHIFT_31)
@@ -170,7 +170,7 @@ def mix(word: np.uint64) -> np.uint64:
 
 @kernel
 def quick_uniform(key: int | np.uint64, vehicle: int, tick: int, stream: int) -> float:
-    """As `uniform`, for what every vehicle draws in every tick: a fifth of the time.
+    """Return a uniform number in a fifth of the time of `uniform`, for draws of every tick.
 
     The finaliser of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number
     generators", OOPSLA 2014) over key, vehicle and (stream, tick) in turn.

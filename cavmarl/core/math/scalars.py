@@ -1,4 +1,4 @@
-"""Guards for single numbers that several models share."""
+"""Limits for single numbers that several models share."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ NEAR_ZERO = 0.01
 
 @kernel
 def clamp(value: float, low: float, high: float) -> float:
-    """`value`, or the end of [low, high] that it lies beyond."""
+    """Return `value`, limited to [low, high]."""
     return min(max(value, low), high)
 
 
 @kernel
 def not_zero(value: float) -> float:
-    """`value` kept at least `NEAR_ZERO` away from zero, on its own side, to be divided by.
+    """Return `value`, moved at least `NEAR_ZERO` away from zero, for use as a divisor.
 
-    Highway-env's `utils.not_zero`: a standing car is taken to creep at 1 cm/s.
+    Highway-env's `utils.not_zero`: a standing car is assumed to creep at 1 cm/s.
     """
     if abs(value) > NEAR_ZERO:
         return value

@@ -1,4 +1,4 @@
-"""Whether something stands between two places: straight walls in square cells."""
+"""Lines of sight between two points: straight walls in square cells."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 
 CELL_M = 50.0
-# A line that runs along the border of two cells is looked at in both.
+# A line along the border of two cells is searched in both.
 _MARGIN_M = 1e-6
 
 
 class Walls(NamedTuple):
-    """Line segments and the cells that they touch; never written."""
+    """Line segments and the cells that they touch; never modified."""
 
     min_x: float  # m, corner of cell (0, 0)
     min_y: float
@@ -29,7 +29,7 @@ class Walls(NamedTuple):
 
 
 def make_walls(
-    segments: NDArray[np.float64],  # (n, 4) their ends x, y, x, y in m; none is fine, too
+    segments: NDArray[np.float64],  # (n, 4) ends x, y, x, y in m; may be empty
     cell_m: float = CELL_M,  # side of a cell
 ) -> Walls:
     """Sort walls into cells."""
@@ -41,7 +41,7 @@ def make_walls(
     min_x, min_y = float(x.min()), float(y.min())
     num_x = int((x.max() - min_x) / cell_m) + 1
     num_y = int((y.max() - min_y) / cell_m) + 1
-    # Each wall is listed in all cells of its bounding box: most are shorter than a cell.
+    # Each wall is listed in all cells of its bounding box: most walls are shorter than a cell.
     columns = np.floor((np.sort(x, axis=1) - min_x + (-_MARGIN_M, _MARGIN_M)) / cell_m)
     rows = np.floor((np.sort(y, axis=1) - min_y + (-_MARGIN_M, _MARGIN_M)) / cell_m)
     columns = np.clip(columns.astype(np.int64), 0, num_x - 1)
@@ -60,7 +60,7 @@ def make_walls(
 
 @kernel
 def _crosses(wall: NDArray[np.float64], x: float, y: float, to_x: float, to_y: float) -> bool:
-    """Whether the line from (x, y) meets a wall, its ends included."""
+    """Return whether the line from (x, y) meets a wall, including its ends."""
     dx = to_x - x
     dy = to_y - y
     side_a = dx * (wall[1] - y) - dy * (wall[0] - x)
@@ -76,15 +76,15 @@ def _crosses(wall: NDArray[np.float64], x: float, y: float, to_x: float, to_y: f
 
 @kernel
 def _clamped(number: float, most: int) -> int:
-    """The whole number below `number`, from 0 to `most`."""
+    """Return the whole number below `number`, limited to [0, most]."""
     return int(min(max(math.floor(number), 0.0), float(most)))
 
 
 @kernel
 def is_cut(walls: Walls, x: float, y: float, to_x: float, to_y: float) -> bool:
-    """Whether a wall meets the straight line between two places, m.
+    """Return whether a wall meets the straight line between two points in m.
 
-    A wall that lies on the line does not: it is the side of a house along which one looks.
+    A wall along the line does not: it is the side of a house along which the line of sight runs.
     """
     if walls.start.size == 1:
         return False
@@ -97,7 +97,7 @@ def is_cut(walls: Walls, x: float, y: float, to_x: float, to_y: float) -> bool:
         low = y
         high = to_y
         if slope != math.inf:
-            # Where the line enters the column and leaves it.
+            # Positions where the line enters and leaves the column.
             left = walls.min_x + i * walls.cell_m
             if i > first:
                 low = y + (left - x) * slope

@@ -1,4 +1,4 @@
-"""Bundles of arrays that kernels take together, codes, and questions about a vehicle's row."""
+"""Bundles of arrays for kernels, codes, and predicates of a vehicle's row."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ import numpy as np
 
 
 def record(*fields: Any) -> np.dtype[np.void]:
-    """The dtype of a record with these fields, each at a multiple of its size."""
+    """Return the dtype of a record with these fields, each aligned to its size."""
     return np.dtype([*fields], align=True)

@@ -1,7 +1,7 @@
-"""Bundles of arrays that kernels take together, so that no kernel has twenty arguments.
+"""Bundles of arrays for kernels, so that no kernel has twenty arguments.
 
-W is the number of worlds stepped together, C the rows a world can hold, A the agents, L lanes, K
-links, G goals. The record dtypes are described where they are made: `roads.network`,
+W is the number of worlds that are stepped together, C the number of rows of a world, A agents, L
+lanes, K links, G goals. The record dtypes are described where they are defined: `roads.network`,
 `roads.routing`, `driving.vehicles`, `traffic.native`.
 """
 
@@ -17,7 +17,7 @@ from cavmarl.core.math.walls import Walls
 
 
 class RoadArrays(NamedTuple):
-    """What kernels take of a `RoadNetwork`: the record arrays and nothing else."""
+    """The record arrays of a `RoadNetwork`."""
 
     points: NDArray[np.void]  # POINT (num_points,)
     lanes: NDArray[np.void]  # LANE (L,)
@@ -34,12 +34,12 @@ class RoadArrays(NamedTuple):
     detectors: NDArray[np.void]  # DETECTOR (D,)
     phase_detectors: NDArray[np.int32]  # see PHASE["first_detector"]
     lane_place: NDArray[np.int32]  # (L,) the first PLACE of each lane, or -1
-    places: NDArray[np.void]  # PLACE (num_places,) detectors that bodies on a lane can cover
+    places: NDArray[np.void]  # PLACE (num_places,) detectors that vehicles on a lane can cover
     maps: NDArray[np.void]  # MAP (M,), see `roads.kernels.map_choice`
 
 
 class LaneGrid(NamedTuple):
-    """Which lanes lie near a place: square cells over the map, lanes of a cell in CSR form."""
+    """The lanes near a point: square cells over the map, with each cell's lanes in CSR form."""
 
     min_x: float
     min_y: float
@@ -51,34 +51,34 @@ class LaneGrid(NamedTuple):
 
 
 class Scripts(NamedTuple):
-    """Where scripted vehicles and pedestrians are, by tick; see `scenarios.movement_scripts`."""
+    """Positions of scripted vehicles and pedestrians by tick; see `scenarios.movement_scripts`."""
 
     frames: NDArray[np.void]  # FRAME (num_frames,), by VEHICLE["goal"] of a scripted row
-    covers: NDArray[np.void]  # COVER (num_covers,) of lanes by bodies
-    claims: NDArray[np.void]  # CLAIM (num_claims,) of links by vehicles that will be there soon
-    cues: NDArray[np.void]  # CUE (T,) what scripts wait for
-    room: int  # lanes that all of them can cover at the same time
-    reach_m: float  # the farthest from a body to the middle of a stretch that it covers
+    covers: NDArray[np.void]  # COVER (num_covers,) stretches of lanes that bodies cover
+    claims: NDArray[np.void]  # CLAIM (num_claims,) links claimed by vehicles that arrive soon
+    cues: NDArray[np.void]  # CUE (T,) conditions that scripts wait for
+    room: int  # maximum number of lanes covered at the same time
+    reach_m: float  # largest distance of a body from the middle of a stretch that it covers
 
 
 class TripTables(NamedTuple):
-    """What vehicles are and which ways there are; the same for all worlds of an environment."""
+    """Vehicle types and routes; the same for all worlds of an environment."""
 
     types: NDArray[np.void]  # VTYPE (num_types,), by VEHICLE["vtype"]
     steps: NDArray[np.void]  # PLAN (num_steps,), see `lanes.route_following`
     stops: NDArray[np.void]  # STOP (num_stops,), by VEHICLE["stop"]
-    first_detour: int  # PLAN row of the first goal of demand vehicles that take another way
-    begin_s: float  # the clock of the demand at tick 0
-    view_m: float  # how far any driver looks for others along the road, at most VIEW_M
-    see_m: float  # how far before a line its centre is when a driver first asks about it
-    num_fixed: int  # steps from here on are written while the world runs
+    first_detour: int  # PLAN row of the first goal of demand vehicles that are rerouted
+    begin_s: float  # time of the demand at tick 0
+    view_m: float  # how far any driver looks for vehicles along the road, at most VIEW_M
+    see_m: float  # distance before a stop line from which drivers check it
+    num_fixed: int  # steps from this one on are written while the world runs
     scripts: Scripts
-    trip_horizon: float = 0.0  # so many times its free time a trip of an agent may take; 0: any
+    trip_horizon: float = 0.0  # limit of agents' trips, in multiples of free time; 0: no limit
     tick_s: float = 0.1
 
 
 class SharedState(NamedTuple):
-    """What the shards of one process have in common of W worlds; see `Worlds`."""
+    """State of W worlds that the shards of one process share; see `Worlds`."""
 
     ticks: NDArray[np.int64]
     keys: NDArray[np.uint64]
@@ -92,39 +92,39 @@ class SharedState(NamedTuple):
 class Worlds(NamedTuple):
     """A shard's part of W worlds: the vehicles and signals that a tick reads and writes.
 
-    `rows` is the committed state of the tick, `next_rows` what `advance` makes of it: the same
-    array, but in the ticks that put rows in order.
+    `rows` is the committed state of the tick, `next_rows` the result of `advance`. Both are the
+    same array, except in ticks that sort the rows.
     """
 
     rows: NDArray[np.void]  # VEHICLE (W, C)
     next_rows: NDArray[np.void]  # VEHICLE (W, C)
-    num_owned: NDArray[np.int64]  # (W,) rows [0, num_owned) are this shard's own
+    num_owned: NDArray[np.int64]  # (W,) rows [0, num_owned) belong to this shard
     num_rows: NDArray[np.int64]  # (W,) rows [num_owned, num_rows) are ghosts
     ticks: NDArray[np.int64]  # (W,) since reset
     keys: NDArray[np.uint64]  # (W,) the root of all random numbers of the episode
     signal_phase: NDArray[np.int32]  # (W, num_signals) PHASE row that is on
-    controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
-    detected_s: NDArray[np.float64]  # (W, D) when a body was last over each detector
+    controllers: NDArray[np.void]  # (W, num_signals) PHASE row that is on
+    detected_s: NDArray[np.float64]  # (W, D) time when a body was last over each detector
     num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
     pending: NDArray[
         np.float64
     ]  # (W, A, D + 1, 2) agents' commands of the last D ticks of latency, by tick modulo D + 1
-    num_near: NDArray[np.int64]  # (W,) the first ghosts, up to here, can touch owned vehicles
+    num_near: NDArray[np.int64]  # (W,) only ghosts before this row can touch owned vehicles
     num_touching: NDArray[np.int64]  # (W,) owned vehicles that touched another before this tick
-    num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since reset
+    num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since the reset
     step: NDArray[
         np.void
-    ]  # PLAN (W, C) of each row the step of its lane, see `route_following.own_step`
-    step_at: NDArray[np.int64]  # (W, C) 1 + which of `TripTables.steps` that is, 0: none yet
-    outer: NDArray[np.void]  # OUTER (W, C) owned next rows that other zones may see, rising
-    num_outer: NDArray[np.int64]  # (W,) -1: not noted since rows changed
-    cues: NDArray[np.int64]  # (W, T) the tick in which each cue of the script came, -1: not yet
+    ]  # PLAN (W, C) the step of each row's lane, see `route_following.own_step`
+    step_at: NDArray[np.int64]  # (W, C) 1 + its index in `TripTables.steps`, 0: none yet
+    outer: NDArray[np.void]  # OUTER (W, C) owned next rows that other zones may see, ascending
+    num_outer: NDArray[np.int64]  # (W,) -1: not up to date with the rows
+    cues: NDArray[np.int64]  # (W, T) tick of each cue of the script, -1: not yet
 
 
 class ZoneState(NamedTuple):
-    """What all k zones have of W worlds, side by side; each shard's `Worlds` are views of it."""
+    """State of all k zones of W worlds; the `Worlds` of each shard are views of it."""
 
-    rows: NDArray[np.void]  # VEHICLE (2, k, W, C) what `rows` and `next_rows` are views of
+    rows: NDArray[np.void]  # VEHICLE (2, k, W, C) memory of `rows` and `next_rows`
     num_owned: NDArray[np.int64]  # (k, W)
     num_rows: NDArray[np.int64]  # (k, W)
     num_near: NDArray[np.int64]  # (k, W)
@@ -135,61 +135,61 @@ class ZoneState(NamedTuple):
     step_at: NDArray[np.int64]  # (k, W, C)
     outer: NDArray[np.void]  # OUTER (k, W, C)
     num_outer: NDArray[np.int64]  # (k, W)
-    border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, rising
+    border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, ascending
     num_border: NDArray[np.int64]  # (k, W)
     spare: NDArray[np.void]  # VEHICLE (1,)
 
 
 class DepartureQueue(NamedTuple):
-    """What one place keeps of each world, however it is divided: ids, the queue, the counts."""
+    """Per-world data that is never divided: ids, the queue of departures, counts."""
 
-    orders: NDArray[np.void]  # DEPARTURE (W, D) what a demand file orders, in order of `due`
+    orders: NDArray[np.void]  # DEPARTURE (W, D) departures of a demand file, in order of `due`
     num_orders: NDArray[np.int64]  # (W,)
-    next_order: NDArray[np.int64]  # (W,) the first one that is not due yet
-    queue: NDArray[np.void]  # DEPARTURE (W, C + D) vehicles that wait to enter, in id order
+    next_order: NDArray[np.int64]  # (W,) the first departure that is not due yet
+    queue: NDArray[np.void]  # DEPARTURE (W, C + D) vehicles that wait to enter, in order of id
     num_queue: NDArray[np.int64]  # (W,)
-    next_id: NDArray[np.int64]  # (W,) the next vehicle's id
-    num_entered: NDArray[np.int64]  # (W,) agents that have been ordered so far
+    next_id: NDArray[np.int64]  # (W,) id of the next vehicle
+    num_entered: NDArray[np.int64]  # (W,) agents that have departed so far
     counts: NDArray[np.int64]  # (W, NUM_COUNTS) departed, arrived, removed since reset
     sums: NDArray[np.float64]  # (W, NUM_SUMS) sums over arrived vehicles
-    passing: NDArray[np.void]  # VEHICLE (W, C + D) that leave or may enter in this tick
+    passing: NDArray[np.void]  # VEHICLE (W, C + D) vehicles that leave or may enter in this tick
     num_passing: NDArray[np.int64]  # (W,)
-    places: NDArray[np.int64]  # (W, C + D) where in the queue those stand that are about to enter
-    tries: NDArray[np.int32]  # (W, C + D) LANE on which each of the queue tries to enter, or -1
-    ranks: NDArray[np.int64]  # (W, C + D, E) how crowded the lanes of its edge are, at most E
-    last_s: NDArray[np.float64]  # (W, C + D, E) where on them one enters that is to be the last, m
-    lane_taken: NDArray[np.bool_]  # (L,) a vehicle tries to enter there in this tick
-    spare: NDArray[np.void]  # VEHICLE (1,) room
+    places: NDArray[np.int64]  # (W, C + D) positions in the queue of vehicles that may enter
+    tries: NDArray[np.int32]  # (W, C + D) LANE on which each queued vehicle tries to enter, or -1
+    ranks: NDArray[np.int64]  # (W, C + D, E) occupancy rank of the lanes of its edge, at most E
+    last_s: NDArray[np.float64]  # (W, C + D, E) position on them for a vehicle that enters last, m
+    lane_taken: NDArray[np.bool_]  # (L,) whether a vehicle tries to enter there in this tick
+    spare: NDArray[np.void]  # VEHICLE (1,) scratch
 
 
 class TripTable(NamedTuple):
-    """Trips to draw from, map by map."""
+    """Trips to draw from, by map."""
 
     pairs: NDArray[np.int32]  # (P, 2) LANE and goal
     first: NDArray[np.int64]  # (M + 1,) trips of map m: pairs[first[m] : first[m + 1]]
 
 
 class Demand(NamedTuple):
-    """What the generator draws departures from; the same for all worlds of an environment."""
+    """The generator's distributions of departures; the same for all worlds of an environment."""
 
     agent_trips: TripTable
-    start_trips: TripTable  # of background vehicles at reset, dense by lane length
+    start_trips: TripTable  # of background vehicles at the reset, in proportion to lane length
     enter_trips: TripTable  # of background vehicles that enter later
-    # (M,) whether those enter at the start of their lane (a road into the map)
+    # (M,) whether these enter at the start of their lane (a road into the map)
     enter_at_start: NDArray[np.bool_]
-    num_agents: int  # agents in the world at any one time
-    num_ids: int  # agents that an episode can have
+    num_agents: int  # agents in the world at the same time
+    num_ids: int  # agents of an episode
     num_background: int
-    reenter: bool  # whether a vehicle that leaves orders a new one
+    reenter: bool  # whether a vehicle that leaves is replaced by a new one
     endless: bool  # whether agents get another goal before they reach theirs
-    seats: bool  # whether the new one of an agent takes the same id
+    seats: bool  # whether an agent's new vehicle keeps the agent's id
     speed_factor_spread: float
-    blank: NDArray[np.void]  # VEHICLE (1,) what a new record starts from
+    blank: NDArray[np.void]  # VEHICLE (1,) initial value of a new record
     agent_types: NDArray[np.int32]  # VTYPE rows that agents have in turn, by their number
 
 
 class Scratch(NamedTuple):
-    """Room that a tick works in; between calls it knows nothing but which lists to clear."""
+    """Working memory of a tick; between calls, only the lists to clear have a meaning."""
 
     lanes: Lists  # by lane, lists of entries
     lane_start: NDArray[np.int32]  # entries of lane l: [lane_start[l], lane_end[l]); at L: of all.
@@ -199,23 +199,23 @@ class Scratch(NamedTuple):
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
     link_end: NDArray[np.int32]
     approach: NDArray[np.void]  # APPROACH (4 C,) vehicles on or before links, by link
-    largest: NDArray[np.int8]  # (J,) the largest size class of those, by the links' junctions
+    largest: NDArray[np.int8]  # (J,) the largest size class of these, by the links' junctions
     pairs: NDArray[np.void]  # APPROACH (4 C,) the same before sorting
-    order: NDArray[np.int32]  # (C,) the owned rows as they lie along the lanes
+    order: NDArray[np.int32]  # (C,) the owned rows in order along the lanes
     accel: NDArray[np.float64]  # (C,) decided accelerations
-    link_ahead: NDArray[np.int32]  # (C,) the link whose stop line each row is next to
+    link_ahead: NDArray[np.int32]  # (C,) the link at the next stop line of each row
     lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right, or STAYS_ASIDE
     blinker: NDArray[np.int32]  # (C,)
     hold: NDArray[np.int32]  # (C,)
-    hit: NDArray[np.int64]  # (C,) id of the vehicle each row touches
+    hit: NDArray[np.int64]  # (C,) id of the vehicle that each row touches
 
 
 class Sensors(NamedTuple):
-    """What the agents' sensors are set to, and where each writes in a frame."""
+    """Settings of the agents' sensors, and the offset of each sensor in a frame."""
 
     stack: int  # frames in an observation
-    ego: bool  # whether it is on; it writes at 0
-    ego_size: bool  # whether it tells of the vehicle's type
+    ego: bool  # whether the sensor is on; its offset is 0
+    ego_size: bool  # whether it includes the vehicle's type
     route_at: int
     route_points: int
     route_spacing_m: float
@@ -233,27 +233,28 @@ class Sensors(NamedTuple):
     lidar_range_m: float
     lidar_speeds: bool
     rays: NDArray[np.float64]  # (lidar_rays, 2) directions in the ego frame
-    walls: Walls  # that hide neighbours; none: they are seen through walls
-    near_body: NDArray[np.int32]  # (neighbors,) room; with walls, for those that they hide, too
+    walls: Walls  # walls that hide neighbours; empty: neighbours are seen through walls
+    near_body: NDArray[np.int32]  # (neighbors,) scratch; larger if walls hide neighbours
     near_squared: NDArray[np.float64]
-    echoes: NDArray[np.void]  # ECHO (lidar_rays,) room
+    echoes: NDArray[np.void]  # ECHO (lidar_rays,) scratch
     history_at: int
-    history: int  # numbers of the frame before that stay in the next one
+    history: int  # numbers of the frame before that are kept in the next one
 
 
 class Outputs(NamedTuple):
-    """What agents get at the end of a step, at their own index; absent agents have zeros.
+    """Outputs for the agents at the end of a step, by agent index; zeros for absent agents.
 
-    T is the number of terms, D the size of a flat observation. What an agent saw before is kept
-    here and nowhere else: the frames of a stack move up within `observations`.
+    T is the number of terms, D the length of a flat observation. Earlier observations are only
+    stored
+    here: the frames of a stack move up within `observations`.
     """
 
     observations: NDArray[np.float32]  # (W, A, D) the stacked frames, oldest first
     terms: NDArray[np.float32]  # (W, A, T)
     rewards: NDArray[np.float32]  # (W, A)
     terminated: NDArray[np.bool_]  # (W, A) the vehicle ended in this step
-    present: NDArray[np.bool_]  # (W, A) had a vehicle at the end of the step
+    present: NDArray[np.bool_]  # (W, A) the agent had a vehicle at the end of the step
     acted: NDArray[np.bool_]  # (W, A) and had it during the whole step
     events: NDArray[np.int32]  # (W, A) EVENT_* bits of the step
     vehicle_ids: NDArray[np.int64]  # (W, A) -1 where absent
-    places: NDArray[np.float64]  # (W, A, 2) x and y of the vehicle, m; left over where absent
+    places: NDArray[np.float64]  # (W, A, 2) x and y of the vehicle, m; outdated if absent

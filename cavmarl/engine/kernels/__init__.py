@@ -1,1 +1,1 @@
-"""Compiled loops over the results and the actions of all agents."""
+"""Kernels for the actions and the results of all agents."""

@@ -1,4 +1,4 @@
-"""Actions of all agents at once: whether each is in range, and what it means."""
+"""Validation and decoding of the actions of all agents."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from cavmarl.core.compiled import kernel
 @kernel
 def decode_pairs(
     actions: NDArray[Any],  # (W, A, 2) floats
-    mask: NDArray[np.bool_],  # (W, A) whose are read; those of others count as 0
-    acceleration_mps2: float,  # what a throttle of 1 means
-    steering_rad: float,  # what a steering of 1 means
-    last: NDArray[np.float64],  # (W, A, 2) is written, the actions themselves
-    controls: NDArray[np.float64],  # (W, A, 2) is written, what they mean
-) -> bool:  # whether all are within [-1, 1]; False of what is no number, too
-    """Decode shares of the largest throttle and steering angle; nothing if one is out of range."""
+    mask: NDArray[np.bool_],  # (W, A) agents whose actions are read; others count as 0
+    acceleration_mps2: float,  # of a throttle of 1
+    steering_rad: float,  # of a steering of 1
+    last: NDArray[np.float64],  # (W, A, 2) is written, the actions
+    controls: NDArray[np.float64],  # (W, A, 2) is written, m/s² and rad
+) -> bool:  # whether all actions are within [-1, 1]; NaN is not
+    """Decode throttle and steering in [-1, 1]. Write nothing if an action is out of range."""
     for w in range(mask.shape[0]):
         for agent in range(mask.shape[1]):
             if mask[w, agent]:
@@ -31,7 +31,7 @@ def decode_pairs(
             throttle = 0.0
             steering = 0.0
             if mask[w, agent]:
-                throttle = float(actions[w, agent, 0]) + 0.0  # of -0.0 too, 0.0
+                throttle = float(actions[w, agent, 0]) + 0.0  # -0.0 becomes 0.0
                 steering = float(actions[w, agent, 1]) + 0.0
             last[w, agent, 0] = throttle
             last[w, agent, 1] = steering
@@ -43,12 +43,12 @@ def decode_pairs(
 @kernel
 def decode_choices(
     actions: NDArray[Any],  # (W, A) whole numbers
-    mask: NDArray[np.bool_],  # (W, A) whose are read; others stay idle
+    mask: NDArray[np.bool_],  # (W, A) agents whose actions are read; others stay idle
     idle: int,  # the choice that changes nothing
-    choices: int,  # how many there are
+    choices: int,  # number of choices
     last: NDArray[np.int64],  # (W, A) is written
-) -> bool:  # whether all are choices
-    """Take over choices; nothing if one is none."""
+) -> bool:  # whether all actions are valid choices
+    """Copy choices. Write nothing if one is invalid."""
     for w in range(mask.shape[0]):
         for agent in range(mask.shape[1]):
             if mask[w, agent] and not 0 <= actions[w, agent] < choices:

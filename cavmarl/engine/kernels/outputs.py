@@ -1,7 +1,7 @@
-"""The outputs of all agents of a world at once, whichever shards own them.
+"""The outputs of all agents of a world, independent of the shards that own them.
 
-The order at the end of a step: `clear_outputs`, `sense` of every shard, `settle_outputs`, `credit`
-of every shard (`engine.tick`).
+The order at the end of a step is `clear_outputs`, `sense` of every shard, `settle_outputs`,
+`credit` of every shard (`engine.tick`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cavmarl.rewards.kernels.reward import write_rewards
 
 @kernel
 def clear_outputs(outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
-    """Make all agents of the chosen worlds (W,) absent; the observations stay for the stacks."""
+    """Mark all agents of the chosen worlds (W,) as absent, but keep observations for stacks."""
     for w in range(chosen.size):
         if not chosen[w]:
             continue
@@ -46,7 +46,7 @@ def settle_outputs(
 ) -> None:
     """Finish the outputs that all shards have written, in the chosen worlds (W,).
 
-    The observations of absent agents become 0, and rewards are written, as `write_rewards` says.
+    Set the observations of absent agents to 0, and write rewards with `write_rewards`.
     """
     for w in range(chosen.size):
         if chosen[w]:

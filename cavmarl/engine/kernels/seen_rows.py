@@ -1,4 +1,4 @@
-"""Vehicles as frames show them: rows of one record made of those of another, in one pass."""
+"""Conversion of vehicle records for frames and recordings, in one pass."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 
-_BLOCK = 512  # rows that stay in the cache while they are taken apart
+_BLOCK = 512  # rows that fit into the cache while they are split
 
 
 @kernel
 def split_rows(
     raw: NDArray[np.uint8],  # (n, size of a row)
-    offsets: NDArray[np.int64],  # (C + 1,) where each field begins in a row
-    starts: NDArray[np.int64],  # (C,) where its column begins in `out`
+    offsets: NDArray[np.int64],  # (C + 1,) offset of each field in a row, and the size of a row
+    starts: NDArray[np.int64],  # (C,) offset of its column in `out`
     out: NDArray[np.uint8],  # is written
 ) -> None:
-    """Make columns of packed rows, while other threads have the interpreter."""
+    """Split packed rows into columns, while other threads run Python."""
     for first in range(0, raw.shape[0], _BLOCK):
         last = min(first + _BLOCK, raw.shape[0])
         for c in range(starts.size):
@@ -31,11 +31,11 @@ def split_rows(
 @kernel
 def write_seen(
     rows: NDArray[np.void],  # VEHICLE (n,)
-    order: NDArray[np.int64],  # (n,) in which they are written
+    order: NDArray[np.int64],  # (n,) the row for each place of `seen`
     types: NDArray[np.void],  # VTYPE (t,)
     seen: NDArray[np.void],  # SEEN (n,) is written
 ) -> None:
-    """Copy what is seen of vehicles."""
+    """Copy the fields of SEEN from vehicles."""
     for k in range(order.size):
         row, out = rows[order[k]], seen[k]
         out.id = row.id

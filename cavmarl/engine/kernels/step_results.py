@@ -1,7 +1,7 @@
-"""What worlds report of a step, beside the observations, in one pass over their agents.
+"""The results of a step, except observations, in one pass over the agents.
 
-A step writes some ten small arrays. One by one that is some thirty calls of NumPy, and each of them
-waits for memory: the kernels before it have filled the caches with vehicles.
+A step writes about ten small arrays. With NumPy this takes about thirty calls, and each waits for
+memory, because the kernels before it have filled the caches with vehicles.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_OF_FATE, EVENTS_THA
 
 
 class Results(NamedTuple):
-    """See `step_arrays.StepArrays`, of which these are some."""
+    """Some of the arrays of `step_arrays.StepArrays`, which describes them."""
 
     rewards: NDArray[np.float32]  # (W, A)
     terms: NDArray[np.float32]  # (W, A, T)
@@ -34,11 +34,11 @@ class Results(NamedTuple):
 @kernel
 def report(
     outputs: Outputs,  # of the step
-    steps: NDArray[np.int64],  # (W,) since each world's reset; are counted
+    steps: NDArray[np.int64],  # (W,) since each world's reset; increased by 1
     horizon: int,  # steps of an episode
-    results: Results,  # are written
+    results: Results,  # is written
 ) -> bool:  # whether the trip of some vehicle has ended
-    """Write what the agents have got, all but which act next."""
+    """Write the agents' results of a step; `report_continuation` writes the other fields."""
     ended = False
     for w in range(steps.size):
         steps[w] += 1
@@ -63,14 +63,14 @@ def report(
 @kernel
 def report_continuation(
     outputs: Outputs,  # of the step
-    departures: DepartureQueue,  # vehicles that wait, and how many have arrived
+    departures: DepartureQueue,  # waiting vehicles, and the number of arrivals
     steps: NDArray[np.int64],  # (W,) since each world's reset
     horizon: int,  # steps of an episode
-    results: Results,  # are written
+    results: Results,  # is written
 ) -> bool:  # whether an episode is over
-    """Write which agents act next and which episodes are over, once vehicles that end are gone.
+    """Write which agents act next and which episodes are over, after ended vehicles have left.
 
-    An episode is over at its horizon, and when no agent is there and none waits to enter.
+    An episode is over at its horizon, or when no agent is present and none waits to enter.
     """
     some_over = False
     for w in range(steps.size):
@@ -91,11 +91,11 @@ def report_continuation(
 @kernel
 def keep_last(
     results: Results,  # which agents have ended, and which episodes are over
-    # (W, A, D); those of agents that are gone become 0, unless worlds begin anew in the next step
+    # (W, A, D); set to 0 for agents that are gone, unless worlds reset in the next step
     observations: NDArray[np.float32],
-    # (W, A, D) where something has ended, what they were; written
+    # (W, A, D) is written, in worlds where an agent or the episode has ended
     final_observations: NDArray[np.float32],
-    in_next_step: bool,  # when worlds begin anew
+    in_next_step: bool,  # whether worlds reset in the next step
 ) -> None:
     """Keep the last observations of agents that have ended."""
     for w in range(observations.shape[0]):

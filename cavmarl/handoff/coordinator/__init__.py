@@ -1,1 +1,1 @@
-"""WorldCoordinators of divided worlds, their journal and the monitor of invariants."""
+"""Coordinators of divided worlds, their journal and the monitor of invariants."""

@@ -1,10 +1,9 @@
-"""`Coordinator`: what a coordinator of one world is, however it reaches its zones.
+"""`Coordinator`: the base class of coordinators of one world.
 
-It decides which zone advances which vehicle to the next tick, and sees it done. How rows change
-hands is done by the division.
+A coordinator decides which zone advances each vehicle to the next tick, and checks the result. The
+division moves the rows.
 
-`LocalCoordinator` lives in the process of all of its zones; over nodes there is another one,
-`NodeCoordinator`.
+`LocalCoordinator` runs in one process with all its zones, `NodeCoordinator` over nodes.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from cavmarl.ownership.messages import Birth, Record, Removed
 
 
 class Near(NamedTuple):
-    """A vehicle that another zone has to be told of; see `zones.kernels.borders.NEAR`."""
+    """A vehicle near another zone, or beyond its border; see `zones.kernels.borders.NEAR`."""
 
     vehicle: int
     source: int
@@ -30,20 +29,20 @@ class Near(NamedTuple):
 
 
 class Watcher(Protocol):
-    """Is told what happens, as `ownership.trace.Trace` is."""
+    """A receiver of records, such as `ownership.trace.Trace`."""
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Records, in the order of the journal."""
+        """Receive records, in the order of the journal."""
         ...
 
 
 class Coordinator(ABC):
-    """Decides ownership, tick by tick: `begin`, then the zones' work, then `end`."""
+    """Decides ownership, tick by tick: `begin`, then the zones compute, then `end`."""
 
     def __init__(self, directory: Directory, journal: Journal | None) -> None:
         self._directory = directory
-        self.journal = journal  # what takes the records
-        self.switched = 0  # vehicles that have changed their owner
+        self.journal = journal  # stores the records
+        self.switched = 0  # number of changes of owner
         self._watchers: tuple[Watcher, ...] = ()
         self._births: list[Birth] = []
         self._gone: list[Removed] = []  # between two ticks
@@ -60,25 +59,25 @@ class Coordinator(ABC):
     @property
     @abstractmethod
     def is_open(self) -> bool:
-        """Whether a tick has been begun and is not committed."""
+        """Whether a tick has begun and is not committed."""
 
     def watch(self, watcher: Watcher) -> None:
-        """Tell one more of all that happens from now on."""
+        """Send all further records also to this watcher."""
         self._watchers = (*self._watchers, watcher)
 
     def notes(self) -> tuple[tuple[Birth, ...], tuple[Removed, ...]]:
-        """Vehicles born since the last BEGIN, and gone since the last COMMIT."""
+        """Return vehicles that entered since the last BEGIN, and left since the last COMMIT."""
         return tuple(self._births), tuple(self._gone)
 
     def resume(self, births: Iterable[Birth] = (), gone: Iterable[Removed] = ()) -> None:
         self._births, self._gone, self._removed = list(births), list(gone), []
 
     def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
-        """(id, zone) of vehicles that are new since the last BEGIN."""
+        """Add new vehicles, (id, zone), since the last BEGIN."""
         self._births.extend(Birth(vehicle, zone, b"") for vehicle, zone in vehicles)
 
     def left(self, vehicles: Iterable[tuple[int, int]]) -> None:
-        """(id, reason) of vehicles that have left the world."""
+        """Add vehicles, (id, reason), that have left the world."""
         place = self._removed if self.is_open else self._gone
         place.extend(Removed(vehicle, reason) for vehicle, reason in vehicles)
 
@@ -89,14 +88,14 @@ class Coordinator(ABC):
     @abstractmethod
     def begin(
         self,
-        everybody: bool,  # look at all rows: they have changed since the ghosts were renewed
+        everybody: bool,  # check all rows, because rows have changed since ghosts were renewed
         inputs: bytes = b"",  # digest of the actions
     ) -> None:
-        """Decide the way to the next tick, and let rows change hands.
+        """Decide the owners for the next tick, and move rows between owners.
 
         Raises:
-            ProtocolError: a vehicle was lost or doubled, or it cannot be decided.
-            ConfigError: a zone has not seen a vehicle that enters it.
+            ProtocolError: a vehicle was lost or duplicated, or the owner cannot be decided.
+            ConfigError: a zone has no ghost of a vehicle that enters it.
         """
 
     @abstractmethod
@@ -104,15 +103,15 @@ class Coordinator(ABC):
         self,
         rows: Callable[[int], int],  # zone → digest of its rows
     ) -> None:
-        """Commit the tick, through which every zone is.
+        """Commit the tick that all zones have computed.
 
         Raises:
-            ProtocolError: a vehicle was lost or doubled.
+            ProtocolError: a vehicle was lost or duplicated.
         """
 
     @abstractmethod
     def in_flight(self) -> list[tuple[int, int, int, str]]:
-        """(vehicle, owner, zone that it was offered to, how it stands), between two ticks."""
+        """Return (vehicle, owner, zone to which it is offered, state), between two ticks."""
 
     def close(self) -> None:
         """Close the journal."""

@@ -1,4 +1,4 @@
-"""Makes the coordinators of a divided world, as `zones` in an environment's settings asks for."""
+"""Construction of the coordinators of divided worlds from the settings in `zones`."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ class CoordinatorSetup(NamedTuple):
     """The coordinators of a divided environment."""
 
     coordination: WorldCoordinators  # of all worlds
-    transfers: tuple[TransferLog, ...]  # world → what became of each hand-over
+    transfers: tuple[TransferLog, ...]  # one log per world
 
 
 class WorldRun(NamedTuple):
-    """One world's, where another process has said what it is."""
+    """The id and the journal of one world's run, chosen by another process."""
 
-    run: bytes  # 16 bytes that no other run has
-    journal: Path | None  # its file, which is there and is begun anew; None: it has none
+    run: bytes  # 16 bytes, a unique id
+    journal: Path | None  # an existing file, which is overwritten; None: no journal
 
 
 class OpenRun(NamedTuple):
-    """One world's, with its journal open; a fork of this process may write it."""
+    """The id and the open journal of one world's run; a fork of this process may write it."""
 
     run: bytes
     journal: Journal | None
 
     @classmethod
     def of(cls, run: WorldRun) -> OpenRun:
-        """Open the journal of a run. Raises JournalError: it cannot be opened."""
+        """Open the journal of a run. Raises JournalError if it cannot be opened."""
         journal = None if run.journal is None else Journal(run.journal, anew=True)
         return cls(run.run, journal)
 
 
 def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
-    """What `make_coordinators` chooses for each world, for processes that may do it repeatedly.
+    """Choose the id and the journal of each world, for processes that make coordinators repeatedly.
 
     Raises:
-        JournalError: a journal cannot be begun.
+        JournalError: a journal cannot be created.
     """
     runs = []
     for w in range(num_worlds):
@@ -69,15 +69,15 @@ def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
 
 def make_coordinators(
     settings: ZonesConfig,  # journal, checks and deadlines
-    division: ZonedShards,  # of the shards, one a zone
+    division: ZonedShards,
     longest_move_m: float,  # of a vehicle in a tick
-    # one a world; None: they are chosen, and their journals must not be there
+    # one per world; None: chosen here, and their journals must not exist
     runs: Sequence[OpenRun] | None = None,
 ) -> CoordinatorSetup:
-    """The coordinators of a divided world.
+    """Make the coordinators of divided worlds.
 
     Raises:
-        JournalError: a journal cannot be begun.
+        JournalError: a journal cannot be created.
     """
     limits = limits_of(settings, division.codec.schema)
     transfers = tuple(TransferLog(limits.lifetime) for _ in range(division.num_worlds))
@@ -95,13 +95,13 @@ def make_coordinators(
 
 
 class _OwnersRows:
-    """States of vehicles whose zones share a process: a new owner takes the old one's row."""
+    """States of vehicles where zones share a process: the new owner copies the old owner's row."""
 
     def digest_of(self, vehicle: int) -> bytes:
         return self.state(vehicle)
 
     def state(self, vehicle: int) -> bytes:
-        raise ProtocolError(f"vehicle {vehicle}: no state is sent between zones of one process")
+        raise ProtocolError(f"vehicle {vehicle}: zones of one process send no states")
 
 
 def _coordinator(
@@ -112,7 +112,7 @@ def _coordinator(
     transfers: TransferLog,
     given: OpenRun | None,
 ) -> LocalCoordinator:
-    """The coordinator of one world."""
+    """Make the coordinator of one world."""
     if given is None:
         journal = None
         if settings.journal:
@@ -129,7 +129,7 @@ def _monitor(
     limits: Limits,
     longest_move_m: float,
 ) -> InvariantMonitor:
-    """The monitor of all worlds, and is told what their coordinators do."""
+    """Make the monitor of all worlds, and let the coordinators send their records to it."""
     records = [OwnersOnRecord(division.count, limits) for _ in coordinators]
     for coordinator, record in zip(coordinators, records, strict=True):
         coordinator.watch(record)
@@ -138,6 +138,6 @@ def _monitor(
 
 
 def journal_path(journal: str, w: int, num_worlds: int) -> Path:
-    """Of several worlds each has a file: `run.jsonl` becomes `run.0.jsonl` and so on."""
+    """Return the journal of world `w`; with several worlds, `run.0.jsonl` for `run.jsonl` etc."""
     path = Path(journal)
     return path if num_worlds == 1 else path.with_suffix(f".{w}{path.suffix}")

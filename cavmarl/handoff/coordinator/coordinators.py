@@ -1,4 +1,4 @@
-"""`WorldCoordinators`: the coordinators of W worlds, and the rows that change hands as they say."""
+"""`WorldCoordinators`: the coordinators of W worlds, and the changes of owner that they decide."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from cavmarl.zones.kernels.zone_lookup import zones_of
 
 
 class OwnershipRuntime(Protocol):
-    """What decides ownership in W worlds, as a tick calls it.
+    """The decisions about ownership in W worlds that a tick needs.
 
     Attributes:
-        coordinators: one a world, if they are in this process.
-        needs_ghosts: whether ghosts and vehicles near borders are looked for in each tick.
+        coordinators: one per world, if they are in this process.
+        needs_ghosts: whether each tick must find ghosts and vehicles near borders.
     """
 
     coordinators: tuple[LocalCoordinator, ...]
@@ -34,58 +34,58 @@ class OwnershipRuntime(Protocol):
     def reset(self, chosen: NDArray[np.bool_]) -> None: ...
 
     def save(self, w: int) -> SavedOwnership | None:
-        """What decides the next changes of owner in a world; None: it is not known here."""
+        """Return the state that the next changes of owner depend on; None: not known here."""
         ...
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """Worlds have been loaded; None: ownership begins anew."""
+        """Resume after worlds were loaded; None: ownership begins anew."""
         ...
 
     def begin(self, commands: Commands) -> None:
-        """The rows are those of a committed tick; vehicles change their owner now."""
+        """Change owners of vehicles before a tick, by the committed rows."""
         ...
 
     def left(self, departures: DepartureQueue) -> None:
-        """Vehicles in `departures.passing` have left the world."""
+        """Record that the vehicles in `departures.passing` have left the world."""
         ...
 
     def entered(self, departures: DepartureQueue) -> None:
-        """Vehicles in `departures.passing` are new."""
+        """Record that the vehicles in `departures.passing` have entered the world."""
         ...
 
     def end(self) -> None:
-        """All zones of this process are through with the tick."""
+        """End the tick, after all zones of this process have computed it."""
         ...
 
     def in_flight(self, w: int) -> list[TransferInFlight]: ...
 
 
 class NoOwnershipRuntime:
-    """One zone owns all vehicles, so nothing has to be decided."""
+    """The replacement where one zone owns all vehicles."""
 
     coordinators: tuple[LocalCoordinator, ...] = ()
     needs_ghosts = False
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """All vehicles are of the one zone."""
+        """Do nothing."""
 
     def save(self, w: int) -> None:
-        """There is nothing to know of owners."""
+        """Return None: there is no state."""
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """All vehicles are of the one zone."""
+        """Do nothing."""
 
     def begin(self, commands: Commands) -> None:
-        """No vehicle changes its owner."""
+        """Do nothing: no vehicle changes its owner."""
 
     def left(self, departures: DepartureQueue) -> None:
-        """Nothing is recorded of vehicles that leave."""
+        """Do nothing: nothing is recorded."""
 
     def entered(self, departures: DepartureQueue) -> None:
-        """New vehicles are of the one zone."""
+        """Do nothing: nothing is recorded."""
 
     def end(self) -> None:
-        """Nothing is committed."""
+        """Do nothing: nothing is committed."""
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
         """Return no transfers."""
@@ -99,21 +99,21 @@ class WorldCoordinators:
 
     def __init__(
         self,
-        division: ZonedShards,  # whose rows change hands
-        coordinators: Sequence[LocalCoordinator],  # one a world
+        division: ZonedShards,
+        coordinators: Sequence[LocalCoordinator],  # one per world
         digests: RowDigests | None = None,  # of zones' rows; None: not needed
-        monitor: InvariantMonitor | None = None,  # checks every tick that is committed; None: none
+        monitor: InvariantMonitor | None = None,  # checks every committed tick; None: no checks
     ) -> None:
         self.coordinators = tuple(coordinators)
         self._division = division
         self._digests = digests
         self._monitor = monitor
         self._rows = [self._live(w) for w in range(len(self.coordinators))]
-        # Worlds whose rows have changed since their ghosts were renewed.
+        # Whether rows of a world have changed since its ghosts were renewed.
         self._stirred = [True] * len(self.coordinators)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Begin an episode in the chosen worlds (W,), with the vehicles that are there."""
+        """Begin an episode in the chosen worlds (W,), with their present vehicles."""
         for w, coordinator in enumerate(self.coordinators):
             if chosen[w]:
                 coordinator.reset()
@@ -123,23 +123,22 @@ class WorldCoordinators:
                     self._monitor.begin(w, coordinator.notes()[0])
 
     def save(self, w: int) -> SavedOwnership:
-        """What decides the next changes of owner in a world, but for its zones."""
+        """Return the state that the next changes of owner depend on, except the zones."""
         saved = self.coordinators[w].save()
         if not self._stirred[w]:
             return saved
-        # Rows have moved since those near a border were noted, and are looked at again.
+        # Rows have changed since vehicles near borders were recorded, so they are searched again.
         numbers = saved.numbers._replace(is_stirred=1, crossed=0)
         return saved._replace(numbers=numbers, near=saved.near[:0])
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """Go on with worlds that have been loaded.
+        """Resume after worlds were loaded.
 
         Args:
-            saved: of each world, what was known of owners; None: ownership begins anew, with the
-                vehicles where they are.
+            saved: the ownership of each world; None: it begins anew, with the present vehicles.
 
         Raises:
-            JournalError: a journal has never ended where it did then.
+            JournalError: a journal does not contain the position that the state names.
             ProtocolError: an invariant does not hold.
         """
         for w, coordinator in enumerate(self.coordinators):
@@ -156,7 +155,7 @@ class WorldCoordinators:
                 self._monitor.go_on(w, table, coordinator.notes()[0], gone)
 
     def _rows_of(self, w: int) -> dict[int, tuple[int, int]]:
-        """Vehicle → (zone, epoch) of all vehicles of a world."""
+        """Return (zone, epoch) of all vehicles of a world, by id."""
         found: dict[int, tuple[int, int]] = {}
         for zone in range(self._division.count):
             rows = self._division.owned(w, zone)
@@ -165,7 +164,7 @@ class WorldCoordinators:
         return found
 
     def cut(self) -> None:
-        """Zones are others, between two ticks: at the next one all vehicles are checked."""
+        """Let the next tick check all vehicles, after the zones have changed between two ticks."""
         for w, coordinator in enumerate(self.coordinators):
             births, gone = coordinator.notes()
             coordinator.resume(self._division.changes.settle_newborn(w, births), gone)
@@ -216,7 +215,7 @@ class WorldCoordinators:
 
 
 def _digest(commands: Commands, w: int) -> bytes:
-    """Digest of what the agents of a world do, 16 bytes."""
+    """Return a digest, 16 bytes, of the actions of a world's agents."""
     digest = blake2b(commands.controls[w].tobytes(), digest_size=16)
     digest.update(commands.meta_actions[w].tobytes())
     if commands.declared.any():

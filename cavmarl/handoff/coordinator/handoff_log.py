@@ -1,4 +1,4 @@
-"""`HandoffLog`: changes of owner of one world whose zones share a process, and approaches."""
+"""`HandoffLog`: approaches and changes of owner in one world whose zones share a process."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class OwnerChange(NamedTuple):
 
 
 class SavedBorders(NamedTuple):
-    """What is known of the borders of one world; see `BorderRecords`."""
+    """The saved `BorderRecords` of one world."""
 
     tick: int
     acknowledged: int
@@ -47,7 +47,7 @@ class SavedBorders(NamedTuple):
 
 
 class HandoffLog:
-    """Gives vehicles to the zones that they are in, and keeps what came of it until it is read."""
+    """Hands vehicles over to the zones in which they are, and keeps unread changes."""
 
     def __init__(self, division: ZonedShards, world: int) -> None:
         self._division = division
@@ -56,21 +56,20 @@ class HandoffLog:
         self._hand_over = division.changes.hand_over_all
         self._release = division.changes.release_all
         self._neighbours = division.neighbours
-        self._teleports: set[tuple[int, int]] = set()  # tick and vehicle, of changes not taken yet
+        self._teleports: set[tuple[int, int]] = set()  # (tick, vehicle) of changes not read yet
 
     def hand_over(
         self,
-        everybody: bool,  # look at all rows: they have changed since the ghosts were renewed
-        vehicles: int,  # how many there have to be
-        # those of them that entered since the last tick began; they stay where they are
-        newborn: Sequence[Birth],
-    ) -> int:  # how many have changed
-        """Let vehicles change their owner, by the committed rows.
+        everybody: bool,  # check all rows, because rows have changed since ghosts were renewed
+        vehicles: int,  # expected number of vehicles
+        newborn: Sequence[Birth],  # entered since the last tick began; they keep their owner
+    ) -> int:  # number of changes
+        """Change the owners of vehicles that have crossed a border, by the committed rows.
 
         Raises:
-            ConfigError: a zone has not seen a vehicle that enters it.
-            ProtocolError: a vehicle enters a zone that is no neighbour of its own, though zones
-                stay and vehicles are put nowhere.
+            ConfigError: a zone has no ghost of a vehicle that enters it.
+            ProtocolError: a vehicle enters a zone that is not a neighbour of its own, although the
+                zones have not changed and vehicles are not teleported.
         """
         division, book, w = self._division, self._book, self._world
         changed = 0
@@ -88,12 +87,14 @@ class HandoffLog:
         self._neighbours = division.neighbours
         # Vehicles that entered after the ghosts were renewed have not been checked.
         if book.owned.item(w) != (vehicles if everybody else vehicles - len(newborn)):
-            raise ProtocolError(f"zones own {division.counts(w)} vehicles, not {vehicles}")
+            raise ProtocolError(
+                f"the zones own {division.counts(w)} vehicles, but {vehicles} are expected"
+            )
         book.ms[w] = 1e3 * perf_counter()
         return changed
 
     def _note_teleports(self, changed: int) -> None:
-        """Note which of the newest changes go to zones that are no neighbours."""
+        """Record which of the newest changes are between zones that are not neighbours."""
         division, last = self._division, len(self)
         new = self._book.changes[self._world, last - changed : last]
         near = division.neighbours[new["source"], new["target"]]
@@ -106,13 +107,13 @@ class HandoffLog:
         self._teleports.update(zip(far["tick"].tolist(), far["vehicle"].tolist(), strict=True))
 
     def teleports(self, switches: Iterable[Switch], tick: int) -> tuple[int, ...]:
-        """Vehicles that have changed in a tick to a zone that is no neighbour of the old one."""
+        """Return the vehicles whose new owner in a tick is not a neighbour of the old one."""
         if not self._teleports:
             return ()
         return tuple(s.vehicle for s in switches if (tick, s.vehicle) in self._teleports)
 
     def forget_teleports(self, tick: int) -> None:
-        """Those up to a tick are not asked for any more."""
+        """Forget the teleports up to a tick."""
         if self._teleports:
             self._teleports = {entry for entry in self._teleports if entry[0] > tick}
 
@@ -129,7 +130,7 @@ class HandoffLog:
         return ProtocolError(refused(change.vehicle, change.source, change.target, zones))
 
     def release(self, changed: int) -> None:
-        """The tick is over in which the newest so many have changed."""
+        """Complete the newest changes at the end of their tick."""
         division = self._division
         self._release(
             division.zones, division.zoned, division.side,
@@ -145,7 +146,7 @@ class HandoffLog:
         return [OwnerChange(*change) for change in found.tolist()]
 
     def take(self, but: int = 0) -> NDArray[np.void]:
-        """CHANGE (n,), all but so many of the newest, which are kept."""
+        """Return and remove all changes CHANGE (n,), except the newest `but`."""
         last = len(self)
         changes = self._book.changes[self._world]
         taken: NDArray[np.void] = changes[: last - but].copy()
@@ -154,21 +155,21 @@ class HandoffLog:
         return taken
 
     def take_counts(self) -> tuple[int, int]:
-        """(vehicles that were near, of all ticks; that have turned away) since this was asked."""
+        """Return and clear the numbers of vehicles near a border, over ticks, and turned away."""
         acknowledged, aborted = self._book.acknowledged, self._book.aborted
         counts = acknowledged.item(self._world), aborted.item(self._world)
         acknowledged[self._world] = aborted[self._world] = 0
         return counts
 
     def coming(self) -> list[tuple[int, int]]:
-        """(vehicle, zone that it has been offered to), of the tick that is over."""
+        """Return (vehicle, zone to which it was offered) of the last complete tick."""
         book, w = self._book, self._world
         turn = 1 - book.turn.item(w)
         entries = book.coming[w, turn, : book.num_coming[w, turn]]
         return list(zip(entries["vehicle"].tolist(), entries["target"].tolist(), strict=True))
 
     def save(self) -> SavedBorders:
-        """What the next tick has to know of vehicles near borders."""
+        """Return the state of vehicles near borders that the next tick depends on."""
         book, w = self._book, self._world
         now = book.turn.item(w)
         num_now, num_before = book.num_coming[w, now], book.num_coming[w, 1 - now]
@@ -185,7 +186,7 @@ class HandoffLog:
         )
 
     def go_on(self, saved: SavedBorders) -> None:
-        """Go on from what `save` returned; clocks begin now."""
+        """Resume from a state that `save` returned. Clocks start now."""
         book, w = self._book, self._world
         now = book.turn.item(w)
         self.reset(saved.tick)

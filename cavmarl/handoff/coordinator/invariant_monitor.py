@@ -1,9 +1,8 @@
-"""`InvariantMonitor`: the invariants of ownership, checked after every tick of every world.
+"""`InvariantMonitor`: checks of the invariants of ownership after every tick of every world.
 
-What it needs of the vehicles is taken in one compiled pass over their rows
-(`kernels.invariant_checks`), which finds vehicles that have come and gone; what it knows of owners
-comes from the coordinators' records, and costs what changes in them. The words of an error are
-found when there is one (`coordinator.violations`).
+One compiled pass over the rows (`kernels.invariant_checks`) sums up the vehicles and finds entered
+and left ones. The expected owners come from the coordinators' records, at a cost that grows with
+the changes. Only a violation is described in detail (`coordinator.violations`).
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class Departed(NamedTuple):
     """A vehicle that has left the world since the last tick."""
 
     vehicle: int
-    zone: int  # that owned it
+    zone: int  # its last owner
     epoch: int
 
 
@@ -54,18 +53,19 @@ def _add(sums: NDArray[np.uint64], zone: int, term: int) -> None:
 
 
 def _nothing() -> None:
-    """There are no late records."""
+    """Do nothing: there are no late records."""
 
 
 class OwnersOnRecord:
-    """Owners by the records of a coordinator, whose trace is judged on the way.
+    """The owners according to the records of a coordinator, with a check of the records.
 
-    It is told what a `Trace` is told, and by coordinators that make records later, which vehicles
-    change their owner meanwhile.
+    It receives the same records as a `Trace`. A coordinator that makes records later announces
+    changes of owner meanwhile with `foretold`.
 
     Attributes:
-        left: vehicles that have been removed.
-        ask: lets the coordinator make the records that it still owes.
+        entered: number of vehicles that have entered.
+        left: number of vehicles that have left.
+        ask: lets the coordinator make its outstanding records.
     """
 
     def __init__(
@@ -73,20 +73,20 @@ class OwnersOnRecord:
         zones: int,
         limits: Limits,
     ) -> None:
-        self.entered = self.left = 0  # vehicles that zones have begun to own, since the reset
+        self.entered = self.left = 0  # since the reset
         self._checker = TraceChecker(limits.deferral, limits.lifetime, is_direct=True)
         self._sums = np.zeros(zones, dtype=np.uint64)
-        self._current = self._sums  # with what records that are still to come add to them
+        self._current = self._sums  # including announced changes
         self.ask: Callable[[], None] = _nothing
 
     @property
     def owners(self) -> dict[int, Owner]:
-        """Vehicle → (zone, epoch) as of the committed tick."""
+        """(zone, epoch) of each vehicle at the committed tick, by id."""
         self.ask()
         return self._checker.owners
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Note records. Raises ProtocolError: one that a correct run does not leave here."""
+        """Receive records. Raises ProtocolError if a correct run does not make such a record."""
         for record in records:
             self._take(record)
             if isinstance(record, Reset):
@@ -96,14 +96,14 @@ class OwnersOnRecord:
                 self._commit()
 
     def foretold(self, changes: Iterable[OwnerChange]) -> None:
-        """Changes of owner of the committed tick, of which records will tell later."""
+        """Receive changes of owner of the committed tick before their records."""
         sums = self._current = self._current.copy()
         for change in changes:
             _add(sums, change.source, -int(owner_hash(change.vehicle, change.epoch - 1)))
             _add(sums, change.target, int(owner_hash(change.vehicle, change.epoch)))
 
     def go_on(self, table: Table) -> None:
-        """Know what a coordinator knows that goes on from a saved state."""
+        """Resume with the table of a coordinator that resumes from a saved state."""
         self._checker.go_on(table)
         self.entered, self.left = len(table.owners), 0
         sums = self._current = self._sums = np.zeros_like(self._sums)
@@ -111,7 +111,10 @@ class OwnersOnRecord:
             _add(sums, zone, int(owner_hash(vehicle, epoch)))
 
     def sums(self, births: Sequence[Birth], gone: Sequence[Departed] = ()) -> NDArray[np.uint64]:
-        """(k,) by zone the sum of `owner_hash` of its vehicles, with what is not on record yet."""
+        """Return the sum (k,) of `owner_hash` of each zone's vehicles.
+
+        `births` and `gone` are changes that are not recorded yet.
+        """
         if not (births or gone):
             return self._current
         sums = self._current.copy()
@@ -131,7 +134,7 @@ class OwnersOnRecord:
             ) from None
 
     def _commit(self) -> None:
-        sums = self._current = self._sums  # announced vehicles are on record by the end of these
+        sums = self._current = self._sums  # the records now include all announced changes
         for vehicle, before, after in self._checker.changes:
             if before is None:
                 self.entered += 1
@@ -146,7 +149,7 @@ class OwnersOnRecord:
 class InvariantMonitor:
     """Raises ProtocolError after the first tick in which an invariant does not hold.
 
-    Its memory is as large as the worlds are, however long they run.
+    Its memory grows with the size of the worlds, but not with the length of their run.
     """
 
     def __init__(
@@ -158,7 +161,7 @@ class InvariantMonitor:
         _, count, num_worlds, capacity = division.zoned.rows.shape
         self._ticks = [0] * num_worlds
         self._vehicles: list[set[int]] = [set() for _ in range(num_worlds)]
-        # What the last check has written, and the last but one.
+        # The results of the last check and of the one before it.
         self._kept = [
             (make_kept(count, capacity), make_kept(count, capacity)) for _ in range(num_worlds)
         ]
@@ -172,14 +175,14 @@ class InvariantMonitor:
         self._watch = specialized(watch)
 
     def begin(self, w: int, births: Sequence[Birth]) -> None:
-        """Look at a world that has been reset. Raises ProtocolError: an invariant does not hold."""
+        """Check a world that has been reset. Raises ProtocolError if an invariant does not hold."""
         self._begin(w)
         self._look(w, births, new_late=0)
 
     def go_on(
         self, w: int, table: Table, births: Sequence[Birth], gone: Sequence[Departed] = ()
     ) -> None:
-        """Look at a world that goes on from a saved state.
+        """Check a world that resumes from a saved state.
 
         Raises:
             ProtocolError: an invariant does not hold.
@@ -194,7 +197,7 @@ class InvariantMonitor:
         self._vehicles[w].clear()
 
     def end(self, w: int, births: Sequence[Birth]) -> None:
-        """Look at a world after a tick. Raises ProtocolError: an invariant does not hold."""
+        """Check a world after a tick. Raises ProtocolError if an invariant does not hold."""
         self._ticks[w] += 1
         self._look(w, births, new_late=1)
 
@@ -222,7 +225,7 @@ class InvariantMonitor:
             violations.explain(kind, vehicle, record.owners, births)
 
     def _are_single(self, w: int) -> bool:
-        """Note vehicles that have come and gone; whether none has come that was there."""
+        """Record entered and left vehicles. Return whether no vehicle has entered twice."""
         entered = self._strays.entered[: self._found["entered"].item()].tolist()
         left = self._strays.left[: self._found["left"].item()].tolist()
         vehicles = self._vehicles[w]

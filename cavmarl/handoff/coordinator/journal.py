@@ -1,7 +1,7 @@
-"""The coordinator's log on disk: what has been decided is there before it is told to any zone.
+"""The coordinator's write-ahead log on disk: decisions are stored before any zone receives them.
 
 A line is a record of `ownership.log_records`. Nothing is kept in memory, and an append is one
-write: a process that dies leaves whole lines, and at most one that is cut short.
+write. So a process that dies leaves complete lines, and at most one incomplete line.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ _TAIL = '"checksum":"{}"}}\n'
 class JournalPlace(NamedTuple):
     """The end of a line of a journal."""
 
-    lines: int  # up to there
-    checksum: int  # of the last of them, a signed word; 0 before the first
+    lines: int  # number of lines up to here; -1: there is no journal
+    checksum: int  # of the last of these lines, a signed word; 0 before the first line
     size: int  # of these lines in bytes
 
     @classmethod
     def nowhere(cls) -> JournalPlace:
-        """Of what has no journal."""
+        """Return the place for worlds without a journal."""
         return cls(-1, 0, 0)
 
     def chain(self) -> LogChain:
-        """What writes the next line."""
+        """Return the chain that writes the next line."""
         chain = LogChain()
         if self.lines:
             chain.sequence, chain.last = self.lines, f"{self.checksum & ((1 << 64) - 1):016x}"
@@ -49,20 +49,20 @@ class JournalPlace(NamedTuple):
 
 
 class JournalReader:
-    """The records of a file, one after the other.
+    """An iterator over the records of a file.
 
     Attributes:
-        chain: where the whole lines end that have been read.
-        size: bytes of them.
-        torn: the number of the line that was dropped and how it begins, or nothing.
+        chain: the chain at the end of the complete lines that have been read.
+        size: of these lines in bytes.
+        torn: a description of the incomplete last line that was dropped; empty: none.
     """
 
     def __init__(
         self,
         path: Path,
         *,
-        # whether a last line that is cut short ends the log instead of being an error: it was never
-        # acted upon
+        # whether an incomplete last line, which was never acted upon, is dropped; if not, it is an
+        # error
         drop_torn: bool = False,
     ) -> None:
         self.path = path
@@ -71,11 +71,11 @@ class JournalReader:
 
     @property
     def lines(self) -> int:
-        """Whole lines that have been read."""
+        """The number of complete lines that have been read."""
         return self.chain.sequence
 
     def __iter__(self) -> Iterator[Record]:
-        """From the first line on."""
+        """Yield the records, from the first line on."""
         self.chain, self.size, self.torn = LogChain(), 0, ""
         try:
             with self.path.open("rb") as file:
@@ -98,57 +98,59 @@ class JournalReader:
     def _end_torn(self, line: bytes) -> None:
         self.torn = f"line {self.chain.sequence + 1} is cut short: {line[:40]!r}"
         if not self._drop_torn:
-            raise JournalError(f"{self.path}: {self.torn}; it was never acted upon")
+            raise JournalError(
+                f"{self.path}: {self.torn}; it was never acted upon, so read with drop_torn=True"
+            )
 
 
 def _open_to_append(path: str, flags: int) -> int:
-    """Open a file whose writes go to its end, also where it is cut off meanwhile."""
+    """Open a file whose writes go to its end, even after another process truncates it."""
     return os.open(path, flags | os.O_APPEND, 0o666)
 
 
 class Journal:
-    """A file that records are appended to, by one run at a time.
+    """A file to which one run at a time appends records.
 
     Attributes:
-        dropped: the line that was dropped, or nothing.
+        dropped: a description of the incomplete line that was dropped; empty: none.
     """
 
     def __init__(
         self,
-        path: Path,  # of the file; without `resume` it must not exist
+        path: Path,  # of the file, which must not exist unless `resume` or `anew` is set
         *,
-        # go on behind what is there. All of it is read, and a last line that is cut short is
+        # append to the lines of the file. All of them are read, and an incomplete last line is
         # dropped
         resume: bool = False,
-        # the file may exist, and the first line or `go_to` cuts off what is in it: that is done by
-        # the process that writes here, which may be a fork of this one
+        # overwrite an existing file. The process that writes, possibly a fork of this one,
+        # truncates it with its first line or with `go_to`
         anew: bool = False,
-        # when an append returns, its lines have been given to the operating system ("flush"), so
-        # that they outlive the process, or have been written out ("fsync"), so that they outlive
-        # the machine
+        # "flush": when an append returns, the operating system has the lines, so that they outlive
+        # the process; "fsync": they are on disk, so that they outlive the machine
         sync: Sync = "flush",
     ) -> None:
         if sync not in get_args(Sync):
-            raise ConfigError(f"sync is {sync!r}: it has to be one of {get_args(Sync)}")
+            raise ConfigError(f"sync = {sync!r}: must be one of {get_args(Sync)}")
         self.path = path
         self.dropped = ""
         self._chain = LogChain()
         self._size = 0  # of the lines
         self._fsync = sync == "fsync"
         if resume and not path.is_file():
-            raise JournalError(f"{path}: is no file to go on with; begin one without resume")
+            raise JournalError(f"{path}: there is no such journal to resume; omit resume")
         try:
             self._file = FileIO(path, "ab" if resume or anew else "xb", opener=_open_to_append)
         except FileExistsError as error:
             raise JournalError(
-                f"{path}: exists; go on with it (resume), or choose another path"
+                f"{path}: the journal exists already; resume it, or choose another path"
             ) from error
         except OSError as error:
             raise self._unwritable(error) from error
-        # Worlds are not closed: their journal is, when it is not referenced any more.
+        # Callers may drop worlds without closing them; the journal is closed with its last
+        # reference.
         weakref.finalize(self, self._file.close)
         self._pid = os.getpid()
-        self._is_taken = not anew  # by the process that writes
+        self._is_taken = not anew  # whether the process that writes has prepared the file
         try:
             self._lock()
             if resume:
@@ -164,24 +166,25 @@ class Journal:
 
     @property
     def place(self) -> JournalPlace:
-        """Where it ends."""
+        """The end of the journal."""
         word = int(self._chain.last or "0", 16)
         return JournalPlace(self.sequence, word - ((word >> 63) << 64), self._size)
 
     def go_to(self, place: JournalPlace) -> None:
-        """Cut off what follows a place where it has ended before; this process goes on from there.
+        """Truncate the journal to an earlier end, and let this process append there.
 
-        For a process that has taken over the file of another one, which writes no more.
+        A process may take over the file of another process that has stopped writing.
 
         Raises:
-            JournalError: it has never ended there.
+            JournalError: the journal has no such earlier end.
         """
         chain = place.chain()
         try:
             if not self._has_ended(place, chain.last):
                 raise JournalError(
-                    f"{self.path}: has no line {place.lines} that ends at byte {place.size}; it is "
-                    "the journal of another run, or has been changed"
+                    f"{self.path}: line {place.lines} does not end at byte {place.size}, so this "
+                    "is the journal of another run, or it has been changed; use the journal of "
+                    "the saved state"
                 )
             os.truncate(self.path, place.size)
         except OSError as error:
@@ -198,7 +201,7 @@ class Journal:
             return file.read(len(tail)) == tail
 
     def append(self, records: Iterable[Record]) -> None:
-        """Write records down; when it returns, messages may be sent."""
+        """Append records. When this returns, messages about them may be sent."""
         if not self._is_taken:
             self.go_to(self.place)
         refuse_fork(self._pid, f"the lines of {self.path}")
@@ -206,7 +209,7 @@ class Journal:
         if not lines:
             return
         if self._file.closed:
-            raise JournalError(f"{self.path}: the journal is closed")
+            raise JournalError(f"{self.path}: the journal is closed; open it again to append")
         left = memoryview("".join(lines).encode())
         try:
             while left:
@@ -219,11 +222,11 @@ class Journal:
             raise self._unwritable(error) from error
 
     def close(self) -> None:
-        """Close the file; once more does nothing."""
+        """Close the file. Closing it again does nothing."""
         self._file.close()
 
     def read(self) -> Iterator[Record]:
-        """What has been written, from the first line on; errors as of `JournalReader`."""
+        """Return an iterator over all records. It raises the errors of `JournalReader`."""
         return iter(JournalReader(self.path))
 
     def __enter__(self) -> Self:
@@ -238,8 +241,8 @@ class Journal:
         self.close()
 
     def _lock(self) -> None:
-        """Keep all others from writing here, as long as the file is open."""
-        if sys.platform == "win32":  # an open file can be shared there, by an unknown process
+        """Lock the file against other writers while it is open."""
+        if sys.platform == "win32":  # has no fcntl
             return
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -252,7 +255,7 @@ class Journal:
             raise self._unwritable(error) from error
 
     def _read(self) -> None:
-        """Find the end of what is there, and cut off what follows it."""
+        """Find the end of the last complete line, and truncate the file there."""
         reader = JournalReader(self.path, drop_torn=True)
         for _ in reader:
             pass
@@ -266,5 +269,5 @@ class Journal:
     def _unwritable(self, error: OSError) -> JournalError:
         return JournalError(
             f"{self.path}: the journal cannot be written ({error.strerror}); "
-            "make room there, or choose another path"
+            "free disk space there, or choose another path"
         )

@@ -1,4 +1,4 @@
-"""What a journal tells: counts of all events, and the owners at each tick."""
+"""Summary of a journal: counts of events, and the owners at each tick."""
 
 from __future__ import annotations
 
@@ -14,24 +14,23 @@ from cavmarl.ownership.table import Table
 
 @dataclass
 class JournalSummary:
-    """What a journal tells, as far as it was committed."""
+    """Counts of the committed events in a journal."""
 
-    run: str = ""  # which one, in hex
+    run: str = ""  # id of the run, in hex
     lines: int = 0
     episodes: int = 0  # that began
     ticks: int = 0  # that were committed
-    first_tick: int = -1  # the first of them; ticks are not numbered anew at a reset
-    last_tick: int = -1  # the last of them
+    first_tick: int = -1  # the first committed tick; a reset does not restart the numbers
+    last_tick: int = -1  # the last committed tick
     births: int = 0  # vehicles that entered
     removals: int = 0  # vehicles that left
     switches: int = 0  # changes of owner
-    forced: int = 0  # of these with the state attached, since the target was not ready in time
-    # ticks that vehicles stayed with a zone that did not contain them, all together
-    deferrals: int = 0
-    hosts: int = 0  # processes that were given a zone
-    fences: int = 0  # processes that were given up
-    unfinished: int = -1  # the tick that was begun and not committed, or -1
-    torn: str = ""  # a last line that is cut short, or nothing
+    forced: int = 0  # changes of owner with the state attached: the target was not ready in time
+    deferrals: int = 0  # sum over vehicles of ticks with an owner whose zone they had left
+    hosts: int = 0  # assignments of a zone to a process
+    fences: int = 0  # processes that were fenced
+    unfinished: int = -1  # the tick that was begun but not committed; -1: none
+    torn: str = ""  # an incomplete last line; empty: none
 
     def to_dict(self) -> dict[str, Any]:
         return vars(self).copy()
@@ -50,10 +49,10 @@ class JournalSummary:
 
 
 def summarize(path: Path) -> tuple[JournalSummary, Table]:
-    """A journal's summary, and the table of owners and hosts that it leads to.
+    """Return a journal's summary, and its final table of owners and hosts.
 
     Raises:
-        JournalError: it cannot be read, is damaged, or was not written by a coordinator.
+        JournalError: the journal cannot be read, is damaged, or is not one of a coordinator.
     """
     zones = _zones(path)
     summary, table = JournalSummary(), Table(zones)
@@ -79,13 +78,15 @@ def summarize(path: Path) -> tuple[JournalSummary, Table]:
 
 
 def owners_at(path: Path, tick: int) -> Table:
-    """The table as of the commit of a tick."""
+    """Return the table of owners at the commit of a tick."""
     table, reader = Table(_zones(path)), JournalReader(path, drop_torn=True)
     for record in reader:
         _apply(table, record, reader)
         if isinstance(record, Commit) and record.tick == tick:
             return table
-    raise JournalError(f"{path}: tick {tick} was not committed; the last one is {table.tick}")
+    raise JournalError(
+        f"{path}: tick {tick} was not committed; use a tick up to the last one, {table.tick}"
+    )
 
 
 def _apply(table: Table, record: Record, reader: JournalReader) -> None:
@@ -96,14 +97,17 @@ def _apply(table: Table, record: Record, reader: JournalReader) -> None:
 
 
 def _zones(path: Path) -> set[int]:
-    """Zones that ever had a host."""
+    """Return the zones that ever had a host."""
     reader = JournalReader(path, drop_torn=True)
     zones = set()
     for record in reader:
         if reader.lines == 1 and not isinstance(record, Reset):
-            raise JournalError(f"{path}: a journal begins with a RESET, which names the run")
+            raise JournalError(
+                f"{path}: the first line is not a RESET with the id of the run; use the journal "
+                "of a coordinator"
+            )
         if isinstance(record, Host):
             zones.add(record.zone)
     if not reader.lines:
-        raise JournalError(f"{path}: has no whole line")
+        raise JournalError(f"{path}: the journal has no complete line; use one with a run")
     return zones

@@ -1,16 +1,14 @@
-"""`LocalCoordinator`: the coordinator of a world whose zones all live in its own process.
+"""`LocalCoordinator`: the coordinator of a world whose zones are all in one process.
 
-There no message is lost, no zone is late, and no process dies alone. What `Coordinator` and the
-hosts of
-its zones tell each other is known to all of them at once, so no message is made: a vehicle over a
-border is offered, acknowledged and handed over in one call, the new owner takes the old one's row
-as it is, and a lease is the call that advances a shard. What is decided and written down is the
-same, record by record, as over messages of which none is lost.
+In one process no message is lost, no zone is late, and no process dies alone. So no messages are
+needed: a vehicle across a border is offered, acknowledged and handed over in one call, the new
+owner copies the old owner's row, and the call that advances a shard replaces the lease. The
+decisions and the records are the same as with messages if none of them is lost.
 
-The table of owners is brought up to date every now and then, and on request. Records are
-made only where they are read: all of them, at once, for a journal, and for watchers those of
-ticks in which a vehicle has entered, left, or changed its owner, as the table comes to know of it.
-Callers that need changes in their own tick register with `foretell`.
+The table of owners is updated from time to time, and on request. Records are made only if they
+are read. A journal gets all records at once. Watchers get the records of ticks in which a vehicle
+has entered, left or changed its owner, when the table is updated. Callers that need changes in
+the same tick set `foretell`.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ from cavmarl.zones.kernels.ownership_changes import LATE
 
 
 class _News(NamedTuple):
-    """Vehicles that have entered and left by the end of a tick."""
+    """Vehicles that have entered and left in a tick."""
 
     births: tuple[Birth, ...] = ()
     removed: tuple[Removed, ...] = ()
@@ -46,19 +44,19 @@ _NO_NEWS = _News()
 
 
 class LocalCoordinator(Coordinator):
-    """Decides ownership, without messages.
+    """A coordinator that decides ownership without messages.
 
     Attributes:
-        foretell: told at once of changes of owner that records tell of later.
+        foretell: called at once with changes of owner whose records follow later.
     """
 
     def __init__(
         self,
         directory: Directory,
-        journal: Journal | None,  # takes the records; None: not kept
+        journal: Journal | None,  # stores the records; None: they are not stored
         book: HandoffLog,  # hands rows over
-        counts: Callable[[], list[int]],  # how many vehicles each zone owns now, by its rows
-        transfers: TransferLog,  # told of all that goes on
+        counts: Callable[[], list[int]],  # returns the number of vehicles in each zone's rows
+        transfers: TransferLog,  # receives all transfers
     ) -> None:
         super().__init__(directory, journal)
         self._book = book
@@ -69,10 +67,10 @@ class LocalCoordinator(Coordinator):
         self._is_open = False
         self._tick = 0
         self._vehicles = 0
-        self._changed = 0  # in the tick in progress
-        self._late = 0  # changes that the table does not know
+        self._changed = 0  # number of changes in the present tick
+        self._late = 0  # number of changes that are not in the table yet
         self._new: tuple[Birth, ...] = ()
-        self._news: dict[int, _News] = {}  # by ticks, of those that the table does not know
+        self._news: dict[int, _News] = {}  # by tick, entries that are not in the table yet
 
     @property
     def directory(self) -> Directory:
@@ -110,7 +108,7 @@ class LocalCoordinator(Coordinator):
                 self._record(*directory.host(zone, worker=0).records)
 
     def save(self) -> SavedOwnership:
-        """What it knows between two ticks, beside zones and their rows."""
+        """Return the state between two ticks, except zones and their rows."""
         table, borders = self.directory.table, self._book.save()
         born = {birth.vehicle: (birth.zone, 0) for birth in self._births}
         births = [(birth.vehicle, birth.zone) for birth in self._births]
@@ -147,17 +145,17 @@ class LocalCoordinator(Coordinator):
         )
 
     def go_on(self, saved: SavedOwnership, rows: Mapping[int, tuple[int, int]]) -> list[Departed]:
-        """Go on from what `save` returned.
+        """Resume from a saved state.
 
         Args:
-            saved: what was saved.
-            rows: vehicle → (zone, epoch) of all rows that zones own.
+            saved: the result of `save`.
+            rows: (zone, epoch) of all owned rows, by vehicle id.
 
         Returns:
-            the vehicles that have left since the tick that is on record.
+            The vehicles that have left since the last recorded tick.
 
         Raises:
-            JournalError: the journal has never ended where it did then.
+            JournalError: the journal does not contain the position that the state names.
         """
         numbers = saved.numbers
         if self.journal is not None:
@@ -191,7 +189,7 @@ class LocalCoordinator(Coordinator):
         return [Departed(vehicle, zone, epoch) for vehicle, _, zone, epoch in gone]
 
     def begin(self, everybody: bool, inputs: bytes = b"") -> None:
-        """Hand over vehicles outside their owner's zone, as `Coordinator.begin` says."""
+        """Hand over vehicles outside of their owner's zone; see `Coordinator.begin`."""
         births = self._births
         try:
             changed = self._book.hand_over(everybody, self._vehicles, births)
@@ -210,7 +208,7 @@ class LocalCoordinator(Coordinator):
             self._record(self._begun(self._tick + 1, switches, self._new, inputs))
 
     def end(self, rows: Callable[[int], int]) -> None:
-        """Commit, if the zones own what they should, as `Coordinator.end` says."""
+        """Check the numbers of vehicles and commit; see `Coordinator.end`."""
         changed, self._is_open = self._changed, False
         self._tick += 1
         if changed:
@@ -234,7 +232,7 @@ class LocalCoordinator(Coordinator):
             self.foretell(self._book.newest(changed))
 
     def catch_up(self) -> None:
-        """Let the table and the rows of transfers say what has come of the ticks up to now."""
+        """Update the table and the log of transfers up to the present tick."""
         table = self._directory.table
         if table.tick == self._tick:
             return
@@ -262,7 +260,10 @@ class LocalCoordinator(Coordinator):
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
     def _settle(self, tick: int, changes: NDArray[np.void], news: _News, is_told: bool) -> None:
-        """Put what came of one tick, or of all up to one, on the table, and tell watchers of it."""
+        """Apply the changes of one tick, or of all ticks up to it, to the table.
+
+        `is_told`: also make the records of the tick for watchers.
+        """
         table = self._directory.table
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
         switches = tuple(map(Switch, *columns, repeat(False)))
@@ -295,7 +296,7 @@ class LocalCoordinator(Coordinator):
         return Commit(table.episode, table.tick, removed, zones, world)
 
     def in_flight(self) -> list[tuple[int, int, int, str]]:
-        """(vehicle, owner, zone that knows that it comes, `prepared`), between two ticks."""
+        """Return (vehicle, owner, zone that is prepared for it, "prepared"), between two ticks."""
         owners = self.directory.table.owners
         return sorted(
             (vehicle, owners[vehicle][0], target, "prepared")
@@ -304,17 +305,19 @@ class LocalCoordinator(Coordinator):
         )
 
     def _check(self, births: Iterable[Birth]) -> None:
-        """Compare what zones should own with their rows, where all that have left are on record."""
+        """Compare the numbers of vehicles in the up-to-date table with the rows."""
         owned = list(self.directory.table.counts.values())
         for birth in births:
             owned[birth.zone] += 1
         counts = self._counts()
         if counts != owned:
-            raise ProtocolError(f"at tick {self.tick} zones own {counts} vehicles, not {owned}")
+            raise ProtocolError(
+                f"tick {self.tick}: the zones own {counts} vehicles, but {owned} are expected"
+            )
 
 
 def _no_digest(zone: int) -> int:
-    """Of a zone's rows, where none is taken."""
+    """Return 0: without a journal, no digest is needed."""
     return 0
 
 
@@ -323,7 +326,7 @@ def _switch(change: OwnerChange) -> Switch:
 
 
 def _removed_with(changes: NDArray[np.void], left: Mapping[int, int]) -> list[bool]:
-    """Whether each vehicle left the world in the tick in which it changed."""
+    """Return whether each vehicle left the world in the tick of its change."""
     if not left:
         return [False] * len(changes)
     pairs = zip(changes["vehicle"].tolist(), changes["tick"].tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""`RowDigests`: digests of sets of vehicles, by what they are and not by their owners."""
+"""`RowDigests`: digests of sets of vehicles that do not depend on the owners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.handoff.kernels.digests import digest_rows
 
 
 def digest_tables(fields: Iterable[str]) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
-    """Masks and factors (n,) of the words of VEHICLE, for digests in which some fields count."""
+    """Return masks and factors (n,) of the words of VEHICLE, for digests of some fields."""
     blank = np.zeros(1, dtype=VEHICLE)
     for name in fields:
         blank[name].view(np.uint8)[:] = 0xFF
@@ -23,13 +23,13 @@ def digest_tables(fields: Iterable[str]) -> tuple[NDArray[np.uint64], NDArray[np
 
 
 class RowDigests:
-    """Digests of rows, which add up: that of two zones is the sum of theirs modulo 2**128."""
+    """Additive digests: the digest of the rows of two zones is the sum modulo 2**128."""
 
     def __init__(self) -> None:
         self._masks, self._factors = digest_tables(STATE_FIELDS)
 
     def of(self, rows: NDArray[np.void]) -> int:
-        """Of VEHICLE (n,), in [0, 2**128)."""
+        """Return the digest of VEHICLE (n,), in [0, 2**128)."""
         words = rows.view(np.uint64).reshape(len(rows), len(self._masks))
         upper, lower = digest_rows(words, len(rows), self._masks, self._factors)
         return (int(upper) << 64) | int(lower)

@@ -1,8 +1,8 @@
-"""What decides the next changes of owner in one world, as words of its saved state.
+"""The state of a world's coordinator as words of the world's saved state.
 
-Owners and epochs are in the rows of the vehicles. Beside them a coordinator has to know which
-vehicles stand near a border, which have come and gone since the last tick, and where its journal
-ends. The words name the zones, so that a reader with other zones can leave them out.
+Owners and epochs are in the rows of the vehicles. A coordinator also needs the vehicles near
+borders, the vehicles that have entered and left since the last tick, and the end of its journal.
+The words include the zones, so that worlds with different zones can ignore them.
 """
 
 from __future__ import annotations
@@ -32,20 +32,19 @@ class OwnershipNumbers(NamedTuple):
     """The single numbers of a coordinator's state."""
 
     episode: int
-    tick: int  # that is committed, of all episodes
-    switched: int  # vehicles that have changed their owner
+    tick: int  # the committed tick, counted over all episodes
+    switched: int  # number of changes of owner
     seen_below: int  # all smaller ids have been in the episode
-    is_stirred: int  # 1: rows have changed since the ghosts were renewed
-    repartition_steps_done: int  # that the worlds have made, where zones are cut anew
-    # of the borders' records; see `BorderRecords`
+    is_stirred: int  # 1: rows have changed since ghosts were renewed
+    repartition_steps_done: int  # steps begun, if zones may change
+    # see `BorderRecords`
     near_tick: int
     acknowledged: int
     aborted: int
     crossed: int
     owned: int
     known: int
-    # where the journal ends; the first is -1: there is none
-    journal: JournalPlace
+    journal: JournalPlace  # the end of the journal
 
     @classmethod
     def of(cls, numbers: Words) -> OwnershipNumbers:
@@ -63,17 +62,17 @@ class SavedOwnership(NamedTuple):
     """The state of the coordinator of one world, between two ticks."""
 
     zones: NDArray[np.float64]  # (1 + k, 4) bounds of the partition, and the rectangle of each zone
-    counts: Words  # (k,) how many of the vehicles each zone owns; they come in the order of zones
+    counts: Words  # (k,) number of vehicles of each zone; vehicles are in the order of zones
     numbers: OwnershipNumbers
     seen: Words  # (n,) further ids that have been in the episode
-    births: Words  # (n, 2) vehicle and zone, of those that are not on record yet
-    gone: Words  # (n, 4) vehicle, reason, its zone and epoch, of those that have left meanwhile
+    births: Words  # (n, 2) vehicle and zone of entered vehicles that are not recorded yet
+    gone: Words  # (n, 4) vehicle, reason, zone and epoch of left vehicles that are not recorded yet
     near: NDArray[np.void]  # NEAR (n,)
     coming: NDArray[np.void]  # COMING (n,)
     before: NDArray[np.void]  # COMING (n,) of the tick before
 
     def pack(self) -> Words:
-        """All of it as words: how many rows each part has, then the parts."""
+        """Return the state as words: the number of rows of each part, then the parts."""
         parts = (
             self.zones.view(np.int64),
             self.counts,
@@ -90,10 +89,10 @@ class SavedOwnership(NamedTuple):
 
     @classmethod
     def unpack(cls, words: Words) -> SavedOwnership | None:
-        """Read what `pack` returned, with zeros behind it or not; None: there is nothing.
+        """Read words that `pack` returned, possibly padded with zeros. All zeros give None.
 
         Raises:
-            ConfigError: it was something else.
+            ConfigError: the words are damaged.
         """
         if not words.any():
             return None
@@ -103,7 +102,7 @@ class SavedOwnership(NamedTuple):
             for length, columns in zip(lengths.tolist(), _COLUMNS.values(), strict=False)
         ]
         if min(wide) < 0 or len(lengths) < len(_COLUMNS) or sum(wide) > len(words) - len(lengths):
-            raise _damaged("its parts do not fit into it")
+            raise _damaged("its parts are longer than the whole")
         parts, at = {}, len(lengths)
         for (name, columns), size in zip(_COLUMNS.items(), wide, strict=True):
             part = np.ascontiguousarray(words[at : at + size])
@@ -127,44 +126,44 @@ class SavedOwnership(NamedTuple):
         self,
         vehicles: NDArray[np.void],  # VEHICLE (n,) in the order of zones
         zones: int,
-        capacity: int,  # of vehicles of a world
+        capacity: int,  # largest number of vehicles in a world
     ) -> None:
-        """See that it is about these vehicles of so many zones, and names no others.
+        """Check that the state is consistent with these vehicles and zones.
 
         Raises:
-            ConfigError: it does not.
+            ConfigError: it is not.
         """
         numbers, counts, near = self.numbers, self.counts, self.near
         births, gone = self.births, self.gone
         if len(counts) != zones or (counts < 0).any() or counts.sum() != len(vehicles):
-            raise _damaged(f"zones own {counts.tolist()} of {len(vehicles)} vehicles")
+            raise _damaged(f"the zones own {counts.tolist()} of {len(vehicles)} vehicles")
         if max(map(len, (near, self.coming, self.before))) > 2 * capacity:
-            raise _damaged("more vehicles are near borders than there can be")
+            raise _damaged("more vehicles are near borders than a world can hold")
         if numbers.episode < -1 or min(numbers[1:-1]) < 0 or numbers.is_stirred > 1:
-            raise _damaged(f"{numbers} has a number out of its range")
+            raise _damaged(f"{numbers} has a number outside of its range")
         of_zones = (
             births[:, 1], gone[:, 2], near["source"], near["target"],
             self.coming["target"], self.before["target"],
         )  # fmt: skip
         if any(((column < 0) | (column >= zones)).any() for column in of_zones):
-            raise _damaged(f"it names a zone that is none of {zones}")
+            raise _damaged(f"it names a zone that is not one of {zones}")
         if ((near["row"] < 0) | (near["row"] >= counts[near["source"]])).any():
-            raise _damaged("a vehicle near a border stands in no row of its zone")
+            raise _damaged("a vehicle near a border has no row in its zone")
         firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
         if (vehicles["id"][firsts[near["source"]] + near["row"]] != near["vehicle"]).any():
-            raise _damaged("a vehicle near a border stands in another's row")
+            raise _damaged("a vehicle near a border has the row of another vehicle")
         if len(np.setdiff1d(births[:, 0], np.union1d(vehicles["id"], gone[:, 0]))):
-            raise _damaged("a vehicle that has entered is not there")
+            raise _damaged("a vehicle that has entered is missing")
         pairs = np.array([near["vehicle"], near["target"]])[:, near["crossed"]].T.tolist()
         known = np.array([self.coming["vehicle"], self.coming["target"]]).T.tolist()
         if any(pair not in known for pair in pairs):
             raise _damaged("a vehicle that has crossed a border was not near it")
 
     def partition(self) -> ZonePartition:
-        """Its zones.
+        """Return the zones of the state.
 
         Raises:
-            ConfigError: they are none.
+            ConfigError: the zones are invalid.
         """
         if len(self.zones) < 2:
             raise _damaged("it has no zones")
@@ -173,7 +172,7 @@ class SavedOwnership(NamedTuple):
 
 
 def without_journal(words: Words) -> Words:
-    """What `pack` returned of one world, (1, n), for a file: no journal goes on from there."""
+    """Return the packed state (1, n) of one world without its place in a journal, for a file."""
     saved = SavedOwnership.unpack(words[0])
     if saved is None:
         return words
@@ -182,7 +181,7 @@ def without_journal(words: Words) -> Words:
 
 
 def zone_table(partition: ZonePartition) -> NDArray[np.float64]:
-    """The zones of a partition as `SavedOwnership` has them."""
+    """Return the zones of a partition in the form of `SavedOwnership.zones`."""
     return np.concatenate([np.array([partition.bounds]), partition.rects])
 
 
@@ -202,5 +201,7 @@ def _records_of(words: Words, dtype: np.dtype[Any], names: tuple[str, ...]) -> N
     return records
 
 
-def _damaged(what: str) -> ConfigError:
-    return ConfigError(f"the state says of the owners of vehicles what cannot be: {what}")
+def _damaged(problem: str) -> ConfigError:
+    return ConfigError(
+        f"the ownership in the saved state is damaged: {problem}; use an intact state"
+    )

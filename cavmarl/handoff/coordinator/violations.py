@@ -1,6 +1,6 @@
-"""Describes a violated invariant: which, when, where, the vehicle, and the values.
+"""Description of a violated invariant, with the tick, the zone, the vehicle and the values.
 
-Only called when the monitor has found that something is wrong, so it may look at every vehicle.
+It runs only after the monitor has found a violation, so it may search all vehicles.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Place = tuple[int, np.void]
 
 
 class Violations:
-    """The state of a world that is wrong somewhere."""
+    """The state of a world that violates an invariant."""
 
     def __init__(self, division: ZonedShards, w: int, clock: CheckTime, before: Kept) -> None:
         self._division = division
@@ -39,7 +39,7 @@ class Violations:
     def explain(
         self, kind: int, vehicle: int, owners: Mapping[int, Owner], births: Sequence[Birth]
     ) -> None:
-        """Say what is wrong."""
+        """Raise ProtocolError with the first violation that is found."""
         expected = {**owners, **{birth.vehicle: (birth.zone, 0) for birth in births}}
         for words in (
             self._doubled(),
@@ -51,8 +51,8 @@ class Violations:
             for word in words:
                 raise ProtocolError(f"tick {self._clock.tick} of world {self._w}: {word}")
         raise ProtocolError(
-            f"tick {self._clock.tick} of world {self._w}: sums of hashes differ, but no row does: "
-            "rows have been changed meanwhile"
+            f"tick {self._clock.tick} of world {self._w}: the sums of hashes differ, but the rows "
+            "do not: rows have changed during the check"
         )
 
     def _doubled(self) -> Iterator[str]:
@@ -69,7 +69,7 @@ class Violations:
             should = self._clock.tick - (self._clock.new_late if last is None else last["late"])
             yield (
                 f"advanced once a tick: vehicle {vehicle} of zone {zone} is at tick {row['tick']}, "
-                f"but should be at {should}"
+                f"but should be at tick {should}"
             )
         elif kind == KIND_FAR:
             zone, row = places[0]
@@ -79,7 +79,7 @@ class Violations:
             yield (
                 f"continuity: vehicle {vehicle} of zone {zone} moved {moved_m:.2f} m in a tick, "
                 f"from ({last['x']:.2f}, {last['y']:.2f}) to ({row['x']:.2f}, {row['y']:.2f}); "
-                f"{self._clock.limit_m:.2f} m are the most"
+                f"the limit is {self._clock.limit_m:.2f} m"
             )
 
     def _last(self, vehicle: int) -> np.void | None:
@@ -96,7 +96,7 @@ class Violations:
 
     def _owners(self, expected: Mapping[int, Owner]) -> Iterator[str]:
         live = sum(map(len, self._places.values()))
-        count = f"{live} vehicles live, {len(expected)} have entered and not left"
+        count = f"there are {live} vehicles, but {len(expected)} have entered and not left"
         for vehicle in sorted(expected.keys() | self._places.keys()):
             places = self._places.get(vehicle, [])
             if not places:
@@ -110,8 +110,8 @@ class Violations:
                 yield f"population: vehicle {vehicle} of zone {zone} has never entered: {count}"
             elif expected[vehicle] != (zone, row["epoch"]):
                 yield (
-                    f"owner on record: vehicle {vehicle} is with zone {zone} at epoch "
-                    f"{row['epoch']}, but the directory says zone {expected[vehicle][0]} and epoch "
+                    f"owner on record: zone {zone} owns vehicle {vehicle} at epoch "
+                    f"{row['epoch']}, but the directory has zone {expected[vehicle][0]} and epoch "
                     f"{expected[vehicle][1]}"
                 )
 
@@ -128,11 +128,11 @@ class Violations:
                 if found != due:
                     yield (
                         f"ghosts: zone {zone} has {found} ghosts of vehicle {vehicle}, not "
-                        f"{int(due)}: zone {owner} owns it {math.sqrt(squared):.2f} m outside of "
-                        f"that zone, which sees {halo.seen_m:.2f} m far"
+                        f"{int(due)}: the vehicle of zone {owner} is {math.sqrt(squared):.2f} m "
+                        f"outside of zone {zone}, which sees up to {halo.seen_m:.2f} m"
                     )
             for vehicle in sorted(copies):
-                yield f"ghosts: zone {zone} has a ghost of vehicle {vehicle}, which is not there"
+                yield f"ghosts: zone {zone} has a ghost of vehicle {vehicle}, which does not exist"
             for ghost in ghosts:
                 yield from self._differences(zone, ghost)
 
@@ -141,6 +141,6 @@ class Violations:
         for name in GHOST_FIELDS:
             if ghost[name].tobytes() != row[name].tobytes():
                 yield (
-                    f"age of ghosts: zone {zone} has vehicle {ghost['id']} with {name} = "
-                    f"{ghost[name]}, but its owner, zone {owner}, with {row[name]}"
+                    f"age of ghosts: zone {zone} has a ghost of vehicle {ghost['id']} with {name} "
+                    f"= {ghost[name]}, but its owner, zone {owner}, has {row[name]}"
                 )

@@ -1,1 +1,1 @@
-"""Compiled loops: digests of rows and checks of invariants."""
+"""Kernels for digests of rows and checks of invariants."""

@@ -1,8 +1,8 @@
-"""Digests of vehicles' rows that know neither zones nor the order of rows.
+"""Digests of vehicles' rows that depend neither on zones nor on the order of rows.
 
-The digest of a set of rows is the sum of the rows' own, so zones can be added up (invariant I10).
-It tells of any accidental difference; it is no protection against a search for two rows of one
-digest.
+The digest of a set of rows is the sum of the digests of its rows, so the digests of zones can be
+added (invariant I10). It detects accidental differences, but is not cryptographic: two rows with
+the same digest can be constructed.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from cavmarl.core.math.rng import mix
 def row_digest(
     words: NDArray[np.uint64], i: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
 ) -> np.uint64:
-    """That of one of the records, as whole words."""
-    row = words[i]  # so that several words are multiplied at once
+    """Return the digest of record `i`, given as whole words."""
+    row = words[i]  # a row of its own lets the compiler multiply several words at once
     total = np.uint64(0)
     for n in range(row.shape[0]):
         total += (row[n] & masks[n]) * factors[n]
@@ -29,11 +29,11 @@ def row_digest(
 @kernel
 def digest_rows(
     words: NDArray[np.uint64],  # (C, n) the records of vehicles as whole words
-    num: int,  # how many count
-    masks: NDArray[np.uint64],  # (n,) which bits of each word count
+    num: int,  # number of records
+    masks: NDArray[np.uint64],  # (n,) the bits of each word that count
     factors: NDArray[np.uint64],  # (n,) odd random numbers
 ) -> tuple[np.uint64, np.uint64]:
-    """Upper and lower half of the sum of the digests of `words[:num]`, modulo 2**128."""
+    """Return the upper and lower half of the digest of `words[:num]`, modulo 2**128."""
     upper = np.uint64(0)
     lower = np.uint64(0)
     for i in range(num):

@@ -1,8 +1,8 @@
-"""One look at all rows of a world after a tick: what the invariants of ownership need of them.
+"""Checks of the invariants of ownership in one pass over all rows of a world after a tick.
 
-Sets are compared by sums of hashes, so neither the order of rows nor that of zones matters. What
-cannot be told from sums, a vehicle's own last tick, stands where its row does: nearly all stay
-there. Vehicles on another row are searched among those that are not where they were.
+Sets are compared by sums of hashes, so neither the order of rows nor that of zones matters. The
+comparison of a vehicle with its last tick needs its last row. Nearly all vehicles keep their row;
+the others are searched among the vehicles that are missing from their former rows.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ KEPT = np.dtype(
         ("id", np.int64),
         ("x", np.float64),
         ("y", np.float64),
-        ("late", np.int64),  # the world's tick less the vehicle's
+        ("late", np.int64),  # the world's tick minus the vehicle's
     ],
     align=True,
 )
@@ -38,7 +38,7 @@ KEPT = np.dtype(
 LOST = np.dtype(
     [
         ("id", np.int64),
-        ("zone", np.int32),  # where the last check has seen it
+        ("zone", np.int32),  # zone and row at the last check
         ("row", np.int32),
         ("state", np.int64),  # BLANK, MISSING or FOUND
     ],
@@ -50,9 +50,9 @@ FOUND = 2
 
 TALLY = np.dtype(
     [
-        ("vehicles", np.int64),  # that the zone owns
-        ("owned", np.uint64),  # sum of `owner_hash` of the zone's vehicles
-        ("due", np.uint64),  # sum of the digests of others' vehicles within its halo
+        ("vehicles", np.int64),  # number of owned vehicles
+        ("owned", np.uint64),  # sum of `owner_hash` of owned vehicles
+        ("due", np.uint64),  # sum of the digests of other zones' vehicles that the zone must see
         ("seen", np.uint64),  # sum of the digests of its ghosts
     ],
     align=True,
@@ -62,8 +62,8 @@ FINDING = np.dtype(
     [
         ("kind", np.int64),
         ("vehicle", np.int64),
-        ("entered", np.int64),  # vehicles that the last check has not seen
-        ("left", np.int64),  # that this one has not seen
+        ("entered", np.int64),  # number of vehicles that were not there at the last check
+        ("left", np.int64),  # number of vehicles that are not there at this check
     ],
     align=True,
 )
@@ -73,63 +73,61 @@ ANY_LATE = -1
 
 
 class CheckTime(NamedTuple):
-    """When a check is made."""
+    """The tick of a check, and the limits that depend on it."""
 
     tick: int
-    # by how much the tick of a vehicle lags that was not there before; ANY_LATE: it is not known
-    new_late: int
-    limit_m: float  # no vehicle moves further from one check to the next
+    new_late: int  # expected `late` of an entered vehicle; ANY_LATE: not known
+    limit_m: float  # longest move of a vehicle between two checks
 
 
 class Kept(NamedTuple):
-    """What one check leaves for the next."""
+    """The data that one check keeps for the next."""
 
-    # KEPT (k, C) of the vehicles that each zone owns, in the order of its rows
-    rows: NDArray[np.void]
-    num: NDArray[np.int64]  # (k,) how many
+    rows: NDArray[np.void]  # KEPT (k, C) of the owned vehicles of each zone, in the order of rows
+    num: NDArray[np.int64]  # (k,) number of owned vehicles
 
 
 class Strays(NamedTuple):
-    """Vehicles that are not where the last check has seen them; scratch of one check."""
+    """Vehicles that have changed their row since the last check; scratch of one check."""
 
     table: NDArray[np.void]  # LOST (a power of two,), a hash table; blank between two checks
-    places: NDArray[np.int64]  # (n,) where in it a vehicle stands
-    rows: NDArray[np.int64]  # (n, 2) zone and row where another stood
-    entered: NDArray[np.int64]  # (n,) vehicles that the last check has not seen
-    left: NDArray[np.int64]  # (n,) vehicles that this one has not seen
+    places: NDArray[np.int64]  # (n,) indices in the table of missing vehicles
+    rows: NDArray[np.int64]  # (n, 2) zone and row of vehicles that are new in their row
+    entered: NDArray[np.int64]  # (n,) ids that were not there at the last check
+    left: NDArray[np.int64]  # (n,) ids that are not there at this check
 
 
 def make_kept(zones: int, capacity: int) -> Kept:
-    """Of a world not checked yet."""
+    """Return the data for a world that has not been checked yet."""
     return Kept(np.zeros((zones, capacity), KEPT), np.zeros(zones, np.int64))
 
 
 def make_strays(zones: int, capacity: int) -> Strays:
-    """For worlds of so many zones and rows in each; what is not needed is never touched."""
+    """Return scratch memory for worlds with a number of zones and of rows in each zone."""
     most = zones * capacity
-    # Half empty, so that places are found at once.
+    # The table is at most half full, so that searches are short.
     table = np.zeros(1 << max(2 * most - 1, 1).bit_length(), LOST)
     return Strays(table, *(np.zeros(shape, np.int64) for shape in (most, (most, 2), most, most)))
 
 
 KIND_NONE = 0
-KIND_TICK = 1  # it was not advanced once
-KIND_FAR = 2  # it is too far from where it was
-KIND_SUMS = 3  # zones own others, or see others, than they should
+KIND_TICK = 1  # a vehicle was not advanced exactly once
+KIND_FAR = 2  # a vehicle is too far from its last position
+KIND_SUMS = 3  # zones own or see wrong vehicles
 
 
 @kernel
 def owner_hash(vehicle: int, epoch: int) -> np.uint64:
-    """What a vehicle adds to the sum of those that a zone owns."""
+    """Return a vehicle's term in the sum over the vehicles that a zone owns."""
     return mix(mix(np.uint64(vehicle)) + np.uint64(epoch))
 
 
 @kernel
 def owned_sum(
     rows: NDArray[np.void],  # of a zone
-    num: int,  # how many it owns; they come first
+    num: int,  # number of owned rows, which come first
 ) -> np.uint64:
-    """The sum of `owner_hash` of the vehicles that a zone owns, as its rows say."""
+    """Return the sum of `owner_hash` of the vehicles that a zone owns, from its rows."""
     total = np.uint64(0)
     for row in range(num):
         total += owner_hash(rows[row]["id"], rows[row]["epoch"])
@@ -138,7 +136,7 @@ def owned_sum(
 
 @kernel
 def _place(table: NDArray[np.void], vehicle: int) -> int:
-    """Where a vehicle stands, or the first blank behind its hash."""
+    """Return the index of a vehicle in the table, or of the first blank entry after its hash."""
     last = table.shape[0] - 1
     place = np.int64(mix(np.uint64(vehicle)) & np.uint64(last))
     while table[place]["state"] != BLANK and table[place]["id"] != vehicle:
@@ -148,7 +146,7 @@ def _place(table: NDArray[np.void], vehicle: int) -> int:
 
 @kernel
 def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
-    """Note where a missing vehicle stood; returns how many are noted, `num` before."""
+    """Record the former row of a missing vehicle. Return the new number of missing vehicles."""
     place = _place(strays.table, vehicle)
     entry = strays.table[place]
     entry["id"] = vehicle
@@ -161,7 +159,7 @@ def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
 
 @inlined_kernel
 def _note(found: np.void, kind: int, vehicle: int) -> None:
-    """Keep the finding about the smallest id."""
+    """Record a finding, if it is about a lower id than the present one."""
     if found["kind"] == KIND_NONE or vehicle < found["vehicle"]:
         found["kind"] = kind
         found["vehicle"] = vehicle
@@ -169,36 +167,35 @@ def _note(found: np.void, kind: int, vehicle: int) -> None:
 
 @inlined_kernel
 def _judge(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
-    """Compare a vehicle with what it was at the last check."""
+    """Compare a vehicle with its state at the last check."""
     dx = now["x"] - last["x"]
     dy = now["y"] - last["y"]
     if now["late"] != last["late"]:
         _note(found, KIND_TICK, now["id"])
-    elif not dx * dx + dy * dy <= limit_m * limit_m:  # nor where it is nowhere
+    elif not dx * dx + dy * dy <= limit_m * limit_m:  # true for NaN, too
         _note(found, KIND_FAR, now["id"])
 
 
 @kernel
 def watch(
     zones: ZoneArrays,
-    halo: Halo,  # how far each zone sees over its borders
-    zoned: ZoneState,  # the rows, owned ones and ghosts
+    halo: Halo,  # how far each zone sees beyond its borders
+    zoned: ZoneState,  # owned rows and ghosts
     words: NDArray[np.uint64],  # (2, k, W, C, n) the rows as whole words
-    side: int,  # where the committed rows are, 0 or 1
+    side: int,  # the buffer of the committed rows, 0 or 1
     w: int,
     clock: CheckTime,
-    masks: NDArray[np.uint64],  # (n,) which bits a ghost has in common with its owner's row
+    masks: NDArray[np.uint64],  # (n,) the bits that a ghost shares with its owner's row
     factors: NDArray[np.uint64],  # (n,) odd random numbers
-    before: Kept,  # what the last check wrote
-    now: Kept,  # overwritten, for the next check
-    strays: Strays,  # scratch; entered and left are overwritten
-    live: int,  # vehicles that there should be
-    expected: NDArray[np.uint64],  # (k,) what `TALLY["owned"]` should be of each zone
-    tallies: NDArray[np.void],  # TALLY (k,) overwritten
-    # FINDING (1,) overwritten: the one about the smallest id, if there is any
-    found: NDArray[np.void],
+    before: Kept,  # from the last check
+    now: Kept,  # is written, for the next check
+    strays: Strays,  # scratch; entered and left are written
+    live: int,  # expected number of vehicles
+    expected: NDArray[np.uint64],  # (k,) expected `TALLY["owned"]` of each zone
+    tallies: NDArray[np.void],  # TALLY (k,) is written
+    found: NDArray[np.void],  # FINDING (1,) is written: the finding about the lowest id, if any
 ) -> int:
-    """Look at all rows of one world after a tick; KIND_* of what is found."""
+    """Check all rows of one world after a tick. Return the KIND_* of the finding."""
     finding = found[0]
     finding["kind"] = KIND_NONE
     count = zones.rects.shape[0]
@@ -261,7 +258,7 @@ def _match(
     moved: int,
     finding: np.void,
 ) -> None:
-    """Search vehicles on other rows among those that are not where they were."""
+    """Search vehicles that are new in their row among the missing ones."""
     table = strays.table
     entered = 0
     for n in range(moved):
@@ -298,7 +295,7 @@ def _owe_ghosts(
     factors: NDArray[np.uint64],
     tallies: NDArray[np.void],
 ) -> None:
-    """Add a zone's row to what those zones have to see that it is near to."""
+    """Add the digest of a zone's row to the sums of the zones that must see it."""
     x = row["x"]
     y = row["y"]
     digest = np.uint64(0)
@@ -307,7 +304,7 @@ def _owe_ghosts(
     for n in range(halo.near_start[here], halo.near_start[here + 1]):
         other = halo.near[n]
         if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
-            if sought:  # many out here are seen by none
+            if sought:  # many outer rows are seen by no zone and need no digest
                 digest = row_digest(words, i, masks, factors)
                 sought = False
             tallies[other]["due"] += digest

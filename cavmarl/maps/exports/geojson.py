@@ -1,4 +1,4 @@
-"""Lanes as GeoJSON: longitude, latitude and height of their middles."""
+"""Lanes as GeoJSON: longitude, latitude and height of their centre lines."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _DEGREES_DIGITS, _HEIGHT_DIGITS = 8, 3
 
 
 def write_geojson(network: RoadNetwork, target: Path, source: Path) -> int:
-    """Write each lane outside junctions as a line; returns how many.
+    """Write each lane outside junctions as a line; return the number of lanes.
 
     Args:
-        network: a map that says where it lies on the earth.
-        target: the file.
-        source: the map's file, of which licence and origin are kept.
+        network: a map with a georeference.
+        target: the file to write.
+        source: the map's file, whose licence and origin are copied.
 
     Raises:
         MapError: the map has no projection, or the target cannot be written.
@@ -30,8 +30,8 @@ def write_geojson(network: RoadNetwork, target: Path, source: Path) -> int:
     """
     if network.geo is None:
         raise MapError(
-            f"{network.name}: the map does not say where it lies on the earth: GeoJSON is in "
-            "degrees: build it from OpenStreetMap, or with a projParameter"
+            f"{network.name}: the map has no georeference, and GeoJSON needs degrees: "
+            "build it from OpenStreetMap, or with a projParameter"
         )
     degrees = unproject_points(network)
     features = []
@@ -68,7 +68,7 @@ def write_geojson(network: RoadNetwork, target: Path, source: Path) -> int:
 
 
 def unproject_points(network: RoadNetwork) -> Any:
-    """Longitudes and latitudes (n, 2) of all points of a map with a projection."""
+    """Return longitudes and latitudes (n, 2) of all points of a map with a projection."""
     assert network.geo is not None
     return unproject(np.stack([network.points["x"], network.points["y"]], axis=1), network.geo)
 

@@ -1,4 +1,4 @@
-"""Lanelet2 (.osm) through its own package, read back by it."""
+"""Lanelet2 (.osm), written by its own package and read back for a check."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ _BICYCLE = 1 << VEHICLE_CLASSES.index("bicycle")
 
 
 def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
-    """Write each lane as a lanelet; returns what was written and what its package reads back.
+    """Write each lane as a lanelet; return the numbers of lanelets written and read back.
 
-    Lanelets of lanes that lead into each other share their points there, so that routes go on.
+    Lanelets of lanes that lead into each other share end points, so that routes are connected.
 
     Raises:
-        MapError: the map has no projection, the target cannot be written, or what is read back has
-            not as many lanelets.
+        MapError: the map has no projection, the target cannot be written, or another number of
+            lanelets is read back.
         MissingExtraError: lanelet2 or pyproj is not installed.
     """
     if network.geo is None:
         raise MapError(
-            f"{network.name}: the map does not say where it lies on the earth: Lanelet2 is in "
-            "degrees: build it from OpenStreetMap, or with a projParameter"
+            f"{network.name}: the map has no georeference, and Lanelet2 needs degrees: "
+            "build it from OpenStreetMap, or with a projParameter"
         )
     lanelet2: Any = require("lanelet2", "lanelet2")
     from lanelet2.core import AttributeMap, Lanelet, LaneletMap, LineString3d, Point3d, getId
@@ -56,7 +56,7 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
         return LineString3d(getId(), points, AttributeMap({"type": "line_thin"}))
 
     for lane, row in enumerate(network.lanes):
-        told = {
+        attributes = {
             "type": "lanelet",
             "subtype": "road" if int(row["permissions"]) != _BICYCLE else "bicycle_lane",
             "location": "urban",
@@ -64,7 +64,7 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
             "speed_limit": f"{row['speed_mps'] * 3.6:.1f} km/h",
             "name": network.lane_ids[lane],
         }
-        made.add(Lanelet(getId(), line(lane, 0.5), line(lane, -0.5), AttributeMap(told)))
+        made.add(Lanelet(getId(), line(lane, 0.5), line(lane, -0.5), AttributeMap(attributes)))
     try:
         lanelet2.io.write(str(target), made, projector)
         back = lanelet2.io.load(str(target), projector)
@@ -77,7 +77,7 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
 
 
 class _Joints:
-    """Points that lanelets share where one leads into the other."""
+    """Points that lanelets share if one leads into the other."""
 
     def __init__(self, network: RoadNetwork) -> None:
         assert network.geo is not None
@@ -93,7 +93,7 @@ class _Joints:
 
 
 def _beside(network: RoadNetwork, lane: int, side: float) -> NDArray[np.float64]:
-    """The border of a lane, `side` widths to the left of its middle."""
+    """Return the border of a lane, `side` widths to the left of its centre line."""
     shape = network.lane_polyline(lane)
     along = np.gradient(shape[:, :2], axis=0)
     length = np.maximum(np.hypot(*along.T), 1e-9)

@@ -1,4 +1,4 @@
-"""OpenDRIVE by netconvert, mended for ASAM's rules and proved by reading it back."""
+"""OpenDRIVE from netconvert, repaired for ASAM's rules and verified by reading it back."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.reader import read_network
 
 _HEAD = b'<?xml version="1.0" encoding="UTF-8"?>\n'
 STAGES = ("reading", "netconvert writes", "ASAM's rules", "netconvert reads", "comparison")
-_MINOR = "8"  # OpenDRIVE 1.8, whose rules ASAM's checker asks for
+_MINOR = "8"  # OpenDRIVE 1.8, which ASAM's checker verifies
 
 
 def write_opendrive(
@@ -29,9 +29,9 @@ def write_opendrive(
     timeout_s: float | None = None,
     told: Callable[[str], None] = lambda stage: None,
 ) -> RoundTrip:
-    """Write a SUMO network as OpenDRIVE, and read that back; `told` which of `STAGES` begins.
+    """Write a SUMO network as OpenDRIVE and read it back; call `told` at the start of each stage.
 
-    The target is written where what came back differs, too: the result says so.
+    The target is also written if the file read back differs; the result reports the differences.
 
     Raises:
         MapError: netconvert refuses the network or its own export, or the target cannot be written.
@@ -63,7 +63,7 @@ def write_opendrive(
 
 
 def _mended(draft: Path, facts: Mapping[str, str]) -> Element:
-    """The export by ASAM's rules, with what the map says of its origin, and without the date."""
+    """Return the export, repaired for ASAM's rules, with the map's origin and without the date."""
     root: Element = defusedxml.ElementTree.fromstring(draft.read_bytes(), forbid_dtd=True)
     mend_curves(root)
     _join_controllers(root)
@@ -79,7 +79,7 @@ def _mended(draft: Path, facts: Mapping[str, str]) -> Element:
 
 
 def _mend_object(element: Element) -> None:
-    """A crosswalk: its height, and its outline where 1.5 and later have it."""
+    """Add the height of a crosswalk, and move its outline to the place required since 1.5."""
     element.attrib.setdefault("zOffset", "0")
     outlines = element.findall("outline")
     if outlines:
@@ -91,7 +91,7 @@ def _mend_object(element: Element) -> None:
 
 
 def _join_controllers(root: Element) -> None:
-    """One controller a traffic light: netconvert writes one for each of its programs."""
+    """Merge the controllers of a traffic light: netconvert writes one for each program."""
     found: dict[str, Element] = {}
     for controller in root.findall("controller"):
         first = found.setdefault(controller.get("id", ""), controller)

@@ -1,8 +1,8 @@
-"""What netconvert's OpenDRIVE lacks for the rules of ASAM's checker, mended in its curves.
+"""Repairs the curves of netconvert's OpenDRIVE for the rules of ASAM's checker.
 
-netconvert states lengths of cubic curves that are up to a decimetre off, repeats elevations that go
-on as they are, and draws the roads on which vehicles turn round from the wrong side, or about one
-point. Lines over junctions miss the directions of roads by up to some milliradians.
+netconvert writes lengths of cubic curves that are up to a decimetre off, and repeats elevations
+that do not change. It draws roads for U-turns from the wrong side, or about one point. The
+directions of lines over junctions differ from those of roads by some milliradians.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from cavmarl.maps.exports.opendrive_lanes import LANES, part_roads
 
-_SEALED_M = 1e-3  # from lane to lane, where one leads into the other
+_SEALED_M = 1e-3  # maximum gap between lanes that lead into each other
 _SAME_RAD = 1e-4  # the outermost lane of a wide road is 20 m from the reference line
-_PIVOT_M = 0.5  # shorter, a line on which vehicles turn round takes the other side of their lane
+_PIVOT_M = 0.5  # a shorter line for a U-turn is moved to the other side of its lane
 _SAME_GRADE = 1e-6
-_PARTS = 64  # of a curve, for its length: some nearly stand still and turn
+_PARTS = 64  # of a curve, to compute its length: some curves nearly stop and turn
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _U, _V = ("aU", "bU", "cU", "dU"), ("aV", "bV", "cV", "dV")
 
@@ -29,7 +29,7 @@ Coefficients = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RoadEnd:
-    """Where the reference line of a road begins or ends."""
+    """The start or end of a road's reference line."""
 
     x_m: float
     y_m: float
@@ -45,7 +45,7 @@ class RoadEnd:
 
 
 def mend_curves(root: Element) -> int:
-    """Mend all roads of a document; how many roads over junctions had to be drawn anew."""
+    """Repair all roads of a document; return how many roads over junctions were redrawn."""
     part_roads(root)
     roads = {road.get("id", ""): road for road in root.iter("road")}
     drawn = sum(_seal(road, roads) for road in roads.values() if road.get("junction", "-1") != "-1")
@@ -59,7 +59,7 @@ def mend_curves(root: Element) -> int:
 
 
 def _coefficients(curve: Element) -> Coefficients:
-    """(2, 4) of u and v by the share p of the curve."""
+    """Return the coefficients (2, 4) of u and v in the curve's parameter p."""
     return np.array([[float(curve.get(key, "0")) for key in keys] for keys in (_U, _V)])
 
 
@@ -85,7 +85,7 @@ def _end(road: Element, at_start: bool) -> RoadEnd:
 
 
 def _seal(road: Element, roads: dict[str, Element]) -> bool:
-    """Draw a road over a junction anew where its lanes do not meet those that it joins."""
+    """Redraw a road over a junction if its lanes do not meet those that it joins."""
     before, after = (
         roads.get(link.get("elementId", "")) if link is not None else None
         for link in (road.find("link/predecessor"), road.find("link/successor"))
@@ -93,7 +93,7 @@ def _seal(road: Element, roads: dict[str, Element]) -> bool:
     lanes = road.findall(LANES)
     if before is None or after is None or not lanes or len(_geometries(road)) != 1:
         return False
-    first = lanes[0]  # the innermost one
+    first = lanes[0]  # the innermost lane
     ids = [
         0 if link is None else int(link.get("id", "0"))
         for link in (first.find("link/predecessor"), first.find("link/successor"))
@@ -118,22 +118,22 @@ def _seal(road: Element, roads: dict[str, Element]) -> bool:
 
 
 def _taper(road: Element, roads: dict[str, Element]) -> None:
-    """Let lanes over a junction begin and end as wide as the lanes that they join."""
+    """Let lanes over a junction begin and end with the widths of the lanes that they join."""
     length_m = float(road.get("length", "0"))
     for lane in road.iterfind(LANES):
         widths = []
         for kind in ("predecessor", "successor"):
             link, other = lane.find(f"link/{kind}"), road.find(f"link/{kind}")
             if link is not None and other is not None:
-                there = roads.get(other.get("elementId", ""))
-                widths.append(_width_m(there, int(link.get("id", "0"))))
+                joined = roads.get(other.get("elementId", ""))
+                widths.append(_width_m(joined, int(link.get("id", "0"))))
         width = lane.find("width")
         if width is None or len(widths) < 2 or None in widths or length_m < _SEALED_M:
             continue
         first, last = (float(one or 0.0) for one in widths)
         if abs(last - first) < _SEALED_M and abs(float(width.get("a", "0")) - first) < _SEALED_M:
             continue
-        step = last - first  # level at both ends
+        step = last - first  # with zero slope at both ends
         for key, value in zip(
             "abcd", (first, 0.0, 3.0 * step / length_m**2, -2.0 * step / length_m**3), strict=True
         ):
@@ -149,7 +149,7 @@ def _width_m(road: Element | None, lane: int) -> float | None:
 
 
 def _offset_m(road: Element) -> float:
-    """How far to the left of the reference line lanes begin."""
+    """Return how far to the left of the reference line lanes begin."""
     offset = road.find("lanes/laneOffset")
     return 0.0 if offset is None else float(offset.get("a", "0"))
 
@@ -165,7 +165,7 @@ def _set_offset(road: Element, offset_m: float) -> float:
 
 
 def _inner_m(road: Element, lane: int) -> float:
-    """The side of a lane that is nearer to the reference line, positive to the left."""
+    """Return the border of a lane nearer to the reference line, positive to the left."""
     inner_m = _offset_m(road)
     for one in road.iterfind(LANES):
         width = one.find("width")
@@ -181,7 +181,7 @@ def _draw(
     leaves: RoadEnd,
     arrives: RoadEnd,
 ) -> None:
-    """A cubic curve; an arc of a circle where both ends lie on one."""
+    """Draw a cubic curve, which is a circular arc if both ends lie on one."""
     chord = math.dist(start, end)
     turn = math.remainder(arrives.heading_rad - leaves.heading_rad, math.tau)
     handle = chord * 2.0 / (3.0 * (1.0 + abs(math.cos(0.5 * turn))))
@@ -204,14 +204,14 @@ def _draw(
 
 
 def curve_length_m(found: Coefficients) -> float:
-    """Of a cubic curve by its coefficients (2, 4), by Gauss's quadrature in parts."""
+    """Return the length of a cubic curve with coefficients (2, 4), by Gaussian quadrature."""
     p = ((np.arange(_PARTS)[:, None] + 0.5 * (_NODES + 1.0)) / _PARTS).ravel()
     slope = found[:, 1, None] + 2.0 * found[:, 2, None] * p + 3.0 * found[:, 3, None] * p * p
     return float(np.tile(_WEIGHTS, _PARTS) @ np.hypot(slope[0], slope[1]) / (2.0 * _PARTS))
 
 
 def _state_lengths(road: Element) -> None:
-    """Give each curve the length that it has, and all that lies along the road its place."""
+    """Write the length of each curve, and move all records along the road accordingly."""
     old, new = [0.0], [0.0]
     for geometry in _geometries(road):
         curve = geometry.find("paramPoly3")
@@ -241,7 +241,7 @@ def _state_lengths(road: Element) -> None:
 
 
 def _join_lines(road: Element) -> None:
-    """Make one of straight geometries that go on as the one before."""
+    """Merge straight geometries that continue the previous one."""
     view, before = road.find("planView"), None
     for geometry in _geometries(road):
         if geometry.find("line") is None or view is None:
@@ -258,7 +258,7 @@ def _join_lines(road: Element) -> None:
 
 
 def _drop_repeated(profile: Element | None) -> None:
-    """Leave out straight elevations that go on as the one before."""
+    """Remove straight elevations that continue the previous one."""
     before: tuple[float, float, float] | None = None
     for record in profile.findall("elevation") if profile is not None else ():
         s, a, b, c, d = (float(record.get(key, "0")) for key in ("s", *"abcd"))

@@ -1,7 +1,7 @@
-"""Roads over junctions parted where their lanes are not neighbours on the roads that they join.
+"""Splits roads over junctions if their lanes are not neighbours on the roads that they join.
 
-netconvert makes one road of all lanes that lead from one road to another, side by side. Where a
-lane between them leads elsewhere, or two end in one lane, they would lie apart, or over each other.
+netconvert makes one road of all lanes that lead from one road to another, side by side. If a lane
+between them leads elsewhere, or two lanes end in one, the lanes would be apart or overlap.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ LANES = "lanes/laneSection/right/lane"
 
 
 def part_roads(root: Element) -> int:
-    """Give each group of neighbouring lanes a road of its own; how many roads were added."""
+    """Give each group of neighbouring lanes a road of its own; return how many were added."""
     connections = {
         connection.get("connectingRoad", ""): (junction, connection)
         for junction in root.iter("junction")
@@ -44,7 +44,7 @@ def part_roads(root: Element) -> int:
 
 
 def _groups(road: Element) -> list[list[str]]:
-    """The ids of lanes, those together that are neighbours at both ends."""
+    """Return the ids of lanes, grouped by lanes that are neighbours at both ends."""
     groups: list[list[str]] = []
     before: tuple[int, int] | None = None
     for lane in road.findall(LANES):
@@ -60,7 +60,7 @@ def _groups(road: Element) -> list[list[str]]:
 
 
 def _copied(road: Element, connection: Element, number: str) -> tuple[Element, Element]:
-    """A road and its connection under another number; what lies beside it stays with the first."""
+    """Return copies of a road and its connection with another number, without objects."""
     part, link = deepcopy(road), deepcopy(connection)
     part.set("id", number)
     link.set("connectingRoad", number)
@@ -71,7 +71,7 @@ def _copied(road: Element, connection: Element, number: str) -> tuple[Element, E
 
 
 def _keep(road: Element, connection: Element, ids: list[str]) -> None:
-    """Only some lanes of a road, numbered anew from the inside."""
+    """Remove all but some lanes of a road, and number these from the inside."""
     names = {name: str(-number) for number, name in enumerate(ids, start=1)}
     for right in road.iterfind("lanes/laneSection/right"):
         for lane in right.findall("lane"):

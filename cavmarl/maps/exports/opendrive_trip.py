@@ -1,4 +1,4 @@
-"""What cars may use of a map, of its OpenDRIVE file, and of what netconvert reads from that."""
+"""Compares a map with its OpenDRIVE file and with what netconvert reads from that file."""
 
 from __future__ import annotations
 
@@ -11,63 +11,63 @@ import numpy as np
 from cavmarl.maps.exports.opendrive_lanes import LANES
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
-MOST_OFF = 0.02  # of the length of all roads
+MOST_OFF = 0.02  # maximum relative error of the total length
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 @dataclass(frozen=True)
 class CarRoads:
-    """Roads that cars may use. Of the others, netconvert leaves out some."""
+    """Roads that cars may use; netconvert leaves out some of the others."""
 
     edges: int
     lanes: int
     links: int  # movements over junctions
     road_m: float
-    merges: int = 0  # of the links: into a lane that another lane of the same road enters, too
+    merges: int = 0  # links into a lane that another lane of the same road also enters
 
 
 @dataclass(frozen=True)
 class RoundTrip:
-    """A map, the file that it was written to, and that file as netconvert reads it.
+    """A map, the file written from it, and that file as read by netconvert.
 
-    netconvert takes only one of the lanes of a road that enter the same lane of the next one, and
-    cuts roads at junctions anew: it may read fewer links and shorter roads than the file has.
+    netconvert reads only one of several lanes of a road that enter the same lane of the next road,
+    and shortens roads at junctions. It may read fewer links and shorter roads than the file has.
     """
 
     map: CarRoads
     file: CarRoads
     read: CarRoads
-    problems: tuple[str, ...] = field(init=False)  # empty if topology and lengths came back
+    problems: tuple[str, ...] = field(init=False)  # empty if topology and lengths are the same
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "problems", tuple(self._found()))
 
     def _found(self) -> list[str]:
         found = [
-            f"{name} {count} in the map, {there} in the file"
+            f"{name} {count} in the map, {written} in the file"
             for name in ("edges", "lanes", "links")
-            if (count := getattr(self.map, name)) != (there := getattr(self.file, name))
+            if (count := getattr(self.map, name)) != (written := getattr(self.file, name))
         ]
         found += [
-            f"{name} {count} in the map, {there} read by netconvert"
+            f"{name} {count} in the map, {read} read by netconvert"
             for name in ("edges", "lanes")
-            if (count := getattr(self.map, name)) != (there := getattr(self.read, name))
+            if (count := getattr(self.map, name)) != (read := getattr(self.read, name))
         ]
         fewest = self.map.links - self.map.merges
         if not fewest <= self.read.links <= self.map.links:
             found.append(f"links {self.map.links} in the map, {self.read.links} read by netconvert")
         if self.off > MOST_OFF:
-            found.append(f"the roads of the file are {self.off:.1%} off in their length")
+            found.append(f"the total length of the file's roads is {self.off:.1%} off")
         return found
 
     @property
     def off(self) -> float:
-        """How far the length of all roads of the file is off, as a share."""
+        """Relative error of the total length of the roads in the file."""
         return _off(self.map, self.file)
 
     @property
     def read_off(self) -> float:
-        """The same of what netconvert reads."""
+        """Relative error of the total length of the roads that netconvert reads."""
         return _off(self.map, self.read)
 
     @property
@@ -75,8 +75,8 @@ class RoundTrip:
         return not self.problems
 
     def to_dict(self) -> dict[str, Any]:
-        told = {"off": self.off, "read_off": self.read_off, "same": self.same}
-        return asdict(self) | told
+        derived = {"off": self.off, "read_off": self.read_off, "same": self.same}
+        return asdict(self) | derived
 
 
 def _off(one: CarRoads, other: CarRoads) -> float:
@@ -84,7 +84,7 @@ def _off(one: CarRoads, other: CarRoads) -> float:
 
 
 def roads_of_map(network: RoadNetwork) -> CarRoads:
-    """Of a SUMO network."""
+    """Return the roads of a SUMO network."""
     lanes, links = network.lanes, network.links
     cars = (lanes["permissions"] & _CAR != 0) & ~lanes["internal"]
     edges = np.unique(lanes["edge"][cars])
@@ -100,7 +100,7 @@ def roads_of_map(network: RoadNetwork) -> CarRoads:
 
 
 def roads_of_file(root: Element) -> CarRoads:
-    """Of an OpenDRIVE document as netconvert writes it: lanes to the right, in one section."""
+    """Return the roads of netconvert's OpenDRIVE: lanes on the right, in one section."""
     roads = {road.get("id", ""): road for road in root.iter("road")}
     driven = {
         (number, lane.get("id", ""))
@@ -121,7 +121,7 @@ def roads_of_file(root: Element) -> CarRoads:
 
 
 def _movements(root: Element, roads: dict[str, Element]) -> set[tuple[Any, Any]]:
-    """From lane to lane, each as its road and its number, over the roads of junctions."""
+    """Return pairs of lanes, each as (road, number), that are connected over junctions."""
     found = set()
     for connection in root.iterfind("junction/connection"):
         over = roads[connection.get("connectingRoad", "")]

@@ -1,4 +1,4 @@
-"""How true a map or a cloud is to a measured point cloud: alignment, distances, road edges.
+"""Comparison of a map or a cloud with a measured point cloud: alignment, distances, road edges.
 
-Stands on the rest of `maps`.
+Builds on the rest of `maps`.
 """

@@ -1,7 +1,7 @@
 """Point clouds from files: csv and other text, ply, pcd, las and laz.
 
-The kind is told by the file's first bytes, for text by its ending. What is no place (NaN, infinite)
-is left out and counted.
+The first bytes of the file give its format; text is recognized by its suffix. Points with NaN or
+infinite coordinates are left out and counted.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from cavmarl.core.errors import CapacityError, MapError, require
 Points = NDArray[np.float64]
 
 CLOUD_ENDINGS = (".csv", ".txt", ".xyz", ".ply", ".pcd", ".las", ".laz")
-MOST_POINTS = 50_000_000  # 1.2 GB as they are read, several times that while they are compared
-_MOST_DIGITS = 18  # of a number of points
+MOST_POINTS = 50_000_000  # 1.2 GB after reading, several times that during a comparison
+_MOST_DIGITS = 18  # of the number of points
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -33,15 +33,15 @@ _WORDS = re.compile(r"[,;\s]+")
 
 @dataclass(frozen=True)
 class Cloud:
-    """Places in one frame."""
+    """Points in one frame."""
 
     name: str
     points: Points  # (n, 3) x, y, z in m
-    # what happened to its points: "read", and what each filter has removed, in this order
+    # number of points "read", then removed by each filter, in order
     counts: dict[str, int] = field(default_factory=dict)
 
     def kept(self, points: Points, filter_name: str) -> Cloud:
-        """The cloud with fewer points, and how many a filter has removed."""
+        """Return the cloud with fewer points, and count those that a filter has removed."""
         removed = self.counts.get(filter_name, 0) + len(self.points) - len(points)
         return Cloud(self.name, points, self.counts | {filter_name: removed})
 
@@ -51,10 +51,10 @@ def is_cloud(path: Path) -> bool:
 
 
 def read_cloud(path: Path) -> Cloud:
-    """The points of a file, in the file's frame and unit (las: scaled as it says).
+    """Return the points of a file, in the file's frame and unit (las: with the file's scale).
 
     Raises:
-        MapError: the file is missing, cut short, of another kind, or holds no place.
+        MapError: the file is missing, truncated, of another kind, or has no valid point.
         CapacityError: it has more points than `MOST_POINTS`.
         MissingExtraError: pcd, las and laz need the extra `maps`.
     """
@@ -66,7 +66,7 @@ def read_cloud(path: Path) -> Cloud:
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
-        raise MapError(f"{path}: is no text: {_known()}") from error
+        raise MapError(f"{path}: not a text file: {_known()}") from error
     sound = np.isfinite(found).all(axis=1)
     cloud = Cloud(path.name, found, {"read": len(found)}).kept(found[sound], "no numbers")
     if not len(cloud.points):
@@ -76,12 +76,12 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:
-    """Places as csv or ply, as `read_cloud` reads them.
+    """Write points as csv or ply, in the form that `read_cloud` reads.
 
-    Raises MapError: another ending, or the file cannot be written.
+    Raises MapError: the suffix is another one, or the file cannot be written.
     """
     if path.suffix.lower() not in (".csv", ".ply"):
-        raise MapError(f"{path}: clouds are written as .csv or .ply")
+        raise MapError(f"{path}: the name must end in .csv or .ply")
     try:
         if path.suffix.lower() == ".csv":
             head = "x,y,z"
@@ -107,7 +107,7 @@ def _read(path: Path, head: bytes, stream: BinaryIO) -> Points:
         return _read_pcd(path, stream.read(4096))
     if path.suffix.lower() in (".csv", ".txt", ".xyz"):
         return _read_text(path, stream)
-    raise MapError(f"{path}: its content is not what '{path.suffix}' says: {_known()}")
+    raise MapError(f"{path}: its content does not match '{path.suffix}': {_known()}")
 
 
 def _check_number(path: Path, number: int) -> None:
@@ -130,7 +130,7 @@ def _read_text(path: Path, stream: BinaryIO) -> Points:
     if head and not _is_number(words[0]):
         if not {"x", "y", "z"} <= set(words):
             raise MapError(
-                f"{path}, line {first}: the head has no columns x, y and z: name them so"
+                f"{path}, line {first}: the header has no columns x, y and z: name them so"
             )
         columns = tuple(words.index(axis) for axis in "xyz")
         skipped = first
@@ -158,14 +158,14 @@ def _is_number(word: str) -> bool:
 
 
 def _read_ply(path: Path, stream: BinaryIO) -> Points:
-    """The `vertex` element; other elements must come after it, as they do."""
+    """Read the `vertex` element, which must come first."""
     order, number, properties = _ply_head(path, stream)
     _check_number(path, number)
     names = [name for name, _ in properties]
     if number == 0:
         return np.zeros((0, 3))
     if len(set(names)) < len(names):
-        raise MapError(f"{path}: a value of its vertices is named twice: export it again")
+        raise MapError(f"{path}: two values of its vertices have one name: export it again")
     if not {"x", "y", "z"} <= set(names):
         raise MapError(f"{path}: its vertices have no x, y and z: export it again")
     if order == "=":
@@ -188,7 +188,7 @@ def _read_ply(path: Path, stream: BinaryIO) -> Points:
 
 
 def _ply_head(path: Path, stream: BinaryIO) -> tuple[str, int, list[tuple[str, str]]]:
-    """The order of its bytes, the number of its vertices, and name and type of their values."""
+    """Return the byte order, the number of vertices, and name and type of their values."""
     order, number, element = "", -1, ""
     properties: list[tuple[str, str]] = []
     for _ in range(1000):
@@ -202,34 +202,34 @@ def _ply_head(path: Path, stream: BinaryIO) -> tuple[str, int, list[tuple[str, s
                 order = _PLY_ORDERS[form]
             case ["element", element, text] if text.isdigit() and len(text) <= _MOST_DIGITS:
                 if element != "vertex" and number < 0 and int(text):
-                    raise MapError(f"{path}: '{element}' stands before its vertices: export again")
+                    raise MapError(f"{path}: '{element}' comes before its vertices: export again")
                 number = int(text) if element == "vertex" else number
             case ["property", code, name] if element == "vertex" and code in _PLY_TYPES:
                 properties.append((name, _PLY_TYPES[code]))
             case ["property", *_] if element == "vertex":
                 raise MapError(
-                    f"{path}: {' '.join(words)!r} of a vertex is no number: export again"
+                    f"{path}: {' '.join(words)!r} of a vertex is not a number: export again"
                 )
-    raise MapError(f"{path}: its head says no format, or no number of vertices: export it again")
+    raise MapError(f"{path}: its header has no format, or no number of vertices: export it again")
 
 
 def _cut_short(path: Path, number: int, found: int) -> MapError:
     return MapError(
-        f"{path}: is cut short: {found} points of {number} are there: copy or download it again"
+        f"{path}: is truncated: it has {found} of {number} points: copy or download it again"
     )
 
 
 def _read_pcd(path: Path, head: bytes) -> Points:
     pypcd4: Any = require("pypcd4", "maps")
-    said = re.search(rb"^POINTS\s+(\d+)", head, re.MULTILINE)
-    number = int(said[1][:_MOST_DIGITS]) if said else -1
+    match = re.search(rb"^POINTS\s+(\d+)", head, re.MULTILINE)
+    number = int(match[1][:_MOST_DIGITS]) if match else -1
     _check_number(path, number)
     try:
         read = pypcd4.PointCloud.from_path(path)
         found = read.numpy(("x", "y", "z")).astype(np.float64)
-    except Exception as error:  # its own errors have no common base
+    except Exception as error:  # pypcd4's errors have no common base
         raise MapError(
-            f"{path}: is no whole pcd file ({type(error).__name__}: {error}): copy or export it "
+            f"{path}: not a complete pcd file ({type(error).__name__}: {error}): copy or export it "
             "again"
         ) from error
     if number >= 0 and len(found) != number:
@@ -247,9 +247,9 @@ def _read_las(path: Path) -> Points:
             found = np.asarray(read.xyz, dtype=np.float64)
     except CapacityError:
         raise
-    except Exception as error:  # laspy's, its decoder's and struct's have no common base
+    except Exception as error:  # errors of laspy, its decoder and struct have no common base
         raise MapError(
-            f"{path}: is no whole las or laz file ({type(error).__name__}: {error}): copy or "
+            f"{path}: not a complete las or laz file ({type(error).__name__}: {error}): copy or "
             "export it again"
         ) from error
     if len(found) != number:

@@ -1,4 +1,4 @@
-"""Clouds thinned out, freed of outliers and cropped; each filter counts what it removes."""
+"""Filters that thin out and crop clouds and remove outliers; each counts what it removes."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.maps.fidelity.cloud_files import Cloud
 
 NEIGHBOURS = 8
-_SWAPPED = 0.4  # of the points that lie on the map only if x and y are swapped
-_VOXEL_BITS = 20  # of a voxel's number on an axis, and its sign
+_SWAPPED = 0.4  # if this share more of the points is on the map with x and y swapped, they are
+_VOXEL_BITS = 20  # of a voxel's index on an axis, plus its sign
 
 
 def thin_out(cloud: Cloud, voxel_m: float, threads: int = 2) -> Cloud:
-    """One point, the mean, in each cube with this side; 0: as it is."""
+    """Return one point, the mean, for each cube of this side; 0: no filter."""
     if voxel_m == 0.0:
         return cloud
     if not 0.0 < voxel_m < np.inf:
         raise ConfigError(f"voxels of {voxel_m:g} m: give a side above 0, or 0 for no filter")
     gicp: Any = require("small_gicp", "maps")
-    # The library numbers voxels from (0, 0, 0) on and leaves out what is too far from there.
+    # The library numbers voxels from (0, 0, 0) on and drops points too far from there.
     middle = 0.5 * (cloud.points.min(axis=0) + cloud.points.max(axis=0))
     if np.ptp(cloud.points, axis=0).max() / voxel_m >= 2.0 * (1 << _VOXEL_BITS):
         raise ConfigError(
             f"{cloud.name}: is {np.ptp(cloud.points, axis=0).max():.0f} m long, too much for "
-            f"voxels of {voxel_m:g} m: take larger ones, or remove stray points"
+            f"voxels of {voxel_m:g} m: use larger ones, or remove stray points"
         )
     thinned = gicp.voxelgrid_sampling(cloud.points - middle, voxel_m, threads)
     return cloud.kept(np.asarray(thinned.points())[:, :3] + middle, "voxel filter")
 
 
 def drop_outliers(cloud: Cloud, sigmas: float, threads: int = 2) -> Cloud:
-    """Without points that are far from their neighbours; 0 sigmas: as it is.
+    """Remove points that are far from their neighbours; 0 sigmas: no filter.
 
-    Far is a mean distance to `NEIGHBOURS` others of more than the mean of all points and so many
-    standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
+    A point is far if its mean distance to `NEIGHBOURS` others exceeds the mean over all points by
+    `sigmas` standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
     """
     if sigmas == 0.0 or len(cloud.points) <= NEIGHBOURS:
         return cloud
     if not 0.0 < sigmas < np.inf:
         raise ConfigError(
-            f"outliers beyond {sigmas:g} sigmas: give a number above 0, or 0 for none"
+            f"outliers beyond {sigmas:g} sigmas: give a number above 0, or 0 for no filter"
         )
     distance_m = neighbour_distances(cloud.points, NEIGHBOURS, threads).mean(axis=1)
     kept = distance_m <= distance_m.mean() + sigmas * distance_m.std()
@@ -50,7 +50,7 @@ def drop_outliers(cloud: Cloud, sigmas: float, threads: int = 2) -> Cloud:
 
 
 def neighbour_distances(points: Any, number: int, threads: int = 2) -> Any:
-    """(n, number) distances in m of each point to those of its own cloud that are next to it."""
+    """Return (n, number) distances in m of each point to its nearest neighbours in the cloud."""
     gicp: Any = require("small_gicp", "maps")
     centred = points - points.mean(axis=0)
     _, squares = gicp.KdTree(centred, threads).batch_knn_search(centred, number + 1, threads)
@@ -58,9 +58,9 @@ def neighbour_distances(points: Any, number: int, threads: int = 2) -> Any:
 
 
 def crop(cloud: Cloud, box_m: tuple[float, float, float, float], margin_m: float) -> Cloud:
-    """What lies within a box of the plane, and so much around it.
+    """Return the points within a box of the plane and a margin around it.
 
-    Raises MapError: nothing does, or much more would with x and y swapped.
+    Raises MapError: no point is inside, or many more are with x and y swapped.
     """
     low = np.array(box_m[:2]) - margin_m
     high = np.array(box_m[2:]) + margin_m

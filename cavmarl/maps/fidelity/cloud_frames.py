@@ -1,4 +1,4 @@
-"""Clouds brought into the frame of a map."""
+"""Transforms clouds to the frame of a map."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ FRAMES = ("map", "projected", "degrees", "swapped", "left-handed")
 
 
 def in_map_frame(cloud: Cloud, frame: str, network: RoadNetwork | None) -> Cloud:
-    """The cloud in the map's own x, y, z.
+    """Return the cloud in the map's own x, y, z.
 
     Args:
-        cloud: as its file has it.
+        cloud: the cloud as read from its file.
         frame: `map`; `projected`, the map's projection without its offset; `degrees`, longitude,
             latitude, height; `swapped`, y before x; `left-handed`, with y to the south.
-        network: the map; None: only frames that need none.
+        network: the map; None: only frames that need no map are allowed.
 
     Raises:
-        ConfigError: no such frame.
-        MapError: the frame needs a map's projection, and there is none.
+        ConfigError: there is no such frame.
+        MapError: the frame needs a map with a projection.
     """
     points = cloud.points.copy()
     match frame:
@@ -36,7 +36,7 @@ def in_map_frame(cloud: Cloud, frame: str, network: RoadNetwork | None) -> Cloud
         case "projected" | "degrees":
             if network is None or network.geo is None:
                 raise MapError(
-                    f"{cloud.name}: is {frame}, and the map does not say where it lies: build it "
+                    f"{cloud.name}: frame '{frame}' needs a map with a georeference: build the map "
                     "with a projection, or give the cloud in the map's own frame"
                 )
             geo = network.geo
@@ -45,5 +45,5 @@ def in_map_frame(cloud: Cloud, frame: str, network: RoadNetwork | None) -> Cloud
             else:
                 points[:, :2] += np.array([geo.offset_x_m, geo.offset_y_m])
         case _:
-            raise ConfigError(f"frame '{frame}': is none of {', '.join(FRAMES)}")
+            raise ConfigError(f"frame '{frame}': must be one of {', '.join(FRAMES)}")
     return Cloud(cloud.name, points, cloud.counts)

@@ -1,4 +1,4 @@
-"""One cloud laid onto another: trimmed ICP by small_gicp, and whether it can be believed."""
+"""Registration of a cloud with another one: trimmed ICP by small_gicp, and its reliability."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ _NORMAL_NEIGHBOURS = 20
 _STAGES = 12
 _SETTLED_M, _SETTLED_RAD = 1e-4, 1e-6
 _ITERATIONS = 50
-_WIDEST_M = 10.0  # what is farther from the other cloud is never taken for the same place
-# A part of so few normals along a direction leaves the cloud free to slide along it.
+_WIDEST_M = 10.0  # points farther from the other cloud never correspond to it
+# If the share of normals along a direction is smaller, the cloud can slide along it.
 _HELD = 0.005
-# The kept part lies on the other cloud if it is nearer to it than its own neighbours are, about.
+# The kept points fit the other cloud if they are about as near to it as to their neighbours.
 _SPACINGS, _LEAST_LIMIT_M, _MOST_LIMIT_M = 2.5, 0.1, 0.5
 _SAMPLE = 10_000  # points, for the spacing
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """The rigid motion that lays a source onto a target, and what speaks for it."""
+    """The rigid motion that aligns a source with a target, and its quality."""
 
     transform: Points  # (4, 4), from the source's frame to the target's
     trimmed_rmse_m: float  # of the share of the points that is kept
-    limit_m: float  # of `trimmed_rmse_m`
+    limit_m: float  # limit of `trimmed_rmse_m`
     stages: int
-    problems: tuple[str, ...]  # why it is not to be believed; empty if it is
-    before_m: Points  # (n,) of each point of the source to its nearest, as it was given
-    distance_m: Points  # where it was laid
+    problems: tuple[str, ...]  # why it is not reliable; empty if it is
+    before_m: Points  # (n,) distance of each point of the source to the target before the motion
+    distance_m: Points  # (n,) the same after the motion
 
     @property
     def converged(self) -> bool:
@@ -47,21 +47,21 @@ class Alignment:
 
     @property
     def angle_deg(self) -> float:
-        """Of the whole rotation, about whatever axis."""
-        # By the sine too: near 0 the cosine alone has no digits.
+        """Angle of the whole rotation, about any axis."""
+        # Uses the sine, too: near 0, the cosine alone is imprecise.
         turn = self.transform[:3, :3]
         skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0)))
 
 
 def moved(points: Points, transform: Points) -> Points:
-    """Points (n, 3) by a motion (4, 4)."""
+    """Return points (n, 3) transformed by a motion (4, 4)."""
     found: Points = points @ transform[:3, :3].T + transform[:3, 3]
     return found
 
 
 def nearest_distances(points: Points, others: Points, threads: int = 2) -> Points:
-    """(n,) distances in m of points (n, 3) to the nearest of others (m, 3) each."""
+    """Return distances (n,) in m of points (n, 3) to the nearest of others (m, 3)."""
     gicp: Any = require("small_gicp", "maps")
     middle = others.mean(axis=0)
     tree = gicp.KdTree(others - middle, threads)
@@ -72,13 +72,13 @@ def nearest_distances(points: Points, others: Points, threads: int = 2) -> Point
 
 
 class Target:
-    """A cloud that others are laid onto, with its tree; about its own middle, for the digits."""
+    """A cloud for registration, with its search tree; centred at its mean for precision."""
 
     def __init__(self, points: Points, threads: int = 2) -> None:
         gicp: Any = require("small_gicp", "maps")
         if len(points) < FEWEST_POINTS:
             raise MapError(
-                f"a cloud of {len(points)} points: {FEWEST_POINTS} are needed at least: take "
+                f"a cloud of {len(points)} points: must be at least {FEWEST_POINTS}: use "
                 "smaller voxels, or another cloud"
             )
         self.middle_m = points.mean(axis=0)
@@ -96,7 +96,7 @@ class Target:
         return float(np.sqrt(np.median(np.asarray(squares)[:, 1])))
 
     def nearest(self, points: Points) -> tuple[NDArray[np.int64], Points]:
-        """The number of the nearest point of each of (n, 3) places, and the distance in m."""
+        """Return the row of the point nearest to each of (n, 3) positions, and distances in m."""
         rows, squares = self.tree.batch_nearest_neighbor_search(
             points - self.middle_m, self.threads
         )
@@ -104,15 +104,15 @@ class Target:
 
 
 def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
-    """Lay a source onto a target by ICP that keeps a share of the nearest pairs.
+    """Align a source with a target by ICP with a share of the nearest pairs.
 
-    Stage by stage pairs farther than twice the distance of the `keep` nearest are left out
-    (Chetverikov et al., "The trimmed iterative closest point algorithm", 2002); within a stage
+    In each stage, pairs farther than twice the distance of the `keep` nearest are left out
+    (Chetverikov et al., "The trimmed iterative closest point algorithm", 2002). Within a stage,
     small_gicp minimises distances between surfaces (generalized ICP).
 
     Raises:
-        ConfigError: `keep` is no share.
-        MapError: too few points.
+        ConfigError: `keep` is not a valid share.
+        MapError: there are too few points.
     """
     gicp: Any = require("small_gicp", "maps")
     if not 0.1 <= keep <= 1.0:
@@ -145,19 +145,19 @@ def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
         if last_m < _SETTLED_M and narrower_m > 0.95 * gate_m:
             break
         gate_m = narrower_m
-    problems, rmse_m, limit_m = _judged(own, target, rows, distance_m, keep, stages, last_m)
+    problems, rmse_m, limit_m = _assess(own, target, rows, distance_m, keep, stages, last_m)
     absolute = motion.copy()
     absolute[:3, 3] += target.middle_m - motion[:3, :3] @ own.middle_m
     return Alignment(absolute, rmse_m, limit_m, stages, problems, before_m, distance_m)
 
 
 def _size_m(step: Points, points: Points) -> float:
-    """How far a motion moves the corners of a cloud, at most."""
+    """Return the largest displacement of the corners of a cloud by a motion."""
     corners = np.stack([points.min(axis=0), points.max(axis=0)])
     return float(np.linalg.norm(moved(corners, step) - corners, axis=1).max())
 
 
-def _judged(
+def _assess(
     own: Target,
     target: Target,
     rows: NDArray[np.int64],
@@ -166,25 +166,25 @@ def _judged(
     stages: int,
     last_m: float,
 ) -> tuple[tuple[str, ...], float, float]:
-    """What speaks against it, the RMSE of the pairs kept, and its limit."""
+    """Return the problems of an alignment, the RMSE of the kept pairs, and its limit."""
     order = np.argsort(distance_m, kind="stable")[: max(int(keep * len(distance_m)), 1)]
     rmse_m = float(np.sqrt(np.mean(distance_m[order] ** 2)))
     spacing_m = max(own.spacing_m, target.spacing_m)
     limit_m = float(np.clip(_SPACINGS * spacing_m, _LEAST_LIMIT_M, _MOST_LIMIT_M))
     problems = []
     if last_m > 10.0 * _SETTLED_M:
-        problems.append(f"it still moved by {1e3 * last_m:.1f} mm in stage {stages}, the last one")
+        problems.append(f"it still moved by {1e3 * last_m:.1f} mm in the last stage, {stages}")
     if rmse_m > limit_m:
         problems.append(
             f"the nearest {keep:.0%} of the points are {rmse_m:.3f} m off, more than "
-            f"{limit_m:.3f} m: other places, or a start too far away (--start)"
+            f"{limit_m:.3f} m: the clouds show other places, or start too far apart (--start)"
         )
     normals = np.asarray(target.cloud.normals())[rows[order], :3]
     share, axes = np.linalg.eigh(normals.T @ normals / len(normals))
     if share[0] < _HELD:
         along = ", ".join(f"{value:.2f}" for value in axes[:, 0])
         problems.append(
-            f"nothing holds it along ({along}), where it can slide: give walls (--buildings), or "
-            "a cloud with more than a plane"
+            f"nothing fixes it along ({along}), where it can slide: give walls (--buildings), or "
+            "a cloud that is more than a plane"
         )
     return tuple(problems), rmse_m, limit_m

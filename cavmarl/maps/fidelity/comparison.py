@@ -1,8 +1,8 @@
-"""Two clouds compared: ICP's RMSE, mean distances both ways, and their report.
+"""The comparison of two clouds: ICP's RMSE, mean distances in both directions, and a report.
 
-Equations (1) and (2) and Table I are those of the paper on the hybrid digital twin that
-`docs/reference/map_fidelity.md` names: RMSE = sqrt(mean |T(p) - q|²) over nearest pairs, and the
-mean of the distance from each p to the cloud Q, which is not symmetric.
+Equations (1) and (2) and Table I are from the paper on the hybrid digital twin in
+`docs/reference/map_fidelity.md`: RMSE = sqrt(mean |T(p) - q|²) over nearest pairs, and the mean
+distance from each p to the cloud Q, which is not symmetric.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cavmarl.maps.fidelity.cloud_registration import (
 
 Points = NDArray[np.float64]
 
-# Published, of another site and other clouds: for the eye, not for a verdict.
+# Published values for another site and other clouds, for orientation only.
 PAPER_TABLE = {
     "paper, mesh": {"icp_rmse_m": 0.635, "mean_distance_m": 0.183},
     "paper, CARLA map": {"icp_rmse_m": 1.831, "mean_distance_m": 1.077},
@@ -35,19 +35,19 @@ HISTOGRAM_M = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 5
 
 @dataclass(frozen=True)
 class Comparison:
-    """One cloud P laid onto another, Q."""
+    """A cloud P that was compared with another cloud Q, usually after an alignment."""
 
     source: Cloud  # P, filtered, in its own frame
     reference: Cloud  # Q, filtered
     before_m: float  # mean distance P → Q as the clouds were given
-    alignment: Alignment | None  # None: they were compared as they are
-    distance_m: Points  # (n,) of each point of P to its nearest of Q
-    reverse_m: Points  # of each point of Q to its nearest of P
-    transform: Points  # (4, 4) that P was moved by, with the start
+    alignment: Alignment | None  # None: compared without alignment
+    distance_m: Points  # (n,) distance of each point of P to its nearest point of Q
+    reverse_m: Points  # distance of each point of Q to its nearest point of P
+    transform: Points  # (4, 4) transform of P, including the start
 
     @property
     def aligned(self) -> Points:
-        """P where it was laid, (n, 3)."""
+        """P after the transform, (n, 3)."""
         return moved(self.source.points, self.transform)
 
     @property
@@ -89,9 +89,9 @@ def compare(
     registered: bool = True,
     threads: int = 2,
 ) -> Comparison:
-    """Lay P (`source`) onto Q (`reference`), if `registered`, and measure distances both ways.
+    """Align P (`source`) with Q (`reference`), if `registered`, and measure both distances.
 
-    `start`: (4, 4) that takes P about to its place. `keep`: see `align`.
+    `start`: (4, 4) approximate transform of P. `keep`: see `align`.
     """
     target = Target(reference.points, threads)
     begin = np.eye(4) if start is None else start
@@ -110,7 +110,7 @@ def compare(
 
 
 def histogram(distance_m: Points) -> list[dict[str, float | int | None]]:
-    """How many points lie from … to … m off."""
+    """Return the number of points in each interval of distances in m."""
     counts, _ = np.histogram(distance_m, bins=np.array(HISTOGRAM_M))
     return [
         {"from_m": low, "to_m": None if np.isinf(high) else high, "points": int(count)}
@@ -119,7 +119,7 @@ def histogram(distance_m: Points) -> list[dict[str, float | int | None]]:
 
 
 def start_transform(text: str | None) -> Points:
-    """(4, 4) of "x,y,z,yaw" in m and degrees."""
+    """Return the transform (4, 4) of "x,y,z,yaw" in m and degrees."""
     motion = np.eye(4)
     if text is None:
         return motion

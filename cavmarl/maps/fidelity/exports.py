@@ -1,4 +1,4 @@
-"""Distances of each point as csv or ply, and a page with a picture that can be turned."""
+"""Exports of distances per point (csv, ply), and a page with a picture that can be rotated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.maps.fidelity.comparison import PAPER_TABLE, Comparison
 
 _PAGE = Path(__file__).with_name("page.html")
 _SHOWN = 60_000  # points of each cloud on the page
-_FAR_M = 1.0  # painted red, and all beyond
+_FAR_M = 1.0  # this distance and more is red
 _VERTEX = np.dtype(
     [
         *((axis, "<f8") for axis in "xyz"),
@@ -27,7 +27,7 @@ _VERTEX = np.dtype(
 
 
 def colors_of(distance_m: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(n, 3) from blue, 0 m, over green and yellow to red, `_FAR_M` and more."""
+    """Return colours (n, 3): from blue at 0 m via green and yellow to red from `_FAR_M` on."""
     share = np.clip(distance_m / _FAR_M, 0.0, 1.0)
     stops = np.array([0.0, 0.33, 0.66, 1.0])
     table = np.array([(40, 80, 220), (40, 180, 90), (245, 200, 40), (220, 40, 40)])
@@ -36,9 +36,9 @@ def colors_of(distance_m: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def write_points(path: Path, comparison: Comparison) -> None:
-    """Each point of P where it was laid, with its distance: csv, or ply with colours."""
+    """Write each point of P after the transform, with its distance: csv, or ply with colours."""
     if path.suffix.lower() not in (".csv", ".ply"):
-        raise ConfigError(f"{path}: points go to a .csv or a .ply")
+        raise ConfigError(f"{path}: the name must end in .csv or .ply")
     points, distance_m = comparison.aligned, comparison.distance_m
     try:
         if path.suffix.lower() == ".csv":
@@ -66,7 +66,7 @@ def write_points(path: Path, comparison: Comparison) -> None:
 
 
 def write_page(path: Path, comparisons: Sequence[Comparison]) -> None:
-    """One file with the table, the histograms and the clouds, to be turned with the mouse."""
+    """Write a page with the table, the histograms, and the clouds, which the mouse rotates."""
     middle = comparisons[0].reference.points.mean(axis=0)
     scenes = []
     for comparison in comparisons:
@@ -93,7 +93,7 @@ def write_page(path: Path, comparisons: Sequence[Comparison]) -> None:
 
 
 def _some(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The rows of `_SHOWN` points at most, evenly."""
+    """Return the rows of at most `_SHOWN` points, evenly spaced."""
     return np.linspace(0, len(points) - 1, min(len(points), _SHOWN)).astype(np.int64)
 
 

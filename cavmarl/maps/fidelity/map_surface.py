@@ -1,4 +1,4 @@
-"""The surface that a map draws, as a cloud: lanes from border to border, and walls of buildings."""
+"""The surface of a map as a cloud: lanes from border to border, and walls of buildings."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ _FINEST_M = 0.1
 
 
 def map_surface(network: RoadNetwork, box_m: Box, spacing_m: float = 0.25) -> tuple[Cloud, float]:
-    """Places on the map's lanes and walls within a box of the plane, and how far they are apart.
+    """Return points on the map's lanes and walls within a box of the plane, and their spacing.
 
-    Where more than `MOST_POINTS` would be needed, they are farther apart than `spacing_m`.
+    If more than `MOST_POINTS` would be needed, the spacing is larger than `spacing_m`.
 
-    Raises MapError: no lane lies in the box.
+    Raises MapError: the box has no lane.
     """
     lanes = lanes_in(network, box_m)
     if not len(lanes):
         place = "x {0:.1f} … {2:.1f}, y {1:.1f} … {3:.1f}".format(*box_m)
         raise MapError(
             f"the map '{network.name}' has no lane within {place}: give another cloud, or "
-            "the frame that it is in (--frame projected, degrees, swapped)"
+            "the cloud's frame (--frame projected, degrees, swapped)"
         )
     area_m2 = float((network.lanes["length_m"][lanes] * network.lanes["width_m"][lanes]).sum())
     walls = _walls_in(network, box_m)
@@ -43,7 +43,7 @@ def map_surface(network: RoadNetwork, box_m: Box, spacing_m: float = 0.25) -> tu
 
 
 def lanes_in(network: RoadNetwork, box_m: Box) -> NDArray[np.int64]:
-    """LANE rows whose bounding boxes meet a box."""
+    """Return LANE rows whose bounding boxes meet a box."""
     rows = network.lanes
     meets = (rows["max_x"] >= box_m[0]) & (rows["min_x"] <= box_m[2])
     meets &= (rows["max_y"] >= box_m[1]) & (rows["min_y"] <= box_m[3])
@@ -51,7 +51,7 @@ def lanes_in(network: RoadNetwork, box_m: Box) -> NDArray[np.int64]:
 
 
 def along_lane(network: RoadNetwork, lane: int, spacing_m: float) -> tuple[Points, Points]:
-    """Places (n, 3) on a lane's centre line, not farther apart, and its direction there (n, 2)."""
+    """Return points (n, 3) on a lane's centre line, at most `spacing_m` apart, and directions."""
     points = network.lane_points(lane)
     end_m = float(points["s"][-1])
     at = np.linspace(0.0, end_m, int(end_m / spacing_m) + 2)
@@ -86,7 +86,7 @@ def _lengths(walls: NDArray[np.void]) -> Points:
 
 
 def _ground_m(network: RoadNetwork) -> tuple[Points, Points]:
-    """Places of the plane (n, 2) and the height of the road there: walls stand at that height."""
+    """Return points of the plane (n, 2) and the road's heights there, on which walls stand."""
     points = network.points
     return np.stack([points["x"], points["y"]], axis=1), np.asarray(points["z"])
 

@@ -1,8 +1,8 @@
-"""A cloud beside the borders and heights of a map's roads.
+"""Compares the borders and heights of a map's roads with a cloud.
 
-A border is found where, from the middle of the outer lane outwards, the ground first leaves the
-road's height by more than a kerb's least: a kerb, a bank, a ditch or a wall. Where roads end
-without a step there is nothing to find, and nothing is counted.
+A border is where, from the middle of the outer lane outwards, the ground first leaves the road's
+height by more than `STEP_M`: a kerb, a bank, a ditch or a wall. If a road ends without a step, no
+border is found, and nothing is counted.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from cavmarl.roads.network import RoadNetwork
 
 Points = NDArray[np.float64]
 
-STATION_M = 2.0  # from one cross-section to the next
-BEYOND_M = 3.0  # how far outside of the map's border the cloud's is looked for
-STEP_M = 0.05  # of height, the least that is a border
+STATION_M = 2.0  # between two cross-sections
+BEYOND_M = 3.0  # how far outside of the map's border the cloud's border is searched
+STEP_M = 0.05  # minimum change of height at a border
 _BIN_M = 0.1
-_LEVEL_M = 1.5  # points that are farther over or under the road belong to something else
-_FEWEST = 3  # points of a bin, of one of its neighbours and of a height
+_LEVEL_M = 1.5  # points farther above or below the road are not of the road
+_FEWEST = 3  # minimum number of points of a bin, of its neighbour and of a height
 _FEWEST_STATIONS = 6
 _OUTLIER = 3.0  # median deviations
 
 
 @dataclass(frozen=True)
 class RoadFit:
-    """How a cloud's roads lie beside a map's; offsets are the cloud's minus the map's."""
+    """The differences between a cloud's roads and a map's; offsets are cloud minus map."""
 
     stations: int  # cross-sections of the map in the cloud's box
-    edge_offset_m: Points  # of those with a border in the cloud; positive: farther outside
-    height_offset_m: Points  # of those with a road in the cloud
-    # (4, 4) that takes the cloud to the map by both; None: too few borders, or all of one direction
+    edge_offset_m: Points  # of cross-sections with a border in the cloud; positive: farther outside
+    height_offset_m: Points  # of cross-sections with a road in the cloud
+    # (4, 4) from the cloud to the map; None: too few borders, or all in one direction
     transform: Points | None
 
     @property
@@ -133,7 +133,7 @@ def _stations(network: RoadNetwork, box_m: Box) -> _Stations:
 
 
 def _section(outer_m: Points, height_m: Points) -> tuple[float | None, float | None]:
-    """Where the cloud's border lies, and the height of its road, from the map's border."""
+    """Return the position of the cloud's border and its road's height, relative to the map's."""
     low_m = float(outer_m.min())
     road = (
         outer_m <= max(0.5 * low_m, low_m + 0.5) if low_m < -0.5 else np.zeros(len(outer_m), bool)
@@ -152,7 +152,7 @@ def _section(outer_m: Points, height_m: Points) -> tuple[float | None, float | N
         inside = outer_m[order[first:end]]
         steps = np.abs(height_m[order[first:end]] - road_m) > STEP_M
         if steps.mean() > 0.5:
-            # Off the road from the first point that is, or from the last one that is not.
+            # The road ends at the first point off it, or after the last point on it.
             return float(
                 inside[steps].min() if before is None else max(before, inside.min())
             ), road_m
@@ -163,7 +163,7 @@ def _section(outer_m: Points, height_m: Points) -> tuple[float | None, float | N
 def _motion(
     stations: _Stations, at: NDArray[np.int64], offset_m: Points, heights_m: Points
 ) -> Points | None:
-    """The least-squares motion in the plane, and the median step in height."""
+    """Return the least-squares motion in the plane, with the median step in height."""
     if len(at) < _FEWEST_STATIONS:
         return None
     middle = np.median(offset_m)

@@ -1,3 +1,3 @@
-"""Heights of a map: models of the ground read, laid under a network, kept continuous."""
+"""Heights of a map: terrain models are read and draped over a network continuously."""
 
 from __future__ import annotations

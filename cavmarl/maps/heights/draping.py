@@ -1,7 +1,7 @@
-"""Heights laid under a network that lies flat; nothing moves in the plane.
+"""Drapes a flat network over a terrain model; positions in the plane do not change.
 
-On the ground a lane is where the model is. Bridges and tunnels go straight from abutment to
-abutment; where they cross another road, they keep `CLEARANCE_M` from it, with ramps.
+On the ground, a lane has the model's height. Bridges and tunnels are straight from abutment to
+abutment. Where they cross another road, they keep `CLEARANCE_M` from it, with ramps.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from cavmarl.maps.net_document import HEIGHT_DIGITS, NetDocument, shape_text
 from cavmarl.maps.osm_roads import OsmRoads
 from cavmarl.maps.projection import unproject
 
-CLEARANCE_M = 5.0  # from road to road, where one crosses above another
+CLEARANCE_M = 5.0  # between roads, where one crosses above the other
 RAMP_GRADE = 0.08
-STEEP_GRADE = 0.15  # is told
-MOST_GRADE = 0.25  # is refused
+STEEP_GRADE = 0.15  # reported
+MOST_GRADE = 0.25  # an error
 _LIST = 8
 
 Heights = NDArray[np.float64]
@@ -34,20 +34,20 @@ Heights = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class HeightReport:
-    """What was done to lay heights under a map."""
+    """A report about draping a map over a terrain model."""
 
     models: tuple[str, ...]
     cell_m: float  # of the finest model
     heights_m: tuple[float, float]  # lowest and highest of all lanes
-    places: int  # at which the model was asked
-    filled_places: int  # in voids of the model, filled from around
+    places: int  # at which the model was evaluated
+    filled_places: int  # in voids of the model, interpolated
     void_cells: int  # of the models around the map
-    raised_edges: tuple[str, ...]  # on bridges and in tunnels, all or in part
+    raised_edges: tuple[str, ...]  # partly or completely on bridges or in tunnels
     crossings: int  # of lanes on two levels
-    ramp_places: int  # on the ground, moved off the model so that a crossing keeps its clearance
-    smoothed_places: int  # moved off the model by the limit of grade
+    ramp_places: int  # on the ground, moved from the model to keep the clearance of a crossing
+    smoothed_places: int  # moved from the model by the limit of the grade
     most_smoothed_m: float
-    max_grade: float  # of what was built
+    max_grade: float  # of the result
     steep: tuple[str, ...]  # roads above `STEEP_GRADE`, with their grades
 
     def to_dict(self) -> dict[str, Any]:
@@ -56,32 +56,32 @@ class HeightReport:
 
 @dataclass(frozen=True)
 class HeightOptions:
-    """Heights that a build is asked for."""
+    """Options for the heights of a build."""
 
     models: tuple[Path, ...]
-    limit_grade: float | None = None  # roads are made no steeper than that; None: as the model is
-    max_grade: float = MOST_GRADE  # roads that are steeper are refused
+    limit_grade: float | None = None  # roads are made no steeper; None: as the model
+    max_grade: float = MOST_GRADE  # steeper roads are errors
 
 
 def drape(
     document: NetDocument, options: HeightOptions, roads: OsmRoads | None, source: Path
 ) -> HeightReport:
-    """Give each lane and junction of a document its heights.
+    """Set the heights of each lane and junction of a document.
 
     Args:
         document: a network without heights, which is changed.
-        options: the models, and what is done with steep roads.
-        roads: where bridges and tunnels are; None: all roads are on the ground.
-        source: where the map is from, for messages.
+        options: the models, and the treatment of steep roads.
+        roads: the bridges and tunnels; None: all roads are on the ground.
+        source: source of the map, for messages.
 
     Raises:
-        MapError: the map is not projected or has heights, the model cannot be used or does not
-            cover it, or a road is too steep.
+        MapError: the map has no projection, or has heights; the model cannot be used or does not
+            cover the map; or a road is too steep.
         MissingExtraError: pyproj or Pillow is not installed.
     """
     if document.geo is None:
         raise MapError(
-            f"{source}: the map does not say where it lies on the earth (no projection): heights "
+            f"{source}: the map has no georeference (no projection): heights "
             "need an OpenStreetMap extract, or a network with projParameter in its <location>"
         )
     stations = stations_of(document)
@@ -131,17 +131,17 @@ def drape(
 
 
 def raise_levels(document: NetDocument, roads: OsmRoads, source: Path) -> int:
-    """Give a network without a model of the ground the levels that its crossings need.
+    """Set the heights that crossings need in a network without a terrain model.
 
-    The ground is at 0. Only bridges and tunnels that cross another road, and their ramps, leave it.
+    The ground is at 0. Only bridges and tunnels that cross other roads, and their ramps, leave it.
 
     Args:
-        document: a projected network without heights, which is changed where roads cross so.
-        roads: where bridges and tunnels are.
-        source: where the map is from, for messages.
+        document: a projected network without heights; changed if it has such crossings.
+        roads: the bridges and tunnels.
+        source: source of the map, for messages.
 
     Returns:
-        How many lanes cross one another on two levels.
+        The number of lanes that cross on two levels.
 
     Raises:
         MapError: an end of a bridge or tunnel cannot be projected.
@@ -159,7 +159,7 @@ def raise_levels(document: NetDocument, roads: OsmRoads, source: Path) -> int:
 
 
 def _at_hubs(stations: Stations, ground: Heights) -> Heights:
-    """A junction lies where the lanes that meet there do, in the mean."""
+    """Return heights of junctions: the mean of the lanes that meet there."""
     base = int(stations.first[-1])
     links = stations.graph.links[stations.graph.links[:, 1] >= base]
     number = len(stations.hubs_m)
@@ -172,7 +172,7 @@ def _at_hubs(stations: Stations, ground: Heights) -> Heights:
 def _cleared(
     stations: Stations, heights: Heights, levels: Levels, crossed: NDArray[np.int64]
 ) -> Heights:
-    """Lift bridges over what they cross, from the lowest up; lower tunnels, from the highest."""
+    """Lift bridges above crossed roads, lowest first; lower tunnels, highest first."""
     upper, lower = levels[crossed[:, 0]], levels[crossed[:, 1]]
     for level in sorted({*upper[upper > 0].tolist()}):
         pairs = crossed[upper == level]
@@ -222,9 +222,9 @@ def _write(document: NetDocument, stations: Stations, heights: Heights) -> None:
 
 
 def _write_middles(document: NetDocument, stations: Stations, heights: Heights) -> None:
-    """The line that an edge's lanes were made from, as high as its first lane beside it.
+    """Set the heights of edges' centre lines to those of their first lanes.
 
-    netconvert makes exports from it.
+    netconvert uses the centre lines in exports.
     """
     node = {
         junction.get("id", ""): f"{junction.get('x')},{junction.get('y')}"
@@ -265,7 +265,7 @@ def _lane_ends(stations: Stations) -> dict[int, NDArray[np.int64]]:
 
 
 def _grades(stations: Stations, heights: Heights) -> dict[int, float]:
-    """The steepest grade of each lane, by its row."""
+    """Return the steepest grade of each lane, by its row."""
     step = np.diff(stations.s_m)
     rise = np.abs(np.diff(heights[: len(stations.s_m)]))
     grade = np.where(step > 1e-3, rise / np.maximum(step, 0.1), 0.0)
@@ -277,7 +277,7 @@ def _grades(stations: Stations, heights: Heights) -> dict[int, float]:
 
 
 def _steep(grades: dict[int, float], roads: OsmRoads | None, stations: Stations) -> list[str]:
-    """Roads and junctions above `STEEP_GRADE`, the steepest first."""
+    """Return roads and junctions above `STEEP_GRADE`, the steepest first."""
     worst: dict[str, float] = {}
     for row, grade in grades.items():
         if grade > STEEP_GRADE + 1e-3:

@@ -1,4 +1,4 @@
-"""A model of the ground: tiles of heights, asked at longitudes and latitudes."""
+"""A terrain model: tiles of heights, evaluated at longitudes and latitudes."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MapError, require
 from cavmarl.maps.heights.tile_files import WGS84, Grid, HeightTile, read_tile
 
-_MOST_FILLED = 0.5  # of the places asked
+_MOST_FILLED = 0.5  # of the evaluated places
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of what was asked a model knows."""
+    """The coverage of evaluated places by a model."""
 
     places: int
-    # places between cells without a height, which neighbours gave
+    # places between cells without a height, interpolated from neighbours
     filled_places: int
-    void_cells: int  # of the tiles that were asked, filled
-    cells: int  # of these tiles
+    void_cells: int  # number of filled cells of the tiles
+    cells: int  # number of cells of these tiles
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
 class HeightModel:
-    """Tiles of heights; where they overlap, the first one that knows a place says it."""
+    """Tiles of heights; where tiles overlap, the first tile with a height counts."""
 
     def __init__(self, paths: Sequence[str | Path]) -> None:
         """Raises MapError: a file cannot be used; see `read_tile`."""
@@ -39,10 +39,10 @@ class HeightModel:
         self.cell_m = min(map(_cell_m, self.tiles))
 
     def at(self, degrees: NDArray[np.float64]) -> tuple[NDArray[np.float64], Coverage]:
-        """Heights in m (n,) at longitudes and latitudes (n, 2), linear between cells.
+        """Return heights in m (n,) at longitudes and latitudes (n, 2), interpolated linearly.
 
         Raises:
-            MapError: a place lies off the tiles, or too many lie where these know no height.
+            MapError: a place is outside of the tiles, or too many places have no height.
             MissingExtraError: pyproj is not installed.
         """
         heights = np.full(len(degrees), np.nan)
@@ -80,15 +80,15 @@ class HeightModel:
             swapped = any(_cells_of(tile, degrees[:, ::-1])[2].any() for tile in self.tiles)
             hint = "; longitude and latitude look swapped in one of the two" if swapped else ""
             raise MapError(
-                f"{names}: {off.mean():.0%} of the roads lie off the model (they reach from "
+                f"{names}: {off.mean():.0%} of the roads are outside of the model (they reach from "
                 f"longitude {west:.4f} to {east:.4f}, latitude {south:.4f} to {north:.4f}){hint}: "
                 "give more tiles (--dem again), or crop the map (--bbox)"
             )
         unknown = np.isnan(heights) | filled
         if np.isnan(heights).any() or unknown.mean() > _MOST_FILLED:
             raise MapError(
-                f"{names}: {unknown.mean():.0%} of the roads lie in voids of the model, more than "
-                f"the {_MOST_FILLED:.0%} that are filled: give another model"
+                f"{names}: {unknown.mean():.0%} of the roads are in voids of the model; at most "
+                f"{_MOST_FILLED:.0%} can be filled: give another model"
             )
 
 
@@ -100,7 +100,7 @@ def _cell_m(tile: HeightTile) -> float:
 def _cells_of(
     tile: HeightTile, degrees: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Row and column, with fractions, of each place; and whether it lies on the tile."""
+    """Return fractional rows and columns of places, and whether they are on the tile."""
     x, y = degrees[:, 0], degrees[:, 1]
     if tile.crs != WGS84:
         pyproj: Any = require("pyproj", "maps")
@@ -111,7 +111,7 @@ def _cells_of(
         x, y = motion.transform(x, y)
     column, row = (x - tile.x0) / tile.dx, (y - tile.y0) / tile.dy
     rows, columns = tile.heights_m.shape
-    edge = 0.5 + 1e-6  # half a cell around the middles of the outer cells
+    edge = 0.5 + 1e-6  # half a cell around the centres of the outer cells
     inside = (column >= -edge) & (column <= columns - 1 + edge)
     inside &= (row >= -edge) & (row <= rows - 1 + edge)
     return np.clip(row, 0.0, rows - 1), np.clip(column, 0.0, columns - 1), inside
@@ -120,7 +120,7 @@ def _cells_of(
 def _cut(
     grid: Grid, row: NDArray[np.float64], column: NDArray[np.float64]
 ) -> tuple[Grid, NDArray[np.float64], NDArray[np.float64]]:
-    """The part of a grid around some places, and the places in it."""
+    """Return the part of a grid around some places, and their positions in it."""
     margin = 16
     top, left = max(int(row.min()) - margin, 0), max(int(column.min()) - margin, 0)
     part = grid[top : int(row.max()) + margin + 2, left : int(column.max()) + margin + 2]
@@ -139,7 +139,7 @@ def _bilinear(grid: Grid, row: NDArray[np.float64], column: NDArray[np.float64])
 
 
 def _filled(grid: Grid) -> Grid:
-    """A grid without voids: means of the known cells around, from ever coarser grids."""
+    """Return a grid without voids, filled with means of known cells from coarser grids."""
     void = np.isnan(grid)
     if not void.any():
         return grid

@@ -1,4 +1,4 @@
-"""Which lanes lie on bridges and in tunnels, and where one crosses above another."""
+"""The levels of lanes on bridges and in tunnels, and their crossings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Levels = NDArray[np.int64]
 
 
 def levels_of(stations: Stations, roads: OsmRoads, geo: GeoReference, source: Path) -> Levels:
-    """The level (places and junctions,) of each place: 0 on the ground, above, below."""
+    """Return the level (places and junctions,) of each place: 0 on the ground, above, below."""
     levels = np.zeros(stations.graph.places, np.int64)
     raised = {name for name, way in roads.ways.items() if way.level}
     for row, lane in enumerate(stations.lanes):
@@ -47,7 +47,7 @@ def _ends(roads: OsmRoads, name: str, geo: GeoReference, source: Path) -> Points
 
 
 def _between(places: Points, ends: Points) -> NDArray[np.bool_]:
-    """Which places of a lane lie between those that are nearest to two points."""
+    """Return which places of a lane are between those nearest to two points."""
     near = [int(hypot_all(*(places - end).T).argmin()) for end in ends]
     chosen = np.zeros(len(places), bool)
     chosen[min(near) : max(near) + 1] = True
@@ -55,7 +55,7 @@ def _between(places: Points, ends: Points) -> NDArray[np.bool_]:
 
 
 def _spread_to_junctions(stations: Stations, levels: Levels) -> None:
-    """A junction, and what lies in it, is raised where all lanes that meet there are."""
+    """Raise a junction and its lanes if all lanes that meet there are raised."""
     base = int(stations.first[-1])
     ends: dict[int, set[int]] = {}
     around: dict[int, set[int]] = {}
@@ -80,7 +80,7 @@ def _spread_to_junctions(stations: Stations, levels: Levels) -> None:
 
 
 def crossings(stations: Stations, levels: Levels) -> Rows:
-    """Pairs (n, 2) of places, the upper one first, at which lanes of two levels cross."""
+    """Return pairs (n, 2) of places, the upper one first, where lanes of two levels cross."""
     start = np.delete(np.arange(stations.first[-1]), stations.first[1:] - 1)
     a, b = stations.plane_m[start], stations.plane_m[start + 1]
     level = levels[start]

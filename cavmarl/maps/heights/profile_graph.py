@@ -1,4 +1,4 @@
-"""Heights along roads as a graph of places: limits of grade, and bridges between abutments."""
+"""Heights along roads as a graph of places: limits of the grade, and bridges."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 Heights = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-_SHORTEST_M = 0.01  # of a link, where two ends lie on each other
+_SHORTEST_M = 0.01  # minimum length of a link, for coincident ends
 _TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True)
 class ProfileGraph:
-    """Places along lanes, and the links on which vehicles go from one to the next."""
+    """Places along lanes, and links along which vehicles drive from place to place."""
 
     places: int
     links: Rows  # (n, 2)
@@ -26,7 +26,7 @@ class ProfileGraph:
 
     @cached_property
     def _neighbours(self) -> tuple[list[int], list[int], list[float]]:
-        """First neighbour of each place, the neighbours, and how far they are."""
+        """First neighbour of each place, the neighbours, and their distances."""
         ends = np.concatenate([self.links, self.links[:, ::-1]])
         far = np.concatenate([self.lengths_m, self.lengths_m])
         order = np.argsort(ends[:, 0], kind="stable")
@@ -34,9 +34,9 @@ class ProfileGraph:
         return first.tolist(), ends[order, 1].tolist(), far[order].tolist()
 
     def capped(self, heights: Heights, caps: Heights, grade: float) -> Heights:
-        """The highest profile that lies under some caps and rises from them by `grade` at most.
+        """Return the highest profile below some caps that rises from them by at most `grade`.
 
-        It is `heights` where these lie below. `caps`: (places,) m; infinite where there is none.
+        Where `heights` are lower, they do not change. `caps`: (places,) m; infinite: none.
         """
         first, neighbours, far = self._neighbours
         result, own = caps.tolist(), heights.tolist()
@@ -47,27 +47,27 @@ class ProfileGraph:
             if height > result[row]:
                 continue
             for link in range(first[row], first[row + 1]):
-                there = neighbours[link]
+                beside = neighbours[link]
                 reached = height + grade * far[link]
-                # where it meets what is there, it ends
-                if reached < result[there] and reached < own[there]:
-                    result[there] = reached
-                    heapq.heappush(heap, (reached, there))
+                # the slope ends where it meets the present heights
+                if reached < result[beside] and reached < own[beside]:
+                    result[beside] = reached
+                    heapq.heappush(heap, (reached, beside))
         lowered: Heights = np.minimum(np.array(result), heights)
         return lowered
 
     def lifted(self, heights: Heights, floors: Heights, grade: float) -> Heights:
-        """The lowest profile above `heights` and some floors that falls from these by `grade`."""
+        """Return the lowest profile above `heights` and some floors, with slopes of `grade`."""
         return -self.capped(-heights, -floors, grade)
 
     def limited(self, heights: Heights, grade: float) -> Heights:
-        """The profile nearest to `heights` on which no link is steeper than `grade`."""
+        """Return the profile nearest to `heights` with no link steeper than `grade`."""
         return (self.capped(heights, heights, grade) + self.lifted(heights, heights, grade)) / 2.0
 
     def spanned(self, heights: Heights, free: NDArray[np.bool_]) -> Heights:
-        """Heights whose `free` places lie straight between the others that they are linked with.
+        """Return heights whose `free` places are on straight lines between their other neighbours.
 
-        Conjugate gradients on the links' lengths; a free part without an abutment stays.
+        Conjugate gradients on the links' lengths; free parts without an abutment do not change.
         """
         touched = free[self.links].any(axis=1)
         rows, numbers = np.unique(self.links[touched], return_inverse=True)

@@ -1,4 +1,4 @@
-"""Places along all lanes of a network file, at most a metre apart, where heights are found."""
+"""Places along all lanes of a network file, at most a metre apart, for heights."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from cavmarl.maps.heights.profile_graph import ProfileGraph
 from cavmarl.maps.net_document import DocumentLane, NetDocument, Points
 
 STEP_M = 1.0
-_BESIDE = 40  # places before and behind the same share of a lane beside, where the nearest is
-_OFF_M = 0.01  # between what is written and what was found
+_BESIDE = 40  # places before and after the proportional one that are searched on an adjacent lane
+_OFF_M = 0.01  # maximum error of written heights
 
 Rows = NDArray[np.int64]
 
@@ -27,9 +27,9 @@ class Stations:
     lanes: tuple[DocumentLane, ...]
     plane_m: Points  # (n, 2) x and y
     s_m: NDArray[np.float64]  # (n,) from the start of the lane
-    written: NDArray[np.bool_]  # (n,) the file has this place
+    written: NDArray[np.bool_]  # (n,) whether the place is in the file
     first: Rows  # (lanes + 1,) rows of each lane
-    graph: ProfileGraph  # places, then junctions
+    graph: ProfileGraph  # of places, then junctions
     hubs_m: Points  # (junctions, 2)
     junction_ids: tuple[str, ...]
 
@@ -42,9 +42,9 @@ class Stations:
 
 
 def stations_of(document: NetDocument) -> Stations:
-    """Lay stations on each lane of a document.
+    """Return the stations on each lane of a document.
 
-    Raises MapError: a lane has no shape, or the map has heights already.
+    Raises MapError: a lane has no shape, or the map already has heights.
     """
     lanes = tuple(document.lanes)
     parts, s_parts, written = [], [], []
@@ -73,7 +73,7 @@ def stations_of(document: NetDocument) -> Stations:
 
 
 def laid(shape: Points) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]:
-    """Places on a polyline, where they are on it, and which of them are its own points."""
+    """Return places on a polyline, their arc lengths, and which of them are its own points."""
     lengths = hypot_all(*np.diff(shape, axis=0).T)
     counts = np.maximum(np.ceil(lengths / STEP_M).astype(np.int64), 1)
     segment = np.repeat(np.arange(len(counts)), counts)
@@ -91,7 +91,7 @@ def laid(shape: Points) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]
 def _links(
     document: NetDocument, lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows
 ) -> tuple[Points, tuple[str, ...], Rows]:
-    """Junctions' places and ids, and pairs of places between which vehicles go."""
+    """Return junctions' positions and ids, and pairs of places between which vehicles drive."""
     row_of = {lane.id: row for row, lane in enumerate(lanes)}
     along = np.delete(np.arange(first[-1] - 1), first[1:-1] - 1)
     pairs = [np.stack([along, along + 1], axis=1)]
@@ -124,7 +124,7 @@ def _links(
 
 
 def _beside(lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows) -> list[Rows]:
-    """Pairs of places on lanes of one edge that lie beside one another: they are one road."""
+    """Return pairs of adjacent places on lanes of one edge, which have the same height."""
     pairs = []
     window = np.arange(-_BESIDE, _BESIDE + 1)
     for lane, (one, other) in enumerate(pairwise(lanes)):
@@ -139,7 +139,7 @@ def _beside(lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows) -> li
 
 
 def kept_rows(s_m: NDArray[np.float64], z_m: NDArray[np.float64], own: NDArray[np.bool_]) -> Rows:
-    """Rows of a lane to write: its own points, and others where the line would miss a height."""
+    """Return rows of a lane to write: its own points, and others needed for exact heights."""
     kept = set(np.flatnonzero(own).tolist())
     open_parts = list(pairwise(sorted(kept)))
     while open_parts:

@@ -1,7 +1,7 @@
-"""Files of heights: GeoTIFF through Pillow, and SRTM's HGT, as tiles of a grid.
+"""Reads terrain models: GeoTIFF via Pillow, and SRTM's HGT, as tiles of a grid.
 
-netconvert's own reader is not used: its build for Python refuses HGT, takes every GeoTIFF for one
-in degrees and metres, knows no voids, and gives another network than without heights.
+netconvert's own reader is not used: its build for Python refuses HGT, assumes degrees and metres in
+every GeoTIFF, does not handle voids, and changes the network.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ WGS84 = "EPSG:4326"
 _FORMATS = "give a GeoTIFF (.tif), or an SRTM tile (.hgt, .hgt.zip, .hgt.gz)"
 _HGT = re.compile(r"([NS])(\d{2})([EW])(\d{3})", re.IGNORECASE)
 _HGT_VOID = -32768
-_LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # of ground on the earth; all else is a void
+_LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # of ground on the earth; other values are voids
 _MOST_BYTES = 1 << 30
 _FEET = {9002: "feet", 9003: "US feet", 9005: "feet", 9006: "feet"}  # EPSG's units of length
 _USER_DEFINED = 32767
@@ -41,16 +41,16 @@ _LINEAR_UNIT = 3076
 
 @dataclass(frozen=True)
 class HeightTile:
-    """Heights on a grid: its cell (row, column) lies at x0 + column · dx, y0 + row · dy."""
+    """Heights on a grid: cell (row, column) is at x0 + column · dx, y0 + row · dy."""
 
     name: str
-    crs: str  # of x and y, as EPSG's code
-    # (rows, columns) m over the model's own zero; NaN: unknown
+    crs: str  # of x and y, an EPSG code
+    # (rows, columns) m above the model's own zero; NaN: unknown
     heights_m: Grid
     x0: float
     y0: float
     dx: float
-    dy: float  # negative where the first row is the northern one
+    dy: float  # negative if the first row is the northern one
 
     @property
     def box(self) -> tuple[float, float, float, float]:
@@ -65,9 +65,9 @@ def read_tile(path: Path) -> HeightTile:
     """Read one file of heights.
 
     Raises:
-        MapError: it cannot be read, is cut short, is of another kind, has no projection or heights
-            that are not in metres.
-        MissingExtraError: it is a GeoTIFF, and Pillow is not installed.
+        MapError: the file cannot be read, is truncated or of another kind, has no projection, or
+            its heights are not in metres.
+        MissingExtraError: the file is a GeoTIFF, and Pillow is not installed.
     """
     try:
         content = path.read_bytes()
@@ -79,7 +79,7 @@ def read_tile(path: Path) -> HeightTile:
         return _geotiff(path, content)
     if ".hgt" in path.name.lower():
         return _hgt(path, content)
-    raise MapError(f"{path}: is no file of heights: {_FORMATS}")
+    raise MapError(f"{path}: not a file of heights: {_FORMATS}")
 
 
 def _unpacked(path: Path, content: bytes) -> bytes:
@@ -89,7 +89,7 @@ def _unpacked(path: Path, content: bytes) -> bytes:
         packed = zipfile.ZipFile(io.BytesIO(content))
         names = [name for name in packed.namelist() if name.lower().endswith((".hgt", ".tif"))]
         if len(names) != 1:
-            raise MapError(f"{path}: holds {len(names)} files of heights: give them one by one")
+            raise MapError(f"{path}: has {len(names)} files of heights: give them one by one")
         stream = packed.open(names[0])
     unpacked: bytes = stream.read(_MOST_BYTES + 1)
     if len(unpacked) > _MOST_BYTES:
@@ -100,12 +100,14 @@ def _unpacked(path: Path, content: bytes) -> bytes:
 def _hgt(path: Path, content: bytes) -> HeightTile:
     named = _HGT.match(path.name)
     if named is None:
-        raise MapError(f"{path}: an SRTM tile's name says where it lies, as N43E007.hgt: rename it")
+        raise MapError(
+            f"{path}: the name of an SRTM tile must give its position, as N43E007.hgt: rename it"
+        )
     side = math.isqrt(len(content) // 2)
     if side * side * 2 != len(content) or side < 2:
         raise MapError(
-            f"{path}: {len(content)} bytes are no square of 16-bit heights (1201² or 3601²): the "
-            "file is cut short: download it again"
+            f"{path}: {len(content)} bytes are not a square of 16-bit heights (1201² or 3601²): "
+            "the file is truncated: download it again"
         )
     north = int(named[2]) * (1 if named[1].upper() == "N" else -1)
     east = int(named[4]) * (1 if named[3].upper() == "E" else -1)
@@ -118,13 +120,13 @@ def _geotiff(path: Path, content: bytes) -> HeightTile:
     image_module = require("PIL.Image", "maps")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large images: the limit of bytes stands
+            warnings.simplefilter("ignore")  # about large images: the limit of bytes applies
             with image_module.open(io.BytesIO(content)) as image:
                 tags = dict(image.tag_v2)
                 raw = np.asarray(image)
     except (OSError, ValueError, SyntaxError, KeyError, TypeError, EOFError) as error:
         raise MapError(
-            f"{path}: cannot be read as a GeoTIFF ({error}): the file is cut short or of another "
+            f"{path}: cannot be read as a GeoTIFF ({error}): the file is truncated or of another "
             "kind: download it again, or convert it (gdal_translate -ot Float32)"
         ) from error
     except image_module.DecompressionBombError as error:
@@ -136,13 +138,15 @@ def _geotiff(path: Path, content: bytes) -> HeightTile:
     keys = _geo_keys(tags)
     _check_metres(path, keys)
     x0, y0, dx, dy = _placed(path, tags)
-    if keys.get(_RASTER_TYPE, 1) != 2:  # the tie point is a cell's corner, not its middle
+    if keys.get(_RASTER_TYPE, 1) != 2:  # the tie point is a cell's corner, not its centre
         x0, y0 = x0 + dx / 2, y0 + dy / 2
     void = str(tags.get(_NO_DATA, "")).strip("\0 ")
     try:
         no_data = float(void) if void else None
     except ValueError as error:
-        raise MapError(f"{path}: '{void}' for a void is no number: mend the file") from error
+        raise MapError(
+            f"{path}: '{void}', the value of voids, is not a number: repair the file"
+        ) from error
     return HeightTile(path.name, _crs(path, keys), _cleaned(raw, no_data), x0, y0, dx, dy)
 
 
@@ -156,7 +160,7 @@ def _cleaned(raw: NDArray[Any], void: float | None) -> Grid:
 
 
 def _geo_keys(tags: dict[int, Any]) -> dict[int, int]:
-    """The keys of GeoTIFF that hold a number themselves."""
+    """Return the keys of GeoTIFF whose value is a number in the directory."""
     words = tuple(tags.get(_GEO_KEYS, ()))
     rows = [words[first : first + 4] for first in range(4, len(words) - 3, 4)]
     return {int(key): int(value) for key, place, _, value in rows if place == 0}
@@ -177,7 +181,7 @@ def _check_metres(path: Path, keys: dict[int, int]) -> None:
 
 
 def _feet_of(projected: int) -> str | None:
-    """What a projection in feet calls them; None: it is in metres, or unknown."""
+    """Return the name of a projection's unit if it is feet; None: metres, or unknown."""
     if projected in (0, _USER_DEFINED):
         return None
     pyproj: Any = require("pyproj", "maps")
@@ -189,7 +193,7 @@ def _feet_of(projected: int) -> str | None:
 
 
 def _placed(path: Path, tags: dict[int, Any]) -> tuple[float, float, float, float]:
-    """X and y of the first cell's corner (or middle), and the steps from cell to cell."""
+    """Return x and y of the first cell's corner (or centre), and the steps between cells."""
     tie, scale, matrix = tags.get(_TIE_POINTS), tags.get(_SCALE), tags.get(_MATRIX)
     if matrix is not None and len(matrix) == 16 and matrix[1] == matrix[4] == 0.0:
         place = (matrix[3], matrix[7], matrix[0], matrix[5])
@@ -197,11 +201,9 @@ def _placed(path: Path, tags: dict[int, Any]) -> tuple[float, float, float, floa
         dx, dy = scale[0], -scale[1]
         place = (tie[3] - tie[0] * dx, tie[4] - tie[1] * dy, dx, dy)
     else:
-        raise MapError(
-            f"{path}: does not say where it lies, or lies askew: warp it (gdalwarp -t_srs {WGS84})"
-        )
+        raise MapError(f"{path}: has no position, or is rotated: warp it (gdalwarp -t_srs {WGS84})")
     if not (all(map(math.isfinite, place)) and place[2] != 0.0 and place[3] != 0.0):
-        raise MapError(f"{path}: lies at {place}: mend its place (gdal_edit.py)")
+        raise MapError(f"{path}: its position is {place}: repair it (gdal_edit.py)")
     return float(place[0]), float(place[1]), float(place[2]), float(place[3])
 
 
@@ -209,7 +211,7 @@ def _crs(path: Path, keys: dict[int, int]) -> str:
     code = keys.get(_PROJECTED, keys.get(_GEOGRAPHIC, 0))
     if code in (0, _USER_DEFINED):
         raise MapError(
-            f"{path}: has no projection with a code of EPSG: warp it (gdalwarp -t_srs {WGS84}), or "
-            "say which it is (gdal_edit.py -a_srs EPSG:…)"
+            f"{path}: has no projection with an EPSG code: warp it (gdalwarp -t_srs {WGS84}), or "
+            "set it (gdal_edit.py -a_srs EPSG:…)"
         )
     return f"EPSG:{code}"

@@ -25,7 +25,7 @@ MOST_BYTES = 1 << 28  # of an array that is allocated at once
 
 _NO_ACCESS = 0  # PROT_NONE: reserves addresses only
 _AT_THIS_PLACE = 0x10  # MAP_FIXED
-_COLLAPSE = 25  # MADV_COLLAPSE, which Python's mmap does not know
+COLLAPSE = 25  # MADV_COLLAPSE, which Python's mmap does not know
 _FAILED = ctypes.c_void_p(-1).value
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -54,7 +54,7 @@ def huge_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float6
     whole = size // HUGE_BYTES * HUGE_BYTES  # the rest stays in small pages
     for place in range(0, whole, HUGE_BYTES):
         memory[place] = b"\0"  # only allocated pages can be merged
-    _libc.madvise(ctypes.addressof(memory), whole, _COLLAPSE)  # if it fails, pages stay small
+    _libc.madvise(ctypes.addressof(memory), whole, COLLAPSE)  # if it fails, pages stay small
     return np.frombuffer(memoryview(memory), dtype=kind, count=prod(sides)).reshape(sides)
 
 
@@ -70,7 +70,7 @@ def collapse_heap() -> None:
         first, last = (int(place, 16) for place in heap.split("-"))
         first, last = -(-first // HUGE_BYTES) * HUGE_BYTES, last // HUGE_BYTES * HUGE_BYTES
         if first < last:
-            _libc.madvise(first, last - first, _COLLAPSE)  # if it fails, pages stay small
+            _libc.madvise(first, last - first, COLLAPSE)  # if it fails, pages stay small
 
 
 def _map_aligned(size: int) -> ctypes.Array[ctypes.c_char]:

@@ -43,7 +43,7 @@ MAX_CALLERS = 64  # callers that are not authenticated yet
 BACKLOG = 1024  # callers that the system holds until they are accepted
 NO_DESCRIPTORS_S = 0.05  # pause if another thread takes the last descriptor
 _VERSION = struct.Struct("<4sH")
-_HELLO = struct.Struct(f"<4sHI{NONCE}s")
+HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
 class PendingConnection:
@@ -77,7 +77,7 @@ class PendingConnection:
             except (ssl.SSLWantReadError, ssl.SSLWantWriteError):
                 return None
             self._extend()
-        wanted = PROOF if self._expected else _HELLO.size
+        wanted = PROOF if self._expected else HELLO.size
         try:
             received = self._socket.recv(wanted - len(self._received))
         except BlockingIOError:
@@ -104,7 +104,7 @@ class PendingConnection:
         self.until_s = time.monotonic() + HANDSHAKE_S
 
     def _answer(self, hello: bytes) -> None:
-        magic, version, self.number, _ = _HELLO.unpack(hello)
+        magic, version, self.number, _ = HELLO.unpack(hello)
         if magic != MAGIC:
             raise MessageError(
                 f"a caller sends {hello[:4]!r}, which starts no handshake of cavmarl"
@@ -282,7 +282,7 @@ def _encrypted(connection: socket.socket, place: tuple[str, int], secret: bytes)
 
 
 def _prove(connection: socket.socket, place: tuple[str, int], secret: bytes, number: int) -> None:
-    hello = _HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
+    hello = HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
     connection.sendall(hello)
     received = b""
     while len(received) < NONCE + PROOF:

@@ -102,6 +102,7 @@ class NodeCoordinator:
     """Decides about ownership in W worlds.
 
     Attributes:
+        worlds: what it knows of each world.
         switched: number of changes of owner.
         is_late: a vehicle without a record has crossed a border, so a lease of no ticks is due.
     """
@@ -115,7 +116,7 @@ class NodeCoordinator:
         journals: Sequence[Journal | None],  # of each world
         is_checked: bool = False,  # check the vehicles that zones own
     ) -> None:
-        self._worlds = [
+        self.worlds = [
             _World(run, len(node_of), limits, journal, is_checked)
             for run, journal in zip(runs, journals, strict=True)
         ]
@@ -126,7 +127,7 @@ class NodeCoordinator:
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Start; return the hostings of all zones, by worlds."""
         self.know(neighbours)
-        for world in self._worlds:
+        for world in self.worlds:
             world.write(world.directory.reset())
             for zone, node in enumerate(self._node_of):
                 world.write(world.directory.host(zone, worker=node))
@@ -134,7 +135,7 @@ class NodeCoordinator:
 
     def know(self, neighbours: Neighbours) -> None:
         """Let vehicles change between these zones only, from now on."""
-        for world in self._worlds:
+        for world in self.worlds:
             world.directory.know(neighbours)
 
     def recover(self, node_of: Sequence[int], switched: int) -> list[list[Hosting]]:
@@ -147,7 +148,7 @@ class NodeCoordinator:
         Returns:
             the hostings of all zones, by worlds.
         """
-        for world in self._worlds:
+        for world in self.worlds:
             moved = [z for z, node in enumerate(node_of) if node != self._node_of[z]]
             for zone in moved:
                 world.write(world.directory.fence(zone))
@@ -162,7 +163,7 @@ class NodeCoordinator:
 
     def _hostings(self) -> list[list[Hosting]]:
         zones = range(len(self._node_of))
-        return [[world.directory.hosting(zone) for zone in zones] for world in self._worlds]
+        return [[world.directory.hosting(zone) for zone in zones] for world in self.worlds]
 
     def receive(self, number: int, frame: NodeFrame) -> None:
         """Apply acknowledgements as soon as they come.
@@ -186,11 +187,11 @@ class NodeCoordinator:
         Raises:
             MessageError: they are about a zone of another node, or name something unknown.
         """
-        check_indices("world", (w for w, _ in messages), len(self._worlds))
+        check_indices("world", (w for w, _ in messages), len(self.worlds))
         for report in reports:
             self._check_report(number, report)
         for w, message in messages:
-            zone, table = getattr(message, "zone", None), self._worlds[w].directory.table
+            zone, table = getattr(message, "zone", None), self.worlds[w].directory.table
             if zone is None or message.episode != table.episode or message.tick < table.tick:
                 continue
             if not 0 <= zone < len(self._node_of) or self._node_of[zone] != number:
@@ -208,13 +209,13 @@ class NodeCoordinator:
                 raise MessageError(f"{digest!r} is not a digest of vehicle {vehicle}")
 
     def _check_movers(self, number: int, w: int, report: Report) -> None:
-        owners = self._worlds[w].directory.table.owners
+        owners = self.worlds[w].directory.table.owners
         for vehicle, *_ in report.movers:
             if vehicle not in owners or self._node_of[owners[vehicle][0]] != number:
                 raise MessageError(f"node {number} offers vehicle {vehicle}, which it does not own")
 
     def _apply(self, w: int, message: Message) -> None:
-        world = self._worlds[w]
+        world = self.worlds[w]
         table = world.directory.table
         is_present = message.episode == table.episode and message.tick >= table.tick
         if isinstance(message, Ack | Nack) and is_present:
@@ -230,7 +231,7 @@ class NodeCoordinator:
             self._apply_all({number: messages for number, (messages, _) in reports.items()})
         every = [report for _, report in reports.values() if report]
         self.is_late = any(one.is_late for report in every for one in report)
-        for w, world in enumerate(self._worlds):
+        for w, world in enumerate(self.worlds):
             reported = [report[w] for report in every]
             if world.directory.is_quiet:
                 world.directory.commit_quiet()
@@ -256,15 +257,15 @@ class NodeCoordinator:
     def _apply_all(self, messages_of: Mapping[int, Sequence[tuple[int, Message]]]) -> None:
         """Apply messages about a tick; zones without a message have changed nothing."""
         worlds = {w for messages in messages_of.values() for w, _ in messages}
-        disturbed = [w for w in worlds if self._worlds[w].directory.is_quiet]
+        disturbed = [w for w in worlds if self.worlds[w].directory.is_quiet]
         for w in disturbed:
-            self._worlds[w].write(self._worlds[w].directory.break_quiet())
+            self.worlds[w].write(self.worlds[w].directory.break_quiet())
         for number, messages in messages_of.items():
             with reading(number):
                 for w, message in messages:
                     self._apply(w, message)
         for w in disturbed:
-            self._worlds[w].directory.answer_for_silent()
+            self.worlds[w].directory.answer_for_silent()
 
     def begin(self, timeout_s: float) -> dict[int, bytes]:
         """Decide the ownership in the next ticks, once all offers are answered.
@@ -276,7 +277,7 @@ class NodeCoordinator:
             SilenceError: an offer is not answered in time.
         """
         until_s = self._links.now_s() + timeout_s
-        for world in self._worlds:
+        for world in self.worlds:
             while missing := set(world.movers) - world.answered:
                 if self._links.now_s() > until_s:
                     targets = {self._node_of[zone] for _, zone in missing}
@@ -287,7 +288,7 @@ class NodeCoordinator:
 
     def _decide(self) -> list[tuple[int, Message]]:
         messages = []
-        for w, world in enumerate(self._worlds):
+        for w, world in enumerate(self.worlds):
             births, world.births = world.births, []
             world.answered.clear()
             if world.is_silent(births) and world.directory.begin_quiet():
@@ -301,11 +302,11 @@ class NodeCoordinator:
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
         """Changes of owner of each world."""
-        return tuple(world.log for world in self._worlds)
+        return tuple(world.log for world in self.worlds)
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
         """Return the vehicles of a world whose next zone has acknowledged their state."""
-        world = self._worlds[w]
+        world = self.worlds[w]
         owners = world.directory.table.owners
         return [
             TransferInFlight(vehicle, owners[vehicle][0], zone, "prepared")
@@ -326,6 +327,6 @@ class NodeCoordinator:
         return {node: packed(some) for node, some in by_node.items()}
 
     def close(self) -> None:
-        for world in self._worlds:
+        for world in self.worlds:
             if world.journal is not None:
                 world.journal.close()

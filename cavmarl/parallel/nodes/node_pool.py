@@ -171,8 +171,8 @@ class NodePool:
                 self._cut = self._cut._replace(neighbours=neighbours)
                 self._state = self._state._replace(cut=self._cut)
                 hostings = hostings or self.coordinator.host(neighbours)
-                self._send_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
-                self._commit()
+                self.send_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
+                self.commit()
             except LinkLostError as lost:
                 self._lose(lost, has_begun=False)
                 self.generation += 1  # frames of this attempt are void
@@ -347,10 +347,10 @@ class NodePool:
             self._links.send(number, FrameKind.COMMAND, kept, pieces)
         if not command.changes:
             return {n: frame.data for n, frame in self._receive_all(FrameKind.RESULT).items()}
-        results = self._commit()
+        results = self.commit()
         for _ in range(1, leases):
             self.coordinator.lease(self._begin_lease(), self._ticks_per_step)
-            results = self._commit()
+            results = self.commit()
         if command.cut is not None:
             with reading(self.reporter):
                 near = read_neighbours(read_json(results[self.reporter], list), self._num_zones)
@@ -364,7 +364,7 @@ class NodePool:
         lease = decide()
         while self.coordinator.is_late:
             self.coordinator.lease(lease, 0)
-            self._commit()
+            self.commit()
             lease = decide()
         return lease
 
@@ -479,8 +479,8 @@ class NodePool:
         self._cut = state.cut
         self.coordinator.know(state.cut.neighbours)
         hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)
-        self._send_zones(hostings, moves, begins=False, kept=kept)
-        self._commit()
+        self.send_zones(hostings, moves, begins=False, kept=kept)
+        self.commit()
         self._new.clear()
         self._is_torn = False
         self._keep_again_s = -math.inf
@@ -511,7 +511,7 @@ class NodePool:
         zones[successor] = state.zones[hosts[0]]
         return ZoneMoves(zones, {}, []), kept
 
-    def _send_zones(
+    def send_zones(
         self,
         hostings: Sequence[Sequence[Hosting]],
         moves: ZoneMoves,
@@ -544,7 +544,7 @@ class NodePool:
         self.reporter = self.reporter if self.reporter in old else (old or self._living)[0]
         return self.reporter
 
-    def _commit(self) -> dict[int, memoryview]:
+    def commit(self) -> dict[int, memoryview]:
         """Wait for the reports of all nodes on a tick, and commit it.
 
         Returns:

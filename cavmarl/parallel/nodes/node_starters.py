@@ -82,12 +82,13 @@ class LocalNodes:
         self._seen_stopped: set[int] = set()
         self._processes: list[subprocess.Popen[Any]] = []
         try:
-            self._processes = [self._start(number) for number in range(nodes)]
+            self._processes = [self.start(number) for number in range(nodes)]
         except BaseException:
             self.close()
             raise
 
-    def _start(self, number: int) -> subprocess.Popen[Any]:
+    def start(self, number: int) -> subprocess.Popen[Any]:
+        """Start the process of a node."""
         arguments = map(str, (*self._place, number))
         # Kept states and large frames are allocated anew each time.
         process = start_python(
@@ -132,7 +133,7 @@ class LocalNodes:
     def replace(self, number: int, is_silent: bool) -> None:
         self._processes[number].kill()
         self._processes[number].wait()
-        self._processes[number] = self._start(number)
+        self._processes[number] = self.start(number)
 
     def stopped(self) -> set[int]:
         return {n for n, process in enumerate(self._processes) if is_stopped(process.pid)}

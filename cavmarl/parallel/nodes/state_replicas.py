@@ -28,7 +28,12 @@ KEPT = 2  # states, since the newest one may not have arrived everywhere
 
 
 class StateReplicas:
-    """The states that one node keeps."""
+    """The states that one node keeps.
+
+    Attributes:
+        own: states of this node, by their numbers.
+        others: node → states that it has sent, by their numbers.
+    """
 
     def __init__(
         self, worlds: LocalWorlds, logs: Sequence[ToldLog], links: Links, number: int
@@ -37,15 +42,15 @@ class StateReplicas:
         self._logs = logs  # of commands to SUMO
         self._links = links
         self._number = number
-        self._own: dict[int, Bytes] = {}  # by numbers of states
-        self._others: dict[int, dict[int, Bytes]] = {}  # node → its states, by numbers
+        self.own: dict[int, Bytes] = {}
+        self.others: dict[int, dict[int, Bytes]] = {}
         self._given: dict[int, NodeFrame] = {}  # by nodes that give zones away
         self._is_settled = True  # no state was kept since `settle`
 
     def begin_anew(self, worlds: LocalWorlds, logs: Sequence[ToldLog]) -> None:
         """Keep states of other worlds; replicas of other nodes stay, as they may be of these."""
         self._worlds, self._logs = worlds, logs
-        self._own.clear()
+        self.own.clear()
         self._given.clear()
 
     def settle(self) -> None:
@@ -53,15 +58,15 @@ class StateReplicas:
         if self._is_settled:
             return
         self._is_settled = True
-        newest = max(self._own, default=0)
-        for states in (self._own, *self._others.values()):
+        newest = max(self.own, default=0)
+        for states in (self.own, *self.others.values()):
             for old in [number for number in states if number < newest]:
                 del states[old]
 
     def keep(self, state: int, living: Sequence[int]) -> None:
         """Keep the present state here, and send a replica to the next living node."""
         data = to_bytes(self._worlds.save())
-        _add(self._own, state, data)
+        _add(self.own, state, data)
         self._is_settled = False
         if len(living) > 1:
             to = living[(living.index(self._number) + 1) % len(living)]
@@ -76,18 +81,18 @@ class StateReplicas:
         Raises:
             ConfigError: the state is one of other worlds.
         """
-        _drop_later(self._own, -1)
+        _drop_later(self.own, -1)
         like = [*(log.words for log in self._logs), *self._worlds.save()]
         found = from_bytes(data, like)
         saved = found[len(self._logs) :]
         self._worlds.check(saved)
         for log, words in zip(self._logs, found, strict=False):
             log.take_up(words)
-        self._own[state] = to_bytes(saved)
+        self.own[state] = to_bytes(saved)
 
     def receive(self, number: int, frame: NodeFrame) -> None:
         """Keep the replica of another node."""
-        _add(self._others.setdefault(number, {}), frame.number, frame.data)
+        _add(self.others.setdefault(number, {}), frame.number, frame.data)
         self._is_settled = False
 
     def receive_given(self, number: int, frame: NodeFrame) -> None:
@@ -111,13 +116,13 @@ class StateReplicas:
         Raises:
             WorkerError: the state of a lost node is not here.
         """
-        for states in (self._own, *self._others.values()):
+        for states in (self.own, *self.others.values()):
             _drop_later(states, state)
         like = self._worlds.save()
-        own = self._own.get(state)
+        own = self.own.get(state)
         saved = None if own is None else self._read(own, like)
         for number in lost:
-            found = self._others.get(number, {}).get(state)
+            found = self.others.get(number, {}).get(state)
             if saved is None or found is None:
                 raise WorkerError(f"there is no replica of the state of node {number}")
             try:

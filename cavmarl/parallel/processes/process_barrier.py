@@ -190,7 +190,7 @@ def _plain_look(theirs: Words, number: int, yields: bool) -> bool:
     return bool(theirs[NUMBER] >= number)
 
 
-_has, _set, _look, _pass, present_core = (
+_has, _set, look, _pass, present_core = (
     (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
     if IS_PLAIN
     else (
@@ -208,7 +208,7 @@ def load_kernels() -> None:
     words = np.zeros(WORDS, dtype=np.int64)
     _set(words, NUMBER, 1, words)
     _has(words, 1)
-    _look(words, 1, True)
+    look(words, 1, True)
     _pass()
     present_core()
 
@@ -226,11 +226,11 @@ def wait_for(
     is_apart: bool = False,
 ) -> None:
     """Wait until the other side reaches a number, which it does soon unless it is dead."""
-    if _look(theirs, number, False):
+    if look(theirs, number, False):
         return
     now = time.perf_counter()
     alone, end = now + is_apart * ALONE_S, now + AWAKE_S
-    while not _look(theirs, number, now >= alone):
+    while not look(theirs, number, now >= alone):
         now = time.perf_counter()
         if now > end:
             time.sleep(NAP_S)
@@ -281,14 +281,14 @@ class WakeSignal:
         After a long wait or long work, a side polls only briefly. The operating system puts waking
         processes on free cores, but leaves polling processes where they are, even two on one core.
         """
-        if _look(self.theirs, number, self._crowded):
+        if look(self.theirs, number, self._crowded):
             return True
         if last_s > LONG_WORK_S and not is_soon:
             return False
         is_soon |= last_s < LONG_S and work_s < LONG_WORK_S
         end = time.perf_counter() + (LONG_S if is_soon else SHORT_S)
         while time.perf_counter() < end:
-            if _look(self.theirs, number, self._crowded):
+            if look(self.theirs, number, self._crowded):
                 return True
         return False
 

@@ -32,14 +32,14 @@ class Watchdog:
     def verdict(self) -> str | None:
         """Return what is wrong with the process, None: nothing. Call it every `CHECK_S`."""
         try:
-            state, spent = _look(self._pid)
+            state, spent = read_state(self._pid)
         except OSError:
             return None  # it has ended, which its pool notices
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
         is_still = state == "S"
         if is_still:  # processes that it has started may work for it
-            for child, ticks in map(_look_if_there, _started_by(self._pid)):
+            for child, ticks in map(_read_state_if_there, descendants(self._pid)):
                 is_still &= child not in AT_WORK
                 spent += ticks
         self._still = self._still + 1 if is_still and spent == self._spent else 0
@@ -55,7 +55,7 @@ class Watchdog:
 
 def is_stopped(pid: int) -> bool:
     """Return whether a process is stopped (SIGSTOP), if the system can tell."""
-    return _look_if_there(pid)[0] in "Tt"
+    return _read_state_if_there(pid)[0] in "Tt"
 
 
 def processor_s(pid: int) -> float:
@@ -63,24 +63,24 @@ def processor_s(pid: int) -> float:
     return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
 
 
-def _started_by(pid: int) -> list[int]:
+def descendants(pid: int) -> list[int]:
     """Return the descendants of a process."""
     try:
         text = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
     except OSError:  # it has ended, or the system cannot tell
         return []
     children = [int(word) for word in text.split()]
-    return children + [one for child in children for one in _started_by(child)]
+    return children + [one for child in children for one in descendants(child)]
 
 
-def _look_if_there(pid: int) -> tuple[str, int]:
+def _read_state_if_there(pid: int) -> tuple[str, int]:
     try:
-        return _look(pid)
+        return read_state(pid)
     except OSError:
         return "X", 0
 
 
-def _look(pid: int) -> tuple[str, int]:
+def read_state(pid: int) -> tuple[str, int]:
     """Return the state of a process, a letter, and its processor time in system ticks."""
     text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     fields = text.rpartition(")")[2].split()

@@ -101,12 +101,12 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
         barrier.load_kernels()
         _refuse_threads()
     except Exception as error:
-        _send(pool, describe(error))
+        send_to_pool(pool, describe(error))
         os._exit(1)
     gc.collect()
     gc.freeze()  # so that workers do not write to shared pages
     collapse_heap()
-    _send(pool, {"ready": len(jobs)})
+    send_to_pool(pool, {"ready": len(jobs)})
     _fork_on_demand(pool, parent, jobs, start)
 
 
@@ -129,7 +129,7 @@ def describe(error: BaseException) -> dict[str, str]:
     return {"kind": type(error).__name__, "text": message, "traceback": text}
 
 
-def _send(pool: socket.socket, what: Mapping[str, Any]) -> None:
+def send_to_pool(pool: socket.socket, what: Mapping[str, Any]) -> None:
     """Send to the pool. If it is gone (Ctrl-C), the next read from its socket notices."""
     with suppress(BrokenPipeError, ConnectionResetError):
         pool.send(json.dumps(what).encode())
@@ -153,7 +153,7 @@ def _fork_on_demand(
             pid = order["reap"]
             _, status = os.waitpid(pid, 0)
             alive.discard(pid)
-            _send(pool, {"status": os.waitstatus_to_exitcode(status)})
+            send_to_pool(pool, {"status": os.waitstatus_to_exitcode(status)})
             continue
         number, (wire,) = order["fork"], descriptors
         jobs[number].before_fork()
@@ -168,7 +168,7 @@ def _fork_on_demand(
             _work(number, jobs[number], socket.socket(fileno=wire), start)
         os.close(wire)
         alive.add(pid)
-        _send(pool, {"pid": pid})
+        send_to_pool(pool, {"pid": pid})
 
 
 def _end(alive: set[int]) -> NoReturn:

@@ -235,7 +235,7 @@ class WorkerProcesses:
             statuses = {j: server.reap(process) for j, process in old.items()}
             cause = _describe_status(statuses[k])
             for j in team:
-                self._fork(j)
+                self.fork(j)
         except ServerGoneError:
             cause = "the process that starts workers ended"
             old = self._start_anew(old, ordered)
@@ -327,7 +327,7 @@ class WorkerProcesses:
             try:
                 self._resources.server = ForkServer(self._program.module, self._start_message, fds)
                 for k in range(self._count):
-                    self._fork(k)
+                    self.fork(k)
                 return
             except ServerGoneError as error:
                 causes.append(str(error) or "no answer")
@@ -348,7 +348,8 @@ class WorkerProcesses:
             self._resources.server.close()
             self._resources.server = None
 
-    def _fork(self, k: int) -> None:
+    def fork(self, k: int) -> None:
+        """Let the server fork the process of worker `k`."""
         assert self._resources.server is not None
         process = self._resources.server.fork(k)
         self.processes[k] = process

@@ -104,7 +104,7 @@ class Image:
         words = self._words
         size = int(words[0]) if len(words) else 0
         if not _HEAD <= size <= len(words) or words[1] != _checksum(words[2:size]):
-            raise WorkerError("the state of a worker in shared memory is not what it wrote")
+            raise WorkerError("the state of a worker in shared memory is damaged")
         ranks = words[_HEAD : _HEAD + len(dtypes)].tolist()
         shape_at = _HEAD + len(ranks)
         at = shape_at + sum(ranks)

@@ -1,1 +1,1 @@
-"""Compiled loops: plans to goals, steps of routes, phases of signals, what stands on a map."""
+"""Compiled loops: plans to goals, steps of routes, phases of signals, static objects."""

@@ -1,6 +1,6 @@
-"""What stands on a map for ever: its lanes in pieces and its buildings, and those near a vehicle.
+"""The static objects of a map (pieces of lanes, buildings), and those near a vehicle.
 
-Items lie cell by cell in an index, so what is near a vehicle is always found in the same order.
+Objects are in the order of the index's cells, so a search always returns them in the same order.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ WALL = record(
     ("ay", np.float64),
     ("bx", np.float64),
     ("by", np.float64),
-    ("height", np.float64),  # m over the ground
+    ("height", np.float64),  # m above the ground
     ("building", np.int64),
 )
 
 
 class Backdrop(NamedTuple):
-    """What stands on a map for ever, in its frame, and how types of vehicles look.
+    """The static objects of a map in its frame, and the semantic classes of vehicle types.
 
-    Items lie cell by cell, by their middles; of an index, `start` counts them and `largest` is half
-    the length of the longest.
+    Objects are sorted by the cells of their centres; an index has only `start`, their counts, and
+    `largest`, half of the largest extent.
     """
 
-    semantics: NDArray[np.uint8]  # (num_types,) class of each VTYPE row
-    strips: NDArray[np.float64]  # (num_strips, 4, 2) lanes in pieces: right and left start, left
+    semantics: NDArray[np.uint8]  # (num_types,) semantic class of each VTYPE row
+    strips: NDArray[np.float64]  # (num_strips, 4, 2) pieces of lanes: right and left start, left
     lined: NDArray[np.float64]  # and right end; (num_strips,) 1: its sides are lane lines
     strip_index: Grid
     walls: NDArray[np.void]  # WALL (num_walls,)
     wall_index: Grid
     roofs: NDArray[np.float64]  # (num_roofs, 4, 2) corners of convex parts of footprints
-    roof_height: NDArray[np.float64]  # (num_roofs,) m over the ground
+    roof_height: NDArray[np.float64]  # (num_roofs,) m above the ground
     roof_index: Grid
 
 
@@ -47,12 +47,12 @@ class Backdrop(NamedTuple):
 def gather_walls(
     ego: np.void, walls: NDArray[np.void], index: Grid, reach_m: float, out: NDArray[np.void]
 ) -> int:
-    """The walls around a vehicle, always in the same order.
+    """Collect the walls around a vehicle, always in the same order.
 
-    `walls`: WALL (num_walls,) in the frame of the map. `reach_m`: walls that are farther away are
-    left out. `out`: WALL (num_walls,), overwritten up to the returned number.
+    `walls`: WALL (num_walls,) in the frame of the map. `reach_m`: walls farther away are left out.
+    `out`: WALL (num_walls,), overwritten up to the returned number.
 
-    Returns how many there are.
+    Returns the number of walls.
     """
     cos, sin = cos_sin(ego["heading"])
     far = reach_m + index.largest[0]
@@ -82,7 +82,7 @@ def gather_walls(
 
 @kernel
 def _comes_near(ax: float, ay: float, bx: float, by: float, reach_m: float) -> bool:
-    """Whether the segment from a to b comes within `reach_m` of the origin."""
+    """Return whether the segment from a to b comes within `reach_m` of the origin."""
     ex = bx - ax
     ey = by - ay
     squared = ex * ex + ey * ey
@@ -104,19 +104,19 @@ def gather_quads(
     out_corners: NDArray[np.float64],
     out_values: NDArray[np.float64],
 ) -> int:
-    """The quads around a vehicle, and some that are a little too far, always in the same order.
+    """Collect the quads around a vehicle, always in the same order; some may be too far away.
 
     Args:
-        ego: VEHICLE record of the one that looks.
+        ego: VEHICLE record of the observer.
         corners: (num_quads, 4, 2) in the frame of the map.
-        values: (num_quads,) what else is known of each.
-        index: of the quads, by their middles; `largest` is the largest half diagonal.
-        reach_m: all quads of which a part is so near are found.
+        values: (num_quads,) an attribute of each quad.
+        index: index of the quads by their centres; `largest` is the largest half diagonal.
+        reach_m: all quads are found that have a part within this distance.
         out_corners: (num_quads, 4, 2) in the vehicle's frame, overwritten.
-        out_values: (num_quads,), overwritten.
+        out_values: (num_quads,) attributes of the found quads, overwritten.
 
     Returns:
-        how many there are.
+        The number of quads.
     """
     cos, sin = cos_sin(ego["heading"])
     far = reach_m + index.largest[0]

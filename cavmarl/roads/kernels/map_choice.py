@@ -1,4 +1,4 @@
-"""Which map an episode is on, where a network has several."""
+"""The choice of an episode's map from a network with several maps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavmarl.core.math.rng import STREAM_MAP, below
 
 @kernel
 def map_of(key: np.uint64, num_maps: int) -> int:
-    """The MAP row of an episode: a function of its key, so of seed, world and episode."""
+    """Return the MAP row of an episode, a function of its key (of seed, world and episode)."""
     if num_maps == 1:
         return 0
     number: int = np.int64(below(key, 0, 0, STREAM_MAP, num_maps))  # type: ignore[assignment]

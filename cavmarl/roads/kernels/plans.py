@@ -1,8 +1,8 @@
-"""Lane-level plans: for one goal, what to do next from every lane of the map.
+"""Lane-level plans: the next step to one goal, for every lane of the map.
 
 Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs
-the time it takes at the speed limit; a lane change costs the more time the shorter the lane is, so
-that it is made early and where there is room.
+the time at the speed limit. A lane change costs more on shorter lanes, so that plans change lanes
+early and where there is room.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 
-LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time on a long lane, s;
-LANE_CHANGE_M = 250.0  # twice as much on a lane of this length, which is hardly enough for one
+LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a long lane, in travel time, s;
+LANE_CHANGE_M = 250.0  # it doubles on a lane of this length, which is hardly enough for a change
 TURNAROUND = ord("t")
 
 
 @kernel
 def _is_allowed(roads: RoadArrays, link: int) -> bool:
-    """Whether plans use a link: turnarounds only where the road ends."""
+    """Return whether plans use a link; turnarounds are used only at the ends of roads."""
     if roads.links[link]["direction"] != TURNAROUND:
         return True
     edge = roads.edges[roads.lanes[roads.links[link]["from_lane"]]["edge"]]
@@ -37,7 +37,7 @@ def _is_allowed(roads: RoadArrays, link: int) -> bool:
 
 @kernel
 def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
-    """Whether an allowed movement goes from the end of lane `before` to the start of `lane`."""
+    """Return whether an allowed movement goes from the end of lane `before` to `lane`."""
     row = roads.lanes[before]
     if row["internal"]:
         return True
@@ -49,9 +49,9 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
 
 @kernel
 def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
-    """Cost in s of leaving a lane sideways: plans change lanes where there is room to.
+    """Return the cost in s of a lane change; shorter lanes cost more.
 
-    Inside junctions vehicles do not change lanes.
+    Inside junctions, vehicles do not change lanes.
     """
     if roads.lanes[lane]["internal"]:
         return math.inf
@@ -62,7 +62,7 @@ def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
 
 @kernel
 def _lane_cost(roads: RoadArrays, lane: int, cost: NDArray[np.float64]) -> tuple[float, int, int]:
-    """Least cost from the start of `lane` without changing it: (cost, next lane, link)."""
+    """Return the least cost from the start of `lane` without a change: (cost, next lane, link)."""
     row = roads.lanes[lane]
     best = math.inf
     best_next = -1
@@ -91,7 +91,7 @@ def _settle(
     cost: NDArray[np.float64],
     plan: NDArray[np.void],
 ) -> None:
-    """Write the plan of a lane whose cost, and that of all cheaper lanes, is final."""
+    """Write the plan of a lane. Its cost, and that of all cheaper lanes, must be final."""
     row = roads.lanes[lane]
     step = plan[lane]
     length = row["length_m"]
@@ -128,11 +128,11 @@ def _settle(
 
 
 class _Search(NamedTuple):
-    """What a search keeps of each lane: a binary heap of lanes by cost, then by lane."""
+    """State of a search: cost of each lane, and a binary heap of lanes by cost, then by lane."""
 
-    cost: NDArray[np.float64]  # (L,) of the cheapest way found so far, s
-    heap: NDArray[np.int32]  # (L,) lanes that are found and not settled
-    place: NDArray[np.int32]  # (L,) of a lane in the heap; `_UNSEEN`, or `_SETTLED`
+    cost: NDArray[np.float64]  # (L,) cost of the cheapest known way, s
+    heap: NDArray[np.int32]  # (L,) lanes that are reached and not settled
+    place: NDArray[np.int32]  # (L,) index of a lane in the heap; `_UNSEEN`, or `_SETTLED`
 
 
 _UNSEEN, _SETTLED = -1, -2
@@ -147,7 +147,7 @@ def _comes_before(search: _Search, one: int, other: int) -> bool:
 
 @kernel
 def _put_up(search: _Search, lane: int, at: int) -> None:
-    """Put a lane into the heap at a place, or above it."""
+    """Move a lane up in the heap from index `at`."""
     while at > 0:
         above = search.heap[(at - 1) // 2]
         if _comes_before(search, above, lane):
@@ -161,7 +161,7 @@ def _put_up(search: _Search, lane: int, at: int) -> None:
 
 @kernel
 def _put_down(search: _Search, lane: int, size: int) -> None:
-    """Put a lane into a heap of some size whose first place is empty."""
+    """Move a lane down in a heap of some size whose first place is empty."""
     at = 0
     while True:
         below = 2 * at + 1
@@ -181,7 +181,7 @@ def _put_down(search: _Search, lane: int, size: int) -> None:
 
 @kernel
 def _offer(search: _Search, lane: int, cost: float, size: int) -> int:
-    """Note a way from a lane if it is the cheapest so far; return the new size of the heap."""
+    """Update the cost of a lane if the new cost is lower; return the new size of the heap."""
     if search.place[lane] == _SETTLED or not cost < search.cost[lane]:
         return size
     search.cost[lane] = cost
@@ -194,7 +194,7 @@ def _offer(search: _Search, lane: int, cost: float, size: int) -> int:
 
 @kernel
 def _take_first(search: _Search, size: int) -> int:
-    """Take the cheapest lane out of a heap of some size, and settle it."""
+    """Remove the cheapest lane from a heap of some size, and settle it."""
     first = search.heap[0]
     if size > 1:
         _put_down(search, search.heap[size - 1], size - 1)
@@ -252,9 +252,10 @@ def plan_goal(
     Args:
         roads: the road arrays.
         goal_edge: EDGE row to reach.
-        change_weight: what lane changes cost, over the usual; large: only where nothing else leads.
+        change_weight: multiple of the usual cost of lane changes. If it is large, plans change
+            lanes only if there is no other way.
         permission: bit of LANE["permissions"] that a lane needs.
-        plan: PLAN records (L,), written whole. Lanes from which the goal cannot be reached get
+        plan: PLAN records (L,), overwritten. Lanes from which the goal cannot be reached get
             to_go = inf and next = -1.
     """
     num_lanes = roads.lanes.shape[0]

@@ -1,4 +1,4 @@
-"""Explicit routes: for a sequence of edges, what to do next from every lane of each of them."""
+"""Explicit routes: the next step from every lane of each edge in a sequence of edges."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ def plan_route(
 ) -> int:
     """Fill the steps of one route, edge after edge.
 
-    Each edge's lanes have their steps together; a vehicle's way on the edge is the place of the
-    first one minus the edge's first lane. Costs are those of `kernels.plans`, over the route only.
+    The steps of an edge's lanes are contiguous. A vehicle's "way" on the edge is the index of the
+    first step minus the edge's first lane. Costs are as in `kernels.plans`, but only over the
+    route.
 
     Args:
         roads: the road arrays.
-        edges: (n,) EDGE rows, each connected to the one before.
-        permission: bits of LANE["permissions"], one of which a lane needs.
-        first_step: where in `steps` the route begins.
-        steps: PLAN; written from `first_step`. Lanes from which the route cannot be followed get
-            to_go = inf.
-        cost: room, as long as `steps`.
+        edges: (n,) EDGE rows, each connected to the previous one.
+        permission: bits of LANE["permissions"]; a lane needs one of them.
+        first_step: index in `steps` at which the route begins.
+        steps: PLAN, overwritten from `first_step` on. Lanes from which the route cannot be
+            followed get to_go = inf.
+        cost: working memory, as long as `steps`.
 
     Returns:
-        how many steps were written.
+        The number of steps.
     """
     end = first_step
     for n in range(edges.shape[0]):
@@ -60,7 +61,7 @@ def plan_route(
                 cost[way + lane] = roads.lanes[lane]["length_m"] / roads.lanes[lane]["speed_mps"]
             else:
                 _go_through(roads, lane, way, edges[n + 1], way_after, steps, cost)
-        # Changes spread over the lanes of an edge, from the kerb inwards and back again.
+        # Changes are propagated over the lanes of an edge, from the kerb inwards and back again.
         for lane in range(first + 1, first + edge["num_lanes"]):
             _go_sideways(roads, lane, lane - 1, permission, way, steps, cost)
         for lane in range(first + edge["num_lanes"] - 2, first - 1, -1):
@@ -120,7 +121,7 @@ def _go_sideways(
     steps: NDArray[np.void],
     cost: NDArray[np.float64],
 ) -> None:
-    """Leave a lane for one beside it where that is cheaper than what its step says so far."""
+    """Change to the lane beside if that is cheaper than the present step."""
     row = roads.lanes[lane]
     side = int(row["left"] == beside) - int(row["right"] == beside)
     if side == 0 or not row["permissions"] & permission:
@@ -143,11 +144,11 @@ def _go_sideways(
 def trace_edges(
     roads: RoadArrays, plan: NDArray[np.void], first_edge: int, out: NDArray[np.int32]
 ) -> int:
-    """The edges that a plan leads along, from the lane of an edge from which it is shortest.
+    """Find the edges along a plan, starting from the lane of an edge with the shortest way.
 
-    `plan`: PLAN (L,) of one goal. `out`: room for the EDGE rows, the first one included.
+    `plan`: PLAN (L,) of one goal. `out`: memory for EDGE rows, including the first edge.
 
-    Returns how many edges, 0 where the plan has no way, -1 where `out` is too short.
+    Returns the number of edges, 0 if the plan has no way, -1 if `out` is too short.
     """
     edge = roads.edges[first_edge]
     lane = -1
@@ -164,12 +165,12 @@ def trace_edges(
 def follow_plan(
     roads: RoadArrays, plan: NDArray[np.void], lane: int, out: NDArray[np.int32]
 ) -> int:
-    """The edges that a plan leads along from a lane.
+    """Find the edges along a plan from a lane.
 
     `plan`: PLAN (L,) of one goal, with a way from that lane. `lane`: LANE row outside junctions.
-    `out`: room for the EDGE rows, that of the lane included.
+    `out`: memory for EDGE rows, including that of the lane.
 
-    Returns how many edges, -1 where `out` is too short.
+    Returns the number of edges, -1 if `out` is too short.
     """
     out[0] = roads.lanes[lane]["edge"]
     found = 1
@@ -192,7 +193,7 @@ def follow_plan(
 
 @kernel
 def _is_better(plan: NDArray[np.void], lane: int, other: int) -> bool:
-    """Whether a plan needs fewer lane changes from one lane than from another, or a shorter way."""
+    """Return whether a plan needs fewer lane changes from `lane` than from `other`, or less way."""
     one = plan[lane]
     two = plan[other]
     if one["changes"] != two["changes"]:

@@ -1,11 +1,12 @@
-"""Signals: which phase is on, of fixed-time programs and of actuated ones.
+"""Signals: the present phase of fixed-time programs and of actuated programs.
 
-A fixed-time program is a function of the tick. An actuated one is SUMO's gap-based control: a green
-phase that may be prolonged is, while vehicles follow one another over its detectors, until its
-longest duration. Its times are whole milliseconds, as SUMO's, and its state is in the world: the
-phase, when it began, when to look next, and when each detector was last under a body.
+A fixed-time program is a function of the tick. An actuated program is SUMO's gap-based control: a
+green phase is prolonged while vehicles follow one another over its detectors, up to its maximum
+duration. Its times are whole milliseconds, like SUMO's. Its state belongs to the world: the phase,
+its beginning, the time of the next check, and when each detector was last occupied.
 
-Source: SUMO's documentation, Simulation/Traffic Lights ("actuated"), and what libsumo 1.28 does.
+Sources: SUMO's documentation, Simulation/Traffic Lights ("actuated"), and the behaviour of libsumo
+    1.28.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.roads.kernels.map_choice import map_of
 
-# From a detector to the centre of any vehicle that is over it or has left it in this tick.
+# Maximum distance from a detector to the centre of a vehicle that is on it or left it in this tick.
 DETECTOR_REACH_M = 30.0
 
-SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and looks no sooner after a switch
+SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and checks no sooner after a switch
 
 
 @kernel
@@ -36,17 +37,17 @@ def detect(
     dt: float,
     detected_s: NDArray[np.float64],
 ) -> None:
-    """Note when bodies were over the detectors: now, or when their rear left in this tick.
+    """Record when vehicles were on the detectors: now, or when their rear left in this tick.
 
-    The latest counts, so that neither the order of rows nor their owner matters.
+    The latest time counts, so the result depends neither on the order of rows nor on their owners.
 
     `lane_place`: (L,) see `RoadArrays`. `places`: PLACE (num_places,). `rows`: VEHICLE (W, C), the
-    committed ones of the tick. `num_owned`: (W,) rows to look at. `detected_s`: (W, D), written;
-    begun afresh at a reset.
+    committed rows of the tick. `num_owned`: (W,) number of rows to check. `detected_s`: (W, D),
+    updated; set to 0 at a reset.
     """
     for w in range(ticks.size):
         if ticks[w] == 0:
-            # As in SUMO, time since the beginning counts as time since a vehicle.
+            # As in SUMO, the start of the episode counts as the time of a vehicle.
             detected_s[w] = 0.0
         for i in range(num_owned[w]):
             row = rows[w, i]
@@ -71,12 +72,12 @@ def switch_signals(
     controllers: NDArray[np.void],
     signal_phase: NDArray[np.int32],
 ) -> None:
-    """Bring every signal to the worlds' ticks; once more at the same tick changes nothing.
+    """Set every signal to the worlds' present ticks; repeated calls change nothing.
 
-    Signals of maps that a world is not on show their first phase.
+    Signals of maps that a world does not use show their first phase.
 
-    `detected_s`: (W, D) what bodies of all shards did up to these ticks. `controllers`: CONTROLLER
-    (W, num_controllers), written. `signal_phase`: (W, num_signals), written.
+    `detected_s`: (W, D) times of detection in all shards up to these ticks. `controllers`:
+    CONTROLLER (W, num_controllers), updated. `signal_phase`: (W, num_signals), overwritten.
     """
     for w in range(ticks.size):
         time = ticks[w] * dt
@@ -113,7 +114,7 @@ def program_at(roads: RoadArrays, k: int, time: float, dt: float) -> int:
 
 @kernel
 def _fixed_phase(roads: RoadArrays, program: int, time: float, dt: float) -> int:
-    """The PHASE row of a fixed-time program at `time`."""
+    """Return the PHASE row of a fixed-time program at `time`."""
     row = roads.programs[program]
     left = (time - row["offset_s"]) % row["cycle_s"]
     phase = row["first_phase"]
@@ -127,7 +128,7 @@ def _fixed_phase(roads: RoadArrays, program: int, time: float, dt: float) -> int
 
 @kernel
 def _start(roads: RoadArrays, controllers: NDArray[np.void], dt: float) -> None:
-    """Begin every actuated program with the phase that its offset names, afresh."""
+    """Reset every actuated program to the phase that its offset gives."""
     for program in range(roads.programs.shape[0]):
         controller = roads.programs[program]["controller"]
         if controller >= 0:
@@ -146,7 +147,7 @@ def _note(
     detector: int,
     detected_s: NDArray[np.float64],
 ) -> None:
-    """Note when a body was over a detector that its centre is `ahead` m of."""
+    """Record when a vehicle was on a detector that is `ahead` m behind its centre."""
     rear = ahead - 0.5 * row["length"]
     if ahead + 0.5 * row["length"] >= 0.0 and rear <= row["speed"] * dt:
         # The tick was driven at the speed at its end (semi-implicit Euler).
@@ -163,7 +164,7 @@ def _control(
     dt: float,
     controllers: NDArray[np.void],
 ) -> None:
-    """Let every actuated program of a world look, as often as is due before the next tick."""
+    """Run all checks of every actuated program that are due before the next tick."""
     now_ms = _milliseconds(tick * dt)
     end_ms = _milliseconds((tick + 1) * dt)
     rows = roads.maps[own_map]
@@ -173,25 +174,25 @@ def _control(
             state = controllers[controller]
             gap_s = roads.programs[program]["detector_gap_s"]
             while state["next_ms"] < end_ms:
-                state["next_ms"] += _look(roads, state, detected_s, gap_s, now_ms)
+                state["next_ms"] += _check(roads, state, detected_s, gap_s, now_ms)
 
 
 @kernel
-def _look(
+def _check(
     roads: RoadArrays,
     state: np.void,
     detected_s: NDArray[np.float64],
     detector_gap_s: float,
     now_ms: int,
 ) -> int:
-    """Prolong the phase or go on to the next; ms until to look again."""
+    """Prolong the phase or switch to the next; return the time to the next check in ms."""
     phase = roads.phases[state["phase"]]
     lasted = now_ms - state["since_ms"]
     gap = math.inf
     if phase["green"] and lasted < phase["max_ms"]:
         gap = _gap(roads, phase, detected_s, now_ms)
     if gap < math.inf:
-        # Until the last vehicle has come from its detector to the stop line.
+        # Until the last vehicle has driven from its detector to the stop line.
         more = max(phase["min_ms"] - lasted, _milliseconds(detector_gap_s - gap), 1)
         if more % SECOND_MS != 0:
             more = ((more + lasted) // SECOND_MS + 1) * SECOND_MS - lasted
@@ -205,7 +206,7 @@ def _look(
 
 @kernel
 def _gap(roads: RoadArrays, phase: np.void, detected_s: NDArray[np.float64], now_ms: int) -> float:
-    """Seconds since a vehicle was on the phase's detectors; inf if longer than each one's gap."""
+    """Return the time in s since a phase's detectors were occupied; inf if above their gaps."""
     gap = math.inf
     for k in range(phase["first_detector"], phase["first_detector"] + phase["num_detectors"]):
         detector = roads.phase_detectors[k]

@@ -1,4 +1,4 @@
-"""Where bodies on two paths touch: the hull of all pairs of places at which they overlap."""
+"""The contact range of bodies on two paths: the hull of all pairs of positions that overlap."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ def swept_range(
     level_m: float,
     foes: bool,
 ) -> tuple[float, float, float, float]:
-    """The first and last place of each centre at which two bodies touch; none: inf first.
+    """Return the first and last position of each centre at which two bodies touch, or inf first.
 
     Args:
-        mine: (n, 6) place of the centre from the stop line, x, y, z, cosine and sine of the body.
-        theirs: (m, 6) the same of the other path.
-        own: half length and half width of the body in m, the length of its path, and where on it
-            the shared area of a conflict begins and ends; the last two are read of foes only.
-        other: the same of the other one.
-        level_m: bodies that differ more in height do not touch.
-        foes: whether a conflict keeps them apart in its area: only pairs count of which one has
-            its front before that, as at its line or at its waiting position, or has left it.
+        mine: (n, 6) positions on a path: distance of the centre from the stop line, x, y, z, and
+            cosine and sine of the body's heading.
+        theirs: (m, 6) the same for the other path.
+        own: half length and half width of the body in m, the length of its path, and the start and
+            end on it of the area that a conflict protects; the last two are read if `foes`.
+        other: the same for the other body.
+        level_m: bodies with a larger difference in height do not touch.
+        foes: whether a conflict keeps the bodies apart in its area. Then only pairs count of which
+            one body has not reached the area, such as at its line or waiting position, or left it.
     """
     first, last = math.inf, -math.inf
     foe_first, foe_last = math.inf, -math.inf
@@ -70,13 +71,13 @@ def swept_range(
 
 @inlined_kernel
 def _is_on(s: float, body: tuple[float, float, float, float, float]) -> bool:
-    """Whether a body at place `s` reaches over its junction."""
+    """Return whether a body at position `s` extends over its junction."""
     on: bool = s + body[0] > 0.0 and s - body[0] < body[2]
     return on
 
 
 @inlined_kernel
 def _is_in_area(s: float, body: tuple[float, float, float, float, float]) -> bool:
-    """Whether a body at place `s` reaches over the shared area of the conflict."""
+    """Return whether a body at position `s` extends over the area of the conflict."""
     inside: bool = s + body[0] > body[3] and s - body[0] < body[4]
     return inside

@@ -1,9 +1,9 @@
-"""Paths over junctions that run backwards, drawn anew so that a car can follow them.
+"""Redraws paths over junctions that run backwards, so that a car can follow them.
 
-netconvert joins the end of one lane to the start of another with a line, also where roads overlap
-and the start lies behind the end, or beside it: that line then runs against both roads, or folds
-back. Here the two lanes are cut back until a curve without such turns joins them. What is cut off
-a lane becomes part of the other paths that begin or end there, so no way changes but the mended.
+netconvert joins the end of one lane to the start of another with a line. If roads overlap, the
+start may lie behind the end, or beside it. The line then runs against both roads, or folds back.
+Here, both lanes are shortened until a smooth curve joins them. The removed part of a lane is added
+to the other paths that begin or end there, so only the repaired paths change.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
 from cavmarl.roads.polylines import SAME_POINT_M, Shape
 
-KINK_RAD = np.radians(60.0)  # a path with a corner sharper than this,
-ASTRAY_RAD = np.radians(90.0)  # that turns so much more than its roads do, cannot be driven;
-BACK_RAD = np.radians(100.0)  # nor can one with such a corner, if its roads
-U_TURN_RAD = np.radians(150.0)  # do not themselves turn round
-SMOOTH_RAD = np.radians(60.0)  # a new path turns this much to and fro at most; if none does,
-WORTH_RAD = np.radians(3.0)  # a longer cut has to save this much
-STEP_M = 0.5  # by which lanes are cut back at least, and in steps of it,
-MOST_M = 12.0  # and how far at most,
-MOST_SHARE = 0.4  # or this share of the lane: its other end may be cut, too
+KINK_RAD = np.radians(60.0)  # a path cannot be driven if it has a corner sharper than this,
+ASTRAY_RAD = np.radians(90.0)  # and turns this much more than its roads do;
+BACK_RAD = np.radians(100.0)  # or if it has such a corner, and its roads
+U_TURN_RAD = np.radians(150.0)  # do not turn round themselves
+SMOOTH_RAD = np.radians(60.0)  # accepted excess turning of a new path; if no path meets it,
+WORTH_RAD = np.radians(3.0)  # a longer cut must save at least this much
+STEP_M = 0.5  # minimum cut of a lane, and its step,
+MOST_M = 12.0  # and its maximum,
+MOST_SHARE = 0.4  # or this share of the lane, as its other end may be cut, too
 CURVE_M = 1.0  # between the points of a new path
 MOST_POINTS = 24
 
@@ -41,9 +41,9 @@ class Way(NamedTuple):
 
 
 def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
-    """Draw paths that no car can follow anew; shapes (n, 3) in m of all lanes, changed in place.
+    """Redraw paths that no car can follow; `shapes` (n, 3) of all lanes in m, changed in place.
 
-    A lane keeps its shape where a movement without internal lanes begins or ends there.
+    A lane keeps its shape if a movement without internal lanes begins or ends there.
     """
     fixed_ends = {way.before for way in ways if not way.inside}
     fixed_starts = {way.after for way in ways if not way.inside}
@@ -71,7 +71,7 @@ def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
             last = way.inside[-1]
             shapes[last] = _join(shapes[last], heads[way.after][0])
         if (way.before in tails or way.after in heads) and _is_broken(shapes, way):
-            mended.add(way)  # what was cut off its lanes runs backwards
+            mended.add(way)  # the part removed from its lanes runs backwards
     for way in ways:
         if way in mended:
             _redraw(shapes, way)
@@ -87,7 +87,7 @@ def _is_broken(shapes: Sequence[Shape], way: Way) -> bool:
 
 
 def _corners(before: Shape, path: Shape, after: Shape) -> NDArray[np.float64]:
-    """Changes of direction in rad along a path, from that of the lane before to that after."""
+    """Return changes of direction in rad along a path, including both adjacent lanes."""
     steps = np.concatenate([before[-2:], path[1:], after[1:2] - after[0] + path[-1]])
     heading = atan2_all(*np.diff(steps[:, 1::-1], axis=0).T)
     corners: NDArray[np.float64] = (np.diff(heading) + np.pi) % (2.0 * np.pi) - np.pi
@@ -95,7 +95,7 @@ def _corners(before: Shape, path: Shape, after: Shape) -> NDArray[np.float64]:
 
 
 def _astray(corners: NDArray[np.float64]) -> float:
-    """How much more is turned, to and fro, than the roads differ, in rad."""
+    """Return the total turning in excess of the difference between the roads, in rad."""
     net = (corners.sum() + np.pi) % (2.0 * np.pi) - np.pi
     return float(np.abs(corners).sum() - abs(net))
 
@@ -103,7 +103,7 @@ def _astray(corners: NDArray[np.float64]) -> float:
 def _needed_cut(
     shapes: Sequence[Shape], way: Way, fixed_end: bool, fixed_start: bool
 ) -> tuple[float, float]:
-    """The least cut in m of both lanes with which a smooth curve joins them, or the best one."""
+    """Return the smallest cuts in m of both lanes with a smooth curve, or the best ones."""
     rooms = [
         0.0 if fixed else min(MOST_SHARE * _length(shapes[lane]), MOST_M)
         for lane, fixed in ((way.before, fixed_end), (way.after, fixed_start))
@@ -122,7 +122,7 @@ def _needed_cut(
 
 
 def _redraw(shapes: list[Shape], way: Way) -> None:
-    """Give the internal lanes of a way a curve, each its share of the length."""
+    """Replace the internal lanes of a way by a curve, divided in proportion to their lengths."""
     curve = _curve(shapes[way.before], shapes[way.after])
     lengths = [max(_length(shapes[lane]), SAME_POINT_M) for lane in way.inside]
     whole = _length(curve)
@@ -132,12 +132,12 @@ def _redraw(shapes: list[Shape], way: Way) -> None:
 
 
 def _curve(before: Shape, after: Shape) -> Shape:
-    """A cubic curve from the end of one lane to the start of another, in their directions."""
+    """Return a cubic curve from the end of one lane to the start of another, tangent to both."""
     start, end = before[-1], after[0]
     leaves, arrives = _direction(before[-2:]), _direction(after[:2])
     chord = float(hypot_all(*(end - start)[:2]))
     cos_turn = float(leaves[0] * arrives[0] + leaves[1] * arrives[1])
-    # The handles that make the curve an arc of a circle where both ends lie on one.
+    # With these handles, the curve is a circular arc if both ends lie on one.
     handle = chord * 2.0 / (3.0 * (1.0 + np.sqrt(max(0.5 * (1.0 + cos_turn), 0.0))))
     number = int(np.clip(np.ceil(chord / CURVE_M), 8, MOST_POINTS))
     t = np.linspace(0.0, 1.0, number + 1)[:, None]
@@ -149,7 +149,7 @@ def _curve(before: Shape, after: Shape) -> Shape:
         + t * t * t * end
     )
     s = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(curve[:, :2], axis=0).T))])
-    curve[:, 2] = start[2] + (end[2] - start[2]) * s / max(s[-1], SAME_POINT_M)  # an even grade
+    curve[:, 2] = start[2] + (end[2] - start[2]) * s / max(s[-1], SAME_POINT_M)  # a constant slope
     return _clean(curve)
 
 
@@ -165,7 +165,7 @@ def _length(shape: Shape) -> float:
 
 
 def _cut(shape: Shape, at_m: float) -> tuple[Shape, Shape]:
-    """The parts of a polyline before and behind a place in m along it."""
+    """Return the parts of a polyline before and after a position in m along it."""
     s = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(shape[:, :2], axis=0).T))])
     point = np.array([[np.interp(at_m, s, shape[:, axis]) for axis in range(3)]])
     near, far = s < at_m - SAME_POINT_M, s > at_m + SAME_POINT_M

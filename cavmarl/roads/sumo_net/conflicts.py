@@ -1,11 +1,11 @@
-"""Where the paths of two movements over a junction meet.
+"""Computes where the paths of two movements over a junction meet.
 
-The map says *that* two links are foes (a bit of the junction's request); this module says *where*:
-the stretch of each path on which a vehicle could touch one on the other path.
+The map says *that* two links are foes (a bit of the junction's request); this module computes
+*where*: the part of each path on which a vehicle could touch a vehicle on the other path.
 
-From that follow CONFLICT rows, how far the movements out of one lane share their way, and where
-cars have to stop so that no vehicle that drives over the junction touches them: maps put the stop
-line at the end of a lane, and some paths sweep across it.
+The results are CONFLICT rows, the common parts of movements from one lane, and the positions where
+cars must stop so that no vehicle on the junction touches them. Maps put the stop line at the end of
+a lane, and some paths sweep across it.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.sumo_net.selection import Movement
 
 SAMPLE_M = 0.5
-# Half a car (2 m wide) on either path and a margin that covers corners cut in a turn.
+# Half a car (2 m wide) on each path, and a margin for corners cut in a turn.
 NEAR_M = 1.0 + 1.0 + 0.6
-# Half a car with a margin.
+# Half a car, with a margin.
 HALF_LENGTH_M = 2.6
 HALF_WIDTH_M = 1.1
-# Paths further apart than this in height are a bridge and the road below it.
+# Paths with a larger difference in height are a bridge and the road below it.
 CLEARANCE_M = 3.0
-# The half length of the stretch where foes never come near each other in the plane.
+# Half length of the area of foes whose paths never come close in the plane.
 TOUCH_M = 1.0
-WAITS_BACK_M = 3.0  # before netconvert's waiting position inside, at most
+WAITS_BACK_M = 3.0  # maximum distance that drivers wait before netconvert's position inside
 
 
 class LinkPath(NamedTuple):
-    """The path of a link over its junction, sampled every `SAMPLE_M` or closer, with both ends."""
+    """The path of a link over its junction, sampled at most every `SAMPLE_M`, with both ends."""
 
     s: NDArray[np.float64]  # (n,) m from the stop line
     xyz: NDArray[np.float64]  # (n, 3) m
@@ -59,24 +59,24 @@ class Overlap(NamedTuple):
     leave_m: float
     foe_enter_m: float
     foe_leave_m: float
-    near: bool = True  # False: the paths keep apart, and this is where they are nearest
+    near: bool = True  # False: the paths stay apart, and this is where they are closest
 
 
 def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
-    """Sample a polyline with arc lengths `s` (n,) and points `xyz` (n, 3), metres, evenly."""
+    """Sample a polyline evenly, given arc lengths `s` (n,) and points `xyz` (n, 3) in metres."""
     count = int(np.ceil((s[-1] - s[0]) / SAMPLE_M)) + 1
     at = np.linspace(s[0], s[-1], max(count, 2))
     return LinkPath(at, np.stack([np.interp(at, s, xyz[:, axis]) for axis in range(3)], axis=1))
 
 
 def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
-    """Where two foes meet, or None if one passes over the other.
+    """Return where two foes meet, or None if one passes over the other.
 
-    `path`: the path of one link. `foe`: the path of the other. `merging`: both lead into the same
-    lane, so the shared area lasts to the end of both.
+    `path`: the path of one link. `foe`: the path of the other link. `merging`: both lead into the
+    same lane, so the shared area extends to the end of both.
 
-    Returns the hull of all stretches with less than `NEAR_M` between the centre lines; `TOUCH_M`
-    around the closest points where no stretch is that near.
+    The area is the hull of all parts with less than `NEAR_M` between the centre lines; if there are
+    none, `TOUCH_M` around the closest points.
     """
     plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
     square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]
@@ -106,10 +106,10 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
 
 
 def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> Overlap | None:
-    """Where cars on two paths would touch as they stand askew in their bends, or None.
+    """Return where cars on two paths would touch, as they are oblique in bends, or None.
 
-    The ways are the paths with some metres of the lanes at their ends. The answer is in places of
-    a front bumper that comes and a rear bumper that leaves, as in `overlap`.
+    The ways are the paths with some metres of the lanes at their ends. The result has the positions
+    of an arriving front bumper and of a leaving rear bumper, as in `overlap`.
     """
     mine, theirs = poses(path, way), poses(foe, foe_way)
     apart = mine.xyz[:, None, :] - theirs.xyz[None, :, :]
@@ -127,14 +127,14 @@ def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> 
 
 
 def poses(path: LinkPath, way: LinkPath) -> Poses:
-    """How a car stands along a path, a part of its way: as a chord, both bumpers on the way."""
+    """Return car poses along a path, a part of its way: a chord with both bumpers on the way."""
     front, rear = places_on(way, path.s + HALF_LENGTH_M), places_on(way, path.s - HALF_LENGTH_M)
     chord = front - rear
     return Poses(0.5 * (front + rear), atan2_all(chord[:, 1], chord[:, 0]))
 
 
 def places_on(way: LinkPath, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) places on a way, which goes on straight before and behind its ends."""
+    """Return (n, 3) positions on a way, which extends straight beyond its ends."""
     ends = np.concatenate([[way.s[0] - 100.0], way.s, [way.s[-1] + 100.0]])
     first, last = way.xyz[1] - way.xyz[0], way.xyz[-1] - way.xyz[-2]
     first = first / max(hypot(float(first[0]), float(first[1])), 1e-6)
@@ -146,10 +146,9 @@ def places_on(way: LinkPath, at: NDArray[np.float64]) -> NDArray[np.float64]:
 def touching(
     apart: NDArray[np.float64], mine: NDArray[np.float64], theirs: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether pairs of car boxes have no separating axis.
+    """Return which pairs of car boxes have no separating axis.
 
-    `apart`: (n, 2) between the centres, m. `mine`: (n,) headings, rad. `theirs`: (n,) headings,
-    rad.
+    `apart`: (n, 2) between the centres, m. `mine`, `theirs`: (n,) headings, rad.
     """
     across = np.abs(sin_all(mine - theirs))
     along = np.abs(cos_all(mine - theirs))
@@ -164,7 +163,7 @@ def touching(
 
 
 def _from_centres(path: LinkPath, centres: NDArray[np.float64]) -> tuple[float, float]:
-    """The stretch that a car covers of the shared area, from the places of its centre there."""
+    """Return the part of the shared area that a car covers, from the positions of its centre."""
     enter, leave = centres.min() + HALF_LENGTH_M, centres.max() - HALF_LENGTH_M
     middle = 0.5 * (enter + leave)
     return _stretch(path, min(enter, middle), max(leave, middle))
@@ -175,11 +174,11 @@ def _stretch(path: LinkPath, start: float, end: float) -> tuple[float, float]:
 
 
 def fork_lengths(from_lane: Sequence[int], paths: Sequence[LinkPath | None]) -> NDArray[np.float64]:
-    """The length of each link's path that lies near another one's from the same lane, in m.
+    """Return the length in m of each link's path that is near another path from the same lane.
 
     Args:
         from_lane: (K,) LANE row that each link leaves.
-        paths: (K,) the path of each link, None where the map has none.
+        paths: (K,) the path of each link, None if the map has none.
     """
     lengths = np.zeros(len(paths))
     leaving: dict[int, list[int]] = defaultdict(list)
@@ -216,20 +215,20 @@ def stop_back(
     approaches: Sequence[LinkPath | None],
     ways: Sequence[LinkPath | None],
 ) -> NDArray[np.float64]:
-    """How far before its end a lane has its stop line, in m.
+    """Return how far before its end each lane has its stop line, in m.
 
     Args:
         ends: (L, 4) x, y, z of each lane's end, m, and its direction there, rad.
         edge: (L,) EDGE row of each lane.
         from_lane: (K,) LANE row that each link leaves.
         junction: (K,) JUNCTION row of each link.
-        paths: (K,) the path of each link, None where the map has none.
-        approaches: (K,) the same with the last metres before the junction: vehicles from another
-            road is asked about there, too.
+        paths: (K,) the path of each link, None if the map has none.
+        approaches: (K,) the same with the last metres before the junction, on which vehicles from
+            another road also matter.
         ways: (K,) the same with some metres of the lanes at both ends.
 
     Returns:
-        (L,), 0 for lanes that no path of another lane's links comes near. Where `MOST_M` is not
+        (L,), 0 for lanes that no path of another lane's links comes near. If `MOST_M` is not
         enough, the lane keeps the map's line.
     """
     back = np.zeros(len(ends))
@@ -288,19 +287,21 @@ def conflict_rows(
     ways: Sequence[LinkPath | None],
     left_hand: bool,
 ) -> tuple[NDArray[np.void], NDArray[np.int32], list[int]]:
-    """All conflicts of all links, each link's first row with the end as last entry, unruled links.
+    """Return all conflicts of links, each link's first row with the end appended, unruled links.
 
-    Two links are foes if either names the other: some maps set the bit on one side only, but a
-    shared area is shared. Links over a bridge and below it are none, whatever the map says. Links
-    from different lanes that the map calls free of each other, but that pass so narrowly that cars
-    would touch, are foes too; of these the turn across the road gives way. Unruled links end in the
-    same lane as another one, and the map has no rule for the two.
+    Two links are foes if either names the other: some maps set the bit on one side only. A link
+        over a
+    bridge and a link below it are no foes, whatever the map says. Links from different lanes that
+    the map declares free of each other, but so close that cars would touch, are foes, too; of
+    these, the turn across the road yields. Unruled links end in the same lane as another link, and
+    the map has no rule for the two.
 
     Args:
-        movements: one a LINK row.
-        paths: the path of each link; None where the map has no internal lanes.
+        movements: one per LINK row.
+        paths: the path of each link; None if the map has no internal lanes.
         ways: the same with some metres of the lanes at both ends.
-        left_hand: whether one drives on the left, where turns to the right lead across the road.
+        left_hand: whether the map has left-hand traffic, in which turns to the right cross the
+            road.
 
     Raises:
         MapError: a junction's request has fewer bits than the junction has links.
@@ -348,9 +349,9 @@ def fill_conflicts(
     conflicts: NDArray[np.void],
     first_conflict: NDArray[np.int32],
 ) -> None:
-    """Write which conflicts each LINK has and where one waits inside for them, into `links`.
+    """Write the conflicts of each LINK, and where vehicles wait for them inside, into `links`.
 
-    And `merges` of each LANE at whose end others turn into its road without standing first.
+    Also set `merges` of lanes at whose end others turn into their road without stopping first.
     """
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
@@ -358,26 +359,26 @@ def fill_conflicts(
     links["wait_m"] = _wait_places(links["wait_m"], owner, conflicts)
     asks = (links["signal"][owner] < 0) & conflicts["merging"] & conflicts["must_yield"]
     asks &= links["state"][conflicts["foe"]] != ord("w")
-    minded = links["from_lane"][conflicts["foe"][asks]]
-    lanes["merges"][minded] = True
+    watched = links["from_lane"][conflicts["foe"][asks]]
+    lanes["merges"][watched] = True
 
 
 def _wait_places(
     wait_m: NDArray[np.float64], owner: NDArray[np.intp], conflicts: NDArray[np.void]
 ) -> NDArray[np.float64]:
-    """Where drivers wait inside, in m from the stop line: out of the way of those that pass.
+    """Return where drivers wait inside, in m from the stop line, out of the way of others.
 
-    netconvert's places are for its own margins. Where one lies up to `WAITS_BACK_M` within an area
-    of vehicles that drive on while it waits for them, drivers wait before that area.
+    netconvert's positions suit its own margins. If a position is up to `WAITS_BACK_M` within the
+    area of vehicles that have priority over it, drivers wait before that area.
 
     Args:
-        wait_m: (K,) netconvert's places; inf: none.
-        owner: (num_conflicts,) LINK row that each conflict is of.
+        wait_m: (K,) netconvert's positions; inf: none.
+        owner: (num_conflicts,) LINK row of each conflict.
         conflicts: CONFLICT (num_conflicts,).
     """
     place = conflicts["enter_m"] + LINE_MARGIN_M
     back = wait_m[owner] - place
-    # Rows are sorted by link, then by foe; sorted by foe, then by link, they are the other sides.
+    # Rows are sorted by link, then foe. Sorted by foe, then link, they are the opposite rows.
     mirror = np.argsort(np.lexsort((owner, conflicts["foe"])))
     drives_on = conflicts["must_yield"] & ~conflicts["must_yield"][mirror]
     moved = drives_on & (back > 0.0) & (back <= WAITS_BACK_M)
@@ -387,7 +388,7 @@ def _wait_places(
 
 
 def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:
-    """The foe's bit in my row of the requests; SUMO writes bit 0 at the right."""
+    """Return the foe's bit in a movement's row of requests; SUMO writes bit 0 at the right."""
     if not requests:
         return False
     row = requests.get(mine.index, "")
@@ -418,7 +419,7 @@ def _grazing(
 
 
 def _shared(path: LinkPath | None, foe: LinkPath | None, *, merging: bool) -> Overlap | None:
-    """The shared area; without internal lanes the junction is a point."""
+    """Return the shared area; without internal lanes, the junction is a point."""
     if path is None or foe is None:
         return Overlap(0.0, path.s[-1] if path else 0.0, 0.0, foe.s[-1] if foe else 0.0)
     return overlap(path, foe, merging=merging)

@@ -1,7 +1,7 @@
-"""Where the detectors of actuated signals lie, and which phases they prolong.
+"""Positions of the detectors of actuated signals, and the phases that they prolong.
 
-SUMO puts one induction loop on every lane that an actuated phase opens, and lets it prolong a phase
-only if all that its lane leads to is open then (SUMO's documentation, Simulation/Traffic Lights,
+SUMO puts one induction loop on every lane that an actuated phase opens. The loop prolongs a phase
+only if everything that its lane leads to is open (SUMO's documentation, Simulation/Traffic Lights,
 "actuated").
 """
 
@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.signal_rows import DETECTOR_GAP_S, SignalRows, param
 # SUMO's defaults of actuated programs, s.
 MAX_GAP_S = 3.0
 PASSING_TIME_S = 1.9
-# Room of a standing vehicle, m.
+# Length that a standing vehicle occupies, m.
 QUEUE_SPACING_M = 7.5
 
 NO_DETECTOR = "NO_DETECTOR"
@@ -30,7 +30,7 @@ _TURNAROUND = (ord("t"), ord("T"))
 
 
 class DetectorRoads(NamedTuple):
-    """What of a network detectors depend on."""
+    """The parts of a network that detectors depend on."""
 
     lanes: NDArray[np.void]
     edges: NDArray[np.void]
@@ -43,12 +43,12 @@ class DetectorRoads(NamedTuple):
 def place_detectors(
     rows: SignalRows, roads: DetectorRoads, first_row: int = 0
 ) -> tuple[NDArray[np.void], NDArray[np.int32]]:
-    """Detectors of the actuated programs in `rows.specs`; their phases are told of them.
+    """Return the detectors of the actuated programs in `rows.specs`, and add them to their phases.
 
-    `rows`: the detectors of each phase are written. `first_row`: the number of the first detector.
+    `rows`: the detectors of each phase are written. `first_row`: row of the first detector.
 
-    Returns DETECTOR (D,) and phase_detectors, beginning with the ones that `rows` already counts.
-    Raises MapError: a parameter of a program is no number, or names a detector of its own.
+    Returns DETECTOR (D,) and phase_detectors, starting with those that `rows` already has.
+    Raises MapError: a parameter is not a number, or names a detector of its own.
     """
     detectors: list[tuple[int, float, float]] = []
     for row, program in rows.specs.items():
@@ -67,7 +67,7 @@ def place_detectors(
 
 
 class _Approaches:
-    """The lanes before one signal, seen with the eyes of one actuated program."""
+    """The lanes before one signal, as needed by one actuated program."""
 
     def __init__(self, program: SignalProgram, roads: DetectorRoads, signal: int) -> None:
         self.program = program
@@ -99,14 +99,14 @@ class _Approaches:
         }
 
     def _alone(self, lane: int) -> bool:
-        """Whether the lane's edge has one lane for motor vehicles."""
+        """Return whether the lane's edge has one lane for motor vehicles."""
         edge = self.roads.edges[self.roads.lanes["edge"][lane]]
         first = edge["first_lane"]
         beside = self.roads.lanes["permissions"][first : first + edge["num_lanes"]]
         return int((beside & _MOTORIZED != 0).sum()) == 1
 
     def shortest_green_s(self, lane: int) -> float | None:
-        """The shortest minimum of the actuated phases that open the lane."""
+        """Return the shortest minimum duration of the actuated phases that open the lane."""
         shortest = [
             phase.min_s
             for phase in self.program.phases
@@ -116,16 +116,16 @@ class _Approaches:
         return min(shortest, default=None)
 
     def place(self, lane: int, shortest_s: float) -> tuple[int, float]:
-        """(LANE, s in m) of the detector of a lane.
+        """Return the position of a lane's detector: (LANE, s in m).
 
-        It lies `detector-gap` seconds before the stop line, but no farther than what the shortest
-        green empties; on short lanes, as far back as there is only one way.
+        It is `detector-gap` seconds before the stop line, but no farther than the queue that the
+        shortest green clears. On short lanes it is further back, while there is only one way.
         """
         custom = self.program.params.get(self.roads.lane_ids[lane])
         if custom is not None:
             raise MapError(
                 f"{self.program.place}: lane '{self.roads.lane_ids[lane]}' has the detector "
-                f"'{custom}' of its own, which is not read: remove this <param>"
+                f"'{custom}' of its own, which is not supported: remove this <param>"
             )
         passing = parameter(self.program, "passing-time", PASSING_TIME_S)
         if passing <= 0.0:
@@ -150,7 +150,7 @@ class _Approaches:
         return parameter(self.program, f"max-gap:{self.roads.lane_ids[lane]}", default)
 
     def usable(self, phase: int, detected: dict[int, int]) -> list[int]:
-        """Lanes, of those in `detected`, whose detectors prolong a phase."""
+        """Return the lanes in `detected` whose detectors prolong a phase."""
         stated = self.program.phases[phase]
         if stated.min_s == stated.max_s:
             return []
@@ -171,7 +171,7 @@ class _Approaches:
         ]
 
     def _counts(self, index: int, state: str, major: set[int]) -> bool:
-        """Whether a green that gives way is as good as one that does not."""
+        """Return whether a green with a duty to yield counts as a green without."""
         unimportant = index in self.never_major or index in self.turnaround
         if index in self.one_lane or (unimportant and major & self.lanes_at[index]):
             return True
@@ -180,7 +180,7 @@ class _Approaches:
         )
 
     def _gives_way(self, link: np.void, state: str) -> bool:
-        """Whether motor vehicles of another road may cross the way of a link in this state."""
+        """Return whether motor vehicles of another road may cross a link in this state."""
         first = link["first_conflict"]
         foes = self.roads.conflicts["foe"][first : first + link["num_conflicts"]]
         for foe in self.roads.links[foes]:
@@ -194,7 +194,7 @@ class _Approaches:
         return False
 
     def _next_lanes(self, lane: int) -> list[int]:
-        """Lanes behind the junction, where a second line of the same signal may be shut."""
+        """Return lanes after the junction, where another line of the same signal may be closed."""
         ahead = self.links[self.links["from_lane"] == lane]
         on = ahead[~np.isin(ahead["direction"], _TURNAROUND)]
         return [int(row) for row in on["to_lane"]]

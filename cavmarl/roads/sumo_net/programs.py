@@ -1,6 +1,6 @@
-"""Signal programs as SUMO's XML states them: <tlLogic> with its phases, and <WAUT> timetables.
+"""Signal programs in SUMO's XML: <tlLogic> with its phases, and <WAUT> timetables.
 
-The same elements stand in networks and in additional files; one reader serves both.
+Networks and additional files have the same elements; one reader serves both.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-# The program that every signal has: nothing is lit, the right of way alone rules.
+# The program that every signal has: the signal is off, and right of way applies.
 OFF = "off"
 
 _REQUIRED = {
@@ -31,11 +31,11 @@ _REQUIRED = {
 class ProgramPhase:
     """One <phase>."""
 
-    duration_s: float  # stated; SUMO's defaults fill in what is not
+    duration_s: float  # as stated; SUMO's defaults replace missing values
     min_s: float
     max_s: float
-    state: str  # a letter for every link of the signal
-    # phases that may come next, by number; empty: the one behind it
+    state: str  # one letter for every link of the signal
+    # indices of phases that may follow; empty: the next one
     following: tuple[int, ...] = ()
 
 
@@ -43,31 +43,31 @@ class ProgramPhase:
 class SignalProgram:
     """One <tlLogic>."""
 
-    signal_id: str  # together the program's name
+    signal_id: str  # with `program_id`, the program's name
     program_id: str
     kind: str  # SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …
-    offset_s: float  # by which all phases are late
-    place: str  # file and line, for complaints
-    phases: list[ProgramPhase] = field(default_factory=list)  # in their order
+    offset_s: float  # delay of all phases
+    place: str  # file and line, for error messages
+    phases: list[ProgramPhase] = field(default_factory=list)  # in order
     params: dict[str, str] = field(default_factory=dict)  # <param> by key
 
 
 @dataclass(frozen=True)
 class Timetable:
-    """One <WAUT>: which program the signals that follow it run when."""
+    """One <WAUT>: the times at which signals switch between programs."""
 
     start: str  # the program at the beginning
-    place: str  # file and line, for complaints
+    place: str  # file and line, for error messages
     # (seconds since the beginning, program), in the file's order
     switches: list[tuple[float, str]] = field(default_factory=list)
     signal_ids: list[str] = field(default_factory=list)  # the signals that follow it
 
 
 class ProgramReader:
-    """Gathers programs and timetables from the elements of a file.
+    """Collects programs and timetables from the elements of a file.
 
     Args:
-        path: of the file, for complaints.
+        path: path of the file, for error messages.
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,9 +79,9 @@ class ProgramReader:
         self._timetable: Timetable | None = None
 
     def start(self, name: str, attrs: Mapping[str, str], line: int) -> None:
-        """Take an element in; others than those of signals are passed over.
+        """Process the start of an element; elements that do not concern signals are ignored.
 
-        Raises MapError: an attribute is missing or no number, or it stands in the wrong place.
+        Raises MapError: an attribute is missing or not a number, or an element is misplaced.
         """
         place = f"{self._path}, line {line}: <{name}>"
         if missing := [key for key in _REQUIRED.get(name, ()) if key not in attrs]:
@@ -119,7 +119,7 @@ class ProgramReader:
 def read_programs(path: Path) -> ProgramReader:
     """Read the signal programs and timetables of an additional file (`.add.xml`, also gzipped).
 
-    Raises MapError: hostile or broken XML, or an element that `ProgramReader.start` refuses.
+    Raises MapError: the XML is malicious or broken, or has an invalid element.
     """
     handler = _AdditionalHandler(path)
     read_xml(path, handler)
@@ -141,12 +141,14 @@ class _AdditionalHandler(ContentHandler):
 
 def _phase(attrs: Mapping[str, str], place: str) -> ProgramPhase:
     duration = _seconds(attrs, "duration", place)
-    # As SUMO reads it: with the shortest duration alone, the longest is open.
+    # As in SUMO: if only the minimum duration is given, there is no maximum.
     longest = math.inf if "minDur" in attrs else duration
     try:
         following = tuple(int(number) for number in attrs.get("next", "").split())
     except ValueError as error:
-        raise MapError(f"{place} has next='{attrs['next']}', which are no phases") from error
+        raise MapError(
+            f"{place} has next='{attrs['next']}': must be phase numbers, separated by spaces"
+        ) from error
     return ProgramPhase(
         duration,
         _seconds(attrs, "minDur", place, duration),
@@ -165,12 +167,12 @@ def _seconds(attrs: Mapping[str, str], key: str, place: str, default: float | No
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise MapError(f"{place} has {key}='{text}', which is no finite number of seconds: mend it")
+        raise MapError(f"{place} has {key}='{text}': must be a finite number of seconds; repair it")
     return value
 
 
 def _clock(text: str) -> float:
-    """Seconds as SUMO writes them: `90`, `00:01:30` or `1:00:00:00` with days."""
+    """Return seconds from SUMO's formats: `90`, `00:01:30`, or `1:00:00:00` with days."""
     parts = [float(part) for part in text.split(":")]
     if len(parts) not in (1, 3, 4):
         raise ValueError(text)

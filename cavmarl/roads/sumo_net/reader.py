@@ -1,4 +1,4 @@
-"""SUMO networks as `RoadNetwork`: sumolib reads the file, this module fills the arrays."""
+"""Reads SUMO networks as `RoadNetwork`: sumolib parses the file, this module fills the arrays."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ from cavmarl.roads.sumo_net.xml_source import limit
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
-APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
-FORK_MINDED_M = 5.0  # behind a junction, where a rear is minded by those that turn off beside it
-MAX_CROSSING_M = 2000  # paths are compared point by point: memory goes by its square
-MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # the environment's variable with another limit
+APPROACH_M = 12.0  # before a junction, where bodies are still oblique to waiting vehicles
+FORK_WATCHED_M = 5.0  # after a junction, where vehicles that turn off beside a rear watch it
+MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the square
+MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable for another limit
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
 
 
 def map_name(path: Path) -> str:
-    """The file's name without the endings of map files."""
+    """Return the file's name without the suffixes of map files."""
     name = path.name
     for ending in _ENDINGS:
         name = name.removesuffix(ending)
@@ -58,7 +58,7 @@ def map_name(path: Path) -> str:
 
 
 def source_hash(path: Path) -> str:
-    """SHA-256 of a file, hex.
+    """Return the SHA-256 of a file, hex.
 
     Raises MapError: the file cannot be read.
     """
@@ -72,11 +72,11 @@ def source_hash(path: Path) -> str:
 def read_network(path: str | Path) -> RoadNetwork:
     """Read a SUMO network file (`.net.xml`, `.net.xml.gz`).
 
-    Lane lengths are those of the polylines; EDGE["length_m"] is the length that the map states.
+    Lane lengths are those of the polylines; EDGE["length_m"] is the length that the map gives.
 
-    Raises MapError: the file is broken, hostile or inconsistent, or nothing in it can be driven.
+    Raises MapError: the file is broken, malicious or inconsistent, or has no drivable lane.
     """
-    # sumolib is only loaded where the cache has no network yet.
+    # Load sumolib only if the cache does not have the network.
     from cavmarl.roads.sumo_net.sumo_xml import parse_net
 
     path = Path(path)
@@ -94,7 +94,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     chosen = select(net)
     if not chosen.edges:
         raise MapError(
-            "no lane that a road vehicle may use: check the lanes' permissions, or what "
+            "no lane that road vehicles may use: check the lanes' permissions, or what "
             "netconvert kept (--keep-edges.by-vclass)"
         )
     movements = chosen.movements
@@ -164,7 +164,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
 def _shapes(
     chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str]
 ) -> list[Shape]:
-    """The middle of each lane as a vehicle can drive it, (n, 3) in m; lanes of roads come first."""
+    """Return the drivable centre line of each lane, (n, 3) in m; lanes of roads come first."""
     shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
     refuse_points(shapes[: len(normal_ids)], normal_ids)
     mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
@@ -173,7 +173,7 @@ def _shapes(
 
 
 def _geo_reference(net: Any) -> GeoReference | None:
-    """Where the map lies on the earth, if its `location` says it."""
+    """Return the position of the map on the earth, if its `location` gives it."""
     try:
         if not net.hasGeoProj():
             return None
@@ -189,7 +189,7 @@ def _geo_reference(net: Any) -> GeoReference | None:
 
 
 def _before(chosen: NetworkSelection, lane_row: dict[int, int]) -> dict[int, int]:
-    """The lane row that leads into each internal lane row, in driving order."""
+    """Return the lane row that leads into each internal lane row, in driving order."""
     before: dict[int, int] = {}
     for movement in chosen.movements:
         source = lane_row[id(movement.connection.getFromLane())]
@@ -231,7 +231,7 @@ def _edge_rows(chosen: NetworkSelection, net: Any, node_row: dict[int, int]) -> 
 def _node_row(edge: Any, node: Any, node_row: dict[int, int]) -> int:
     if node is None or node._coord is None:
         raise MapError(
-            f"edge '{edge.getID()}' has an end at no known junction: build the network again with "
+            f"edge '{edge.getID()}' ends at an unknown junction: build the network again with "
             "netconvert"
         )
     return node_row[id(node)]
@@ -268,10 +268,10 @@ def _lane_rows(
 
 
 def _outer_rows(chosen: NetworkSelection, edges: NDArray[np.void]) -> NDArray[np.intp]:
-    """Rows of the lanes beside which, towards the middle of the road, runs that of the next row."""
+    """Return rows of lanes whose neighbour towards the middle of the road is the next row."""
     edge = np.repeat(np.arange(len(edges)), edges["num_lanes"])
     position = np.array([lane.getIndex() for lane in chosen.lanes])
-    # Lanes cut by an internal junction have parts of unlike lengths: they do not run side by side.
+    # Lanes cut by an internal junction have parts of different lengths, which are not adjacent.
     uncut = {id(move.chain[0]) for move in chosen.movements if len(move.chain) == 1}
     beside = np.array(
         [not lane.getID().startswith(":") or id(lane) in uncut for lane in chosen.lanes]
@@ -301,21 +301,21 @@ def _link_rows(
             raise MapError(
                 f"from lane '{connection.getFromLane().getID()}' to lane "
                 f"'{connection.getToLane().getID()}' are {link['length_m']:.6g} m over the "
-                f"junction, more than {most_m} ({MOST_CROSSING}): mend the shapes of both"
+                f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both"
             )
-        # netconvert cuts a path in two where drivers wait inside the junction.
+        # netconvert splits a path where drivers wait inside the junction.
         link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf
         link["junction"] = node_row[id(movement.node)]
         link["index"] = movement.index
         link["signal"], link["signal_index"] = signals.find(connection, movement.node.getType())
-        # SUMO writes T for U-turns to the right, where one drives on the left.
+        # In left-hand traffic, SUMO writes T for U-turns to the right.
         link["direction"] = ord(connection.getDirection()[0].replace("T", "t"))
         link["state"] = ord(connection.getState()[0])
     return links
 
 
 def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
-    """The SWEEP rows; what links say of them is filled."""
+    """Return the SWEEP rows, and fill the fields of links about them."""
     sweeps, first = sweep_rows(movements)
     links = movements.links
     links["first_sweep"], links["num_sweeps"] = first[:-1], np.diff(first)
@@ -326,14 +326,14 @@ def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
     links["swept_m"] = links["length_m"]
     np.maximum.at(links["swept_m"], sweeps["foe"], sweeps["foe_leave_m"])
     forks = np.bincount(links["from_lane"])[links["from_lane"]] > 1
-    minded = np.where(forks, links["length_m"] + FORK_MINDED_M, 0.0)
-    links["swept_m"] = np.maximum(links["swept_m"], minded)
+    watched = np.where(forks, links["length_m"] + FORK_WATCHED_M, 0.0)
+    links["swept_m"] = np.maximum(links["swept_m"], watched)
     links["swept_m"] = np.minimum(links["swept_m"], links["length_m"] + SWEPT_BEYOND_M)
     return sweeps
 
 
 def _map_neighbors(lanes: NDArray[np.void], points: NDArray[np.void]) -> None:
-    """Fill where the points of each lane lie on its neighbours, in driving order."""
+    """Fill the positions of each lane's points on its neighbours, in driving order."""
     for row in lanes:
         own = points[row["first_point"] : row["first_point"] + row["num_points"]]
         for side in ("left", "right"):
@@ -349,7 +349,7 @@ def _map_neighbors(lanes: NDArray[np.void], points: NDArray[np.void]) -> None:
 
 
 def _lane_ends(lanes: NDArray[np.void], points: NDArray[np.void]) -> NDArray[np.float64]:
-    """(L, 4) x, y, z of each lane's last point and its direction there."""
+    """Return (L, 4) x, y, z of each lane's last point, and its direction there."""
     last = points[lanes["first_point"] + lanes["num_points"] - 1]
     heading = atan2_all(last["sin"], last["cos"])
     return np.stack([last["x"], last["y"], last["z"], heading], axis=1)
@@ -361,7 +361,7 @@ def _connect(
     movements: Sequence[Movement],
     lane_row: dict[int, int],
 ) -> NDArray[np.int32]:
-    """Fill what joins lanes: links out of them, successors of internal lanes, lanes into them."""
+    """Fill the connections of lanes: links from them, successors of internal ones, lanes before."""
     rows = np.arange(len(lanes))
     lanes["first_link"] = np.searchsorted(links["from_lane"], rows, side="left")
     lanes["num_links"] = np.searchsorted(links["from_lane"], rows, side="right")
@@ -396,9 +396,9 @@ def _path(
     approach_m: float = 0.0,
     beyond_m: float = 0.0,
 ) -> LinkPath | None:
-    """The sampled path of a link along its chain of internal lanes.
+    """Return the sampled path of a link along its chain of internal lanes.
 
-    It may begin `approach_m` before the junction, with places below zero, and end `beyond_m` behind
+    It may begin `approach_m` before the junction, with negative positions, and end `beyond_m` after
     it.
     """
     if not movement.chain:

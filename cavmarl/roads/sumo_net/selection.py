@@ -1,4 +1,4 @@
-"""What of a SUMO network can be driven: the lanes and movements that become rows."""
+"""Selects the drivable part of a SUMO network: the lanes and movements that become rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Movement:
     """A permitted movement over a junction, before it becomes a LINK."""
 
     connection: Any  # sumolib's connection out of a normal lane
-    # sumolib's internal lanes on its way, in order; empty where the map has none
+    # sumolib's internal lanes on its way, in order; empty if the map has none
     chain: tuple[Any, ...]
     node: Any  # sumolib's junction
     index: int  # the movement's bit in the junction's request
@@ -34,7 +34,7 @@ class NetworkSelection:
 
 
 def permission_bits(classes: Iterable[str]) -> int:
-    """SUMO's vehicle class names as bits of LANE["permissions"]."""
+    """Return the bits of LANE["permissions"] for SUMO's names of vehicle classes."""
     allowed = set(classes)
     if "all" in allowed:
         return _ALL
@@ -46,10 +46,10 @@ def _is_road(classes: Iterable[str]) -> bool:
 
 
 def select(net: Any) -> NetworkSelection:
-    """Choose the lanes on which road vehicles drive and the movements between them.
+    """Select the lanes for road vehicles, and the movements between them.
 
-    Pure pavements, crossings, walking areas, rails and bicycle lanes are left out, and so are
-    internal lanes that no movement uses.
+    Pavements, crossings, walking areas, rails, bicycle lanes, and internal lanes that no movement
+    uses are left out.
 
     Raises MapError: an internal lane belongs to two movements or leads nowhere.
     """
@@ -91,7 +91,7 @@ def select(net: Any) -> NetworkSelection:
 
 
 def _movements(net: Any, node: Any) -> Iterable[Movement]:
-    """All movements over a junction; their positions are the bits of its request, as in SUMO."""
+    """Yield all movements over a junction; their order gives its request's bits, as in SUMO."""
     index = 0
     for lane_id in node._incLanes or ():
         if not lane_id:
@@ -112,7 +112,7 @@ def _movements(net: Any, node: Any) -> Iterable[Movement]:
 
 
 def _chain(net: Any, connection: Any) -> tuple[Any, ...]:
-    """The internal lanes from a connection's stop line to its target lane."""
+    """Return the internal lanes from a connection's stop line to its target lane."""
     chain: list[Any] = []
     via = connection.getViaLaneID()
     while via:
@@ -132,5 +132,5 @@ def _lane(net: Any, lane_id: str) -> Any:
     edge_id, _, index = lane_id.rpartition("_")
     lanes = net.getEdge(edge_id).getLanes() if net.hasEdge(edge_id) else []
     if not index.isdecimal() or int(index) >= len(lanes):
-        raise MapError(f"lane '{lane_id}' is named but missing: build the network again")
+        raise MapError(f"lane '{lane_id}' is referenced but missing: build the network again")
     return lanes[int(index)]

@@ -1,4 +1,4 @@
-"""Other signal programs for a map that is read: of additional files, by timetable, or by choice."""
+"""Changes of a map's signal programs: additional files, timetables, or explicit choices."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ from cavmarl.roads.sumo_net.signal_rows import SignalRows
 def with_programs(
     network: RoadNetwork, files: Sequence[Path] = (), chosen: Mapping[str, str] | None = None
 ) -> RoadNetwork:
-    """A network whose signals also know the programs of additional files.
+    """Return a network whose signals also have the programs of additional files.
 
-    As in SUMO the program that is loaded last is on, every signal has a program `off`, and a <WAUT>
-    says when the signals that follow it change their program: at once, whatever the phase, and
-    every program counts its time from the beginning. A choice stands above all of that.
+    As in SUMO, the program that is loaded last runs, and every signal has a program `off`. A <WAUT>
+    says when its signals switch their program: at once, in any phase; and every program counts its
+        time
+    from the beginning. A choice overrides all of this.
 
-    `files`: additional files in loading order; elements other than signals' are passed over.
+    `files`: additional files in loading order; elements that do not concern signals are ignored.
     `chosen`: program by signal.
 
-    Returns A network with another `source_hash`, for it has more than one source. Raises MapError:
-    a broken file, an unknown signal or program, a program that does not fit.
+    Returns a network with another `source_hash`, as it has several sources. Raises MapError: a file
+    is broken, a signal or program is unknown, or a program does not fit.
     """
     chosen = chosen or {}
     if not files and not chosen:
@@ -61,20 +62,20 @@ def with_programs(
 
 
 def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetwork:
-    """A network with signals that go dark while the world runs, and stay so.
+    """Return a network with signals that fail while the world runs, and stay off.
 
-    They change to their program `off`: links that must give way anyway blink.
+    They switch to their program `off`; links that must yield anyway blink.
 
-    `outages`: when each goes dark, in s since the beginning of the episode, by signal.
+    `outages`: by signal, the time of its failure in s since the beginning of the episode.
 
-    Returns A network with another `source_hash`. Raises MapError: an unknown signal.
+    Returns a network with another `source_hash`. Raises MapError: a signal is unknown.
     """
     rows = SignalRows.of(network)
     sources = [network.source_hash]
     for signal_id, at_s in sorted(outages.items()):
         _check_signal(rows, signal_id, "outage")
         row = rows.row[signal_id]
-        # A program that is added is on; this one waits for its time.
+        # An added program would run at once; this one waits for its time.
         present = rows.signals[row][0]
         off = _program(network, rows, signal_id, OFF, "outage")
         rows.signals[row][0] = present
@@ -120,20 +121,20 @@ def _follow(network: RoadNetwork, rows: SignalRows, timetable: Timetable) -> Non
 def _program(
     network: RoadNetwork, rows: SignalRows, signal_id: str, program_id: str, place: str
 ) -> int:
-    """The PROGRAM row of a name; the program `off` is made where it is asked for."""
+    """Return the PROGRAM row of a name; the program `off` is created when needed."""
     if program_id == OFF and (signal_id, OFF) not in rows.program_row:
         rows.add(_off(network, rows, signal_id))
     if (signal_id, program_id) not in rows.program_row:
         known = sorted({name for signal, name in rows.program_row if signal == signal_id} | {OFF})
         raise MapError(
             f"{place}: signal '{signal_id}' has no program '{program_id}'; "
-            f"there are {', '.join(known)}"
+            f"use one of {', '.join(known)}"
         )
     return rows.program_row[signal_id, program_id]
 
 
 def _off(network: RoadNetwork, rows: SignalRows, signal_id: str) -> SignalProgram:
-    """The program in which nothing is lit: links that must give way anyway blink."""
+    """Return the program with the signal off: links that must yield anyway blink."""
     row = rows.row[signal_id]
     letters = ["O"] * rows.signals[row][1]
     for link in network.links[network.links["signal"] == row]:
@@ -147,6 +148,6 @@ def _check_signal(rows: SignalRows, signal_id: str, place: str) -> None:
     if signal_id not in rows.row:
         known = ", ".join(sorted(rows.ids)[:8]) or "none"
         raise MapError(
-            f"{place}: this map has no signal '{signal_id}' (there are {known}): "
-            "is the file of another map?"
+            f"{place}: this map has no signal '{signal_id}', only {known}: "
+            "is the file for another map?"
         )

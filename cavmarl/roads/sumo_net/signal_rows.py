@@ -1,6 +1,6 @@
 """Signals and their programs as SIGNAL, PROGRAM, PHASE and SWITCH rows.
 
-Rows are only ever appended, so programs of additional files join those of a map that is read.
+Rows are only appended, so programs of additional files can be added to those of a map.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from cavmarl.core.errors import MapError
 from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
 from cavmarl.roads.sumo_net.programs import ProgramPhase, SignalProgram
 
-# Trains switch these; no train runs here, so their links are read as links without a signal.
+# Trains switch these signals. No trains run here, so their links count as links without a signal.
 RAIL_KINDS = ("rail_signal", "rail_crossing")
 
-MAX_MS = 10**12  # SUMO's time beyond all times: 30 years
+MAX_MS = 10**12  # SUMO's largest time: 30 years
 
-# SUMO's default way from detector to stop line, in seconds at the limit.
+# SUMO's default distance from detector to stop line, in seconds at the limit.
 DETECTOR_GAP_S = 2.0
 
-# What an actuated program may ask for and does not get; `map check` names such programs.
+# Parameters of actuated programs that are not implemented; `map check` lists such programs.
 _UNMODELLED = ("linkMaxDur:", "linkMinDur:", "jam-threshold", "vTypes", "coordinated", "file-")
 
 
 class SignalArrays(NamedTuple):
-    """What a `RoadNetwork` keeps of signals, but for detectors."""
+    """The arrays of a `RoadNetwork` for signals, without detectors."""
 
     signals: NDArray[np.void]  # SIGNAL (num_signals,)
     programs: NDArray[np.void]  # PROGRAM (num_programs,)
@@ -59,7 +59,7 @@ class SignalRows:
 
     @classmethod
     def of(cls, network: RoadNetwork) -> SignalRows:
-        """The rows of a network, to append more."""
+        """Return the rows of a network, so that more can be appended."""
         rows = cls()
         rows.ids = list(network.signal_ids)
         rows.row = {name: row for row, name in enumerate(rows.ids)}
@@ -80,10 +80,11 @@ class SignalRows:
         return rows
 
     def add(self, program: SignalProgram) -> None:
-        """Append a program; of several the last is on, as in SUMO.
+        """Append a program; the last program of a signal runs, as in SUMO.
 
-        Raises MapError: no phases, phases of different lengths, an unknown letter, a cycle of no
-        time, a name that is taken.
+        Raises MapError: the program has no phases, phases of different lengths, an unknown letter,
+            a
+        cycle of zero length, or the name of another program.
         """
         signal_id = program.signal_id
         cycle = sum(phase.duration_s for phase in program.phases)
@@ -135,7 +136,7 @@ class SignalRows:
             raise _error(signal_id, f"has the unknown states {sorted(unknown)}")
         following = phase.following[0] if phase.following else (number + 1) % len(program.phases)
         if not 0 <= following < len(program.phases):
-            raise _error(signal_id, f"has a phase that leads to phase {following}, which is none")
+            raise _error(signal_id, f"has a phase that leads to the missing phase {following}")
         green = bool(set(phase.state) & set("gG")) and not set(phase.state) & set("yY")
         self.phases.append(
             (
@@ -152,15 +153,15 @@ class SignalRows:
         self.letters.extend(map(SIGNAL_STATES.index, phase.state))
 
     def set_detectors(self, program: int, phase: int, detectors: list[int]) -> None:
-        """Say which DETECTOR rows prolong the phase of this number in a program."""
+        """Set the DETECTOR rows that prolong a phase, given by its number, of a program."""
         row = int(self.programs[program][1]) + phase
         self.phases[row] = (*self.phases[row][:-2], len(self.phase_detectors), len(detectors))
         self.phase_detectors += detectors
 
     def find(self, connection: Any, junction_kind: str) -> tuple[int, int]:
-        """The SIGNAL row and state letter of a connection, (-1, -1) without a signal.
+        """Return the SIGNAL row and state letter of a connection, (-1, -1) without a signal.
 
-        Raises MapError: the connection's signal has no program or no letter for it.
+        Raises MapError: the connection's signal has no program, or no letter for it.
         """
         signal_id = connection.getTLSID()
         if not signal_id or (signal_id not in self.row and junction_kind in RAIL_KINDS):
@@ -189,7 +190,7 @@ class SignalRows:
 
 
 def read_signals(programs: list[SignalProgram]) -> SignalRows:
-    """The programs of a network's traffic lights.
+    """Return the programs of a network's traffic lights.
 
     Raises MapError: see `SignalRows.add`.
     """
@@ -200,7 +201,7 @@ def read_signals(programs: list[SignalProgram]) -> SignalRows:
 
 
 def _simplified(program: SignalProgram) -> bool:
-    """Whether SUMO would run the program in another way than this package does."""
+    """Return whether SUMO would run the program differently."""
     chooses = any(len(phase.following) > 1 for phase in program.phases)
     if program.kind != "actuated":
         jumps = any(
@@ -215,9 +216,9 @@ def _simplified(program: SignalProgram) -> bool:
 
 
 def parameter(program: SignalProgram, key: str, default: float) -> float:
-    """A parameter of a program in seconds.
+    """Return a parameter of a program in seconds.
 
-    Raises MapError: no number from 0.
+    Raises MapError: it is not a number of at least 0.
     """
     text = program.params.get(key)
     if text is None:
@@ -227,7 +228,9 @@ def parameter(program: SignalProgram, key: str, default: float) -> float:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0.0):
-        raise MapError(f"{program.place} has {key}='{text}': must be a number of seconds from 0")
+        raise MapError(
+            f"{program.place} has {key}='{text}': must be a number of seconds, at least 0"
+        )
     return value
 
 
@@ -237,6 +240,6 @@ def _milliseconds(seconds: float) -> int:
 
 def _error(signal_id: str, problem: str) -> MapError:
     return MapError(
-        f"signal '{signal_id}' {problem}: mend its <tlLogic> or build it again "
+        f"signal '{signal_id}' {problem}: repair its <tlLogic> or build it again "
         "(netconvert --tls.rebuild)"
     )

@@ -1,7 +1,7 @@
-"""SUMO's network files, read by sumolib, with the checks that sumolib leaves out.
+"""Reads SUMO's network files with sumolib, and adds checks that sumolib lacks.
 
-sumolib merges edges of the same name, takes NaN for a speed and stumbles over missing attributes
-with a bare KeyError. Here every element is checked first; a complaint has a place and a cure.
+sumolib merges edges of the same name, accepts NaN as a speed, and raises a bare KeyError for
+missing attributes. Here, every element is checked first. Error messages have a place and a remedy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.programs import ProgramReader, SignalProgram
 from cavmarl.roads.sumo_net.xml_source import limit, read_xml
 
 MAX_LANE_POINTS = 100_000
-MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # the environment's variable with another limit
+MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # environment variable for another limit
 _MAX_COORDINATE_M = 1e8  # more than twice around the Earth
 
 _REQUIRED = {
@@ -38,7 +38,7 @@ _BITS = re.compile(r"[01]+")
 
 
 class _CheckedReader(ContentHandler):
-    """Hands every element that holds what it must to sumolib's own reader."""
+    """Passes every element to sumolib's own reader after checking it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -79,7 +79,7 @@ class _CheckedReader(ContentHandler):
         known = f' id="{attrs["id"]}"' if "id" in attrs else ""
         return MapError(
             f"{self._path}, line {self._locator.getLineNumber()}: <{name}{known}> {problem}: "
-            "build the network again with netconvert or mend this element"
+            "build the network again with netconvert or repair this element"
         )
 
     def _check(self, name: str, attrs: Mapping[str, str]) -> None:
@@ -100,19 +100,21 @@ class _CheckedReader(ContentHandler):
         elif name == "request":
             for key in ("response", "foes"):
                 if not _BITS.fullmatch(attrs[key]):
-                    raise self._error(name, attrs, f"has {key}='{attrs[key]}', which are no bits")
+                    raise self._error(name, attrs, f"has {key}='{attrs[key]}', must be bits")
 
     def _check_version(self, attrs: Mapping[str, str]) -> None:
         if "version" not in attrs:
             raise self._error("net", attrs, "has no version attribute: not a SUMO network")
         if not _VERSION.fullmatch(attrs["version"]):
-            raise self._error("net", attrs, f"has version='{attrs['version']}', none of SUMO's")
+            raise self._error(
+                "net", attrs, f"has version='{attrs['version']}', not a version of SUMO's"
+            )
 
     def _is_left_hand(self, attrs: Mapping[str, str]) -> bool:
-        said = attrs.get("lefthand", "false")
-        if said not in _TRUTH:
-            raise self._error("net", attrs, f"has lefthand='{said}', neither true nor false")
-        return _TRUTH[said]
+        text = attrs.get("lefthand", "false")
+        if text not in _TRUTH:
+            raise self._error("net", attrs, f"has lefthand='{text}', must be true or false")
+        return _TRUTH[text]
 
     def _check_number(self, name: str, key: str, attrs: Mapping[str, str]) -> None:
         try:
@@ -120,9 +122,9 @@ class _CheckedReader(ContentHandler):
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise self._error(name, attrs, f"has {key}='{attrs[key]}', which is no finite number")
+            raise self._error(name, attrs, f"has {key}='{attrs[key]}', must be a finite number")
         if (name, key) in _POSITIVE and value <= 0.0:
-            raise self._error(name, attrs, f"has {key}='{attrs[key]}', which must be positive")
+            raise self._error(name, attrs, f"has {key}='{attrs[key]}', must be positive")
 
     def _check_unique(self, name: str, attrs: Mapping[str, str]) -> None:
         if (name, attrs["id"]) in self._seen:
@@ -132,7 +134,7 @@ class _CheckedReader(ContentHandler):
     def _check_lane(self, attrs: Mapping[str, str]) -> None:
         expected = f"{self._edge}_{self._next_lane}"
         if attrs["id"] != expected:
-            raise self._error("lane", attrs, f"stands where '{expected}' should")
+            raise self._error("lane", attrs, f"must be '{expected}'")
         self._next_lane += 1
         for point in attrs["shape"].split():
             try:
@@ -140,7 +142,7 @@ class _CheckedReader(ContentHandler):
             except ValueError:
                 numbers = [math.nan]
             if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
-                raise self._error("lane", attrs, f"has the point '{point}', not finite x,y[,z]")
+                raise self._error("lane", attrs, f"has the point '{point}', must be finite x,y[,z]")
             if max(map(abs, numbers)) > _MAX_COORDINATE_M:
                 problem = f"has the point '{point}', beyond {_MAX_COORDINATE_M:g} m"
                 raise self._error("lane", attrs, problem)
@@ -156,16 +158,16 @@ class ParsedNet(NamedTuple):
 
     net: Any  # a `sumolib.net.Net`
     programs: list[SignalProgram]
-    left_hand: bool  # whether one drives on the left
+    left_hand: bool  # whether the map has left-hand traffic
 
 
 def parse_net(path: Path) -> ParsedNet:
     """Read a SUMO network (`.net.xml`, `.net.xml.gz`).
 
     Raises:
-        MapError: hostile or broken XML, a root other than <net>, missing attributes, numbers that
-            are not finite, speeds, lengths or widths that are not positive, ids that occur twice,
-            lanes out of order, references to nothing. The message names the place and the cure.
+        MapError: the XML is malicious or broken, its root is not <net>, an attribute is missing,
+            infinite or NaN, a speed, length or width is not positive, an id occurs twice, lanes are
+            not in order, or a reference is invalid. The message has a place and a remedy.
     """
     handler = _CheckedReader(path)
     read_xml(path, handler)

@@ -1,8 +1,9 @@
-"""Where vehicles on two movements over a junction would touch that no conflict keeps apart.
+"""Sweeps: where vehicles on two movements would touch although no conflict separates them.
 
-Conflicts are those of cars between two stop lines. A bus in a bend cuts it, over lanes beside it,
-over those that wait at the next line, and over those that have just left the junction; so for each
-pair of sizes the bodies are laid along both ways, some metres before and behind the junction, too.
+Conflicts are about cars between two stop lines. A bus cuts bends, over adjacent lanes, over
+vehicles that wait at the next line, and over vehicles that have just left the junction. So for each
+pair of sizes, bodies are moved along both ways, including some metres before and after the
+junction.
 """
 
 from __future__ import annotations
@@ -30,33 +31,33 @@ from cavmarl.roads.sumo_net.conflicts import (
 
 
 class SweptBody(NamedTuple):
-    """Half a body, in m, with a margin."""
+    """Half the size of a body in m, with a margin."""
 
     half_m: float
     half_width_m: float
 
 
-# Of each size class: a car, a van or truck, a bus. A vehicle counts as the next longer one.
+# Bodies of the size classes: car, van or truck, bus. A vehicle counts as the next longer class.
 BODIES = tuple(map(SweptBody, (0.5 * m for m in SIZE_BODIES_M), (0.95, 1.25, 1.3)))
 STEP_M = 0.5
-BEFORE_M = 10.0  # of the front to its line, and
-BEYOND_M = 4.0  # of the rear behind the junction: where bodies are asked about;
-TURN_BEYOND_M = 8.0  # beside one that turns round, which reaches so far over the lane beside
+BEFORE_M = 10.0  # distance of the front before its line, and
+BEYOND_M = 4.0  # of the rear after the junction, within which bodies are examined;
+TURN_BEYOND_M = 8.0  # beside a U-turn, which reaches this far over the adjacent lane
 MARGIN_M = STEP_M
-BEHIND_M = 1.0  # one that follows is at least so far behind a rear on its way
-LEAST_ASIDE_M = 0.5  # from its place on its way: the centre of a body that its rear comes back
+BEHIND_M = 1.0  # distance of a following vehicle behind a rear on its way
+LEAST_ASIDE_M = 0.5  # minimum offset from its way of a body whose rear swings back
 TURNAROUND = ord("t")
-AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # of a way that `along` has to know
+AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # part of a way that `poses_on_rails` needs at each end
 assert len(BODIES) == len(SIZE_LENGTHS_M) + 1
 
 
 class Movements(NamedTuple):
-    """What is asked of the links of a network, each array by LINK row."""
+    """Links of a network with their conflicts and ways, by LINK row."""
 
-    links: NDArray[np.void]  # LINK (K,), conflicts filled
+    links: NDArray[np.void]  # LINK (K,), with conflicts
     conflicts: NDArray[np.void]  # CONFLICT
     ways: Sequence[LinkPath | None]  # over the junction, with `AHEAD_M` of the lanes at its ends
-    # of links that turn round: lanes beside the one behind, on which vehicles only enter; see
+    # for links that turn round: adjacent target lanes that vehicles only enter at a departure; see
     # `unfed_beside`
     unfed: Mapping[int, Sequence[LinkPath]] = MappingProxyType({})
 
@@ -64,9 +65,9 @@ class Movements(NamedTuple):
 def unfed_beside(
     links: NDArray[np.void], lanes: NDArray[np.void], points: NDArray[np.void]
 ) -> dict[int, list[LinkPath]]:
-    """Of each LINK that turns round, the lanes beside that it leads to, into which no link leads.
+    """Return, for each LINK that turns round, adjacent target lanes into which no link leads.
 
-    Their places are those of the link: a lane begins at the link's length.
+    Their positions are those of the link: the lanes begin at the link's length.
     """
     fed = np.zeros(len(lanes), dtype=np.bool_)
     fed[links["to_lane"]] = True
@@ -82,7 +83,7 @@ def unfed_beside(
 
 
 def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32]]:
-    """SWEEP rows of all links, and each link's first row with the end as last entry."""
+    """Return SWEEP rows of all links, and each link's first row with the end appended."""
     by_junction: dict[int, list[int]] = defaultdict(list)
     for link, way in enumerate(movements.ways):
         if way is not None:
@@ -113,7 +114,7 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
 
 
 def _by_own_size(row: tuple[float, ...]) -> tuple[float, ...]:
-    """What rows of a link are sorted by: a driver reads those of its size only."""
+    """Return the sort key of a link's rows: a driver reads only rows of its size."""
     return (row[1], *row)
 
 
@@ -143,16 +144,16 @@ def _find_pair(
 
 
 Range = tuple[float, float, float, float]
-Area = tuple[float, float]  # in places of a front that comes and of a rear that leaves, m
+Area = tuple[float, float]  # positions of an arriving front and of a leaving rear, m
 
 
 def find_pair(
     movements: Movements,
     pair: tuple[int, int],  # LINK rows
-    one: tuple[NDArray[np.float64], SweptBody],  # poses on the first, and the body
-    other: tuple[NDArray[np.float64], SweptBody],  # on the second
+    one: tuple[NDArray[np.float64], SweptBody],  # poses on the first link, and the body
+    other: tuple[NDArray[np.float64], SweptBody],  # on the second link
 ) -> tuple[Area, Area] | None:
-    """Where two bodies on two links touch that no conflict keeps apart: on each of the two."""
+    """Return where two bodies on two links touch, on each link, if no conflict separates them."""
     a, b = (movements.links[link] for link in pair)
     (mine, body), (theirs, foe_body) = one, other
     conflicts = movements.conflicts[a["first_conflict"] :][: a["num_conflicts"]]
@@ -166,11 +167,11 @@ def find_pair(
     extents = (*body, float(a["length_m"]), *mine_m), (*foe_body, float(b["length_m"]), *theirs_m)
     if a["to_lane"] != b["to_lane"]:
         found = swept_range(mine, theirs, *extents, CLEARANCE_M, foes)
-    else:  # behind the junction one follows the other
+    else:  # after the junction, one vehicle follows the other
         mine, beyond = _before_and_beyond(mine, float(a["length_m"]))
         theirs, foe_beyond = _before_and_beyond(theirs, float(b["length_m"]))
         found = swept_range(mine, theirs, *extents, CLEARANCE_M, foes)
-        # One that turns round comes near those that have just left, on their way the other way.
+        # A vehicle that turns round comes near oncoming vehicles that have just left the junction.
         if a["direction"] == TURNAROUND and body.half_m > BODIES[0].half_m:
             turns = mine[mine[:, 0] + body.half_m <= a["length_m"]]
             found = _hull(found, swept_range(turns, foe_beyond, *extents, CLEARANCE_M, foes))
@@ -183,20 +184,20 @@ def find_pair(
 def _before_and_beyond(
     poses: NDArray[np.float64], length_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The poses with their centres before the end of a junction, and those behind it."""
+    """Return the poses whose centres are before the end of a junction, and the other poses."""
     before = poses[:, 0] <= length_m
     return poses[before], poses[~before]
 
 
 def _hull(one: Range, other: Range) -> Range:
-    """The range that holds both, each as `swept_range` answers."""
+    """Return the range that contains both ranges of `swept_range`."""
     return (
         min(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), max(one[3], other[3]),
     )  # fmt: skip
 
 
 def _areas(found: Range, half_m: float, foe_half_m: float) -> tuple[Area, Area] | None:
-    """The areas on both ways, of centres that touch as `swept_range` answers; None: none do."""
+    """Return the areas on both ways from a range of `swept_range`, or None if nothing touches."""
     first, last, foe_first, foe_last = found
     if first == np.inf:
         return None
@@ -205,7 +206,7 @@ def _areas(found: Range, half_m: float, foe_half_m: float) -> tuple[Area, Area] 
 
 
 def _begin_m(link: np.void, enter_m: float) -> float:
-    """Where the shared area of a conflict begins: a front at its waiting position is before it."""
+    """Return the start of a conflict's area; a front at its waiting position is before it."""
     waits = enter_m >= link["wait_m"] - LINE_MARGIN_M
     return float(max(enter_m, link["wait_m"] + WAIT_SLACK_M + STEP_M if waits else 0.0))
 
@@ -217,7 +218,7 @@ def _find_behind(
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    """One that turns round comes back beside those that stand behind it, its rear before that."""
+    """Find contacts of a vehicle that turns round, and of its rear, with vehicles behind it."""
     way = movements.ways[turn]
     assert way is not None
     length = float(movements.links["length_m"][turn])
@@ -249,13 +250,13 @@ def _find_behind(
 def _find_beside(
     movements: Movements,
     turn: int,
-    path: LinkPath,  # of a lane beside, into which no link leads
+    path: LinkPath,  # of an adjacent lane into which no link leads
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    """One that turns round swings over the start of a lane on which others have entered.
+    """Find where a U-turn swings over the start of a lane on which vehicles have departed.
 
-    They are listed on its link, as if they had come by that.
+    They are listed for the U-turn's link, as if they had come from it.
     """
     length = float(movements.links["length_m"][turn])
     for foe, (foe_half, foe_wide) in enumerate(BODIES):
@@ -274,7 +275,7 @@ def _find_beside(
 
 
 def is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
-    """Whether two ways come so near that bodies of any size might touch."""
+    """Return whether two ways are so close that bodies of any size might touch."""
     apart = mine[::2, None, 1:3] - theirs[None, ::2, 1:3]
     square = apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]
     return bool(square.min() < 6.0 * 6.0)
@@ -283,7 +284,7 @@ def is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
 def poses_on_rails(
     way: LinkPath, half_m: float, length_m: float, beyond_m: float = BEYOND_M
 ) -> NDArray[np.float64]:
-    """(n, 6) place of the centre, x, y, z, cosine and sine of bodies with both bumpers on a way."""
+    """Return (n, 6) centre position, x, y, z, cos and sin of bodies with both bumpers on a way."""
     at = np.arange(-(BEFORE_M + half_m), length_m + beyond_m + half_m + STEP_M, STEP_M)
     front, rear = places_on(way, at + half_m), places_on(way, at - half_m)
     chord = front - rear

@@ -1,7 +1,8 @@
-"""Reads untrusted XML: no entities, no document types, no bombs, errors by line.
+"""Reads untrusted XML without entities, document types and bombs; errors have a line.
 
-Three limits, each with a variable of the environment that sets another: the bytes of the text, how
-many times larger it is than the gzipped file, and how deep elements lie in one another.
+Three limits can be changed by environment variables: the size of the text in bytes, its ratio to
+    the
+size of the gzipped file, and the nesting depth of elements.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from defusedxml.expatreader import DefusedExpatParser
 
 from cavmarl.core.errors import CavmarlError, ConfigError, MapError
 
-# A country in OSM is larger than this, but no world that one machine can drive.
+# A country in OSM is larger than this, but so is no world that one machine can simulate.
 MAX_XML_BYTES = 1 << 30
-LIMIT = "CAVMARL_MAX_XML_BYTES"  # the environment's variable with another limit
-# Maps and demand are packed 5 to 40 times smaller, bombs up to 1,032 times.
+LIMIT = "CAVMARL_MAX_XML_BYTES"  # environment variable for another limit
+# Maps and demand are compressed by a factor of 5 to 40, bombs by up to 1,032.
 MAX_XML_RATIO = 100
 RATIO_LIMIT = "CAVMARL_MAX_XML_RATIO"
-_ANY_RATIO_BYTES = 1 << 24  # a text that is as small as this may be packed as well as it can be
-MAX_XML_DEPTH = 100  # of files of maps and demand no more than twelve
+_ANY_RATIO_BYTES = 1 << 24  # a text of this size may be compressed by any factor
+MAX_XML_DEPTH = 100  # files of maps and demand have at most twelve
 DEPTH_LIMIT = "CAVMARL_MAX_XML_DEPTH"
 
-# What XML files of maps and demand come in; UTF-16 is told by its first bytes.
+# Encodings of maps and demand; UTF-16 is recognized by its first bytes.
 _ENCODINGS = frozenset(
     "utf-8 utf8 utf-16 us-ascii ascii iso-8859-1 iso-8859-15 latin-1 windows-1252 cp1252".split()
 )
@@ -45,7 +46,7 @@ _GZIP_MAGIC = b"\x1f\x8b"
 
 
 class _Depth:
-    """Counts open elements: deep ones cost memory without end."""
+    """Counts open elements, as deep nesting would use unlimited memory."""
 
     def __init__(self) -> None:
         self._most, self._open = limit(DEPTH_LIMIT, MAX_XML_DEPTH), 0
@@ -54,8 +55,7 @@ class _Depth:
         self._open += 1
         if self._open > self._most:
             raise OSError(
-                f"its elements lie over {self._most} deep in one another: mend it, or set "
-                f"{DEPTH_LIMIT}"
+                f"its elements are nested over {self._most} deep: repair it, or set {DEPTH_LIMIT}"
             )
 
     def closes(self) -> None:
@@ -91,7 +91,7 @@ class _Builder(TreeBuilder):
 
 
 class _Limited(io.RawIOBase):
-    """A stream that refuses to deliver more than it may: the cure for compressed bombs."""
+    """A stream that raises an error beyond a maximum size, against compressed bombs."""
 
     def __init__(self, raw: io.BufferedReader) -> None:
         packed = raw.read(2) == _GZIP_MAGIC
@@ -119,15 +119,15 @@ class _Limited(io.RawIOBase):
 
 
 def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = MapError) -> None:
-    """Feed the elements of a plain or gzipped XML file to a SAX `handler`.
+    """Pass the elements of a plain or gzipped XML file to a SAX `handler`.
 
-    `handler`: takes the elements; what it raises passes through. `failure`: the error to raise, by
-    what kind of file this is.
+    Exceptions of the handler are not caught. `failure`: type of the error to raise for this kind of
+    file.
 
     Raises:
-        CavmarlError: of the type `failure`: the file is missing, is not well-formed XML, is too
-            large or too deep, or declares a document type or entities. The message names the file
-            and, where there is one, the line.
+        CavmarlError: an error of the type `failure`: the file is missing, is not well-formed XML,
+            is too large or too deep, or declares a document type or entities. The message names the
+            file and, if known, the line.
     """
     try:
         with path.open("rb") as raw:
@@ -143,7 +143,7 @@ def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = 
         ) from error
     except DefusedXmlException as error:
         raise failure(
-            f"{path}: no document type and no entities are needed, and this file declares some "
+            f"{path}: declares a document type or entities, which are not allowed "
             f"({type(error).__name__}): remove its <!DOCTYPE …>"
         ) from error
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
@@ -153,21 +153,21 @@ def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = 
 
 
 def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[CavmarlError]) -> None:
-    """Refuse encodings for which the parser would raise errors of other kinds."""
+    """Raise an error for encodings that would make the parser raise errors of other types."""
     declared = declared_encoding(stream.read(_DECLARATION_BYTES))
     stream.seek(0)
     if declared and declared.lower() not in _ENCODINGS:
-        raise failure(f"{path}, line 1: encoding '{declared}': save the file as UTF-8")
+        raise failure(f"{path}, line 1: encoding '{declared}' is not supported: use UTF-8")
 
 
 def declared_encoding(content: bytes) -> str:
-    """The encoding that the first line of an XML file names; empty: none."""
+    """Return the encoding that the first line of an XML file declares; empty: none."""
     declared = _DECLARED.match(content)
     return declared[1].decode("latin-1") if declared else ""
 
 
 def read_bytes(path: Path) -> bytes:
-    """The XML text of a plain or gzipped file.
+    """Return the XML text of a plain or gzipped file.
 
     Raises:
         OSError: the file cannot be read, or its text is too large.
@@ -177,7 +177,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_tree(path: Path) -> Element:
-    """The root of a plain or gzipped XML file that is read as a whole.
+    """Return the root of a plain or gzipped XML file.
 
     Raises:
         OSError: the file cannot be read, or its text is too large or too deep.
@@ -190,19 +190,19 @@ def read_tree(path: Path) -> Element:
 
 
 def most_bytes() -> int:
-    """How large the text of one file may be: `CAVMARL_MAX_XML_BYTES`, or 1 GiB.
+    """Return the maximum size of a file's text: `CAVMARL_MAX_XML_BYTES`, or 1 GiB.
 
     Raises:
-        ConfigError: that is no number above 0.
+        ConfigError: the variable is not a number above 0.
     """
     return limit(LIMIT, MAX_XML_BYTES)
 
 
 def limit(variable: str, usual: int) -> int:
-    """A limit of the environment, or the usual one.
+    """Return a limit from an environment variable, or the usual limit.
 
     Raises:
-        ConfigError: it is no number above 0.
+        ConfigError: the variable is not a number above 0.
     """
     given = os.environ.get(variable, "")
     if not given:

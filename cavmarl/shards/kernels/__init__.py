@@ -1,1 +1,1 @@
-"""The phases of a tick, over many worlds and over the zones of one process."""
+"""Kernels of the phases of a tick, over W worlds and over the zones of one process."""

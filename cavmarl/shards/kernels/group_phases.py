@@ -23,13 +23,13 @@ from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
 
 @kernel
 def leave_background(departures: DepartureQueue, worlds: Worlds) -> None:
-    """Hand the background vehicles of the next rows that have arrived to the departure queue."""
+    """Move arrived background vehicles of the next rows to the departure queue."""
     leave(departures, worlds, worlds.next_rows, DRIVER_BACKGROUND, 1)
 
 
 @kernel
 def dismiss(departures: DepartureQueue, worlds: Worlds) -> None:
-    """Hand the vehicles of the next rows that SUMO has removed to the departure queue."""
+    """Move vehicles of the next rows that SUMO has removed to the departure queue."""
     leave(departures, worlds, worlds.next_rows, DRIVER_SUMO, 0)
 
 
@@ -55,7 +55,7 @@ def gather_ghosts(
     next_side: int,
     zone: int,
 ) -> None:
-    """Renew the ghosts of a zone in all worlds; other zones may do the same at the same time."""
+    """Renew the ghosts of a zone in all worlds. Zones may run this at the same time."""
     for w in range(zoned.num_owned.shape[1]):
         gather(zones, halo, touching_m, border_m, zoned, next_side, zone, w)
 
@@ -83,7 +83,7 @@ forget_each = for_each_zone(forget)
 
 @kernel
 def turn(members: Members, ticks_in_order: int) -> None:
-    """Let the next rows be in the other half, in a tick that puts rows in order."""
+    """Put the next rows into the other half, in a tick that sorts rows by lane."""
     if members.common.ticks[0] % ticks_in_order == 0:
         members.sides[NEXT] = 1 - members.sides[COMMITTED]
 
@@ -96,7 +96,7 @@ def commit(members: Members) -> None:
 
 @kernel
 def count_rows(zoned: ZoneState) -> None:
-    """Note that an undivided world has no ghosts."""
+    """Set the numbers of rows in an undivided world, which has no ghosts."""
     for zone in range(zoned.num_owned.shape[0]):
         for w in range(zoned.num_owned.shape[1]):
             zoned.num_rows[zone, w] = zoned.num_near[zone, w] = zoned.num_owned[zone, w]

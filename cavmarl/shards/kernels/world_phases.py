@@ -1,6 +1,6 @@
-"""The phases of one tick over many worlds: decide and move, find contacts, take out, let in.
+"""The phases of one tick over W worlds: decisions and motion, contacts, suggested actions.
 
-Drivers decide from the committed rows alone; then these become the next ones, one by one. No phase
+Drivers decide from the committed rows only; afterwards each row moves to the next tick. No phase
 depends on the order of rows.
 """
 
@@ -52,7 +52,7 @@ def begin_step(
     meta_actions: NDArray[np.int64],  # (W, A), ACTION_*; not read for continuous actions
     target_speeds: NDArray[np.float64],  # m/s, rising
 ) -> None:
-    """Clear the accounts of the step and, with discrete actions, set the controllers' targets."""
+    """Clear the sums of the step and, with discrete actions, set the controllers' targets."""
     for w in range(worlds.ticks.shape[0]):
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
@@ -73,14 +73,14 @@ def _any_driver(rows: NDArray[np.void], num: int, driver: int) -> bool:
 
 @kernel
 def _keep_order(owned: int, scratch: Scratch) -> None:
-    """The owned rows as they lie."""
+    """Keep the order of the owned rows."""
     for i in range(owned):
         scratch.order[i] = i
 
 
 @kernel
 def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratch: Scratch) -> None:
-    """The owned rows in the order of the index: neighbours on the road become so in memory."""
+    """Order the owned rows by lane, so that neighbours on the road are neighbours in memory."""
     found = 0
     for i in range(owned):
         # Scripted vehicles may stand in many lists, or in none.
@@ -98,7 +98,7 @@ def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratc
 def _delay(
     pending: NDArray[np.float64], w: int, agent: int, tick: int, throttle: float, steering: float
 ) -> tuple[float, float]:
-    """Put an agent's command behind those that wait, and take out the one that is due."""
+    """Append an agent's command to the delayed commands, and return the one that is due."""
     slots = pending.shape[2]
     last = (tick + slots - 1) % slots
     pending[w, agent, last, 0] = throttle
@@ -147,7 +147,7 @@ def _drive_agent(
 
 @inlined_kernel
 def _fetch_lanes(roads: RoadArrays, rows: NDArray[np.void], k: int, scratch: Scratch) -> None:
-    """Ask for what is read for the next rows: a place on a lane is found among its points."""
+    """Prefetch the lanes of the next rows, and the first points of these lanes."""
     prefetch(roads.lanes, rows[scratch.order[k + SOON]]["lane"], 0)
     near = roads.lanes[rows[scratch.order[k + SOON // 2]]["lane"]]
     prefetch(roads.points, near["first_point"], 0)
@@ -158,7 +158,7 @@ def _fetch_lanes(roads: RoadArrays, rows: NDArray[np.void], k: int, scratch: Scr
 def _decide_in_background(
     roads: RoadArrays, travel: TripTables, worlds: Worlds, w: int, dt: float, scratch: Scratch
 ) -> bool:
-    """Let the background vehicles of a world decide; whether there are any."""
+    """Let the background vehicles of a world decide. Return whether there are any."""
     rows, num, owned = worlds.rows[w], worlds.num_rows[w], worlds.num_owned[w]
     if not _any_driver(rows, owned, DRIVER_BACKGROUND):
         return False
@@ -176,11 +176,11 @@ def _drive_in_background(
     travel: TripTables,
     row: np.void,
     step: np.void,
-    i: int,  # the row that was decided for
+    i: int,  # index of the decision
     dt: float,
     scratch: Scratch,
 ) -> int:
-    """Move a background vehicle as was decided; `EVENT_ARRIVED` if its trip is over, or 0."""
+    """Move a background vehicle as decided. Return `EVENT_ARRIVED` if its trip is over, else 0."""
     row["events"] = 0
     row["hold"] = scratch.hold[i]
     row["blinker"] = scratch.blinker[i]
@@ -196,9 +196,9 @@ def advance(
     roads: RoadArrays,
     plans: NDArray[np.void],  # PLAN (G, L)
     travel: TripTables,
-    lane_grid: LaneGrid,  # which lanes lie near a place
+    lane_grid: LaneGrid,  # index of lanes by position
     worlds: Worlds,  # next_rows is written
-    inner: NDArray[np.float64],  # the part of the zone that no other one sees; see `Halo`
+    inner: NDArray[np.float64],  # the part of the zone that no other zone sees; see `Halo`
     scratch: Scratch,
     # (W, A, 2) throttle in m/s² and steering in rad of continuous actions
     commands: NDArray[np.float64],
@@ -206,8 +206,8 @@ def advance(
     accel_limit: float,  # m/s², of the agents' throttle
     steering_limit: float,  # rad, of the agents' front wheels
     dt: float,  # seconds of the tick
-    in_place: bool,  # whether `next_rows` is `rows`; if not, rows are put in the order of the lanes
-) -> int:  # how many background vehicles have arrived, in all worlds
+    in_place: bool,  # whether `next_rows` is `rows`; if not, rows are sorted by lane
+) -> int:  # number of background vehicles that have arrived, in all worlds
     """Decide all controls from the committed rows, then move every owned row into `next_rows`."""
     arrived = 0
     for w in range(worlds.ticks.shape[0]):
@@ -261,10 +261,10 @@ def advance(
 @kernel
 def resolve(
     # events and hit of the owned next_rows are written; num_contacts rises by one for each vehicle
-    # when it begins to touch another
+    # that begins to touch another vehicle
     worlds: Worlds,
     scratch: Scratch,
-    grid: Grid,  # spatial index over the vehicles of one world, filled here as far as it is needed
+    grid: Grid,  # spatial index over the vehicles of one world, filled here as far as needed
 ) -> None:
     """Mark contacts in `next_rows`."""
     for w in range(worlds.ticks.shape[0]):
@@ -289,15 +289,15 @@ def suggest(
     travel: TripTables,
     worlds: Worlds,  # not written
     scratch: Scratch,
-    discrete: bool,  # whether to answer with meta-actions
+    discrete: bool,  # whether to write meta-actions
     target_speeds: NDArray[np.float64],  # m/s, rising; discrete only
-    lookahead_s: float,  # horizon in which a target speed is to be reached; discrete only
-    dt: float,  # seconds of a step, in which an answer holds
-    # (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows of
-    # absent agents are left as they are
+    lookahead_s: float,  # time in which a target speed is to be reached; discrete only
+    dt: float,  # seconds of a step, for which an action applies
+    # (W, A, 2) is written: throttle in m/s² and steering in rad, or the meta-action in [..., 0];
+    # values of absent agents are unchanged
     out: NDArray[np.float64],
 ) -> None:
-    """What the built-in driver would do in the agents' place."""
+    """Write the actions that the built-in driver would take for the agents."""
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
         owned = worlds.num_owned[w]

@@ -1,8 +1,8 @@
-"""Phases of a tick in several zones of one process, each in one call.
+"""Loops that run a phase of a tick in several zones of one process, as one call.
 
-A call takes some sixty arrays from Python, which in a small zone takes longer than the work itself.
-So `for_each_zone` makes a kernel that calls the kernel of one zone for one zone after the other.
-What a zone does depends on its own rows alone, whichever zones are called with it.
+A call passes about sixty arrays from Python, which takes longer than the work in a small zone.
+`for_each_zone` therefore makes a kernel that calls the kernel of one zone for each zone in turn.
+The result of a zone depends on its own rows only, not on the other zones of the call.
 """
 
 from __future__ import annotations
@@ -33,18 +33,16 @@ COMMITTED, NEXT = 0, 1  # items of `Members.sides`
 
 
 class Members(NamedTuple):
-    """The zones that are called together."""
+    """The zones of a call."""
 
-    numbers: NDArray[np.int64]  # (n,) their numbers, rising
+    numbers: NDArray[np.int64]  # (n,) the numbers of the zones, rising
     frames: NDArray[np.void]  # FRAME (n,) of the spatial index of each zone
-    sides: NDArray[
-        np.int64
-    ]  # (2,) in which half of `ZoneState.rows` the committed rows are, the next
+    sides: NDArray[np.int64]  # (2,) the halves of `ZoneState.rows` with committed and next rows
     zones: ZoneArrays  # of the partition
     halo: Halo
     zoned: ZoneState
     common: SharedState
-    grid: Grid  # scratch memory, as large as the largest zone needs it
+    grid: Grid  # scratch memory, large enough for the largest zone
 
 
 @inlined_kernel
@@ -98,7 +96,7 @@ def grid_of(members: Members, n: int) -> Grid:
     )
 
 
-# What `for_each_zone` passes to parameters of these names; all others are the caller's.
+# Arguments that `for_each_zone` passes to parameters of these names; callers pass all others.
 _OF_ZONE = {
     "worlds": "worlds",
     "rows": "worlds.rows",

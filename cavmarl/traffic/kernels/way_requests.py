@@ -1,4 +1,4 @@
-"""Searches for ways of single vehicles: who searches, the cost of ways, and their storage.
+"""Searches for ways of single vehicles: which vehicles search, costs of ways, storage.
 
 A way found at run time is stored in a slot: room for the steps of one way at the end of
 `TripTables.steps`. Each slot belongs to a world; the world's vehicles determine which are free.

@@ -1,1 +1,1 @@
-"""Compiled loops: which zone a place is in, ghosts, borders, rows that change hands."""
+"""Kernels for zone lookup, ghosts, borders and changes of owner."""

@@ -1,13 +1,13 @@
-"""What processes tell each other about agents: rows of tables, actions, and results, as bytes.
+"""Frames about agents that processes exchange: rows of tables, actions, and results, as bytes.
 
-Rows of tables are how many agents there are, in 8 bytes; their numbers, in 8 bytes each; and then,
+A frame of rows has the number of agents in 8 bytes, the index of each agent in 8 bytes, and then,
 agent by agent, the row of each table.
 
-Actions are words of 8 bytes: how many agents the process owns that they go to, and how many have no
-vehicle; and then of each its number, two controls and a meta-action.
+A frame of actions has words of 8 bytes: the number of agents of the receiving process, the number
+of agents without a vehicle, and then for each agent its index, two controls and a meta-action.
 
-Results are what all processes know alike, where it is told; rows of what agents sense; and rows of
-what agents sensed before something ended. Each part begins at a whole word.
+A frame of results has the data that all processes share, if included; rows of observations; and
+rows of observations before an agent or an episode ended. Each part begins at a whole word.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Owners = NDArray[np.int32]
 Table = NDArray[np.uint8]
 """(A, b) b bytes of each agent."""
 
-UNOWNED = -1  # owns an agent that has no vehicle
+UNOWNED = -1  # the owner of an agent without a vehicle
 
 
 @inlined_kernel
 def _put(part: Bytes, data: Bytes, at: int) -> int:
-    """Write some bytes; where they end."""
+    """Write bytes to a frame. Return where they end."""
     for c in range(part.size):
         data[at + c] = part[c]
     return int(at + part.size)
@@ -40,7 +40,7 @@ def _put(part: Bytes, data: Bytes, at: int) -> int:
 
 @inlined_kernel
 def _take(part: Bytes, data: Bytes, at: int) -> int:
-    """Read them."""
+    """Read bytes from a frame. Return where they end."""
     for c in range(part.size):
         part[c] = data[at + c]
     return int(at + part.size)
@@ -48,7 +48,7 @@ def _take(part: Bytes, data: Bytes, at: int) -> int:
 
 @inlined_kernel
 def _aligned(at: int) -> int:
-    """The next whole word."""
+    """Return the start of the next whole word."""
     return (at + 7) // 8 * 8
 
 
@@ -57,12 +57,12 @@ def _aligned(at: int) -> int:
 
 @kernel
 def pack_agents(
-    mine: Flags,  # (A,) agents that are told of
+    mine: Flags,  # (A,) agents in the frame
     tables: tuple[Table, ...],
-    words: Words,  # written: the frame, with room for all agents
+    words: Words,  # is written: the frame, with room for all agents
     data: Bytes,  # the same memory
-) -> int:
-    """Write a frame; how many bytes it has."""
+) -> int:  # number of bytes
+    """Write a frame of rows."""
     num = 0
     for agent in range(mine.size):
         if mine[agent]:
@@ -78,16 +78,16 @@ def pack_agents(
 
 @kernel
 def take_agents(
-    tables: tuple[Table, ...],  # written
+    tables: tuple[Table, ...],  # is written
     words: Words,  # the first whole words of the frame
-    data: Bytes,  # the frame, and what follows
-    number: int,  # of the process that it comes from
-    owner: Owners,  # (A,) written: that number
+    data: Bytes,  # the frame and the following bytes
+    number: int,  # of the sending process
+    owner: Owners,  # (A,) is written: that number
 ) -> int:
-    """Take a frame.
+    """Read a frame of rows.
 
     Returns:
-        how many bytes it has; -1: it is none that `pack_agents` makes, and nothing is written.
+        The number of bytes; -1 if `pack_agents` has not made the frame, and nothing is written.
     """
     size = 8
     for table in tables:
@@ -111,13 +111,13 @@ def take_agents(
 @kernel
 def note_own(
     present: Flags,  # (W, A) agents that have sensed in this process
-    chosen: Flags,  # (W,) in these worlds
-    number: int,  # of the process
-    own: Flags,  # (W, A) written: those that have sensed here last
-    mine: Flags,  # (W · A,) written: those of them that are in the chosen worlds
-    owner: Owners,  # (W · A,) written: the number, or `UNOWNED`
+    chosen: Flags,  # (W,) worlds to update
+    number: int,  # of this process
+    own: Flags,  # (W, A) is written: agents that have sensed here last
+    mine: Flags,  # (W · A,) is written: these agents in the chosen worlds
+    owner: Owners,  # (W · A,) is written: the number, or `UNOWNED`
 ) -> None:
-    """Note which agents belong to this process, as far as it knows."""
+    """Record which agents belong to this process, as far as it knows."""
     at = 0
     for w in range(own.shape[0]):
         for agent in range(own.shape[1]):
@@ -133,12 +133,12 @@ def pack_actions(
     controls: NDArray[np.float64],  # (A, 2)
     meta_actions: NDArray[np.int64],  # (A,)
     mask: Flags,  # (A,) agents that act
-    owner: Owners,  # (A,) the process of each, as far as is known
-    number: int,  # of the one that is told
-    words: Words,  # (2 + 4 · A,) written
+    owner: Owners,  # (A,) the process of each agent, as far as known
+    number: int,  # of the receiving process
+    words: Words,  # (2 + 4 · A,) is written
     numbers: NDArray[np.float64],  # the same memory
-) -> int:
-    """Write what agents of a process do, and those of none; how many words that has."""
+) -> int:  # number of words
+    """Write a frame of the actions of a process's agents and of agents without a vehicle."""
     at = 2
     for part in range(2):
         words[part] = 0
@@ -157,20 +157,20 @@ def pack_actions(
 
 @kernel
 def take_actions(
-    words: Words,  # they begin with them
+    words: Words,  # begin with the frame
     numbers: NDArray[np.float64],  # the same memory
-    controls: NDArray[np.float64],  # (A, 2) written
-    meta_actions: NDArray[np.int64],  # (A,) written
-    missing: Flags,  # (A,) agents whose actions are awaited; those that come are so no longer
-    owner: Owners,  # (A,) the process of each
-    number: int,  # of this one
-    wrong: Words,  # (A,) written, first of all: agents of another one
+    controls: NDArray[np.float64],  # (A, 2) is written
+    meta_actions: NDArray[np.int64],  # (A,) is written
+    missing: Flags,  # (A,) is written: agents whose actions have not arrived
+    owner: Owners,  # (A,) the process of each agent
+    number: int,  # of this process
+    wrong: Words,  # (A,) the first entries are written: agents of another process
 ) -> tuple[int, int, int]:
-    """Take actions.
+    """Read a frame of actions.
 
     Returns:
-        how many words they have, -1: they are none that `pack_actions` makes, and nothing is
-        written; how many agents are wrong; how many are still missing.
+        The number of words, or -1 if `pack_actions` has not made the frame, and nothing is written;
+        the number of wrong agents; the number of agents that are still missing.
     """
     num_agents = missing.size
     if words.size < 2 or min(words[0], words[1]) < 0 or max(words[0], words[1]) > num_agents:
@@ -202,13 +202,13 @@ def take_actions(
 
 
 class Outcome(NamedTuple):
-    """What results are of, and go to."""
+    """The arrays with results of agents."""
 
-    common: tuple[Bytes, ...]  # what all processes know alike
-    sensed: tuple[Table, ...]
-    final: tuple[Table, ...]  # the same where something ended, before that
-    episode_over: Flags  # (W,) one of the common ones
-    terminations: Flags  # (W, A) likewise
+    common: tuple[Bytes, ...]  # data that all processes share
+    sensed: tuple[Table, ...]  # observations
+    final: tuple[Table, ...]  # observations before an agent or an episode ended
+    episode_over: Flags  # (W,) part of `common`
+    terminations: Flags  # (W, A) part of `common`
 
 
 @inlined_kernel
@@ -224,14 +224,14 @@ def pack_results(
     told: Outcome,
     own: Flags,  # (W, A) agents that have sensed in this process
     chosen: Flags,  # (W,) the worlds that have been reset, or stepped
-    before: Flags,  # (W, A) agents that had sensed here before worlds began anew
-    of_step: bool,
-    with_common: bool,
+    before: Flags,  # (W, A) agents that had sensed here before worlds were reset
+    of_step: bool,  # whether results are of a step; if not, of a reset
+    with_common: bool,  # whether to include `told.common`
     mine: Flags,  # (W · A,) scratch
-    words: Words,  # written
+    words: Words,  # is written
     data: Bytes,  # the same memory
-) -> int:
-    """Write results; how many bytes they have."""
+) -> int:  # number of bytes
+    """Write a frame of results."""
     end = 0
     if with_common:
         for part in told.common:
@@ -254,17 +254,17 @@ def pack_results(
 
 @kernel
 def take_results(
-    told: Outcome,  # written
+    told: Outcome,  # is written
     chosen: Flags,  # (W,) the worlds that have been reset, or stepped
-    of_step: bool,
-    with_common: bool,  # of the process whose results are taken first
-    number: int,  # of that process
-    owner: Owners,  # (W · A,) written: the process of each agent
+    of_step: bool,  # whether results are of a step; if not, of a reset
+    with_common: bool,  # true for the process whose results are read first
+    number: int,  # of the sending process
+    owner: Owners,  # (W · A,) is written: the process of each agent
     unread: Owners,  # (W · A,) scratch
-    words: Words,  # the first whole words of them
+    words: Words,  # the first whole words of the frame
     data: Bytes,
-) -> bool:
-    """Take results; whether they are what `pack_results` makes."""
+) -> bool:  # whether `pack_results` has made the frame
+    """Read a frame of results."""
     end = 0
     if with_common:
         for part in told.common:
@@ -291,7 +291,7 @@ def take_results(
 
 @inlined_kernel
 def _begin(told: Outcome, chosen: Flags, of_step: bool, owner: Owners) -> None:
-    """Agents without a vehicle have zeros, in the chosen worlds, and no process."""
+    """Clear the observations and the owners of all agents in the chosen worlds."""
     num_agents = told.terminations.shape[1]
     for w in range(chosen.size):
         ended = of_step and _has_ended(told, w)

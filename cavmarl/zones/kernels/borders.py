@@ -1,4 +1,4 @@
-"""Vehicles at the borders of zones: crossings, past and near, and how rows change hands."""
+"""Vehicles near the borders of zones: search for crossings, and changes of owner."""
 
 from __future__ import annotations
 
@@ -16,42 +16,42 @@ from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance, zone
 NEAR = np.dtype(
     [
         ("vehicle", np.int64),
-        ("source", np.int64),  # zone that owns it
-        ("row", np.int64),  # where the owner keeps it
-        ("target", np.int64),  # zone that it is in, or will be in
-        ("crossed", np.bool_),  # it is further than the hysteresis outside of its owner's zone
-        ("depth_m", np.float64),  # how far outside of its owner's zone; inside, less than 0: how
-        # far it has to go to the target
+        ("source", np.int64),  # zone that owns the vehicle
+        ("row", np.int64),  # index of its row in this zone
+        ("target", np.int64),  # zone in which it is or will be
+        ("crossed", np.bool_),  # whether it is beyond the hysteresis, outside of the source zone
+        ("depth_m", np.float64),  # distance outside of the source zone; inside, the negative
+        # distance to the target zone
     ],
     align=True,
 )
 
 
 class Borders(NamedTuple):
-    """When a vehicle is near a border, and when behind it."""
+    """The rules for when a vehicle is near a border, and when it has crossed it."""
 
-    hysteresis_m: float  # so far outside of its zone a vehicle still stays with it
-    ahead_s: float  # near a border: behind it after this time, at its velocity
-    max_speed_mps: float  # which no vehicle exceeds
+    hysteresis_m: float  # up to this distance outside of its zone, a vehicle keeps its owner
+    ahead_s: float  # a vehicle is near a border if it crosses it within this time
+    max_speed_mps: float  # upper bound of the speed of vehicles
 
 
 @kernel
 def find_near(
     zones: ZoneArrays,
-    borders: Borders,  # when a vehicle is near one
+    borders: Borders,
     zoned: ZoneState,  # the rows of all zones
-    side: int,  # whose rows, 0 or 1
+    side: int,  # the buffer of rows, 0 or 1
     w: int,
-    # whether to look at all owned rows, and not only at those that `exchange` has found near a
-    # border
+    # whether to check all owned rows, or only those that `exchange` has found near a border
     everybody: bool,
-    # NEAR (2 C,) overwritten: by zones and rows, a crossing before an approach
+    # NEAR (2 C,) is written, in the order of zones and rows; a crossing precedes an approach
     out: NDArray[np.void],
-) -> int:
-    """The owned rows that other zones have to be told of; how many entries there are.
+) -> int:  # number of entries
+    """Find owned vehicles that have crossed a border or are near one.
 
-    A vehicle is near a zone that it lies in, further than the hysteresis outside of its own, and
-    one that it would lie in so after `ahead_s` at its present velocity.
+    A vehicle has crossed a border if it is farther than the hysteresis outside of its owner's zone.
+    It is near a zone in which it would be, after such a crossing, in `ahead_s` at its present
+    velocity.
     """
     found = 0
     for zone in range(zones.rects.shape[0]):
@@ -60,12 +60,12 @@ def find_near(
             i = n if everybody else zoned.border[zone, w, n]
             if i < owned:
                 row = zoned.rows[side, zone, w, i]
-                found = _tell_of(zones, borders, row, zone, i, out, found)
+                found = _add_near(zones, borders, row, zone, i, out, found)
     return found
 
 
 @inlined_kernel
-def _tell_of(
+def _add_near(
     zones: ZoneArrays,
     borders: Borders,
     row: np.void,
@@ -74,11 +74,11 @@ def _tell_of(
     out: NDArray[np.void],
     found: int,
 ) -> int:
-    """Note row i of a zone once for each zone that it is near to; how many entries there are."""
+    """Append row i of a zone for each other zone that it is in or near. Return the new count."""
     rects = zones.rects
     x = row["x"]
     y = row["y"]
-    # Vehicles further inside cannot come out in that time. Infinite rims stay infinite.
+    # Vehicles farther inside cannot leave the zone in that time. Infinite rims stay infinite.
     margin = borders.max_speed_mps * borders.ahead_s
     if (
         rects[zone, 0] + margin < x
@@ -122,20 +122,21 @@ def _note(
 @kernel
 def pass_on(
     vehicle: int,
-    source: int,  # the zone that owns it
-    row: int,  # where it probably is there
-    target: int,  # the zone that will own it
-    epoch: int,  # from then on
-    zoned: ZoneState,  # the rows of all zones, and how many they are
-    side: int,  # whose rows, 0 or 1
+    source: int,  # the present owner
+    row: int,  # its probable row there
+    target: int,  # the next owner
+    epoch: int,  # of the new ownership
+    zoned: ZoneState,  # the rows of all zones and their numbers
+    side: int,  # the buffer of rows, 0 or 1
     w: int,
 ) -> int:
-    """Make a vehicle a ghost of the zone that owned it, and an owned row where it was a ghost.
+    """Change a vehicle's owner: its row becomes a ghost, and its ghost at the target a row.
 
-    The new row says what the old one does, but for its owner and epoch.
+    The new row is a copy of the old one; only its owner and its epoch differ.
 
     Returns:
-        its row at the target; -1: the source does not own it; -2: the target has no ghost of it.
+        The vehicle's row at the target; -1 if the source does not own it; -2 if the target has no
+        ghost of it.
     """
     row = _owned_row(vehicle, source, row, zoned, side, w)
     if row < 0:
@@ -153,7 +154,7 @@ def pass_on(
 
 @kernel
 def give_up(vehicle: int, source: int, row: int, zoned: ZoneState, side: int, w: int) -> bool:
-    """Make a vehicle that a zone owns one of its ghosts; whether it did own it."""
+    """Make an owned vehicle of a zone a ghost. Return whether the zone owned it."""
     row = _owned_row(vehicle, source, row, zoned, side, w)
     if row < 0:
         return False
@@ -165,7 +166,7 @@ def give_up(vehicle: int, source: int, row: int, zoned: ZoneState, side: int, w:
 
 @kernel
 def take_over(vehicle: int, target: int, epoch: int, zoned: ZoneState, side: int, w: int) -> int:
-    """Make a ghost of a zone a row that it owns, at an epoch: where it is; -1: it has none."""
+    """Make a ghost of a zone an owned row. Return the row; -1 if there is no such ghost."""
     rows = zoned.rows[side, target, w]
     place = zoned.num_owned[target, w]
     ghost = place
@@ -182,7 +183,7 @@ def take_over(vehicle: int, target: int, epoch: int, zoned: ZoneState, side: int
 
 @inlined_kernel
 def _owned_row(vehicle: int, zone: int, hint: int, zoned: ZoneState, side: int, w: int) -> int:
-    """Where a zone keeps a vehicle that it owns, probably at `hint`; -1: it does not own it."""
+    """Return the row of a zone's owned vehicle, probably `hint`; -1 if it does not own it."""
     rows = zoned.rows[side, zone, w]
     owned = zoned.num_owned[zone, w]
     found = hint

@@ -1,9 +1,9 @@
-"""Rows that go from shard to shard: ghosts, every tick.
+"""The exchange of ghosts between shards in each tick.
 
-A shard's owned rows come first, its ghosts after them. `exchange` renews those of all zones: every
-zone publishes. Where zones are run by several processes, each lets its own ones `gather`, and then
-`note_gathered` is called once. What comes of it is the same, row by row; but `gather` asks every
-zone, near or far.
+In a shard's rows, owned rows come first and ghosts after them. `exchange` renews the ghosts of all
+zones: each zone publishes its rows. If several processes run the zones, each process calls `gather`
+for its zones, and then one process calls `note_gathered`. Both ways give the same rows in the same
+order, but `gather` reads all zones, near or far.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from cavmarl.zones.kernels.zone_lookup import (
     zone_of,
 )
 
-ROW_LINES = 6  # of memory, that a VEHICLE row takes
+ROW_LINES = 6  # cache lines of a VEHICLE row
 
 
 @kernel
 def exchange(
     zones: ZoneArrays,
     halo: Halo,  # from `partition.zone_halo.zone_halo`, for the same partition
-    touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
-    borders: Borders,  # when a vehicle is near one
-    # the ghosts and how many there are, border and num_border are written. Of the owned rows those
-    # in `outer` are looked at; they are noted here, if they are not yet
+    touching_m: float,  # a ghost farther outside of a zone cannot touch a vehicle of the zone
+    borders: Borders,
+    # the ghosts and their numbers, border and num_border are written. Only owned rows in `outer`
+    # are read; if there is no list of them, it is made here
     zoned: ZoneState,
-    side: int,  # whose rows, 0 or 1
+    side: int,  # the buffer of rows, 0 or 1
     first: int,  # the first world
-    last: int,  # the one after the last
+    last: int,  # one after the last world
     book: BorderRecords,  # vehicles near a border are written
 ) -> None:
-    """Renew all ghosts of some worlds from the owned rows, and note vehicles near a border.
+    """Renew all ghosts of some worlds from the owned rows, and record vehicles near a border.
 
-    Zone z needs a vehicle if and only if a driver there may ask about it: see
-    `visibility_tests.find_looks`. A vehicle that has left its own zone's rectangle, because its
-    transfer is late, is published like any other, to the zone that it is in as well.
+    A zone needs a vehicle if and only if a driver there may consider it; see
+    `visibility_tests.find_looks`. If a late transfer leaves a vehicle outside of its owner's zone,
+    the vehicle is published as usual, also to the zone in which it is.
     """
-    # No other vehicle can be behind a border by then.
+    # Vehicles farther away cannot cross a border within `ahead_s`.
     border_m = borders.max_speed_mps * borders.ahead_s
     count = zones.rects.shape[0]
     for w in range(first, last):
@@ -70,17 +70,18 @@ def gather(
     zones: ZoneArrays,
     halo: Halo,  # as for `exchange`
     touching_m: float,  # as for `exchange`
-    border_m: float,  # within that of another zone an owned row is at a border, m
-    # the ghosts of this zone and how many there are, its border and num_border are written; outer
-    # and num_outer stay
+    border_m: float,  # an owned row within this distance of another zone is at a border, m
+    # the ghosts of this zone and their number, its border and num_border are written; outer and
+    # num_outer are not
     zoned: ZoneState,
-    side: int,  # whose rows, 0 or 1
-    zone: int,  # whose ghosts
+    side: int,  # the buffer of rows, 0 or 1
+    zone: int,  # the zone that gathers
     w: int,
 ) -> None:
-    """Renew the ghosts of one zone from all others' owned rows, and note vehicles at a border.
+    """Renew the ghosts of one zone from the owned rows of all others; record rows at a border.
 
-    It writes what is this zone's alone, and reads of the others what no other call of it writes.
+    Calls for different zones may run at the same time: a call writes only the state of its zone,
+    and reads only state that no call writes.
     """
     near_limit = touching_m * touching_m
     border_limit = min(halo.halo_m * halo.halo_m, border_m * border_m)
@@ -124,12 +125,12 @@ def gather(
 @kernel
 def note_gathered(
     zones: ZoneArrays,
-    borders: Borders,  # when a vehicle is near one
-    zoned: ZoneState,  # num_outer is written: rows may change from here on
-    side: int,  # whose rows, 0 or 1
+    borders: Borders,
+    zoned: ZoneState,  # num_outer is written: rows may change afterwards
+    side: int,  # the buffer of rows, 0 or 1
     book: BorderRecords,  # vehicles near a border are written
 ) -> None:
-    """All zones have gathered their ghosts: note vehicles near a border, as `exchange` does."""
+    """Record vehicles near a border, as `exchange` does, after all zones have gathered ghosts."""
     for w in range(zoned.num_outer.shape[1]):
         for zone in range(zones.rects.shape[0]):
             zoned.num_outer[zone, w] = -1
@@ -148,10 +149,10 @@ def _publish(
     w: int,
     due: NDArray[np.void],
 ) -> None:
-    """Copy the owned rows of one zone behind those of all that need them.
+    """Append the owned rows of one zone to the rows of all zones that need them.
 
-    Needs are found first, for as many as `due` holds: they are unpredictable, and so nothing
-    that follows has to wait for it.
+    The targets are found first, in batches of the size of `due`. Their branches are unpredictable,
+    and in a loop of their own they do not delay the copies.
     """
     near_limit = touching_m * touching_m
     border_limit = border_m * border_m
@@ -174,7 +175,7 @@ def _publish(
         outer = outers[n]
         x = outer["x"]
         y = outer["y"]
-        # Drivers of the background are on their lanes; agents may be anywhere beside them.
+        # Background vehicles are on their lanes; agents may be anywhere beside them.
         if by_lane and outer["driver"] == DRIVER_BACKGROUND:
             lane = outer["lane"]
             for k in range(halo.watcher_start[lane], halo.watcher_start[lane + 1]):
@@ -204,7 +205,7 @@ def _publish(
 def _note_due(
     due: np.void, outer: np.void, zone: int, squared: float, near_limit: float, border_limit: float
 ) -> None:
-    """Note a row for a zone that is so far away, as squares of m; it counts if its place stays."""
+    """Write an entry for a row that a zone may need. The caller keeps or overwrites the entry."""
     due["row"] = outer["row"]
     due["zone"] = zone
     due["near"] = squared <= near_limit
@@ -215,7 +216,7 @@ def _note_due(
 def _send(
     zoned: ZoneState, side: int, zone: int, w: int, due: NDArray[np.void], num_due: int
 ) -> None:
-    """Copy rows of a zone to those that they are due to, and note which are at a border."""
+    """Copy rows of a zone to the zones that need them, and record rows at a border."""
     for n in range(num_due):
         if n + SOON < num_due:
             later = due[n + SOON]["row"]
@@ -225,7 +226,7 @@ def _send(
         i = due[n]["row"]
         _take_ghost(zoned, side, zone, i, due[n]["zone"], w, due[n]["near"])
         found = zoned.num_border[zone, w]
-        # What a row is due to follows one another.
+        # The entries of one row follow one another.
         if due[n]["at_border"] and (found == 0 or zoned.border[zone, w, found - 1] != i):
             zoned.border[zone, w, found] = i
             zoned.num_border[zone, w] = found + 1
@@ -235,7 +236,7 @@ def _send(
 def _note_all_outer(
     inner: NDArray[np.float64], zoned: ZoneState, side: int, zone: int, w: int
 ) -> None:
-    """Note a zone's outer rows, as `advance` does, where rows have changed since."""
+    """List a zone's outer rows, as `advance` does, if rows have changed since."""
     outer = 0
     for i in range(zoned.num_owned[zone, w]):
         row = zoned.rows[side, zone, w, i]
@@ -249,9 +250,10 @@ def _note_all_outer(
 def _take_ghost(
     zoned: ZoneState, side: int, source: int, i: int, zone: int, w: int, near: bool
 ) -> None:
-    """Put row i of a zone behind those of another, before ghosts that can touch none if it can.
+    """Append row i of a zone to another zone's ghosts.
 
-    What its owner knows of its way goes with it: the table of ways is far away in memory.
+    Ghosts that can touch a vehicle of the zone come before all other ghosts. The step of the row's
+    route is copied, too, because the table of routes is far away in memory.
     """
     rows = zoned.rows[side, zone, w]
     step = zoned.step[zone, w]
@@ -273,8 +275,8 @@ def _take_ghost(
 @kernel
 def take_own(
     zones: ZoneArrays, zone: int, source: NDArray[np.void], num: int, rows: NDArray[np.void]
-) -> int:  # how many
-    """Copy the rows of `source[:num]` that lie in a zone, as its own, to the front of `rows`.
+) -> int:  # number of rows
+    """Copy the rows of `source[:num]` in a zone to the front of `rows`, as rows that it owns.
 
     `source` and `rows` may be the same array.
     """

@@ -1,11 +1,11 @@
-"""What a row most likely is a tick later: of a ghost, only what is different goes between nodes.
+"""Forecast of a row one tick later: nodes send only the words of a ghost that differ from it.
 
-Both ends foresee the same, by the same operations on the same numbers, and what is not as foreseen
-is sent. So rows arrive bit for bit whatever a driver does; how many bytes it takes depends on this.
+Sender and receiver compute the same forecast, with the same operations on the same numbers. So rows
+arrive bit for bit whatever a driver does; a good forecast only saves bytes.
 
-A driver of the background chooses an acceleration (`throttle`). Speed, rates and accounts follow
-from it, as `motion.move_background` and `motion.account` have them; where it is on the map follows
-from the roads, and is sent.
+A background driver chooses an acceleration (`throttle`). Speed, rates and sums follow from it, as
+in `motion.move_background` and `motion.account`. The position on the map depends on the roads, and
+is sent.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from cavmarl.core.compiled import inlined_kernel
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS, STANDING_MPS
 from cavmarl.zones.kernels.row_bounds import Bounds
 
-# Which words of a VEHICLE record fields are; the lane is in the low half of its word.
+# The word of a VEHICLE record with each field; the lane is in the low half of its word.
 PLACES = {
     "s": 1, "speed": 3, "lane": 5, "speed_factor": 8, "wait_s": 9, "accel": 21, "jerk": 23,
     "throttle": 26, "tick": 29, "to_go": 30, "distance_m": 31, "free_s": 32, "step_to_go": 33,
@@ -34,37 +34,37 @@ Floats = NDArray[np.float64]
 
 
 class Forecast(NamedTuple):
-    """What it takes to foresee a row."""
+    """The constants and the scratch memory of forecasts."""
 
     dt: float  # s of a tick
     ticks_per_step: int
-    way_to_go: int  # the word of a row with its step that is the step's `to_go`
+    way_to_go: int  # in a row followed by its step, the word with the step's `to_go`
     limits: Floats  # (lanes,) m/s
-    beyond: Floats  # (lanes,) m from a lane's start that its link has before it, to the link's end
+    beyond: Floats  # (lanes,) m from a lane's start to the end of the link that it is in
     row_bounds: Bounds  # of the indices in a row
-    bounds: Bounds  # of those in a row with its step
-    words: Words  # scratch: a row and its step, as foreseen
-    floats: Floats  # the same
+    bounds: Bounds  # of the indices in a row followed by its step
+    words: Words  # scratch: the forecast of a row and its step
+    floats: Floats  # the same memory
 
 
 @inlined_kernel
 def is_told(told: np.uint64, word: int) -> bool:
-    """Whether the bit of a word is set."""
+    """Return whether the bit of a word is set."""
     return bool(told >> np.uint64(word) & np.uint64(1))
 
 
 @inlined_kernel
 def foresee(
     law: Forecast,
-    before: Floats,  # the row a tick ago, with its step
-    before_words: Words,  # the same
-    row: Floats,  # what it is: of what is foreseen, only what has been written is read
-    row_words: Words,  # the same
-    told: np.uint64,  # bits of words that are known, and not written
-    found: Floats,  # written: a copy of the row before, or `row` itself
-    found_words: Words,  # the same
+    before: Floats,  # the row one tick ago, with its step
+    before_words: Words,  # the same memory
+    row: Floats,  # the present row; a word of the forecast is read only after it is written
+    row_words: Words,  # the same memory
+    told: np.uint64,  # bits of words that are known, and are not written
+    found: Floats,  # is written: a copy of the row before, or `row` itself
+    found_words: Words,  # the same memory
 ) -> None:
-    """Write the words that change in every tick, those that others follow from first."""
+    """Write the words that change in every tick, each after the words that it depends on."""
     dt = law.dt
     if not is_told(told, SPEED):
         speed = before[SPEED] + row[THROTTLE] * dt

@@ -1,4 +1,4 @@
-"""Shortest ways along the lanes of a map, ahead or back."""
+"""Shortest paths along the lanes of a map, forwards or backwards."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 
 @inlined_kernel
 def _num_next(roads: RoadArrays, lane: int, forwards: bool) -> int:
-    """How many lanes follow a lane, or lead to it."""
+    """Return the number of lanes that follow a lane, or lead to it."""
     row = roads.lanes[lane]
     if not forwards:
         return int(row["num_into"])
@@ -21,7 +21,7 @@ def _num_next(roads: RoadArrays, lane: int, forwards: bool) -> int:
 
 @inlined_kernel
 def _next(roads: RoadArrays, lane: int, forwards: bool, k: int) -> int:
-    """One of them."""
+    """Return the k-th of the lanes that `_num_next` counts."""
     row = roads.lanes[lane]
     if not forwards:
         return int(roads.into[row["first_into"] + k])
@@ -34,7 +34,7 @@ def _next(roads: RoadArrays, lane: int, forwards: bool, k: int) -> int:
 def begin_paths(
     roads: RoadArrays, lane: int, forwards: bool, way: float, ways: NDArray[np.float64]
 ) -> None:
-    """Let ways begin on a lane, `way` m before its end, or behind its start."""
+    """Begin paths on a lane, `way` m before its end (forwards) or after its start."""
     for k in range(_num_next(roads, lane, forwards)):
         other = _next(roads, lane, forwards, k)
         ways[other] = min(ways[other], way)
@@ -43,14 +43,15 @@ def begin_paths(
 @kernel
 def extend_paths(
     roads: RoadArrays,
-    # in the direction of driving, to the starts of lanes; if not, back to their ends
+    # whether paths lead in the direction of driving, to the starts of lanes; if not, backwards to
+    # the ends of lanes
     forwards: bool,
-    limit_m: float,  # of a way
-    # (L,) m, finite where ways begin, inf elsewhere; those that are longer are left as they are
+    limit_m: float,  # of the length of a path
+    # (L,) m, is written; finite where paths begin, inf elsewhere; values above the limit are kept
     ways: NDArray[np.float64],
     scratch: VisibilityScratch,  # `waits` and `following` are used
 ) -> None:
-    """Shortest ways along the roads, from where they begin to all lanes within a limit."""
+    """Extend paths along the roads to all lanes within a limit, and write their least lengths."""
     head = -1
     tail = -1
     for lane in range(ways.size):

@@ -1,8 +1,7 @@
-"""Changes of owner where all zones share a process: approaches to a border, and changes.
+"""Approaches to borders and changes of owner where one process has all zones.
 
-Both are kept in a `BorderRecords`. Vehicles that come near are noted at the end of a tick, with
-the ghosts;
-in most ticks none has crossed, and nothing is to be done when the next one begins.
+`BorderRecords` has both. Vehicles near a border are recorded at the end of a tick, together with
+the exchange of ghosts. In most ticks no vehicle has crossed, so the next tick has nothing to do.
 """
 
 from __future__ import annotations
@@ -18,38 +17,36 @@ from cavmarl.core.records.arrays import ZoneState
 from cavmarl.zones.kernels.borders import NEAR, Borders, find_near, pass_on
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance
 
-# What `hand_over` returns where it cannot go on, as `pass_on` does.
+# Results of `hand_over` and `pass_on` if they fail.
 NOT_OWNED = -1
 NOT_SEEN = -2
 
 COMING = np.dtype(
     [
         ("vehicle", np.int64),
-        ("target", np.int64),  # zone that it comes near to
+        ("target", np.int64),  # zone that it approaches
         ("epoch", np.int64),  # of its present ownership
         ("tick", np.int64),  # in which it was near first
-        ("depth_m", np.float64),  # how far outside of its owner's zone it was then, see NEAR
-        ("ms", np.float64),  # of the clock, then
+        ("depth_m", np.float64),  # distance outside of its owner's zone in that tick, see NEAR
+        ("ms", np.float64),  # clock time of that tick
     ],
     align=True,
 )
 
 CHANGE = np.dtype(
     [
-        ("tick", np.int64),  # that the new owner computes first
+        ("tick", np.int64),  # first tick that the new owner computes
         ("vehicle", np.int64),
         ("source", np.int64),
         ("target", np.int64),
-        ("epoch", np.int64),  # the new one
+        ("epoch", np.int64),  # of the new ownership
         ("place", np.int64),  # its row at the target
         ("approached", np.int64),  # tick in which it was near first
-        ("prepare_depth_m", np.float64),  # how far outside of the source's zone it was then,
-        ("switch_depth_m", np.float64),  # when it changed,
+        ("prepare_depth_m", np.float64),  # distance outside of the source's zone in that tick,
+        ("switch_depth_m", np.float64),  # at the change of owner,
         ("release_depth_m", np.float64),  # and one tick later; NaN: it has left the world
-        (
-            "ms",
-            np.float64,
-        ),  # since it was near first, or, until its tick is over, of the clock then
+        # duration since it was near first; until the tick ends, clock time of the first approach
+        ("ms", np.float64),
     ],
     align=True,
 )
@@ -57,39 +54,39 @@ CHANGE = np.dtype(
 
 DUE = np.dtype(
     [
-        ("row", np.int32),  # of its owner
-        ("zone", np.int32),  # that needs it
-        ("near", np.bool_),  # it can touch a vehicle there
-        ("at_border", np.bool_),  # of that zone
+        ("row", np.int32),  # index of the row at its owner
+        ("zone", np.int32),  # zone that needs the row
+        ("near", np.bool_),  # whether it can touch a vehicle there
+        ("at_border", np.bool_),  # whether it is at a border of that zone
     ],
     align=True,
 )
-"""A row that is to be sent to a zone as a ghost."""
+"""A row that must be copied to a zone as a ghost."""
 
 AT_ONCE = 512
-"""So many are found before they are sent; more than there can be zones."""
+"""Size of a batch of rows to copy; larger than the greatest number of zones."""
 
 LATE = 256
-"""Once so many changes wait they are read; the last tick may add one for each vehicle."""
+"""Number of unread changes from which on they are read; a tick may add one per vehicle to it."""
 
 
 class BorderRecords(NamedTuple):
-    """What is known of the borders of W worlds; C rows a zone can hold."""
+    """Approaches and changes of owner at the borders of W worlds, with room for C rows a zone."""
 
-    near: NDArray[np.void]  # NEAR (W, 2 C) by the newest rows
+    near: NDArray[np.void]  # NEAR (W, 2 C) in the newest rows
     num_near: NDArray[np.int64]  # (W,)
-    num_crossed: NDArray[np.int64]  # (W,) of them
-    owned: NDArray[np.int64]  # (W,) vehicles, when `near` was made
-    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not changed; two, swapped each tick
-    turn: NDArray[np.int64]  # (W,) which of `coming` is the present one, the other the one before
+    num_crossed: NDArray[np.int64]  # (W,) entries of `near` that have crossed
+    owned: NDArray[np.int64]  # (W,) number of vehicles when `near` was made
+    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near, owner unchanged; two lists, swapped a tick
+    turn: NDArray[np.int64]  # (W,) index of the present list; the other is of the tick before
     num_coming: NDArray[np.int64]  # (W, 2)
-    known: NDArray[np.int64]  # (W,) of the present ones, those that were so before
-    acknowledged: NDArray[np.int64]  # (W,) entries of `coming`, in all ticks before this one
-    aborted: NDArray[np.int64]  # (W,) of them that have turned away or left
-    tick: NDArray[np.int64]  # (W,) whose rows have been looked at
-    ms: NDArray[np.float64]  # (W,) of a clock, when it began
+    known: NDArray[np.int64]  # (W,) entries of the present list that were in the list before
+    acknowledged: NDArray[np.int64]  # (W,) sum of the entries of `coming` in all earlier ticks
+    aborted: NDArray[np.int64]  # (W,) number of vehicles that have turned away or left
+    tick: NDArray[np.int64]  # (W,) tick of the rows in which `near` was found
+    ms: NDArray[np.float64]  # (W,) clock time at the begin of that tick
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
-    changes: NDArray[np.void]  # CHANGE (W, C + LATE) those not read yet
+    changes: NDArray[np.void]  # CHANGE (W, C + LATE) that are not read yet
     num_changes: NDArray[np.int64]  # (W,)
     due: NDArray[np.void]  # DUE (AT_ONCE,) scratch of `exchange`
 
@@ -121,15 +118,15 @@ def make_book(num_worlds: int, capacity: int) -> BorderRecords:
 @kernel
 def look(
     zones: ZoneArrays,
-    borders: Borders,  # when a vehicle is near one
+    borders: Borders,
     zoned: ZoneState,  # the rows of all zones
-    side: int,  # whose rows, 0 or 1
+    side: int,  # the buffer of rows, 0 or 1
     w: int,
-    everybody: bool,  # whether to look at all owned rows, see `find_near`
-    num_newborn: int,  # `book.newborn[w, :num_newborn]` stay where they are
+    everybody: bool,  # whether to check all owned rows, see `find_near`
+    num_newborn: int,  # vehicles in `book.newborn[w, :num_newborn]` are left out
     book: BorderRecords,  # `near` and `coming` are written
 ) -> None:
-    """Note vehicles near a border, and those of them that have crossed it."""
+    """Record vehicles that are near a border or have crossed it."""
     near = book.near[w]
     found = find_near(zones, borders, zoned, side, w, everybody, near)
     num = 0
@@ -152,7 +149,7 @@ def look(
 def look_on(
     zones: ZoneArrays, borders: Borders, zoned: ZoneState, side: int, w: int, book: BorderRecords
 ) -> None:
-    """`look` at the rows of the next tick."""
+    """Run `look` on the rows of the next tick."""
     now = book.turn[w]
     book.tick[w] += 1
     book.acknowledged[w] += book.num_near[w]
@@ -164,19 +161,19 @@ def look_on(
 @kernel
 def hand_over(
     zones: ZoneArrays,
-    borders: Borders,  # when a vehicle is near one
+    borders: Borders,
     zoned: ZoneState,  # the rows of all zones
-    side: int,  # whose rows, 0 or 1
+    side: int,  # the buffer of rows, 0 or 1
     w: int,
     everybody: bool,  # whether rows have changed since `look_on`
     num_newborn: int,  # see `look`
-    book: BorderRecords,  # written
+    book: BorderRecords,  # is written
 ) -> int:
-    """Give every vehicle that lies beyond its zone's hysteresis to the zone that it is in.
+    """Give every vehicle beyond its zone's hysteresis to the zone in which it is.
 
     Returns:
-        how many have changed, by rising ids at the end of `book.changes`; or NOT_OWNED or NOT_SEEN,
-        with the vehicle concerned behind them.
+        The number of changes, which are at the end of `book.changes` by rising ids; or NOT_OWNED or
+        NOT_SEEN, with the failed change after them.
     """
     if everybody:
         look(zones, borders, zoned, side, w, True, num_newborn, book)
@@ -200,9 +197,9 @@ def hand_over(
 def _follow_swap(
     zoned: ZoneState, w: int, near: np.void, changed: int, book: BorderRecords
 ) -> None:
-    """The last to enter a zone fills the row of one that leaves it in the same tick.
+    """Update the row of a vehicle that has moved into the row of one that left its zone.
 
-    Without this `release` would look for it among all rows.
+    Both have changed their zone in this tick. Without this, `release` would search all rows.
     """
     last = zoned.num_owned[near["source"], w]
     newest = book.num_changes[w] - 1
@@ -222,7 +219,7 @@ def _is_newborn(book: BorderRecords, w: int, num_newborn: int, vehicle: int) -> 
 
 @inlined_kernel
 def _renew(zoned: ZoneState, side: int, w: int, book: BorderRecords) -> None:
-    """Let the present `coming` be the vehicles near now; known ones keep what is known of them."""
+    """Write the present list in `coming`. Vehicles in the list before keep their first approach."""
     turn = book.turn[w]
     before = book.coming[w, 1 - turn]
     now = book.coming[w, turn]
@@ -251,7 +248,7 @@ def _renew(zoned: ZoneState, side: int, w: int, book: BorderRecords) -> None:
 
 @inlined_kernel
 def _place_of(coming: NDArray[np.void], num: int, vehicle: int, target: int, epoch: int) -> int:
-    """Index of the entry in `coming[:num]`, or -1."""
+    """Return the index of the entry in `coming[:num]`, or -1."""
     for k in range(num):
         entry = coming[k]
         if entry["vehicle"] == vehicle and entry["target"] == target and entry["epoch"] == epoch:
@@ -261,7 +258,7 @@ def _place_of(coming: NDArray[np.void], num: int, vehicle: int, target: int, epo
 
 @inlined_kernel
 def _next_crossed(near: NDArray[np.void], num: int, last: int) -> int:
-    """The entry of the smallest id above `last` that has crossed, or -1."""
+    """Return the entry of the crossed vehicle with the least id above `last`, or -1."""
     best = -1
     for n in range(num):
         entry = near[n]
@@ -276,7 +273,7 @@ def _next_crossed(near: NDArray[np.void], num: int, last: int) -> int:
 
 @kernel
 def _change(zoned: ZoneState, side: int, w: int, near: np.void, book: BorderRecords) -> int:
-    """Let a vehicle that has crossed change its owner; its new row, or why it has none."""
+    """Change the owner of a vehicle that has crossed. Return the result of `pass_on`."""
     vehicle = near["vehicle"]
     target = near["target"]
     turn = book.turn[w]
@@ -309,13 +306,13 @@ def _change(zoned: ZoneState, side: int, w: int, near: np.void, book: BorderReco
 def release(
     zones: ZoneArrays,
     zoned: ZoneState,  # the rows of all zones
-    side: int,  # whose rows, 0 or 1
+    side: int,  # the buffer of rows, 0 or 1
     w: int,
-    changed: int,  # how many there are of them
-    now_ms: float,  # of a clock
+    changed: int,  # number of the newest changes
+    now_ms: float,  # clock time
     book: BorderRecords,  # `changes` is written
 ) -> None:
-    """Note when the tick of the newest changes ends, and how far from their old zone they are."""
+    """Complete the newest changes at the end of their tick: duration and distance to the source."""
     last = book.num_changes[w]
     for n in range(last - changed, last):
         change = book.changes[w, n]

@@ -1,4 +1,4 @@
-"""Rows of vehicles that come from outside: does each index in them point into its table?"""
+"""Bounds checks of the indices in vehicle rows that other processes send."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 Words = NDArray[np.int64]
 
 Bounds = NDArray[np.int64]
-"""(k, 4) of each index: its word in a row, the bit that it begins with there, or `WHOLE` or
-`WITH_LANE`, its least value, and the first value that is too large."""
+"""(k, 4) for each index: its word in a row; its first bit in the word, `WHOLE` or `WITH_LANE`; its
+least value; and the first value that is too large."""
 
-WHOLE = -1  # the index has the whole word, not 32 bits
-WITH_LANE = -2  # the index is the whole word and the row's lane, added
-_LANE = 5  # the word that has the lane in its low half
+WHOLE = -1  # the index takes the whole word, not 32 bits
+WITH_LANE = -2  # the index is the sum of the whole word and the row's lane
+_LANE = 5  # the word with the lane in its low half
 _LOW = np.int64((1 << 32) - 1)
 _SIGN = np.int64(1 << 31)
 
 
 @inlined_kernel
 def _half(word: int, bit: int) -> int:
-    """A whole number of 32 bits."""
+    """Return the signed number in 32 bits of a word, from a bit on."""
     return int(((word >> bit & _LOW) ^ _SIGN) - _SIGN)
 
 
 @inlined_kernel
 def is_bounded(row: Words, bounds: Bounds) -> bool:
-    """Whether all indices of a row are in their bounds."""
+    """Return whether all indices of a row are within their bounds."""
     for n in range(bounds.shape[0]):
         value = row[bounds[n, 0]]
         bit = bounds[n, 1]
@@ -43,7 +43,7 @@ def is_bounded(row: Words, bounds: Bounds) -> bool:
 
 @kernel
 def are_bounded(rows: Words, bounds: Bounds) -> bool:
-    """The same of all rows, (n, words)."""
+    """Return whether all indices of all rows (n, words) are within their bounds."""
     for n in range(rows.shape[0]):
         if not is_bounded(rows[n], bounds):
             return False

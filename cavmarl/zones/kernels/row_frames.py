@@ -1,18 +1,18 @@
-"""What each process tells another one about the rows of a tick: ghosts, and vehicles that leave.
+"""Frames that two processes exchange about the rows of a tick: ghosts and vehicles that leave.
 
-`exchange` leaves the ghosts of a zone that another process hosts behind that zone's owned rows, of
-which there are none in this one. Of a ghost that was in the frame before only the words that have
-changed are sent. A ghost is V + S + 2 words: its row, its step, the lane of that, its world.
+If another process hosts a zone, the zone has no owned rows here, and `exchange` writes only its
+ghosts. If a ghost was in the frame before, only the words that differ from their forecast are sent.
+A ghost has V + S + 2 words: its row, its step, the place of the step, its world.
 
-A frame is words, of W worlds and k zones of the process that it goes to:
+A frame for a process with k zones in W worlds has these words:
 
-    1           words of the frame
-    W           vehicles that this process owns
-    W           of these that have taken another way since the frame before
-    W           vehicles that leave
-    k · W · 2   ghosts; those of them that can touch a vehicle there
-    n           of each ghost where it was in the frame before; -1: it is sent whole
-    n           of each ghost a bit for each word that is sent: it is not as `ghost_forecast` says
+    1           number of words in the frame
+    W           numbers of vehicles that this process owns
+    W           numbers of changes of route since the frame before
+    W           numbers of vehicles that leave
+    k · W · 2   numbers of ghosts, and of ghosts that can touch a vehicle of the zone
+    n           for each ghost, its index in the frame before; -1: it is sent whole
+    n           for each ghost, a bit per word that is sent, because `ghost_forecast` differs
     …           rows of the vehicles that leave
     …           words of ghosts
 """
@@ -29,39 +29,39 @@ from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.zones.kernels.ghost_forecast import Forecast, foresee, is_told
 from cavmarl.zones.kernels.row_bounds import is_bounded
 
-ID = 0  # the word of a row that names the vehicle
-AFTER = 2  # words of a ghost behind its row and its step
-MOST = 64  # words of a ghost: one word has a bit for each that is sent
-GROUP = 8  # words that are compared at once
+ID = 0  # the word of a row with the vehicle's id
+AFTER = 2  # number of words in a ghost after its row and its step
+MOST = 64  # limit of the words of a ghost: one word has a bit for each of them
+GROUP = 8  # number of words that are compared at once
 NO_FRAME = -(1 << 62)
 
 Words = NDArray[np.int64]
 
 
 class Both(NamedTuple):
-    """What two processes tell each other about, seen from one of them."""
+    """The state that a process exchanges with another process."""
 
-    rows: Words  # (2, k, W, C, V) those of all zones
+    rows: Words  # (2, k, W, C, V) of all zones
     steps: Words  # (k, W, C, S)
     step_at: NDArray[np.int64]  # (k, W, C)
     num_owned: NDArray[np.int64]  # (k, W)
     num_rows: NDArray[np.int64]  # (k, W)
     num_near: NDArray[np.int64]  # (k, W)
     mine: NDArray[np.int64]  # zones of this process
-    theirs: NDArray[np.int64]  # and of the other one
-    running: NDArray[np.int64]  # (W,) written: vehicles of this process, and of others as they come
-    rerouted: NDArray[np.int64]  # (W,) written: those that had taken another way by the last frame
+    theirs: NDArray[np.int64]  # zones of the other process
+    running: NDArray[np.int64]  # (W,) is written: vehicles of this process and of frames so far
+    rerouted: NDArray[np.int64]  # (W,) is written: changes of route up to the last frame
 
 
 class Ghosts(NamedTuple):
-    """Ghosts of a frame, (n, V + S + 2), as whole numbers and as floats: the same memory."""
+    """Ghosts of a frame, (n, V + S + 2), as integers and as floats in the same memory."""
 
     words: Words
     floats: NDArray[np.float64]
 
 
 class Passing(NamedTuple):
-    """What leaves, as the departure queue has it."""
+    """Vehicles that leave, in the arrays of the departure queue."""
 
     rows: Words  # (W, C + D, V)
     num: NDArray[np.int64]  # (W,)
@@ -72,7 +72,7 @@ class Passing(NamedTuple):
 def count_own(
     num_owned: NDArray[np.int64], mine: NDArray[np.int64], running: NDArray[np.int64]
 ) -> None:
-    """Write how many vehicles zones own, (W,)."""
+    """Write the number of vehicles (W,) that the zones of this process own."""
     for w in range(running.size):
         running[w] = 0
         for k in range(mine.size):
@@ -85,15 +85,15 @@ def pack_frame(
     side: int,
     passing: Passing,
     law: Forecast,
-    before: Ghosts,  # those of the frame before
-    slots: NDArray[np.int32],  # scratch, a power of two and more than these
-    now: Ghosts,  # written: the ghosts, first of all
-    frame: Words,  # written
+    before: Ghosts,  # of the frame before
+    slots: NDArray[np.int32],  # scratch; its size is a power of two above the number of `before`
+    now: Ghosts,  # the first rows are written: the ghosts
+    frame: Words,  # is written
 ) -> int:
     """Write a frame.
 
     Returns:
-        how many ghosts it has; if there is no room for them, -1 less that number.
+        The number n of ghosts; -1 - n if there is no room for them.
     """
     num_worlds = both.num_owned.shape[1]
     first = 1 + 3 * num_worlds
@@ -133,11 +133,11 @@ def _pack_ghosts(
     slots: NDArray[np.int32],
     now: Ghosts,
     frame: Words,
-    first: int,  # where `like` begins
+    first: int,  # start of the ghosts' indices in the frame before
     total: int,
-    at: int,  # where their words begin
+    at: int,  # start of the ghosts' words
 ) -> int:
-    """Write the ghosts of a frame; how many words they take."""
+    """Write the ghosts of a frame. Return the number of their words."""
     _fill_slots(before.words, slots)
     row = both.rows.shape[4]
     last = row + both.steps.shape[3]
@@ -172,13 +172,13 @@ def _pack_ghosts(
 
 @inlined_kernel
 def _every_bit(num: int) -> np.uint64:
-    """The first bits, so many, at most 63."""
+    """Return a mask of the lowest `num` bits, at most 63."""
     return (np.uint64(1) << np.uint64(num)) - np.uint64(1)
 
 
 @inlined_kernel
 def _pack_differences(known: Words, ghost: Words, frame: Words, at: int) -> tuple[np.uint64, int]:
-    """Write the words that are not as they are known; their bits, and where they end."""
+    """Write the words that differ from known ones. Return their bits, and where they end."""
     bits = np.uint64(0)
     for first in range(0, ghost.size, GROUP):
         if _differ(known, ghost, first):
@@ -193,7 +193,7 @@ def _pack_differences(known: Words, ghost: Words, frame: Words, at: int) -> tupl
 
 @inlined_kernel
 def _differ(known: Words, ghost: Words, first: int) -> bool:
-    """Whether two rows are different in the words of a group."""
+    """Return whether two rows differ in the words of a group."""
     differ = np.int64(0)
     if first + GROUP <= ghost.size:
         for c in range(GROUP):
@@ -206,9 +206,10 @@ def _differ(known: Words, ghost: Words, first: int) -> bool:
 
 @inlined_kernel
 def _count_ghosts(both: Both, frame: Words) -> int:
-    """How many ghosts a frame says that it has; -1: it is none that `pack_frame` makes.
+    """Return the number of ghosts in a frame; -1 if `pack_frame` has not made the frame.
 
-    Nothing else of a frame may be read if it is -1, nor if there is no room for what it has.
+    The caller must not read more of the frame if the result is -1, or if there is no room for the
+    ghosts.
     """
     num_worlds = both.num_owned.shape[1]
     first = 1 + 3 * num_worlds
@@ -238,19 +239,19 @@ def _count_ghosts(both: Both, frame: Words) -> int:
 def take_frame(
     both: Both,
     side: int,
-    passing: Passing,  # written
+    passing: Passing,  # is written
     law: Forecast,
-    before: Ghosts,  # those of the frame before
-    now: Ghosts,  # written: the ghosts, first of all
+    before: Ghosts,  # of the frame before
+    now: Ghosts,  # the first rows are written: the ghosts
     frame: Words,
 ) -> int:
-    """Append rows that another process packed to the rows of these zones and the departure queue.
+    """Append the rows in a frame to the rows of these zones and to the departure queue.
 
-    Ghosts that can touch a vehicle come before those that cannot.
+    Ghosts that can touch a vehicle come before all other ghosts.
 
     Returns:
-        how many ghosts it has; if there is no room for them, -1 less that number; `NO_FRAME`: it is
-        none that `pack_frame` makes. Below 0 nothing is put anywhere.
+        The number n of ghosts; -1 - n if there is no room for them; `NO_FRAME` if `pack_frame` has
+        not made the frame. If the result is below 0, no rows are appended.
     """
     total = _count_ghosts(both, frame)
     if total < 0:
@@ -300,7 +301,7 @@ def _is_of_world(ghost: Words, num_worlds: int) -> bool:
 
 @inlined_kernel
 def _put(both: Both, side: int, zone: int, w: int, ghost: Words, is_near: bool) -> None:
-    """Put a ghost behind the rows of a zone."""
+    """Append a ghost to the rows of a zone."""
     rows = both.rows[side, zone, w]
     steps = both.steps[zone, w]
     step_at = both.step_at[zone, w]
@@ -322,7 +323,7 @@ def _put(both: Both, side: int, zone: int, w: int, ghost: Words, is_near: bool) 
 
 @inlined_kernel
 def _copy(source: Words, first: int, target: Words, to: int, num: int) -> None:
-    # Unsigned: Numba asks of each other number whether it is below 0.
+    # Unsigned indices, because Numba checks whether signed ones are negative.
     for c in range(num):
         target[np.uint64(to + c)] = source[np.uint64(first + c)]
 
@@ -334,10 +335,10 @@ def _unpack(
     now: Ghosts,
     num: int,
     frame: Words,
-    like: int,  # where `like` begins
-    at: int,  # where the ghosts' words begin
+    like: int,  # start of the ghosts' indices in the frame before
+    at: int,  # start of the ghosts' words
 ) -> bool:
-    """Write the ghosts of a frame to `now`; whether they are of one."""
+    """Write the ghosts of a frame to `now`. Return whether the frame is valid."""
     size = now.words.shape[1]
     for n in range(num):
         found = frame[like + n]
@@ -369,7 +370,7 @@ def _unpack(
 
 @inlined_kernel
 def _slot(ghost: Words, slots: NDArray[np.int32]) -> int:
-    """Where a ghost is looked for first, by its vehicle."""
+    """Return the first slot for a ghost, a hash of its vehicle and its world."""
     word = np.uint64(ghost[ID]) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(ghost[ghost.size - 1])
     return int(np.int64((word >> np.uint64(32)) & np.uint64(slots.size - 1)))
 
@@ -386,7 +387,7 @@ def _fill_slots(before: Words, slots: NDArray[np.int32]) -> None:
 
 @inlined_kernel
 def _find(before: Words, slots: NDArray[np.int32], ghost: Words) -> int:
-    """The ghost of the frame before of the same vehicle; -1: there was none."""
+    """Return the index of the same vehicle's ghost in the frame before; -1: there is none."""
     at = _slot(ghost, slots)
     last = ghost.size - 1
     found = -1

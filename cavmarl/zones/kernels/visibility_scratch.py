@@ -1,4 +1,4 @@
-"""What is known of each lane, and of each link, while a zone's looks are found."""
+"""Scratch memory of the visibility tests, per lane and per link."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 
 class VisibilityScratch(NamedTuple):
-    """What is known of each lane, and of each link, on the way."""
+    """Distances and marks of each lane and each link."""
 
-    first: NDArray[np.float64]  # (L,) the zone's own part of a lane, m; inf: it has none
-    last: NDArray[np.float64]  # (L,)
-    ahead: NDArray[np.float64]  # (L,) way from a driver of the zone to the start of a lane, m
-    behind: NDArray[np.float64]  # (L,) way from the end of a lane to a vehicle with followers, m
-    to_line: NDArray[np.float64]  # (L,) way from the end of a lane to the line of a foe, m
-    to_room: NDArray[np.float64]  # (L,) the same, of one that is left room for
-    beyond: NDArray[np.float64]  # (L,) way from a junction that is asked about to a lane, m
+    first: NDArray[np.float64]  # (L,) start of the zone's part of a lane, m; inf: it has none
+    last: NDArray[np.float64]  # (L,) end of the zone's part of a lane, m
+    ahead: NDArray[np.float64]  # (L,) distance from a driver of the zone to a lane's start, m
+    behind: NDArray[np.float64]  # (L,) distance from a lane's end to a vehicle with followers, m
+    to_line: NDArray[np.float64]  # (L,) distance from a lane's end to the line of a foe, m
+    to_room: NDArray[np.float64]  # (L,) the same, to foes in `swept`
+    beyond: NDArray[np.float64]  # (L,) distance from a junction in `asked` to a lane, m
     asked: NDArray[np.bool_]  # (K,) links that a driver of the zone may want to enter
-    foe: NDArray[np.bool_]  # (K,) their foes
-    swept: NDArray[np.bool_]  # (K,) of these those that vehicles leave room for
-    waits: NDArray[np.bool_]  # (L,) to be looked at
-    following: NDArray[np.int32]  # (L,) which lane is to be looked at then
+    foe: NDArray[np.bool_]  # (K,) foes of these links
+    swept: NDArray[np.bool_]  # (K,) foes for which vehicles leave room
+    waits: NDArray[np.bool_]  # (L,) lanes in the queue of a search
+    following: NDArray[np.int32]  # (L,) the next lane in the queue
 
 
 def make_scratch(num_lanes: int, num_links: int) -> VisibilityScratch:

@@ -1,12 +1,12 @@
-"""Where on each lane the vehicles can be that a zone's drivers may ask about.
+"""The parts of lanes with vehicles that a zone's drivers may consider.
 
-A halo is as wide as the farthest look in any direction. But a driver looks along its way, at those
-beside it, and at vehicles that come to the lines before it; most of the lanes within the halo are
-none of these. This file walks the roads from a zone's own ones and says for every lane from where
-on, or up to where, a vehicle can matter: a place too many is a copy too many, a place too few is
-an error.
+A halo is as wide as the farthest look in any direction. But a driver looks only along its route, at
+vehicles beside it, and at vehicles that approach the lines before it; most lanes within the halo
+are none of these. This module follows the roads from the zone's own lanes, and finds the part of
+each lane in which vehicles can matter. A part that is too large costs superfluous copies; a part
+that is too small is an error.
 
-None of this is part of a tick: it is done once for a partition.
+This runs once per partition, not in ticks.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from cavmarl.zones.kernels.lane_paths import begin_paths, extend_paths
 from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
-AT_LINE_M = 0.2  # so near before a line a vehicle may be about to drive over it
-ASIDE_M = 10.0  # places beside each other on lanes of one edge are not further apart, nor more of s
-BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # to the end of a lane on which followers are looked for
-ROUNDING_M = 0.1  # more than sums over lanes, and float32, are off
+AT_LINE_M = 0.2  # a vehicle within this distance of a line may be about to cross it
+ASIDE_M = 10.0  # bound of the distance, and of the difference in s, of adjacent places on an edge
+BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # distance to the end of lanes with possible followers
+ROUNDING_M = 0.1  # bound of the rounding of sums over lanes and of float32
 
 
 @kernel
 def _within(
     rect: NDArray[np.float64], x: float, y: float, to_x: float, to_y: float
 ) -> tuple[float, float]:
-    """The part of a straight line that lies in a rectangle, as shares of it; (inf, -inf): none."""
+    """Return the part of a segment in a rectangle, as shares from 0 to 1; (inf, -inf) if none."""
     low = 0.0
     high = 1.0
     for axis in range(2):
@@ -61,7 +61,7 @@ def _within(
 
 @kernel
 def _find_own(roads: RoadArrays, rect: NDArray[np.float64], scratch: VisibilityScratch) -> None:
-    """Which part of each lane lies in a rectangle; lanes beside each other have the same."""
+    """Find the part of each lane in a rectangle, the same for all lanes of an edge."""
     for lane in range(roads.lanes.shape[0]):
         scratch.first[lane] = math.inf
         scratch.last[lane] = -math.inf
@@ -92,7 +92,7 @@ def _find_own(roads: RoadArrays, rect: NDArray[np.float64], scratch: VisibilityS
 
 @inlined_kernel
 def _widen(looks: NDArray[np.void], lane: int, first: float, last: float, length: float) -> None:
-    """Let vehicles between two places of a lane be seen."""
+    """Extend the visible part of a lane by the part between two places."""
     if first > last or last < 0.0 or first > length:
         return
     if first <= 0.0:
@@ -105,7 +105,7 @@ def _widen(looks: NDArray[np.void], lane: int, first: float, last: float, length
 
 @inlined_kernel
 def _longest_beside_m(roads: RoadArrays, lane: int) -> float:
-    """How far a lane's neighbours go on beside the junction at its end; 0: they end there, too."""
+    """Return how far adjacent lanes go on beside the junction at a lane's end; 0: not at all."""
     further = 0.0
     for side in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
         if side >= 0 and not roads.lanes[lane]["internal"]:
@@ -117,9 +117,9 @@ def _longest_beside_m(roads: RoadArrays, lane: int) -> float:
 def _look_beyond(
     roads: RoadArrays, lane: int, back: float, half_m: float, looks: NDArray[np.void]
 ) -> None:
-    """Let vehicles behind the end of a lane be seen that may cover a longer one beside it.
+    """Make vehicles visible that are past a lane's end but may cover a longer adjacent lane.
 
-    `back`: from where on followers are seen, in m of the lane; inf: all are, not as followers.
+    `back` is the place in m on the lane from which on followers are visible; inf: all vehicles are.
     """
     further = _longest_beside_m(roads, lane)
     if further == 0.0:
@@ -149,7 +149,7 @@ def _see(
     half_m: float,  # of the longest vehicle
     looks: NDArray[np.void],
 ) -> None:
-    """The same on all lanes of its edge: vehicles beside one may be about to change to it."""
+    """Extend the visible part of all lanes of an edge: adjacent vehicles may change lanes."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         length = roads.lanes[other]["length_m"]
@@ -167,7 +167,7 @@ def _look_along(
     scratch: VisibilityScratch,
     looks: NDArray[np.void],
 ) -> None:
-    """Leaders ahead, and followers: on own lanes, and over their starts."""
+    """Make leaders and followers of the zone's vehicles visible."""
     view_m = max(view_m, see_m, LOOK_BACK_M)
     for lane in range(roads.lanes.shape[0]):
         scratch.ahead[lane] = math.inf
@@ -196,7 +196,7 @@ def _look_along(
 
 @kernel
 def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: VisibilityScratch) -> None:
-    """Which links the zone's drivers may ask about, and which are the foes of these."""
+    """Find the links that the zone's drivers may want to enter, and the foes of these links."""
     largest = size_of(half_m)
     for link in range(roads.links.shape[0]):
         scratch.asked[link] = False
@@ -227,7 +227,7 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
                     scratch.foe[sweep["foe"]] = True
                     scratch.swept[sweep["foe"]] = True
     grown = True
-    while grown:  # on equal roads drivers ask along circles of those that give way
+    while grown:  # on equal roads, drivers follow circles of vehicles that give way
         grown = False
         for link in range(roads.links.shape[0]):
             if not (scratch.foe[link] and on_equal_road(roads, link)):
@@ -242,7 +242,7 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
 
 @kernel
 def _ask(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
-    """All links that lead on from the edge of a lane."""
+    """Mark all links that lead on from the edge of a lane."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         first = roads.lanes[other]["first_link"]
@@ -252,7 +252,7 @@ def _ask(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
 
 @kernel
 def _ask_behind(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
-    """All links beside those that lead to a lane: whose vehicles may be in the way at its start."""
+    """Mark links beside those that lead to a lane: their vehicles may obstruct its start."""
     for k in range(roads.lanes[lane]["num_into"]):
         before = roads.lanes[roads.into[roads.lanes[lane]["first_into"] + k]]
         if before["internal"]:
@@ -263,7 +263,7 @@ def _ask_behind(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> Non
 def _look_at_junctions(
     roads: RoadArrays, half_m: float, scratch: VisibilityScratch, looks: NDArray[np.void]
 ) -> None:
-    """Vehicles that come to the lines of foes, are on a junction, or stand behind it."""
+    """Make vehicles visible that approach the lines of foes, are on a junction, or are after it."""
     for lane in range(roads.lanes.shape[0]):
         scratch.to_line[lane] = math.inf
         scratch.to_room[lane] = math.inf
@@ -302,7 +302,7 @@ def _look_at_junctions(
 
 @inlined_kernel
 def _merge_from(roads: RoadArrays, lane: int, way: float, looks: NDArray[np.void]) -> None:
-    """Let vehicles on the edge of a lane, `way` m before the line, be seen from `MERGES_M` on."""
+    """Make vehicles on the edge of a lane visible within `MERGES_M` of the line, `way` m ahead."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         place = way + roads.lanes[other]["length_m"] - ROUNDING_M
@@ -311,9 +311,9 @@ def _merge_from(roads: RoadArrays, lane: int, way: float, looks: NDArray[np.void
 
 @kernel
 def _look_at_merges(roads: RoadArrays, scratch: VisibilityScratch, looks: NDArray[np.void]) -> None:
-    """Vehicles that come to foes' lines from farther away, where others turn into their lane.
+    """Make vehicles visible from farther away before foes' lines where vehicles merge.
 
-    From the lanes before those lines, and those from which one need not stop before that.
+    They are on the lanes before these lines, or on lanes with the right of way that lead to them.
     """
     for lane in range(roads.lanes.shape[0]):
         if scratch.to_line[lane] == 0.0 and roads.lanes[lane]["merges"]:
@@ -341,16 +341,15 @@ def _look_at_merges(roads: RoadArrays, scratch: VisibilityScratch, looks: NDArra
 @kernel
 def find_looks(
     roads: RoadArrays,
-    # (4,) min_x, min_y, max_x, max_y in m: where drivers of the zone, and departures that it lets
-    # in, can be
+    # (4,) min_x, min_y, max_x, max_y in m: the area of the zone's drivers and departures
     rect: NDArray[np.float64],
-    view_m: float,  # how far any driver looks for others along the road
-    see_m: float,  # how far before a line its centre is when a driver first asks about the junction
+    view_m: float,  # how far any driver looks along the road
+    see_m: float,  # distance of a driver's centre to a line at which it considers the junction
     half_m: float,  # half the length of the longest vehicle
     scratch: VisibilityScratch,  # see `make_scratch`
-    looks: NDArray[np.void],  # LOOK (L,), overwritten
+    looks: NDArray[np.void],  # LOOK (L,) is written
 ) -> None:
-    """Say for each lane where vehicles are that matter to the drivers of one zone."""
+    """Find the part of each lane in which vehicles matter to the drivers of one zone."""
     for lane in range(roads.lanes.shape[0]):
         looks[lane]["head"] = -math.inf
         looks[lane]["tail"] = math.inf
@@ -375,10 +374,9 @@ def _farther(
     zone: int,
     squared: float,
 ) -> float:
-    """The largest of `squared` and the squared distances from a zone of part of a straight piece.
+    """Return the maximum of `squared` and the squared distances of part of a segment from a zone.
 
-    That part reaches from `first` to `last` m of the lane. Nothing of it is further away than its
-    two ends are.
+    The part is from `first` to `last` m of the lane. One of its ends is its farthest point.
     """
     first = max(first, near["s"])
     last = min(last, far["s"])
@@ -398,9 +396,9 @@ def farthest_m(
     roads: RoadArrays,
     rects: NDArray[np.float64],  # (k, 4) all zones, as in `ZoneArrays`
     zone: int,
-    looks: NDArray[np.void],  # LOOK (L,) what `find_looks` has found for it
+    looks: NDArray[np.void],  # LOOK (L,) of the zone, from `find_looks`
 ) -> float:
-    """How far outside of a zone the farthest place lies that its drivers may ask about."""
+    """Return the distance from a zone of the farthest vehicle that its drivers may consider."""
     squared = 0.0
     for lane in range(roads.lanes.shape[0]):
         look = looks[lane]

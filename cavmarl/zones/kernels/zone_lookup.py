@@ -1,12 +1,13 @@
-"""Which zone a place belongs to, and which other zones have to see what is there.
+"""Lookup of the zone of a position, and of the zones that must see a vehicle there.
 
-A zone is a rectangle [min_x, max_x) by [min_y, max_y); those at the rim reach to infinity. The cuts
-of all zones together span a table of cells, each of one zone: a place belongs to the cell that two
-searches among the cuts find. Both only compare the coordinate with stored numbers, so every process
-gives the same answer, on a border as well.
+A zone is a rectangle [min_x, max_x) by [min_y, max_y); zones at the rim extend to infinity. The
+cuts of all zones form a table of cells, each of one zone. Two searches among the cuts find the cell
+of a position. They only compare the coordinates with stored numbers, so all processes agree, also
+on a border.
 
-A vehicle is published by its position: each zone within the halo of it gets it as a ghost, whether
-or not that zone touches the vehicle's own (decision 012), if a driver there may ask about it.
+Ghosts depend on a vehicle's position: a zone gets the vehicle as a ghost if it is within the zone's
+halo and a driver there may consider it, even if the zone does not touch the vehicle's own zone
+(decision 012).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import (
 
 
 class ZoneArrays(NamedTuple):
-    """What kernels take of a `ZonePartition`; k zones."""
+    """The arrays of a `ZonePartition` of k zones, for kernels."""
 
     cuts_x: NDArray[np.float64]  # (columns - 1,) rising, m
     cuts_y: NDArray[np.float64]  # (rows - 1,) rising, m
@@ -35,13 +36,15 @@ class ZoneArrays(NamedTuple):
 
 
 LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line", "room", "merge")])
-"""Vehicles that a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m
-on, and those that announce themselves to a vehicle at `back` m that they follow, or to a line: at
-`line` m unless they are let stand before it, at `room` m even then (`kernels.visibility_tests`).
-To a line at `merge` m, where others turn into their lane, they do so `MERGES_M` ahead at least."""
+"""The vehicles on a lane that a zone's drivers may consider (`kernels.visibility_tests`), by their
+position in m along the lane: vehicles up to `head`, vehicles from `tail` on, and vehicles within
+their registration distance of one of three places. These are `back`, the position of a vehicle that
+they may follow; `line`, a stop line, except for vehicles that may be ignored before it; and `room`,
+a stop line before which no vehicle may be ignored. Moving vehicles are also considered within
+`MERGES_M` of `merge`, a line at which other vehicles turn into their lane."""
 
 WATCH = np.dtype([("zone", np.int32), *((name, LOOK[name]) for name in LOOK.names or ())])
-"""A LOOK, and whose it is."""
+"""A LOOK and its zone."""
 
 
 OUTER = np.dtype(
@@ -58,29 +61,29 @@ OUTER = np.dtype(
     ],
     align=True,
 )
-"""What says of an owned row which zones have to see it. It is noted when the row has just been
-written: rows are large, and those that matter here lie far apart in memory."""
+"""The fields of an owned row that decide which zones must see it. They are copied right after the
+row is written, because rows are large and these fields are far apart in memory."""
 
 
 class Halo(NamedTuple):
-    """How far zones see over their borders, and which vehicles."""
+    """How far zones see beyond their borders, and which vehicles they see."""
 
     halo_m: float
-    inner: NDArray[np.float64]  # (k, 4) the part of a zone in which no other zone sees any
+    inner: NDArray[np.float64]  # (k, 4) the part of a zone in which no other zone sees vehicles
     near_start: NDArray[np.int32]  # (k + 1,)
     near: NDArray[np.int32]  # near[near_start[z] : near_start[z + 1]]: zones within the halo of
-    # zone z, z itself among them
-    sure_m: float  # all vehicles within this distance are seen, further away those
-    seen_m: float  # that drivers may ask about, and beyond this none, since roads lead no further
-    line_m: float  # whose centre is further than this before a line has not reached it
-    watcher_start: NDArray[np.int32]  # (L + 1,); (1,) if sure_m is seen_m, so that there are none
-    watchers: NDArray[np.void]  # WATCH: watchers[watcher_start[l] : watcher_start[l + 1]] are those
-    # zones that may see vehicles on lane l, and which of them
+    # zone z, including z
+    sure_m: float  # all vehicles within this distance are seen
+    seen_m: float  # between `sure_m` and this, vehicles in `watchers` are seen; beyond it, none
+    line_m: float  # a vehicle whose centre is farther before a line has not reached the line
+    watcher_start: NDArray[np.int32]  # (L + 1,); (1,) if sure_m is seen_m: there are no watchers
+    watchers: NDArray[np.void]  # WATCH: watchers[watcher_start[l] : watcher_start[l + 1]] are the
+    # zones that may see vehicles on lane l, and the vehicles that they see
 
 
 @kernel
 def _slot(cuts: NDArray[np.float64], value: float) -> int:
-    """How many of the cuts are at or below `value`; none for NaN."""
+    """Return the number of cuts at or below `value`; 0 for NaN."""
     low = 0
     high = cuts.size
     while low < high:
@@ -94,9 +97,9 @@ def _slot(cuts: NDArray[np.float64], value: float) -> int:
 
 @kernel
 def zone_of(zones: ZoneArrays, x: float, y: float) -> int:
-    """The one zone of a place in metres; a place on a border belongs to the zone that begins there.
+    """Return the zone of a position in metres, in O(log k).
 
-    O(log k).
+    A position on a border belongs to the zone that begins there.
     """
     return int(zones.cells[_slot(zones.cuts_y, y), _slot(zones.cuts_x, x)])
 
@@ -105,29 +108,29 @@ def zone_of(zones: ZoneArrays, x: float, y: float) -> int:
 def zones_of(
     zones: ZoneArrays,
     rows: NDArray[np.void],  # records with `x` and `y` in metres, such as VEHICLE
-    num: int,  # how many of them, `rows[:num]`
-    out: NDArray[np.int32],  # (num,) or longer, overwritten
+    num: int,  # number of rows to look up, `rows[:num]`
+    out: NDArray[np.int32],  # (num,) or longer, is written
 ) -> None:
-    """`zone_of` for many."""
+    """Write the zone of each row's position; see `zone_of`."""
     for i in range(num):
         out[i] = zone_of(zones, rows[i]["x"], rows[i]["y"])
 
 
 @inlined_kernel
 def is_inside(rect: NDArray[np.float64], x: float, y: float) -> bool:
-    """Whether a place is within a rectangle and not on its rim."""
+    """Return whether a position is within a rectangle and not on its rim."""
     inside: bool = rect[0] < x and x < rect[2] and rect[1] < y and y < rect[3]
     return inside
 
 
 @inlined_kernel
 def squared_distance(rects: NDArray[np.float64], zone: int, x: float, y: float) -> float:
-    """From a place to the nearest point of a zone, squared, in m²; 0 inside.
+    """Return the squared distance in m² from a position to the nearest point of a zone; 0 inside.
 
-    Rounding grows with what is rounded. So the squared distance from (x, y) to a vehicle inside the
-    zone, taken by the same operations, is never the smaller of the two: not by one bit.
+    Rounding is monotonic. So the squared distance from (x, y) to a vehicle inside the zone, if
+    computed with the same operations, is never smaller, not even by one bit.
     """
-    # One of the two is negative, and both are inside: no branch has to be guessed.
+    # One difference is negative, or both are inside: this needs no branch.
     dx = max(rects[zone, 0] - x, x - rects[zone, 2], 0.0)
     dy = max(rects[zone, 1] - y, y - rects[zone, 3], 0.0)
     return float(dx * dx + dy * dy)
@@ -135,7 +138,7 @@ def squared_distance(rects: NDArray[np.float64], zone: int, x: float, y: float) 
 
 @inlined_kernel
 def note_outer(outer: np.void, row: np.void, i: int) -> None:
-    """Note VEHICLE row i as one that other zones may have to see."""
+    """Record VEHICLE row i, which other zones may have to see."""
     outer["x"] = row["x"]
     outer["y"] = row["y"]
     outer["s"] = row["s"]
@@ -149,8 +152,8 @@ def note_outer(outer: np.void, row: np.void, i: int) -> None:
 
 @inlined_kernel
 def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
-    """Whether some driver of a zone that watches a vehicle's lane may ask about it."""
-    # Answers are unpredictable: branches would cost more than all that they leave out.
+    """Return whether a driver of a zone that watches a vehicle's lane may consider the vehicle."""
+    # The results are unpredictable, so branches would cost more than the work that they save.
     s = row["s"]
     reach_m = registration_distance_m(row["speed"])
     to_line = watch["line"] - s
@@ -159,7 +162,7 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
     comes = (to_line < reach_m) & (not is_let)
     merges = (watch["merge"] - s < MERGES_M) & (not stands)
     follows = watch["back"] - s < reach_m
-    swept = watch["room"] - s < reach_m  # one that waits leaves it room, even where it is let stand
+    swept = watch["room"] - s < reach_m  # waiting drivers leave room even if it may be ignored
     asked: bool = (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | merges | swept
     return asked
 
@@ -167,12 +170,12 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
 @inlined_kernel
 def is_seen(
     halo: Halo,
-    zone: int,  # that sees, or not
+    zone: int,
     row: np.void,  # VEHICLE or OUTER
-    squared: float,  # m²
+    squared: float,  # m², its `squared_distance` from the zone
 ) -> bool:
-    """Whether a zone has to see a vehicle whose `squared_distance` from it is known."""
-    if not squared <= halo.seen_m * halo.seen_m:  # nor where it is nowhere
+    """Return whether a zone must see a vehicle."""
+    if not squared <= halo.seen_m * halo.seen_m:  # false for NaN, too
         return False
     if squared <= halo.sure_m * halo.sure_m:
         return True

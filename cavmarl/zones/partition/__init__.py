@@ -1,1 +1,1 @@
-"""Maps cut into zones: layouts, the zone file, halos, statistics."""
+"""Partitions of maps into zones: layouts, the zone file, halos, statistics."""

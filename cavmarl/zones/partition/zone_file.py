@@ -1,12 +1,12 @@
-"""Zone files: a partition that is written before a run and read again, bit for bit.
+"""Zone files, which store a partition without loss.
 
     {"schema": "cavmarl.zones", "version": 1,
      "bounds_m": [0.0, 0.0, 200.0, 100.0],
      "zones": [{"id": 0, "rect_m": [0.0, 0.0, 120.0, 100.0]},
                {"id": 1, "rect_m": [120.0, 0.0, 200.0, 100.0]}]}
 
-JSON, or the same as YAML. The rectangles (min_x, min_y, max_x, max_y) tile `bounds_m`; sides on it
-reach to infinity. Ids are 0 to k - 1, in any order.
+The file is JSON, or the same as YAML. The rectangles (min_x, min_y, max_x, max_y) tile `bounds_m`;
+sides on `bounds_m` extend to infinity. Ids are 0 to k - 1, in any order.
 """
 
 from __future__ import annotations
@@ -51,14 +51,17 @@ def read_zones(path: str | Path) -> ZonePartition:
     ids = [zone.id for zone in document.zones]
     count = len(ids)
     if count > MAX_ZONES:
-        raise ConfigError(f"{path}: {count} zones: at most {MAX_ZONES} can be")
+        raise ConfigError(f"{path}: there are {count} zones; use at most {MAX_ZONES}")
     for number in ids:
         if ids.count(number) > 1:
-            raise ConfigError(f"{path}: id {number} stands {ids.count(number)} times: number anew")
+            raise ConfigError(
+                f"{path}: {ids.count(number)} zones have the id {number}; number the zones from 0 "
+                f"to {count - 1}"
+            )
     missing = sorted(set(range(count)) - set(ids))
     if missing:
         raise ConfigError(
-            f"{path}: no zone has the id {missing[0]}: {count} zones have the ids 0 to {count - 1}"
+            f"{path}: no zone has the id {missing[0]}; number the zones from 0 to {count - 1}"
         )
     rects = np.array([zone.rect_m for zone in sorted(document.zones, key=lambda zone: zone.id)])
     try:
@@ -68,7 +71,10 @@ def read_zones(path: str | Path) -> ZonePartition:
 
 
 def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> ZonePartition:
-    """The partition of a zone file; has to be of this map, with `count` zones if that is given."""
+    """Return the partition in a zone file.
+
+    Raises ConfigError if it does not cover this map or does not have `count` zones.
+    """
     partition = read_zones(path)
     if count is not None and partition.count != count:
         raise ConfigError(
@@ -77,22 +83,22 @@ def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> Zone
     extent, bounds = np.array(network.extent_m), np.array(partition.bounds)
     if (extent[:2] < bounds[:2]).any() or (extent[2:] > bounds[2:]).any():
         raise ConfigError(
-            f"{path}: bounds_m = {list(partition.bounds)} do not hold the roads of "
-            f"'{network.name}', which reach from {extent[:2].tolist()} to {extent[2:].tolist()}: "
-            "is it another map's? Cut this one with `cavmarl map zones`"
+            f"{path}: bounds_m = {list(partition.bounds)} does not contain the roads of "
+            f"'{network.name}', which extend from {extent[:2].tolist()} to {extent[2:].tolist()}; "
+            "use a zone file of this map, or make one with `cavmarl map zones`"
         )
     return partition
 
 
 def named_zones(
     network: RoadNetwork,
-    layout: str,  # one of ZONE_LAYOUTS, or a path
-    count: int | None,  # how many zones; None: as many as the file has, of a layout 4
+    layout: str,  # one of ZONE_LAYOUTS, or the path of a zone file
+    count: int | None,  # number of zones; None: as in the file, or 4 for a layout
     *,
-    avoid_junctions: bool = False,  # of `cut_map`
-    weight: str = "lane_length",  # of `cut_map`
+    avoid_junctions: bool = False,  # see `cut_map`
+    weight: str = "lane_length",  # see `cut_map`
 ) -> ZonePartition:
-    """The partition that a layout's name or the path of a zone file stands for."""
+    """Return the partition of a zone file, or the map cut by a layout."""
     if layout in ZONE_LAYOUTS:
         return cut_map(
             network,
@@ -104,8 +110,8 @@ def named_zones(
     if layout.endswith(ZONE_FILE_SUFFIXES):
         return zones_for(network, layout, count)
     raise ConfigError(
-        f"layout '{layout}': is none of {', '.join(ZONE_LAYOUTS)}, and no zone file "
-        f"({', '.join(ZONE_FILE_SUFFIXES)})"
+        f"layout '{layout}' does not exist; use {', '.join(ZONE_LAYOUTS)}, or the path of a zone "
+        f"file ({', '.join(ZONE_FILE_SUFFIXES)})"
     )
 
 

@@ -1,7 +1,7 @@
-"""Which zones see over which borders.
+"""Halos: the areas beyond their borders that zones see.
 
-Ghosts go by reach and not by contact (decision 012): the halo is a distance, and a zone gets every
-vehicle within it, from neighbours or from far behind them.
+A halo is a distance (decision 012): a zone gets every vehicle within it, from neighbours and from
+zones that do not touch it.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.zones.kernels.zone_lookup import LOOK, WATCH, Halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-# Added to the halo, so that no rounding of the sum below can make it too narrow.
+# Added to the halo, so that rounding cannot make it too narrow.
 _ROUNDING_M = 1e-6
 
 
 def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
-    """What `ghost_exchange.exchange` takes, where all vehicles within the halo are seen."""
+    """Return a halo for `ghost_exchange.exchange` in which zones see all vehicles."""
     if not (math.isfinite(halo_m) and halo_m >= 0.0):
-        raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number from 0")
+        raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number from 0 on")
     near = partition.within(halo_m)
     start = np.concatenate([[0], np.cumsum(near.sum(axis=1))]).astype(np.int32)
     return Halo(
@@ -42,10 +42,10 @@ def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
 def lane_watchers(
     partition: ZonePartition,  # of k zones
     lanes: NDArray[np.void],  # LANE (L,)
-    looks: NDArray[np.void],  # LOOK (k, L), the vehicles that each zone may ask about
-    within_m: float,  # zones that are nearer to a lane's bounding box watch it in any case
+    looks: NDArray[np.void],  # LOOK (k, L), the vehicles that each zone's drivers may consider
+    within_m: float,  # a zone within this distance of a lane's bounding box always watches it
 ) -> tuple[NDArray[np.int32], NDArray[np.void]]:
-    """`watcher_start` and `watchers` of a `Halo`."""
+    """Return `watcher_start` and `watchers` of a `Halo`."""
     asked = looks["head"] > -np.inf
     for place in ("tail", "back", "line", "room", "merge"):
         asked |= looks[place] < np.inf
@@ -63,8 +63,8 @@ def lane_watchers(
 
 
 def inner_parts(partition: ZonePartition, seen_m: float) -> NDArray[np.float64]:
-    """(k, 4) the part of each zone in which no other zone that sees `seen_m` far sees a vehicle."""
-    # A little further in: vehicles inside are invisible to every other zone by any rounding.
+    """Return the part (k, 4) of each zone that is farther than `seen_m` from all other zones."""
+    # The margin keeps vehicles in this part invisible to other zones in spite of rounding.
     margin = seen_m + _ROUNDING_M
     inner: NDArray[np.float64] = partition.reaching + np.array([margin, margin, -margin, -margin])
     return inner

@@ -1,8 +1,8 @@
-"""Where to cut a map: into a grid, into strips, or by recursive coordinate bisection.
+"""Layouts of zones: a grid, strips, or recursive coordinate bisection.
 
-Bisection halves what there is, lanes or expected vehicles, across its longer side, then each half
-again (Berger and Bokhari, IEEE Trans. Computers C-36, 1987); a count that is no power of two is
-split as evenly as it goes. Grid and strips have equal sides, whatever is in them.
+Bisection halves the weight of the map (lanes or expected vehicles) across its longer side, then
+each half again (Berger and Bokhari, IEEE Trans. Computers C-36, 1987). A number of zones that is
+not a power of two is split as evenly as possible. Grid and strips have equal sides.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ Floats = NDArray[np.float64]
 Rect = tuple[float, float, float, float]
 
 _WEIGHTS = ("lane_length", "uniform")
-MIN_SIDE_M = 5.0  # of a zone: about a car
-# Around the roads, which have a width; a straight road has an area by it.
+MIN_SIDE_M = 5.0  # of a zone: about the length of a car
+# Margin around the roads, so that a single straight road has an area, too.
 _RIM_M = 5.0
-# How far a cut may be moved to keep junctions whole: of a zone's side, of the lesser part's weight.
+# How far a cut may move to avoid junctions: as a share of a zone's side or of the lesser weight.
 _SIDE_SHIFT = 0.25
 _WEIGHT_SHIFT = 0.1
-# How far beside a junction such a cut lies, where there is room.
+# Distance of such a cut from the junction, if there is room.
 _CLEAR_M = 1.0
 
 
 @dataclass(frozen=True)
 class _Area:
-    """What is cut: the map's box, what counts in it, and what to keep whole."""
+    """The area to cut, with its weight and its junctions."""
 
-    bounds: Bounds  # the box
-    samples: Floats | None  # (n, 3) x, y and weight; none: area counts
+    bounds: Bounds  # the box of the map
+    samples: Floats | None  # (n, 3) x, y and weight; None: weight by area
     junctions: Floats  # (m, 4) boxes that cuts avoid
 
 
@@ -47,18 +47,18 @@ def cut_map(
     layout: str,  # `grid`, `strips` or `bisection`
     count: int,  # k
     *,
-    # move cuts aside, by at most a quarter of a zone's side (bisection: a tenth of the weight),
-    # where that keeps junctions whole
+    # move cuts, by at most a quarter of a zone's side (bisection: a tenth of the weight), so that
+    # they do not cut junctions
     avoid_junctions: bool = False,
-    weight: str = "lane_length",  # what bisection shares out: `lane_length`, or `uniform` for area
-    # (n, 3) x and y in m, and a weight: shared out instead, such as expected vehicles
+    weight: str = "lane_length",  # for bisection: `lane_length`, or `uniform` for area
+    # (n, 3) x and y in m and a weight, such as expected vehicles; it replaces `weight`
     density: Floats | None = None,
 ) -> ZonePartition:
     """Divide a map into `count` zones."""
     if layout not in ZONE_LAYOUTS:
-        raise ConfigError(f"layout '{layout}': there are {', '.join(ZONE_LAYOUTS)}")
+        raise ConfigError(f"layout '{layout}' does not exist; use {', '.join(ZONE_LAYOUTS)}")
     if weight not in _WEIGHTS:
-        raise ConfigError(f"weight '{weight}': there are {', '.join(_WEIGHTS)}")
+        raise ConfigError(f"weight '{weight}' does not exist; use {', '.join(_WEIGHTS)}")
     if not 1 <= count <= MAX_ZONES:
         raise ConfigError(f"{count} zones: must be a whole number from 1 to {MAX_ZONES}")
     min_x, min_y, max_x, max_y = network.extent_m
@@ -80,12 +80,12 @@ def _samples(network: RoadNetwork, weight: str, density: Floats | None) -> Float
     density = np.asarray(density, dtype=np.float64)
     shaped = density.ndim == 2 and density.shape[1] == 3
     if not (shaped and np.isfinite(density).all() and (density[:, 2] >= 0.0).all()):
-        raise ConfigError("density: must be rows of x, y and weight, finite, no weight below 0")
+        raise ConfigError("density: must be rows of finite x, y and weight, with no weight below 0")
     return density[density[:, 2] > 0.0]
 
 
 def _grid_shape(bounds: Bounds, count: int, *, strips: bool) -> tuple[int, int]:
-    """(rows, columns): cells as square as can be, strips across the longer side."""
+    """Return (rows, columns) with cells as square as possible; strips cut the longer side."""
     width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
     shapes = [(rows, count // rows) for rows in range(1, count + 1) if count % rows == 0]
     if strips:
@@ -99,7 +99,7 @@ def _grid_shape(bounds: Bounds, count: int, *, strips: bool) -> tuple[int, int]:
         raise ConfigError(
             f"{count} zones: {best[0]} rows and {best[1]} columns of a map of {width:.0f} m x "
             f"{height:.0f} m would be {height / best[0]:.2f} m x {width / best[1]:.2f} m; a zone's "
-            f"sides must be at least {MIN_SIDE_M:g} m: use fewer zones or another layout"
+            f"sides must be at least {MIN_SIDE_M:g} m, so use fewer zones or another layout"
         )
     return best
 
@@ -114,7 +114,7 @@ def _gridded(area: _Area, rows: int, columns: int) -> list[Rect]:
 
 
 def _even_cuts(area: _Area, axis: int, parts: int) -> list[float]:
-    """The `parts` + 1 sides along an axis."""
+    """Return the `parts` + 1 sides of zones along an axis."""
     low, high = area.bounds[axis], area.bounds[axis + 2]
     side = (high - low) / parts
     room = min(_SIDE_SHIFT * side, (side - MIN_SIDE_M) / 2.0)
@@ -139,9 +139,9 @@ def _bisected(area: _Area, rect: Rect, samples: Floats | None, count: int) -> li
             break
     else:
         raise ConfigError(
-            f"more zones than the map can hold: {count} are left for x {rect[0]:.2f} to "
-            f"{rect[2]:.2f}, y {rect[1]:.2f} to {rect[3]:.2f}, where no cut leaves a part of what "
-            f"is shared out and {MIN_SIDE_M:g} m on both sides: use fewer zones"
+            f"the map cannot hold this many zones: no cut divides x {rect[0]:.2f} to "
+            f"{rect[2]:.2f}, y {rect[1]:.2f} to {rect[3]:.2f} into {count} zones with a share of "
+            f"the weight and sides of {MIN_SIDE_M:g} m; use fewer zones"
         )
     cut = _quiet_cut(area, rect, axis, window)
     low, high = list(rect), list(rect)
@@ -159,7 +159,10 @@ def _bisected(area: _Area, rect: Rect, samples: Floats | None, count: int) -> li
 def _window(
     rect: Rect, samples: Floats | None, axis: int, share: float
 ) -> tuple[float, float, float] | None:
-    """Where a cut may lie, where it leaves `share` below it, where it may lie; None: nowhere."""
+    """Return the first allowed cut, the cut with `share` below it, and the last allowed cut.
+
+    Return None if no cut is allowed.
+    """
     low, high = rect[axis] + MIN_SIDE_M, rect[axis + 2] - MIN_SIDE_M
     shift = _WEIGHT_SHIFT * min(share, 1.0 - share)
     place = _quantile(rect, samples, axis)
@@ -177,7 +180,7 @@ def _window(
 
 
 def _quantile(rect: Rect, samples: Floats | None, axis: int) -> Callable[[float], float]:
-    """The coordinate below which a share of all lies, as a function of the share."""
+    """Return a function from a share to the coordinate below which this share of weight is."""
     if samples is None or not len(samples):
         low, high = rect[axis], rect[axis + 2]
         return lambda share: low + share * (high - low)
@@ -193,20 +196,19 @@ def _quantile(rect: Rect, samples: Floats | None, axis: int) -> Callable[[float]
 
 
 def _quiet_cut(
-    area: _Area,  # whose junctions are kept whole
-    rect: Rect,  # what is cut
+    area: _Area,
+    rect: Rect,  # the part to cut
     axis: int,  # 0: between left and right, 1: between below and above
-    # where it may begin, where the cut is wanted, where it may end
-    window: tuple[float, float, float],
+    window: tuple[float, float, float],  # first allowed, wanted and last allowed cut
 ) -> float:
-    """The cut within a window that divides the fewest junctions; of several the nearest."""
+    """Return the cut within a window that divides the fewest junctions, nearest to the wanted."""
     first, wanted, last = window
     across = 1 - axis
     boxes = area.junctions
     met = (boxes[:, across] < rect[across + 2]) & (boxes[:, across + 2] >= rect[across])
     lows, highs = boxes[met, axis], boxes[met, axis + 2]
     edges = np.unique(np.clip(np.concatenate([lows, highs, [first, last]]), first, last))
-    # Between two edges all cuts divide the same junctions.
+    # All cuts between two adjacent edges divide the same junctions.
     clear = np.minimum(_CLEAR_M, np.diff(edges) / 2.0)
     quiet = np.clip(wanted, edges[:-1] + clear, edges[1:] - clear)
     cuts: list[float] = [wanted, *quiet.tolist()]

@@ -1,4 +1,4 @@
-"""Zones without loops: a vehicle that enters has to leave, or to arrive."""
+"""Search for zones without loops, in which a vehicle cannot drive on forever."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 def zones_without_loop(network: RoadNetwork, partition: ZonePartition) -> tuple[int, ...]:
-    """The zones that hold no closed way: no edges with the junctions between them wholly inside."""
+    """Return the zones without a closed route whose edges and junctions are all inside."""
     lanes, links = network.lanes, network.links
     places = np.stack([network.points["x"], network.points["y"]], axis=1)
     zones = partition.zones_of(places)
@@ -23,7 +23,7 @@ def zones_without_loop(network: RoadNetwork, partition: ZonePartition) -> tuple[
     of_lane = lanes["edge"]
     arcs = np.stack([of_lane[links["from_lane"]], of_lane[links["to_lane"]]], axis=1)[whole]
     component = strong_components(len(network.edges), arcs)
-    # An arc between edges that reach each other is part of a closed way.
+    # An arc between edges that reach each other is part of a closed route.
     closed = component[arcs[:, 0]] == component[arcs[:, 1]]
     with_loop = set(first[whole][closed].tolist())
     return tuple(zone for zone in range(partition.count) if zone not in with_loop)
@@ -32,7 +32,7 @@ def zones_without_loop(network: RoadNetwork, partition: ZonePartition) -> tuple[
 def _of_links(
     network: RoadNetwork, ufunc: np.ufunc, of_lanes: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """The least or greatest zone number on the edges before and behind each link, and on it."""
+    """Return the least or greatest zone on each link and on the edges before and after it."""
     lanes, links = network.lanes, network.links
     of_edges = ufunc.reduceat(of_lanes, network.edges["first_lane"])
     from_edge, to_edge = (lanes["edge"][links[end]] for end in ("from_lane", "to_lane"))

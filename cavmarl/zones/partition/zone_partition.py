@@ -1,9 +1,9 @@
-"""`ZonePartition`: a map divided into rectangles, each place in exactly one of them.
+"""`ZonePartition`: a map divided into rectangles, so that each position is in exactly one zone.
 
-Zones are half-open: [min_x, max_x) by [min_y, max_y). So a place on a border, or where four corners
-meet, belongs to one zone; and as those at the rim reach to infinity, so does every other place.
-`zone_layouts` makes partitions of maps, `zone_file` keeps them, `zone_halo` says how far zones
-must see over their borders, and `zone_statistics` what is in them.
+Zones are half-open: [min_x, max_x) by [min_y, max_y). So a position on a border or at a corner
+belongs to one zone. Zones at the rim extend to infinity, so positions outside of the map have a
+zone, too. `zone_layouts` makes partitions of maps, `zone_file` stores them, `zone_halo` computes
+how far zones see beyond their borders, and `zone_statistics` describes their contents.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _PLACE = np.dtype([("x", np.float64), ("y", np.float64)])
 
 @dataclass(frozen=True)
 class Neighbor:
-    """A zone that touches another."""
+    """A zone that touches another zone."""
 
     zone: int
-    corner: bool  # they share a corner and no more
+    corner: bool  # whether they share only a corner
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +37,12 @@ class ZonePartition:
     """k zones, numbered from 0, that cover the plane without overlap.
 
     Raises:
-        ConfigError: the rectangles overlap, leave a gap, leave `bounds` or are none; the message
+        ConfigError: the rectangles overlap, leave a gap, exceed `bounds` or are empty; the message
             names the zones and the place.
     """
 
-    bounds: Bounds  # the box of the map that was divided. Sides of zones on it count as the rim
-    # (k, 4) min_x, min_y, max_x, max_y in metres, within `bounds` and together all of it; read-only
+    bounds: Bounds  # the box that is divided; its sides are the rim
+    # (k, 4) min_x, min_y, max_x, max_y in metres, read-only; together they tile `bounds`
     rects: NDArray[np.float64]
 
     def __post_init__(self) -> None:
@@ -58,7 +58,7 @@ class ZonePartition:
 
     @cached_property
     def reaching(self) -> NDArray[np.float64]:
-        """`rects` with the rim at infinity, (k, 4): the zones as they are; read-only."""
+        """`rects` with the rim at infinity, (k, 4), read-only."""
         rim = np.array(self.bounds)
         endless = np.array([-np.inf, -np.inf, np.inf, np.inf])
         reaching = np.where(self.rects == rim, endless, self.rects)
@@ -72,11 +72,11 @@ class ZonePartition:
         )
 
     def zone_of(self, x: float, y: float) -> int:
-        """The one zone of a place in metres."""
+        """Return the zone of a position in metres."""
         return zone_of(self.arrays, x, y)
 
     def zones_of(self, xy: NDArray[np.float64]) -> NDArray[np.int32]:
-        """The zones of many places, (n, 2) metres → (n,)."""
+        """Return the zones (n,) of positions (n, 2) in metres."""
         places = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2).view(_PLACE)[:, 0]
         zones = np.empty(len(places), np.int32)
         zones_of(self.arrays, places, len(places), zones)
@@ -84,9 +84,9 @@ class ZonePartition:
 
     @cached_property
     def neighbors(self) -> tuple[tuple[Neighbor, ...], ...]:
-        """For each zone those that touch it, by number; a shared corner counts."""
+        """The zones that touch each zone, by number, including zones that share only a corner."""
         low, high = self.rects[:, None, :2], self.rects[None, :, 2:]
-        # How far two rectangles share each axis: below 0 apart, 0 touching.
+        # Overlap of two rectangles on each axis: below 0 they are apart, at 0 they touch.
         shared = np.minimum(high, high.swapaxes(0, 1)) - np.maximum(low, low.swapaxes(0, 1))
         touching = (shared >= 0.0).all(axis=2) & ~np.eye(self.count, dtype=bool)
         corner = (shared == 0.0).all(axis=2)
@@ -96,7 +96,7 @@ class ZonePartition:
         )
 
     def within(self, distance_m: float) -> NDArray[np.bool_]:
-        """(k, k) which zones are no further apart; each is no further from itself."""
+        """Return (k, k) whether two zones are within a distance; each zone is near itself."""
         rects = self.reaching
         gaps = np.maximum(rects[:, None, :2] - rects[None, :, 2:], 0.0)
         gaps = np.maximum(gaps, gaps.swapaxes(0, 1))
@@ -105,12 +105,12 @@ class ZonePartition:
 
     @property
     def side_neighbors(self) -> tuple[tuple[int, ...], ...]:
-        """For each zone those that share a side with it: corners are hardly ever crossed."""
+        """The zones that share a side with each zone. Vehicles hardly ever cross corners."""
         return tuple(tuple(near.zone for near in row if not near.corner) for row in self.neighbors)
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 of which place belongs to which zone, hex: for manifests."""
+        """Hex SHA-256 of the zones of all positions, for manifests."""
         sides = [[float(side).hex() for side in rect] for rect in self.reaching]
         return hashlib.sha256(json.dumps({"cavmarl.zones": sides}).encode()).hexdigest()
 
@@ -119,7 +119,7 @@ class ZonePartition:
 
     @cached_property
     def _cells(self) -> NDArray[np.int32]:
-        """The zone of each cell between neighbouring sides, (rows, columns)."""
+        """The zone of each cell between adjacent sides, (rows, columns)."""
         sides_x, sides_y = self._sides(0), self._sides(1)
         cells = np.full((len(sides_y) - 1, len(sides_x) - 1), -1, dtype=np.int32)
         for zone, (left, low, right, high) in enumerate(self.rects):
@@ -133,27 +133,27 @@ class ZonePartition:
             row, column = np.argwhere(cells < 0)[0]
             gap = (*sides_x[column : column + 2], *sides_y[row : row + 2])
             raise ConfigError(
-                f"no zone covers {_span(*gap)}: every place of bounds_m needs a zone; let a zone "
-                "beside the gap reach over it"
+                f"no zone covers {_span(*gap)}; extend a zone beside the gap, because zones must "
+                "cover bounds_m"
             )
         cells.setflags(write=False)
         return cells
 
 
 def _check_rects(rects: NDArray[np.float64], bounds: Bounds) -> None:
-    """Refuse what is no rectangle, and what lies outside of `bounds`."""
+    """Raise ConfigError if rectangles are invalid or empty, or do not fit `bounds`."""
     if not len(rects):
-        raise ConfigError("there are no zones: at least one has to cover the map")
-    for what, rect in (("bounds_m", np.array(bounds)), *enumerate(rects)):
-        name = what if isinstance(what, str) else f"zone {what}"
+        raise ConfigError("there are no zones; define at least one, which covers the map")
+    for key, rect in (("bounds_m", np.array(bounds)), *enumerate(rects)):
+        name = key if isinstance(key, str) else f"zone {key}"
         if not np.isfinite(rect).all():
             raise ConfigError(
-                f"{name}: {rect.tolist()} must be finite numbers; sides on bounds_m reach to "
+                f"{name}: {rect.tolist()} must be finite numbers; sides on bounds_m extend to "
                 "infinity by themselves"
             )
         if not (rect[:2] < rect[2:]).all():
             raise ConfigError(
-                f"{name}: {rect.tolist()} is empty: give min_x, min_y, max_x, max_y in m, the "
+                f"{name}: {rect.tolist()} is empty; use min_x, min_y, max_x, max_y in m, with the "
                 "first two below the last two"
             )
     low, high = np.array(bounds[:2]), np.array(bounds[2:])
@@ -161,21 +161,22 @@ def _check_rects(rects: NDArray[np.float64], bounds: Bounds) -> None:
         (rects[:, :2] < low).any(axis=1) | (rects[:, 2:] > high).any(axis=1)
     ):
         raise ConfigError(
-            f"zone {zone}: {rects[zone].tolist()} leaves bounds_m = {list(bounds)}: end it there, "
-            "or widen bounds_m"
+            f"zone {zone}: {rects[zone].tolist()} exceeds bounds_m = {list(bounds)}; make the zone "
+            "smaller, or bounds_m larger"
         )
     for axis, side in enumerate(bounds):
         if side not in rects[:, axis]:
             edge = ("min_x", "min_y", "max_x", "max_y")[axis]
             raise ConfigError(
-                f"no zone reaches {edge} = {side:g} of bounds_m: widen the zones there to it"
+                f"no zone reaches {edge} = {side:g} of bounds_m; extend the zones there to this "
+                "side"
             )
 
 
 def _overlap(a: int, b: int, rects: NDArray[np.float64]) -> str:
     left, low = np.maximum(rects[a, :2], rects[b, :2])
     right, high = np.minimum(rects[a, 2:], rects[b, 2:])
-    return f"zones {a} and {b} overlap in {_span(left, right, low, high)}: take it from one of them"
+    return f"zones {a} and {b} overlap in {_span(left, right, low, high)}; make one of them smaller"
 
 
 def _span(left: float, right: float, low: float, high: float) -> str:

@@ -1,4 +1,4 @@
-"""What is in each zone, and how evenly: lanes, junctions that are cut, vehicles, ghosts."""
+"""Statistics of a partition: lanes, cut junctions, vehicles and ghosts of each zone."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Floats = NDArray[np.float64]
 
 
 def imbalance(values: Sequence[float]) -> float:
-    """Maximum over mean: 1 where all are equal, k where one of k has all; 1 where none has any.
+    """Return maximum / mean: 1 if k values are equal, k if only one is not 0; 1 if all are 0.
 
-    With a worker for each zone the slowest sets the pace: this is how many times as long it takes
-    as a perfect share.
+    With one worker per zone, the slowest worker sets the pace: the imbalance is the ratio of its
+    time to that of a perfect division.
     """
     mean = sum(values) / len(values)
     return max(values) / mean if mean else 1.0
@@ -29,16 +29,16 @@ def imbalance(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class ZoneStatistics:
-    """Figures of a partition; tuples go by zone."""
+    """Statistics of a partition. Tuples have one value per zone, except `narrow`."""
 
     lane_km: tuple[float, ...]  # length of lanes outside of junctions
-    junctions: int  # in which ways cross or merge
-    junctions_cut: int  # of these, in more than one zone
-    cut_junctions: tuple[int, ...]  # of the cut ones, how many each zone has a part of
-    vehicles: tuple[int, ...]  # owned by place; zeros without positions
-    # that each zone is given at most, all within its halo; zeros without positions
+    junctions: int  # number of junctions with crossing or merging lanes
+    junctions_cut: int  # number of these junctions in more than one zone
+    cut_junctions: tuple[int, ...]  # number of cut junctions that are partly in the zone
+    vehicles: tuple[int, ...]  # by position; zeros without positions
+    # upper bound: vehicles of other zones within the halo; zeros without positions
     ghosts: tuple[int, ...]
-    # zones with a side shorter than the halo. They are exact; most of what they simulate are ghosts
+    # zones with a side shorter than the halo; they are exact, but most of their vehicles are ghosts
     narrow: tuple[int, ...]
 
     @property
@@ -60,7 +60,7 @@ def zone_statistics(
     partition: ZonePartition,
     network: RoadNetwork,
     *,
-    halo_m: float = 0.0,  # how far zones see over their borders
+    halo_m: float = 0.0,  # how far zones see beyond their borders
     positions: Floats | None = None,  # (n, 2) x and y of vehicles in m
 ) -> ZoneStatistics:
     places = np.empty((0, 2)) if positions is None else np.asarray(positions, dtype=np.float64)
@@ -85,13 +85,13 @@ def zone_statistics(
 
 
 def _within(rect: Floats, places: Floats, halo_m: float) -> NDArray[np.bool_]:
-    """Whether places lie within the halo of a rectangle: no others are ever seen there."""
+    """Return whether each place is within the halo of a rectangle."""
     away = np.maximum(np.maximum(rect[:2] - places, places - rect[2:]), 0.0)
     return np.asarray((away * away).sum(axis=1) <= halo_m * halo_m)
 
 
 def _zones_of_boxes(partition: ZonePartition, boxes: Floats) -> list[NDArray[np.int32]]:
-    """The zones that each of (n, 4) boxes has a part in."""
+    """Return the zones that each of (n, 4) boxes overlaps."""
     zones = partition.arrays
     columns = np.searchsorted(zones.cuts_x, boxes[:, [0, 2]], side="right")
     rows = np.searchsorted(zones.cuts_y, boxes[:, [1, 3]], side="right")
@@ -102,7 +102,7 @@ def _zones_of_boxes(partition: ZonePartition, boxes: Floats) -> list[NDArray[np.
 
 
 def _lane_km(partition: ZonePartition, network: RoadNetwork) -> Floats:
-    """Lanes outside of junctions, by zone: segments are cut where the zones are."""
+    """Return the length of lanes outside of junctions in each zone, in km."""
     segments = lane_segments(network)
     starts, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
     cuts = [
@@ -121,7 +121,7 @@ def _lane_km(partition: ZonePartition, network: RoadNetwork) -> Floats:
 
 
 def _crossings(starts: Floats, along: Floats, lines: Floats) -> Floats:
-    """Where segments meet each of the lines, (n, lines): from 0 at the start to 1 at the end."""
+    """Return where segments meet lines, (n, lines): from 0 at the start to 1 at the end."""
     steps = np.where(along == 0.0, 1.0, along)[:, None]
     met = (lines[None, :] - starts[:, None]) / steps
     return np.where((along == 0.0)[:, None], 0.0, np.clip(met, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""What the partitioners need of a map: where its lanes and its junctions are."""
+"""Positions of the lanes and junctions of a map, for partitioning."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from cavmarl.roads.network import RoadNetwork
 
 Floats = NDArray[np.float64]
 
-_SAMPLE_M = 2.0  # longest piece of a lane that counts as one place
+_SAMPLE_M = 2.0  # greatest distance of two samples on a lane
 
 
 def lane_segments(network: RoadNetwork) -> Floats:
-    """The straight pieces of all lanes outside of junctions, (n, 4) x, y, x, y in metres."""
+    """Return the straight segments (n, 4) of all lanes outside of junctions: x, y, x, y in m."""
     lanes = network.lanes[~network.lanes["internal"]]
     steps = lanes["num_points"] - 1
     before = np.repeat(np.cumsum(steps) - steps, steps)
@@ -24,7 +24,7 @@ def lane_segments(network: RoadNetwork) -> Floats:
 
 
 def lane_samples(network: RoadNetwork) -> Floats:
-    """Places all along the lanes, (n, 3): x and y in m, and how many metres each stands for."""
+    """Return samples (n, 3) along all lanes: x and y in m, and the length that each represents."""
     segments = lane_segments(network)
     lengths = hypot_all(*(segments[:, 2:] - segments[:, :2]).T)
     pieces = np.maximum(np.ceil(lengths / _SAMPLE_M), 1.0).astype(np.int64)
@@ -36,9 +36,9 @@ def lane_samples(network: RoadNetwork) -> Floats:
 
 
 def junction_boxes(network: RoadNetwork) -> Floats:
-    """Bounding boxes of the junctions in which ways cross or merge, (n, 4), lane widths included.
+    """Return bounding boxes (n, 4) of junctions with crossing or merging lanes, with lane widths.
 
-    min_x, min_y, max_x, max_y in metres; in the order of the JUNCTION rows.
+    A box is min_x, min_y, max_x, max_y in metres. Boxes are in the order of the JUNCTION rows.
     """
     crossing = np.unique(network.links["junction"][network.links["num_conflicts"] > 0])
     inside = network.lanes[network.lanes["internal"]]

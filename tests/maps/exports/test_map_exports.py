@@ -120,7 +120,7 @@ def test_maps_without_a_projection_go_to_no_degrees(tmp_path: Path) -> None:
     from cavmarl.config.registry import find_entry
 
     path = find_entry("ring") / "map" / "map.net.xml"
-    with pytest.raises(MapError, match="where it lies"):
+    with pytest.raises(MapError, match="no georeference"):
         write_geojson(read_network(path), tmp_path / "r.geojson", path)
-    with pytest.raises(MapError, match="where it lies"):
+    with pytest.raises(MapError, match="no georeference"):
         write_lanelet2(read_network(path), tmp_path / "r.osm")

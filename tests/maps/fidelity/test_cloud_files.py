@@ -91,18 +91,18 @@ def test_what_is_no_place_is_left_out_and_counted(tmp_path: Path) -> None:
         ("a.csv", "", "has no points"),
         ("a.csv", "x,y,z\n", "has no points"),
         ("a.csv", "x,y,z\nnan,nan,nan\n", "all 1 points are NaN"),
-        ("a.csv", "a,b,c\n1,2,3\n", "line 1: the head has no columns x, y and z"),
+        ("a.csv", "a,b,c\n1,2,3\n", "line 1: the header has no columns x, y and z"),
         ("a.csv", "x,y,z\n1,2,3\n1,2\n", "needs three numbers"),
         ("a.csv", "x,y,z\n1,2,three\n", "needs three numbers"),
         ("a.ply", "x,y,z\n1,2,3\n", "not what '.ply' says"),
         ("a.ply", "ply\nformat ascii 1.0\nend_header\n", "no number of vertices"),
         ("a.ply", f"{PLY} {'9' * 5000}\n{XYZ}", "no number of vertices"),
-        ("a.ply", f"{PLY} 1\nproperty float x\n{XYZ}", "named twice"),
+        ("a.ply", f"{PLY} 1\nproperty float x\n{XYZ}", "have one name"),
         ("a.ply", f"{PLY} 0\n{XYZ}", "has no points"),
         ("a.ply", f"{PLY} 3\n{XYZ}\n\n\n", "0 points of 3"),
-        ("a.las", "LASF", "no whole las"),
+        ("a.las", "LASF", "not a complete las"),
         ("a.laz", "<html>", "not what '.laz' says"),
-        ("a.pcd", "# .PCD v0.7\nVERSION 0.7\nPOINTS 9\n", "no whole pcd"),
+        ("a.pcd", "# .PCD v0.7\nVERSION 0.7\nPOINTS 9\n", "not a complete pcd"),
         ("a.tif", "II*", "not what '.tif' says"),
         ("none.csv", None, "cannot be read"),
     ],
@@ -123,7 +123,7 @@ def test_files_cut_short_are_refused(
     path = tmp_path / name
     write(path)
     path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(MapError, match=r"cut short|no whole"):
+    with pytest.raises(MapError, match=r"truncated|not a complete"):
         read_cloud(path)
 
 

@@ -112,7 +112,7 @@ def test_wrong_numbers_are_refused() -> None:
     cloud = Cloud("c", street(500))
     with pytest.raises(ConfigError, match="above 0"):
         thin_out(cloud, -1.0)
-    with pytest.raises(ConfigError, match="0 for none"):
+    with pytest.raises(ConfigError, match="0 for no filter"):
         drop_outliers(cloud, float("nan"))
     with pytest.raises(ConfigError, match="keep 2"):
         align(cloud.points, Target(cloud.points), keep=2.0)
