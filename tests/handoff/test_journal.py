@@ -290,7 +290,9 @@ def test_owners_at_every_tick(written: Path) -> None:
     assert at[4].owners == at[2].owners
     assert at[4].deferred == {8: 2}
     assert at[5].owners == {7: (1, 1), 8: (0, 1)}
-    with pytest.raises(JournalError, match="tick 9 was not committed; use a tick up to the last one, 6"):
+    with pytest.raises(
+        JournalError, match="tick 9 was not committed; use a tick up to the last one, 6"
+    ):
         owners_at(written, 9)
 
 

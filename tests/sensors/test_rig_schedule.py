@@ -76,7 +76,10 @@ def test_a_minute_has_as_many_samples_as_the_rate_says(
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"type": "odometry", "rate_hz": 3}, r"try 2\.85714 or 3\.33333; or set schedule: accumulate"),
+        (
+            {"type": "odometry", "rate_hz": 3},
+            r"try 2\.85714 or 3\.33333; or set schedule: accumulate",
+        ),
         ({"type": "imu", "rate_hz": 30}, "try 20 or 40"),
         ({"type": "gnss", "rate_hz": 30}, "try 20"),
         ({"type": "gnss", "rate_hz": 40}, "once a tick at most, 20 Hz"),
