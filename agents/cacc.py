@@ -122,16 +122,16 @@ class CaccPolicy(Policy):
         """Return (W, A) whether the vehicle ahead sends, and the acceleration behind it."""
         ego, lanes = self._part(newest, "ego"), self._part(newest, "lanes")
         gap_m = self._gap_m(newest)
-        told = self._part(newest, "messages")[..., : self._objects * OBJECT_FEATURES]
-        told = told.reshape(*told.shape[:-1], self._objects, OBJECT_FEATURES)
-        centre_m = hypot_all(told[..., 1], told[..., 2]) * self._scale_m
-        between_m = centre_m - 0.5 * (told[..., 8] * LENGTH_SCALE + OWN_LENGTH_M)
-        ahead = (told[..., 0] > 0.0) & (told[..., 1] > 0.0) & (told[..., 10] > 0.0)
+        reports = self._part(newest, "messages")[..., : self._objects * OBJECT_FEATURES]
+        reports = reports.reshape(*reports.shape[:-1], self._objects, OBJECT_FEATURES)
+        centre_m = hypot_all(reports[..., 1], reports[..., 2]) * self._scale_m
+        between_m = centre_m - 0.5 * (reports[..., 8] * LENGTH_SCALE + OWN_LENGTH_M)
+        ahead = (reports[..., 0] > 0.0) & (reports[..., 1] > 0.0) & (reports[..., 10] > 0.0)
         with np.errstate(invalid="ignore"):
             off_m = np.where(ahead, np.abs(between_m - gap_m[..., None]), np.inf)
         which = np.argmin(off_m, axis=-1)[..., None]
         follows = np.take_along_axis(off_m, which, axis=-1)[..., 0] < SAME_M
-        accel = np.take_along_axis(told[..., 7], which, axis=-1)[..., 0] * ACCEL_SCALE
+        accel = np.take_along_axis(reports[..., 7], which, axis=-1)[..., 0] * ACCEL_SCALE
         speed = ego[..., 0] * SPEED_SCALE
         wanted_m = np.maximum(HEADWAY_S * speed, MIN_GAP_M)
         cooperative = (

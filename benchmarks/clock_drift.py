@@ -63,7 +63,7 @@ class ClockDrift:
 
     @property
     def holds(self) -> bool:
-        """Whether the clocks are equal or, if own ticks are obeyed, the master noticed in time."""
+        """Return whether the clocks agree or, with obeyed own ticks, the master noticed in time."""
         if self.answer == "obey" and self.own_ticks:
             return self.noticed_ticks is not None and self.noticed_ticks <= 1
         return all(row.delta_s == 0.0 and row.ratio == 1.0 for row in self.rows)

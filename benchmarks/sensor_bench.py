@@ -76,7 +76,7 @@ class SensorBench:
 
     @property
     def is_same(self) -> bool:
-        """Whether all runs have the same states and frames, step by step."""
+        """Return whether all runs have the same states and frames, step by step."""
         return len({turn.run.digests for turn in self.turns}) == 1
 
     def parts_ms(self, workers: int) -> dict[str, float]:

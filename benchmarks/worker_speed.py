@@ -41,7 +41,7 @@ class Row:
     """The same worlds over a number of workers."""
 
     workers: int  # number of workers; 0: all worlds in the caller's process
-    made_s: float  # until they could be reset
+    made_s: float  # time until the worlds could be reset
     step_ms: tuple[float, ...]  # per turn, ms per step
     busiest_ms: float | None  # processor time per step of the busiest worker, ms
 

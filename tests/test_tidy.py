@@ -62,7 +62,7 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 112_300
+PACKAGE_LINES = 112_700
 REACHABLE_LINES = 74_500  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
@@ -86,10 +86,7 @@ PHRASES = re.compile(
 PHRASES_AT_MOST = 350
 
 WORDS_OF_A_PAGE = 2500  # outside of tables, generated blocks and code
-LONG_PAGES = {
-    "docs/decisions/010-traffic-after-sumo.md",
-    "docs/guides/nodes.md",
-}
+LONG_PAGES: set[str] = set()
 
 
 def sources(*folders: str) -> Iterator[tuple[str, str]]:

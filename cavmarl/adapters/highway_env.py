@@ -50,7 +50,7 @@ _OFF: Mapping[str, Any] = {
 
 
 class HighwayEnv(CavEgoEnv):
-    """One of highway-env's tasks.
+    """A task of highway-env as a Gymnasium environment.
 
     Rewards are highway-env's named rewards, weighted by its keys. In all tasks,
     `reward_speed_range` scales the speed for `high_speed_reward`. `info["rewards"]` has each

@@ -45,7 +45,7 @@ REWARDS = (
 
 @dataclass(frozen=True)
 class HighwayTask:
-    """One task.
+    """A task of highway-env.
 
     Attributes:
         entry: the environment in `envs/` of the task.

@@ -51,13 +51,13 @@ class HighwayRows(VecEnvWrapper):
         observations, rewards, done, infos = self.venv.step_wait()
         self.simulated_s += time.perf_counter() - self._began
         each = self._agents
-        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        row_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done).tolist():
             info = infos[world]
             cut = {"TimeLimit.truncated": info["TimeLimit.truncated"]}
             for k, last in enumerate(info["terminal_observation"]):
-                told[world * each + k] = {"terminal_observation": last, **cut}
-        return self._rows(observations), rewards.repeat(each), done.repeat(each), told
+                row_infos[world * each + k] = {"terminal_observation": last, **cut}
+        return self._rows(observations), rewards.repeat(each), done.repeat(each), row_infos
 
     def _rows(self, observations: Any) -> NDArray[np.float32]:
         rows: NDArray[np.float32] = observations.reshape(self.num_envs, -1)

@@ -268,7 +268,7 @@ def _maps_of(source: str, base_dir: Path) -> list[Path]:
     maps = [base_dir / source / name for name in names if name.endswith(MAP_SUFFIXES)]
     if not maps:
         raise MapError(
-            f"map.source = {source!r}: no map file in {base_dir / source}; its name must end in "
+            f"map.source = {source!r}: no map file in {base_dir / source}; a map must end in "
             f"{' or '.join(MAP_SUFFIXES)}"
         )
     return maps

@@ -334,7 +334,7 @@ class GnssConfig(SampledConfig):
 
     Attributes:
         origin_lat_deg: latitude of the map's (0, 0), if the map has no georeference.
-        origin_lon_deg: longitude of the map's (0, 0), likewise.
+        origin_lon_deg: longitude of the map's (0, 0), see `origin_lat_deg`.
         origin_height_m: height of z = 0 above the ellipsoid.
     """
 

@@ -91,7 +91,7 @@ class RoadsideConfig(Section, key="v2x.roadside"):
 
 @dataclass(frozen=True)
 class ChannelConfig(Section, key="v2x.channel"):
-    """Which packets arrive, and when; with zeros, all packets arrive everywhere at once.
+    """The radio channel: reception and delay; with zeros, packets arrive everywhere at once.
 
     Attributes:
         range_m: maximum distance of reception; 0: no limit.

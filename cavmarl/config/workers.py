@@ -1,4 +1,4 @@
-"""`WorkersConfig`: how worker processes are monitored and given work."""
+"""`WorkersConfig`: the monitoring of worker processes and the distribution of work."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_SENSOR_WORKERS = 256  # per process
 
 @dataclass(frozen=True)
 class WorkersConfig(Section, key="workers"):
-    """How worker processes are monitored and given work; see docs/guides/divide_a_world.md.
+    """Monitoring of worker processes and distribution of work; docs/guides/divide_a_world.md.
 
     Attributes:
         timeout_s: time after which a worker that is still busy with one step or reset is replaced.

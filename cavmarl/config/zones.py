@@ -1,4 +1,4 @@
-"""`ZonesConfig`: how a map is divided into zones."""
+"""`ZonesConfig`: the division of a map into zones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
 
 @dataclass(frozen=True)
 class ZonesConfig(Section, key="zones"):
-    """How the map is divided into zones; see docs/reference/zones.md.
+    """The division of the map into zones; see docs/reference/zones.md.
 
     Attributes:
         layout: method of division: `grid`, `strips`, `bisection`; or a zone file, named like

@@ -29,11 +29,7 @@ class HeightTrack:
     def add(
         self, elapsed_s: float, force_mps2: float, speed_mps: float | None, height_m: float | None
     ) -> None:
-        """Add a step.
-
-        `elapsed_s`: since the last step. `force_mps2`: along the body. `speed_mps`: by the wheels.
-        `height_m`: by GNSS. None: no sample.
-        """
+        """Add a step: force along the body, speed by wheels, height by GNSS; None: no sample."""
         self._steps.append((elapsed_s, force_mps2, speed_mps, height_m))
 
     def smoothed(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -169,7 +169,7 @@ class Tick:
             self.let_in()
 
     def let_in(self) -> None:
-        """Rank → assign → propose, and if any departure has found a gap, accept → admit."""
+        """Run rank → assign → propose and, if any departure has found a gap, accept → admit."""
         traffic, departures, worlds, peers = self.traffic, self.departures, self.worlds, self.peers
         peers.clear_ranks(departures)
         self.executor.rank_lanes(departures)

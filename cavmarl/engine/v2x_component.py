@@ -44,7 +44,7 @@ class V2xComponent:
         self.bus.reset(chosen)
 
     def begin(self, commands: Commands) -> None:
-        """Pass the agents' declared intentions to the bus, in the first tick of a step."""
+        """Pass the events that agents declare to the bus, in the first tick of a step."""
         if commands.declared.size and self._ticks.item(0) % self._ticks_per_step == 0:
             self.bus.declare(commands.declared)
 

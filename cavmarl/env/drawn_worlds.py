@@ -1,4 +1,4 @@
-"""Which worlds of an environment can be drawn, and the local copy that is drawn."""
+"""Checks whether worlds can be drawn, and copies remote worlds to draw them."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def save_session(session: StepSession, mask: NDArray[np.bool_]) -> bytes:
     """
     if key := kept_elsewhere(session.config):
         raise ConfigError(
-            f"{key}: worlds with processes of their own cannot be saved; begin their episodes anew"
+            f"{key}: worlds with processes of their own cannot be saved; reset them instead"
         )
     session.refuse_unready("save_state()")
     saved = session.worlds.save_worlds()

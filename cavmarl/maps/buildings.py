@@ -39,7 +39,7 @@ _DIGITS = 6  # of a metre; nearly level sides would have huge slopes
 
 @dataclass(frozen=True)
 class Footprint:
-    """One building."""
+    """A building."""
 
     name: str  # element and id in the file
     # (n, 2) corners in m in the map's frame, the first not repeated; the inside is given by the

@@ -40,8 +40,8 @@ class MapReport:
     lanes: int
     junctions: int  # where more than two edges meet
     junctions_by_type: dict[str, int]  # all nodes of the map by SUMO's type
-    signals: int  # total number of signal programs
-    programs: int  # of all traffic lights together
+    signals: int  # traffic lights
+    programs: int  # programs of all traffic lights
     actuated_signals: int  # traffic lights with an actuated program
     extent_m: tuple[float, float, float, float]  # min x, min y, max x, max y of the lanes
     elevation_m: tuple[float, float]  # lowest and highest point of the lanes

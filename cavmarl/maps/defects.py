@@ -27,7 +27,7 @@ Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Defect:
-    """One place that looks wrong."""
+    """A place that looks wrong."""
 
     kind: str
     name: str  # of the lane, junction, signal or edge

@@ -25,7 +25,7 @@ HEIGHT_DIGITS = 3
 
 @dataclass(frozen=True)
 class DocumentLane:
-    """One lane of a network file."""
+    """A lane of a network file."""
 
     edge: Element
     element: Element

@@ -73,7 +73,7 @@ class Recording:
 
     @property
     def is_whole(self) -> bool:
-        """Whether the recording was closed; False while it is written, or if its run was killed."""
+        """Return whether the recording was closed; False while written, or if its run died."""
         return self.head.status == "closed"
 
     @property

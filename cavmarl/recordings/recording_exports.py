@@ -82,7 +82,7 @@ def _fcd_line(row: np.void, lane_ids: tuple[str, ...]) -> str:
 def write_csv(
     recording: Recording, path: Path, world: int, episode: int, track: Track = iter
 ) -> int:
-    """Write one line per vehicle and frame, at full precision; arguments as of `write_fcd`."""
+    """Write one line per vehicle and frame, at full precision; see `write_fcd`."""
     names = SEEN.names or ()
     count = 0
     with _writing(path) as file:
@@ -100,7 +100,7 @@ def write_mcap(
 ) -> int:
     """Write MCAP with JSON messages: `/vehicles` as Foxglove's SceneUpdate, and `/events`.
 
-    Foxglove shows it in its 3D panel. Arguments as of `write_fcd`.
+    Foxglove shows it in its 3D panel. See `write_fcd` for the arguments.
 
     Raises:
         MissingExtraError: mcap is not installed.

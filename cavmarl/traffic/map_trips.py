@@ -31,8 +31,7 @@ def for_each_map(network: RoadNetwork, make: Callable[[int], T]) -> list[T]:
     """Return `make(row)` for each MAP row.
 
     Raises:
-            CavmarlError: `make` failed for a map. The class is that of the first error; the text
-                joins all messages.
+        CavmarlError: `make` failed; of the class of the first error, with all messages.
     """
     found: list[T] = []
     refused: list[CavmarlError] = []

@@ -37,7 +37,7 @@ class TripWays:
         """Return the EDGE rows of a way over the `named` edges for the classes in `mask`.
 
         Raises:
-                RouteError: no way joins two consecutive edges; the message names them.
+            RouteError: no way joins two consecutive edges; the message names them.
         """
         found = [np.array([named[0]], dtype=np.int32)]
         for start, goal in pairwise(named.tolist()):

@@ -103,7 +103,7 @@ class ShownEnv:
 
     @property
     def is_watched(self) -> bool:
-        """Whether a page is open."""
+        """Return whether a page is open."""
         return any(audience.wishes.watchers for audience in self.audiences)
 
     def _renew(self) -> None:

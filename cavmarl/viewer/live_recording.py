@@ -16,8 +16,8 @@ from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.vehicle_details import hello_of_map, vehicle_state
 from cavmarl.viewer.viewed_world import Stage, first_stage
 
-MOST_TOLD = 500  # largest number of events shown of an episode
-QUIET = frozenset({"arrived", "transferred"})  # dropped first if there are more
+MOST_SHOWN = 500  # largest number of events shown of an episode
+QUIET = frozenset({"arrived", "transferred"})  # dropped first if there are more events
 MOST_STEPS_AHEAD = 20  # largest number of frames per turn
 
 
@@ -101,10 +101,10 @@ class ShownRecording:
             for found in self._recording.events(self._world)
             if found.episode == self._episode and found.event.kind in TIME_LINE | ASKED
         ]
-        if len(events) > MOST_TOLD:
+        if len(events) > MOST_SHOWN:
             events = [event for event in events if event[1] not in QUIET]
         if events:
-            self._audience.send_events(events[:MOST_TOLD])
+            self._audience.send_events(events[:MOST_SHOWN])
 
 
 def recording_stages(recording: Recording) -> list[tuple[int, int, Stage]]:

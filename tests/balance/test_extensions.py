@@ -64,5 +64,5 @@ def test_zones_stay_where_they_are_good_enough(town: tuple[object, np.ndarray]) 
 @pytest.mark.parametrize("costs", [[1.0] * 3, [1.0, 1.0, 1.0, float("nan")], [1.0, 1.0, 1.0, -1.0]])
 def test_zones_need_a_cost_each(town: tuple[object, np.ndarray], costs: list[float]) -> None:
     network, places = town
-    with pytest.raises(ConfigError, match="one a zone of 4"):
+    with pytest.raises(ConfigError, match="for each of 4 zones"):
         propose_zones(network, cut_map(network, "grid", 4), places, costs)  # type: ignore[arg-type]

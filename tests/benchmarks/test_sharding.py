@@ -136,9 +136,9 @@ def test_the_command_says_that_worlds_differ(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--zones", "1;4"), "--zones 1;4: must be whole numbers"),
+        (("--zones", "1;4"), "--zones 1;4: must be comma-separated whole numbers"),
         (("--zones", "0"), "zones = 0"),
-        (("--layout", "rings"), "is none of grid, strips, bisection"),
+        (("--layout", "rings"), "does not exist; use grid, strips, bisection"),
         (("--layout", "none.json"), "none.json"),
         (("-d", "none.rou.xml"), "none.rou.xml"),
         (("-d", "none.rou.xml", "--agents", "2"), "omit --agents and --background"),

@@ -170,7 +170,7 @@ def test_rows_of_other_settings_are_not_mixed(tmp_path: Path, stubbed: list[int]
 
 def test_a_broken_row_is_named(tmp_path: Path) -> None:
     (tmp_path / ROWS_FILE).write_text('{"seed": 1}\n{"seed"\n')
-    with pytest.raises(ConfigError, match="line 2: is no row"):
+    with pytest.raises(ConfigError, match="line 2: not a valid row"):
         list(read_rows(tmp_path / ROWS_FILE))
 
 

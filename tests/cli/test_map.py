@@ -190,7 +190,7 @@ def test_wrong_options_of_zones_are_refused(shared_maps: Path) -> None:
     assert "must end in .png" in " ".join(result.output.replace("│", " ").split())
     result = runner.invoke(app, ["zones", source, "--layout", "rings"])
     assert isinstance(result.exception, ConfigError)
-    assert "is none of grid, strips, bisection" in str(result.exception)
+    assert "does not exist; use grid, strips, bisection" in str(result.exception)
 
 
 def test_more_zones_than_the_map_can_hold_are_refused(shared_maps: Path) -> None:

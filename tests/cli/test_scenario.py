@@ -86,7 +86,7 @@ def test_a_run_is_played_to_several_agents(capsys: pytest.CaptureFixture[str]) -
         (["failed_u_turn", "--agents", "99"], "set at most"),
         (["signal_outage", "--map", "merge"], "it needs a signal"),
         (["pedestrian_crossing", "--density", "some"], "must be one of none, low, high"),
-        (["pedestrian_crossing", "--picture", "crossing.jpg"], "ends in .png"),
+        (["pedestrian_crossing", "--picture", "crossing.jpg"], "must end in .png"),
     ],
 )
 def test_wrong_use_is_said(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -127,5 +127,5 @@ def test_frames_that_cannot_be_had() -> None:
     with pytest.raises(EpisodeError, match="reset"):
         world.world_frames()
     world.reset(seed=0)
-    with pytest.raises(ConfigError, match="worlds 0 to 0"):
+    with pytest.raises(ConfigError, match="must be from 0 to 0"):
         world.world_frames([1])

@@ -54,5 +54,5 @@ def test_bad_input() -> None:
         "traffic.demand": ["a.rou.xml"],
         "sensors.signal.timing": False,
     }
-    with pytest.raises(ConfigError, match=r"source = 'sumo-traffic': such worlds are only"):
+    with pytest.raises(ConfigError, match=r"source = 'sumo-traffic': such worlds can only"):
         make_vec("grid4x4", workers=1, overrides=sumo, **SMALL)

@@ -95,12 +95,12 @@ def test_what_is_no_name_is_refused(env: object) -> None:
 
 @pytest.mark.parametrize("overrides", [[1, 2], "sensors", 3])
 def test_overrides_are_a_mapping(overrides: object) -> None:
-    with pytest.raises(cavmarl.ConfigError, match="must be a mapping"):
+    with pytest.raises(cavmarl.ConfigError, match="must map dotted keys"):
         cavmarl.parallel_env("ring", overrides=overrides)
 
 
 def test_keys_of_overrides_are_text() -> None:
-    with pytest.raises(cavmarl.ConfigError, match="3 is no key"):
+    with pytest.raises(cavmarl.ConfigError, match="3 is not a key"):
         cavmarl.parallel_env("ring", overrides={3: 3})
 
 

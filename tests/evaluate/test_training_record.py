@@ -46,4 +46,4 @@ def test_a_run_without_workers_has_no_plan(
     begin_training(tmp_path, "test", {"seed": 1}, vec.worlds.world, vec.plans)
     end_training(tmp_path, [])
     said = refusal(capsys, "plan", "--again", str(tmp_path / MANIFEST_FILE))
-    assert "without workers" in said
+    assert "had no workers" in said

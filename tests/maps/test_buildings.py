@@ -126,7 +126,7 @@ def test_polygons_of_sumo_are_read_in_the_frame_of_the_map(tmp_path: Path) -> No
             "line 3: <poly> has a value that is not a number",
         ),
         (OSM.replace(' lon="11.1500"', ""), GEO, "line 2: <node> has no attribute 'lon'"),
-        ("<net/>", None, "<net> is the root of no file of buildings"),
+        ("<net/>", None, "<net> is not the root of a file of buildings"),
         (OSM[:-20], GEO, "broken XML"),
     ],
 )

@@ -173,7 +173,7 @@ def test_a_policy_is_a_name_or_a_path(policy: Any) -> None:
 def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.pkl"
     path.touch()
-    with pytest.raises(PolicyError, match=r"model\.pkl: no policy"):
+    with pytest.raises(PolicyError, match=r"model\.pkl: not a policy"):
         load_policy(path, small_vec())
 
 

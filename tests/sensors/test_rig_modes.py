@@ -90,5 +90,7 @@ def _same(space: Any, seen: Any) -> bool:
 
 
 def test_sensors_are_observed_only_where_there_are_some() -> None:
-    with pytest.raises(ConfigError, match=r"observation\.mode = 'sensors': there is no sensor"):
+    with pytest.raises(
+        ConfigError, match=r"observation\.mode = 'sensors': needs a sensor under rig"
+    ):
         _car({"observation.mode": "sensors"})

@@ -76,7 +76,10 @@ def test_a_minute_has_as_many_samples_as_the_rate_says(
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"type": "odometry", "rate_hz": 3}, r"try 2\.85714 or 3\.33333; or schedule: accumulate"),
+        (
+            {"type": "odometry", "rate_hz": 3},
+            r"try 2\.85714 or 3\.33333; or set schedule: accumulate",
+        ),
         ({"type": "imu", "rate_hz": 30}, "try 20 or 40"),
         ({"type": "gnss", "rate_hz": 30}, "try 20"),
         ({"type": "gnss", "rate_hz": 40}, "once a tick at most, 20 Hz"),
@@ -89,7 +92,7 @@ def test_a_minute_has_as_many_samples_as_the_rate_says(
         ({"type": "gnss", "rate_hz": 5, "dropout": 1.5}, "dropout = 1.5"),
         ({"type": "depth_camera", "rate_hz": 5, "width": 4000, "height": 4000}, "fewer pixels"),
         ({"type": "lidr", "rate_hz": 5}, r"rig\.a\.type = 'lidr': must be one of lidar"),
-        ({"rate_hz": 5}, "a mapping of keys with a type, one of lidar"),
+        ({"rate_hz": 5}, "a mapping with the key type: one of lidar"),
         ({"type": "lidar", "rate_hz": 5, "rayz": 9}, r"did you mean rig\.a\.rays"),
         ({"type": "lidar", "rate_hz": 5, "range_km": 9}, "use range_m"),
     ],

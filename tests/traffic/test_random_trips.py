@@ -64,7 +64,7 @@ def test_a_file_is_written_and_depends_on_the_seed(grid: RoadNetwork, tmp_path: 
 
 def test_a_map_without_a_circuit_is_refused() -> None:
     merge = read_network(find_entry("merge") / "map" / "map.net.xml")
-    with pytest.raises(RouteError, match="without turning round"):
+    with pytest.raises(RouteError, match="without a U-turn"):
         RandomTrips(merge, seed=0)
 
 

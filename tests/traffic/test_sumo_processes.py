@@ -165,7 +165,7 @@ def test_1000_resets_leak_nothing(tmp_path: Path) -> None:
 def test_a_second_start_in_one_process_is_refused(tmp_path: Path) -> None:
     with coupled("grid4x4", [tiny_file(tmp_path)]) as simulation:
         with alone(simulation, tmp_path):
-            with pytest.raises(SumoError, match="one simulation a process"):
+            with pytest.raises(SumoError, match="one simulation per process"):
                 free_libsumo()
             drive(simulation)  # a process of its own
         free_libsumo()
@@ -328,7 +328,7 @@ def test_a_worker_dies_whose_sumo_was_told_too_much_to_keep(tmp_path: Path) -> N
             vec.step(actions)
         os.kill(vec.worlds.pool.pids[0], signal.SIGKILL)
         for _ in range(2):
-            with pytest.raises(SumoError, match=r"(?s)more than 0 MiB.*reset.*sumo\.replay_mib"):
+            with pytest.raises(SumoError, match=r"(?s)exceeds 0 MiB.*reset.*sumo\.replay_mib"):
                 vec.step(actions)
         vec.reset(seed=6)
         vec.step(vec.suggest_actions())

@@ -102,7 +102,7 @@ def test_benchmarl_trains(tmp_path: Path, algorithm: str) -> None:
         ("ppo_rllib.py", "ray.rllib", ["--num-runners", -1], "--num-runners -1: must be"),
         ("ippo_benchmarl.py", "benchmarl", ["--algorithm", "x"], "--algorithm x: must be one of"),
         ("ippo_torchrl.py", "torchrl", ["--env", "nowhere"], "nowhere"),
-        ("ppo_gymnasium.py", "gymnasium", ["--env", "nowhere"], "--env nowhere: no entry"),
+        ("ppo_gymnasium.py", "gymnasium", ["--env", "nowhere"], "nowhere"),
         ("ppo_gymnasium.py", "gymnasium", ["--num-worlds", 3], "a multiple of num_worlds = 3"),
     ],
 )

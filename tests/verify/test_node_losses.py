@@ -37,7 +37,7 @@ def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"nodes": ()}, "must be one or more"),
         ({"nodes": (0,)}, "from 1 on"),
         ({"nodes": (2,), "kills": 30, "steps": 20}, "must be from 0 to 15"),
-        ({"nodes": (3,), "zones": 2}, "hosted by 1 to 2 nodes"),
+        ({"nodes": (3,), "zones": 2}, "needs 1 to 2 nodes"),
     ],
 )
 def test_bad_input(arguments: dict[str, object], words: str) -> None:

@@ -85,9 +85,7 @@ def test_a_density_is_shared_out_instead_of_lanes(cross: RoadNetwork) -> None:
 
 
 def test_no_other_weight_is_known(cross: RoadNetwork) -> None:
-    with pytest.raises(
-        ConfigError, match="weight 'speed' does not exist; use lane_length, uniform"
-    ):
+    with pytest.raises(ConfigError, match="weight 'speed' does not exist; use lane_length"):
         cut_map(cross, "bisection", 2, weight="speed")
 
 

@@ -73,7 +73,7 @@ class _NoneType(ArgumentType):
     __slots__ = ()
 
     def write(self, words: Words, at: int, new: Any) -> None:
-        """`None` takes no word."""
+        """Store nothing: `None` takes no word."""
 
 
 class _Signed(ArgumentType):

@@ -129,9 +129,9 @@ class CallSequence:
     def only_if(self, bound: BoundCall[Any], item: int = 0) -> Iterator[None]:
         """Skip the calls appended within the block unless the last result of a call is true.
 
-        bound: a call that is earlier in the sequence.
-        item: index of the item, if the result is a tuple.
-            item: the item of a result that is a tuple.
+        Args:
+            bound: a call that is earlier in the sequence.
+            item: index of the item, if the result is a tuple.
         """
         address = bound.result_address(item) if bound.is_compiled else 0
         self._add(bound, item, [0, address])

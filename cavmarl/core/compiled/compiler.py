@@ -104,7 +104,7 @@ _Model: Any = TupleModel
 
 
 class _BundleModel(_Model):  # type: ignore[misc]
-    """How Numba passes a named tuple: bundles by address, others unchanged."""
+    """Numba's model of named tuples: bundles are passed by address, others unchanged."""
 
     def get_argument_type(self) -> Any:
         if _is_bundle(self._fe_type):

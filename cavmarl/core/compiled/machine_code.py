@@ -59,8 +59,8 @@ class Source(NamedTuple):
 def kernel_source() -> Source:
     """Return the source of code, according to `CAVMARL_KERNELS` and this machine.
 
-    KernelError: the setting has another value, or requires a library that cannot be used.
-        KernelError: the setting has another value, or asks for a library that cannot be used.
+    Raises:
+        KernelError: the setting has another value, or requires a library that cannot be used.
     """
     choice = os.environ.get(SETTING) or "auto"
     if choice not in CHOICES:

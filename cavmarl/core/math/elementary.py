@@ -144,7 +144,7 @@ def _reduce(angle: float) -> tuple[int, float, float]:
     """Subtract quarter turns from an angle.
 
     Returns:
-        The number of quarter turns, of which only the lowest two bits are valid; and the remainder
+        The number of quarter turns, whose lowest two bits are valid; and the remainder
         in two parts, a number in about [-pi / 4, pi / 4] and a correction.
     """
     angle = float(angle)

@@ -196,8 +196,8 @@ def fill_grid(
 
 @kernel
 def k_nearest(
-    grid: Grid,  # VEHICLE row to leave out, the searching vehicle; -1: none
-    row: int,  # VEHICLE row to leave out, the one that asks; -1 for none
+    grid: Grid,  # filled for this tick
+    row: int,  # VEHICLE row to leave out, the searching vehicle; -1: none
     x: float,  # m
     y: float,  # m
     z: float,  # m; vehicles more than `LEVEL_HEIGHT_M` above or below are left out

@@ -103,7 +103,7 @@ class Worlds(NamedTuple):
     ticks: NDArray[np.int64]  # (W,) since reset
     keys: NDArray[np.uint64]  # (W,) the root of all random numbers of the episode
     signal_phase: NDArray[np.int32]  # (W, num_signals) PHASE row that is on
-    controllers: NDArray[np.void]  # (W, num_signals) PHASE row that is on
+    controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
     detected_s: NDArray[np.float64]  # (W, D) time when a body was last over each detector
     num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
     pending: NDArray[
@@ -156,7 +156,7 @@ class DepartureQueue(NamedTuple):
     num_passing: NDArray[np.int64]  # (W,)
     places: NDArray[np.int64]  # (W, C + D) positions in the queue of vehicles that may enter
     tries: NDArray[np.int32]  # (W, C + D) LANE on which each queued vehicle tries to enter, or -1
-    ranks: NDArray[np.int64]  # (W, C + D, E) occupancy rank of the lanes of its edge, at most E
+    ranks: NDArray[np.int64]  # (W, C + D, E) how crowded each lane of its edge is, at most E
     last_s: NDArray[np.float64]  # (W, C + D, E) position on them for a vehicle that enters last, m
     lane_taken: NDArray[np.bool_]  # (L,) whether a vehicle tries to enter there in this tick
     spare: NDArray[np.void]  # VEHICLE (1,) scratch

@@ -20,7 +20,7 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Obstacle, Readings, StackSe
 
 _GAP_M = 0.8
 _ROAD_M = 2.5  # from the centre of a lane
-_BESIDE_ROAD_M = 6.0  # the same for pedestrians, who may step onto the road
+_BESIDE_ROAD_M = 6.0  # the same for pedestrians: they may step onto the road
 _RANGE_MARGIN_M = 0.05
 _MATCH_M = 3.0  # between an object and its predicted position
 _SAME_M = 0.5  # the same for an object that keeps the kind of an earlier detection: 0.1 s before

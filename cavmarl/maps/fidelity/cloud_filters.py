@@ -83,6 +83,6 @@ def _elsewhere(cloud: Cloud, low: Any, high: Any) -> MapError:
     elif degrees:
         cure = "these look like degrees: --frame degrees"
     return MapError(
-        f"{cloud.name}: lies at x {x0:.1f} … {x1:.1f}, y {y0:.1f} … {y1:.1f}, the map at x "
+        f"{cloud.name}: is at x {x0:.1f} … {x1:.1f}, y {y0:.1f} … {y1:.1f}, the map at x "
         f"{low[0]:.1f} … {high[0]:.1f}, y {low[1]:.1f} … {high[1]:.1f}: {cure}"
     )

@@ -34,7 +34,7 @@ class HeightModel:
     """Tiles of heights; where tiles overlap, the first tile with a height counts."""
 
     def __init__(self, paths: Sequence[str | Path]) -> None:
-        """Raises MapError: a file cannot be used; see `read_tile`."""
+        """Read the tiles; raises MapError if a file cannot be used, see `read_tile`."""
         self.tiles = [read_tile(Path(path)) for path in paths]
         self.cell_m = min(map(_cell_m, self.tiles))
 

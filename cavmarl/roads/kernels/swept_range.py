@@ -31,8 +31,8 @@ def swept_range(
             end on it of the area that a conflict protects; the last two are read if `foes`.
         other: the same for the other body.
         level_m: bodies with a larger difference in height do not touch.
-        foes: whether a conflict keeps the bodies apart in its area. Then only pairs count of which
-            one body has not reached the area, such as at its line or waiting position, or left it.
+        foes: whether a conflict keeps the bodies apart in its area. Then a pair counts only if one
+            body has not reached the area (for example, waits at its line) or has left it.
     """
     first, last = math.inf, -math.inf
     foe_first, foe_last = math.inf, -math.inf

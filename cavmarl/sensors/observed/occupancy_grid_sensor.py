@@ -27,7 +27,7 @@ def features(config: SensorsConfig) -> list[Feature]:
                 label = f"{name}_{column}_{row}"
                 subject = f"cell {column}, {row}"
                 if name == "on_road":
-                    feature = Feature(label, f"{subject}: 1 if on a lane's centre", "", 0.0)
+                    feature = Feature(label, f"{subject}: 1 if it has a centre line", "", 0.0)
                 else:
                     feature = vehicle_feature(name, label, f"vehicle in {subject}", ranges, False)
                 found.append(_bounded(feature, grid))

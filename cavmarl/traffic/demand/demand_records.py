@@ -205,10 +205,8 @@ def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
             f"has {len(texts)} probabilities for {len(names)} {key}", "give one for each"
         )
     weights: list[float | None] = [
-        source.with_attrs(probabilities=text).number(
-            "probabilities", 1.0, least=0.0, most=MAX_WEIGHT
-        )
-        for text in texts
+        part.number("probabilities", 1.0, least=0.0, most=MAX_WEIGHT)
+        for part in (source.with_attrs(probabilities=text) for text in texts)
     ]
     return list(zip(names, weights or [None] * len(names), strict=True))
 

@@ -24,9 +24,7 @@ from cavmarl.driving.kernels.motion.tracking import side_lane
 BODY_LANES = 8  # maximum number of lanes between the front and the centre of a body
 BLINKS_RIGHT = 1  # bits of SUMO's vehicle signals
 BLINKS_LEFT = 2
-EDGES_BEHIND = (
-    2  # the centre is on the front's edge, up to this many edges before it, or one after it
-)
+EDGES_BEHIND = 2  # edges from the front's edge back to the centre's, at most; or one ahead
 
 
 class Paths(NamedTuple):

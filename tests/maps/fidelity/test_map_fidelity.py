@@ -99,7 +99,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:
     assert run(MAP, tmp_path / "none.csv")[0] == 2
     code, said = run(far, far, "--align", "edges")
     assert code == 2
-    assert "no roads" in said
+    assert "without roads" in said
 
 
 def test_a_cloud_that_lies_on_the_map_only_if_swapped_is_refused() -> None:

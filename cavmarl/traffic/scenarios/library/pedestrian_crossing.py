@@ -44,7 +44,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """Stage a pedestrian who starts so that a vehicle that keeps its speed would collide."""
+    """Stage a pedestrian to start so that a vehicle that keeps its speed would collide."""
     lane, s = place, streets.length_m(place) - BEHIND_M
     near, far = streets.kerbs_m(lane, s)
     side = near + KERB_M
