@@ -122,7 +122,7 @@ def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: st
 
 
 def test_zones_of_one_world_over_workers_stay() -> None:
-    with pytest.raises(ConfigError, match="over workers needs zones that stay"):
+    with pytest.raises(ConfigError, match="over workers needs zones that do not change"):
         make_vec("grid4x4", zones=4, workers=2, overrides={"zones.repartition_steps": 5})
 
 
