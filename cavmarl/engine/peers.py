@@ -27,10 +27,7 @@ class Peers(Protocol):
     are_none: bool
 
     def keep_own(self, chosen: NDArray[np.bool_]) -> None:
-        """Drop the vehicles of other processes' zones, after a reset of the chosen worlds (W,).
-
-        Each process has made the vehicles of all zones.
-        """
+        """Drop other processes' vehicles, which a reset of the chosen worlds (W,) has made."""
         ...
 
     def take_up(self, departures: DepartureQueue, side: int) -> None:

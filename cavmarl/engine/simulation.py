@@ -34,11 +34,6 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-_NO_EPISODES = (
-    "the state is damaged: the seed and the number of each world's episode are missing; "
-    "use an intact state"
-)
-
 
 class Simulation(WorldViews):
     """W worlds of one environment on one map.
@@ -240,13 +235,13 @@ class Simulation(WorldViews):
     def check(self, saved: Sequence[NDArray[Any]]) -> None:
         """Check that `load` can take a state. Raises ConfigError if it cannot."""
         if len(saved) < 2 or saved[0].shape != (2,) or saved[1].shape != self._episodes.shape:
-            raise ConfigError(_NO_EPISODES)
+            raise ConfigError("the state is damaged: it lacks the seed or the episodes' numbers")
         snapshot.form_of(self._parts()).check(saved[2:])
 
     def check_share(self, share: Sequence[NDArray[Any]]) -> None:
         """Check that `join` can take a state of one world. Raises ConfigError if it cannot."""
         if [array.shape for array in share[:2]] != [(2,), (1,)]:
-            raise ConfigError(_NO_EPISODES)
+            raise ConfigError("the state is damaged: it lacks the seed or the episodes' numbers")
         snapshot.form_of(self._parts()).check_share(share[2:])
 
     def _saved_ownership(self, saved: Sequence[NDArray[Any]]) -> list[SavedOwnership] | None:
@@ -255,10 +250,7 @@ class Simulation(WorldViews):
         return found if found is not None and self.zones.take_saved(found[0]) else None
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
-        """Return the state of one world, as `save` returns it for a simulation of one world.
-
-        The arrays are views: copy them.
-        """
+        """Return the arrays of `save` for one world alone. They are views: copy them."""
         roots = np.array([self._seed, self._first_world + world], dtype=np.int64)
         episodes = self._episodes[world : world + 1]
         return [roots, episodes, *snapshot.share_of(self._parts(), world)]

@@ -126,10 +126,7 @@ def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
 
 
 def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
-    """Return the frames of W worlds as observations of mode `sensors`.
-
-    Each sensor's observation is a view (W, A, …).
-    """
+    """Return W worlds' frames as observations of mode `sensors`: views (W, A, …) by sensor."""
     return {
         name: sensor.data if sensor.data.shape[2] > 1 else sensor.data[:, :, 0]
         for name, sensor in frames.items()
@@ -170,10 +167,7 @@ def write_sensed(
 
 
 def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
-    """Return the space of one agent's action.
-
-    It is (throttle, steering) in [-1, 1], or the number of a choice.
-    """
+    """Return the space of an action: (throttle, steering) in [-1, 1], or a choice's number."""
     if config.kind == "continuous":
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
     return spaces.Discrete(config.choices)

@@ -58,10 +58,7 @@ class StepTrace:
             self._cycles[-1].append(phase)
 
     def around(self, executor: Executor) -> Executor:
-        """Return an executor that runs and records the phases of `executor`.
-
-        See `Simulation.trace`.
-        """
+        """Return an executor that runs and records phases; see `Simulation.trace`."""
         return _Traced(executor, self.note)
 
 

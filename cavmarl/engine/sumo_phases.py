@@ -116,10 +116,7 @@ class SumoPhases:
             tick.traffic.settle(departures, worlds)
 
     def let_in(self, tick: Tick) -> None:
-        """Add the vehicles that have entered in SUMO.
-
-        If SUMO drives, they become its rows; otherwise they join cavmarl's departure queue.
-        """
+        """Add vehicles that have entered in SUMO: as rows if it drives, else to the queue."""
         sumo, departures, worlds = self._sumo, tick.departures, tick.worlds
         tick.meet()
         if not sumo.drives:

@@ -247,10 +247,7 @@ def _put(target: Array, saved: Array) -> None:
 
 
 def digest_world(parts: Parts, world: int) -> str:
-    """Return a hex digest of one world, independent of the order of rows.
-
-    See `Simulation.state_hash`.
-    """
+    """Return a hex digest of one world, for any order of rows; see `Simulation.state_hash`."""
     worlds, departures, rerouting = parts.worlds, parts.departures, parts.traffic.rerouting
     sumo = parts.sumo
     rows = parts.division.vehicles(world)

@@ -39,10 +39,7 @@ class OwnerChanges:
         self.release_all = specialized(release)
 
     def near(self, w: int, everybody: bool) -> list[Near]:
-        """Return the vehicles of a world near a border, in its committed rows.
-
-        `everybody`: rows have changed since ghosts were renewed, so all rows must be checked.
-        """
+        """Return vehicles near a border, by committed rows; `everybody`: check all rows anew."""
         division = self._division
         if everybody:
             self._look(

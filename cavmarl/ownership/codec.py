@@ -57,21 +57,14 @@ def decode(
     data: bytes,  # one complete message
     run: bytes | None = None,  # of the receiver; None accepts all runs
 ) -> Message:
-    """Decode a message.
-
-    Raises:
-        MessageError: the bytes are damaged, or are of another version or run.
-    """
+    """Decode a message. Raises MessageError if it is damaged, or of another version or run."""
     if len(data) < _HEADER.size + _CRC.size:
         raise MessageError(f"a message of {len(data)} bytes is shorter than a header")
     magic, version, kind, zero = _HEADER.unpack_from(data)
     if magic != MAGIC:
         raise MessageError(f"a message begins with {MAGIC!r}, not with {magic!r}")
     if version != VERSION:
-        raise MessageError(
-            f"the message has version {version}, but this build reads {VERSION}; run the same "
-            "version of cavmarl on all machines"
-        )
+        raise MessageError(f"the message has version {version}, but this build reads {VERSION}")
     body = data[: -_CRC.size]
     if zlib.crc32(body) != _CRC.unpack_from(data, len(body))[0]:
         raise MessageError(f"the checksum of a message of {len(data)} bytes is wrong")

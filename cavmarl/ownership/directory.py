@@ -49,10 +49,7 @@ class StoreError(ProtocolError):
     """The rows in the store differ from the rows that zones reported."""
 
     def __init__(self, zones: tuple[int, ...]) -> None:
-        super().__init__(
-            f"the stored rows of zones {list(zones)} differ from those that the zones reported; "
-            "host these zones anew"
-        )
+        super().__init__(f"zones {list(zones)} stored other rows than reported; host them anew")
         self.zones = zones  # zones that need a new host, which repeats the tick
 
 
@@ -96,9 +93,7 @@ class Directory:
     ) -> Directory:
         """Restore the coordinator that wrote these records. Send `resend` before all else."""
         if not records or not isinstance(records[0], Reset):
-            raise JournalError(
-                "the log does not begin with the RESET that has the run's id; use an intact log"
-            )
+            raise JournalError("a log must begin with a RESET, which has the id of the run")
         directory = cls(records[0].run, zones, store, limits, neighbours)
         for record in records:
             directory.table.apply(record)

@@ -89,18 +89,14 @@ class Endpoint:
     def go_on(self) -> None:
         """Take a lease for the next tick without a STEP. The zone keeps its vehicles."""
         if self.lease is not None:
-            raise ProtocolError(
-                f"zone {self.zone} has a lease for tick {self.lease} already; complete it first"
-            )
+            raise ProtocolError(f"zone {self.zone} has a lease for tick {self.lease} already")
         self._release()
         self._hold(self.tick + 1, ())
 
     def rest(self) -> None:
         """End a lease of `go_on` without a DONE, if no vehicle has left the world."""
         if self.lease is None:
-            raise ProtocolError(
-                f"zone {self.zone} has no lease after tick {self.tick}; call go_on first"
-            )
+            raise ProtocolError(f"zone {self.zone} has no lease after tick {self.tick}")
         self._end_lease(self.lease)
 
     def complete(
@@ -111,9 +107,7 @@ class Endpoint:
     ) -> Done:
         """End the lease, after the result is in the store. Return the DONE."""
         if self.lease is None:
-            raise ProtocolError(
-                f"zone {self.zone} has no lease after tick {self.tick}; wait for a STEP"
-            )
+            raise ProtocolError(f"zone {self.zone} has no lease: no STEP after tick {self.tick}")
         for vehicle, _ in removed:
             after(Party.ROW, self.row_state(vehicle), Event.REMOVE)
             self.tally = self.tally.minus(self.run, vehicle, self.owned.pop(vehicle))

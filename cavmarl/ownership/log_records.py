@@ -60,41 +60,27 @@ class LogChain:
         except (ValueError, RecursionError) as error:
             raise JournalError(f"line {self.sequence + 1} of the log: {error}") from error
         if not isinstance(content, dict):
-            raise JournalError(
-                f"line {self.sequence + 1} of the log is not a JSON object; use an intact log"
-            )
+            raise JournalError(f"line {self.sequence + 1} of the log is not a JSON object")
         record = self.from_dict(content)
         text = line if isinstance(line, str) else line.decode("utf-8", "replace")
-        # Other text with the same content has white space, duplicate keys or different escapes.
-        if text.removesuffix("\n") != _json(content):
-            raise JournalError(
-                f"line {self.sequence} of the log has been changed; use an intact log"
-            )
+        if text.removesuffix("\n") != _json(content):  # white space, duplicate keys or escapes
+            raise JournalError(f"line {self.sequence} of the log has been changed")
         return record
 
     def from_dict(self, line: dict[str, Any]) -> Record:
         where = f"line {self.sequence + 1} of the log"
         if line.get("schema") != SCHEMA:
-            raise JournalError(
-                f"{where} has schema {line.get('schema')!r}, but this build reads {SCHEMA!r}; use "
-                "the version that wrote it"
-            )
+            raise JournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
         if line.get("sequence") != self.sequence:
-            raise JournalError(
-                f"{where} has number {line.get('sequence')}, so lines are missing; use an intact "
-                "log"
-            )
+            raise JournalError(f"{where} has number {line.get('sequence')}, so lines are missing")
         checksum = line.get("checksum")
         if checksum != sealed(line, self.last)["checksum"]:
             raise JournalError(
-                f"{where} does not match its checksum: it is damaged or belongs to another log; "
-                "use an intact log"
+                f"{where} does not match its checksum: it is damaged or belongs to another log"
             )
         kind = KINDS.get(str(line.get("kind")))
         if kind is None:
-            raise JournalError(
-                f"{where} has kind {line.get('kind')!r}; the kinds are {', '.join(KINDS)}"
-            )
+            raise JournalError(f"{where} has the unknown kind {line.get('kind')!r}")
         try:
             values = [parse(line[name]) for name, parse in _PARSE[kind]]
         except (KeyError, TypeError, ValueError) as error:
@@ -124,9 +110,7 @@ def records_from_lines(text: str) -> tuple[Record, ...]:
     records = []
     for line in text.splitlines(keepends=True):
         if not line.endswith("\n"):
-            raise JournalError(
-                f"line {chain.sequence + 1} of the log is incomplete: {line[:40]!r}; remove it"
-            )
+            raise JournalError(f"line {chain.sequence + 1} of the log is incomplete: {line[:40]!r}")
         records.append(chain.read(line))
     return tuple(records)
 
@@ -135,9 +119,7 @@ def replay(records: Iterable[Record]) -> Table:
     """Return the table that results from a log, for any number of zones."""
     log = tuple(records)
     if not log or not isinstance(log[0], Reset):
-        raise JournalError(
-            "the log does not begin with the RESET that has the run's id; use an intact log"
-        )
+        raise JournalError("a log must begin with a RESET, which has the id of the run")
     table = Table({record.zone for record in log if isinstance(record, Host)})
     for record in log:
         table.apply(record)
@@ -188,7 +170,7 @@ def _parse(name: str, hint: Any) -> Callable[[Any], Any]:
 
 def _checked(name: str, kind: type[int], value: Any) -> int:
     if type(value) is not kind or abs(value) >= _LARGEST:
-        raise TypeError(f"{name} = {value!r} is not {kind.__name__} within ±2**63")
+        raise TypeError(f"{name} = {value!r}: must be {kind.__name__}, below 2**63")
     return value
 
 

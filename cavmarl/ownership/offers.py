@@ -68,10 +68,7 @@ class Offers:
         return self._by_target(), withdrawn
 
     def forget(self, vehicle: int) -> None:
-        """Forget the offers of a vehicle that was handed over.
-
-        An ABORT now could reach its target before the STEP.
-        """
+        """Forget a handed-over vehicle: an ABORT could reach its target before the STEP."""
         for pair in [pair for pair in self.open if pair[0] == vehicle]:
             del self.open[pair]
 

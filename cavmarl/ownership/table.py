@@ -175,9 +175,7 @@ class Table:
 
     def _reset(self, record: Reset) -> None:
         if len(record.run) != RUN_BYTES:
-            raise JournalError(
-                f"the id of the run has {len(record.run)} bytes; it must have {RUN_BYTES}"
-            )
+            raise JournalError(f"the id of the run has {len(record.run)} bytes, not {RUN_BYTES}")
         self.run, self.tick, self.episode = record.run, record.tick, record.episode
         self.owners, self.deferred, self.plan = {}, {}, None
         self.counts = dict.fromkeys(self.hosts, 0)
@@ -188,9 +186,7 @@ class Table:
 
     def _begin(self, record: Begin) -> None:
         if self.plan is not None or record.tick != self.tick + 1:
-            raise JournalError(
-                f"BEGIN of tick {record.tick} does not follow the commit of tick {record.tick - 1}"
-            )
+            raise JournalError(f"BEGIN of tick {record.tick} after tick {self.tick}, or repeated")
         if record.switches or record.births:
             self._check_zones(switch.target for switch in record.switches)
             self._check_zones(birth.zone for birth in record.births)
@@ -209,14 +205,10 @@ class Table:
     def _commit(self, record: Commit) -> None:
         plan = self.planned
         if record.tick != plan.record.tick:
-            raise JournalError(
-                f"COMMIT of tick {record.tick}, but tick {plan.record.tick} was begun"
-            )
+            raise JournalError(f"COMMIT of tick {record.tick}, but {plan.record.tick} was begun")
         zones = [entry.zone for entry in record.zones]
         if zones != list(self.hosts):
-            raise JournalError(
-                f"COMMIT of tick {record.tick} has the zones {zones}, not {list(self.hosts)}"
-            )
+            raise JournalError(f"COMMIT of tick {record.tick} has the zones {zones}")
         for vehicle, zone in plan.births.items():
             self.owners[vehicle] = (zone, 0)
         for vehicle, _ in record.removed:

@@ -14,10 +14,7 @@ from cavmarl.shards.shard import Commands
 
 
 class Executor(Protocol):
-    """Runs each phase on all shards, and returns when all shards have run it.
-
-    `ShardGroup` describes the phases.
-    """
+    """Runs each phase on all shards, and returns when all have run it; see `ShardGroup`."""
 
     def begin_step(self, commands: Commands) -> None: ...
     def advance(self, commands: Commands) -> None: ...

@@ -29,7 +29,7 @@ _ENDLESS = ("to_go", "step_to_go")  # fields that are infinite without a route
 _FLOATS = tuple(name for name in VEHICLE.names or () if VEHICLE[name].kind == "f")
 _INT32 = tuple(name for name in VEHICLE.names or () if VEHICLE[name] == np.int32)
 MOST = int(np.iinfo(np.int32).max)
-MOST_IDS = 1 << 62  # of vehicles in a run
+MOST_IDS = 1 << 62  # limit of the ids of vehicles in a run
 
 
 class RowCheck:
@@ -75,7 +75,7 @@ class RowCheck:
             "blinker": range(-1, 2),
             "leg": range(MOST + 1),
             "order": range(-1, MOST + 1),
-            "owner": range(MOST + 1),  # of other zones, perhaps: a load writes it anew
+            "owner": range(MOST + 1),  # may be of different zones; a load overwrites it
             "epoch": range(MOST + 1),
             "transfer": range(AUTHORITATIVE, AUTHORITATIVE + 1),
         }
@@ -111,7 +111,7 @@ class RowCheck:
             return ""
         row, column = np.argwhere(outside)[0].tolist()
         low, high = self._low.item(column), self._high.item(column)
-        return _of(rows[row], _INT32[column], f"not in {low} to {high}")
+        return _of(rows[row], _INT32[column], f"is not in {low} to {high}")
 
     def _wrong_floats(self, rows: NDArray[np.void]) -> str:
         floats = np.stack([rows[name] for name in _FLOATS], axis=1)
@@ -119,14 +119,14 @@ class RowCheck:
         usual[:, _ENDLESS_COLUMNS] |= floats[:, _ENDLESS_COLUMNS] == np.inf
         if not usual.all():
             row, column = np.argwhere(~usual)[0].tolist()
-            return _of(rows[row], _FLOATS[column], f"not a number up to ±{_LARGEST:g}")
+            return _of(rows[row], _FLOATS[column], f"is not a number up to ±{_LARGEST:g}")
         radii_m = 0.5 * _diagonals_m(rows)
         sizes = np.stack([rows["length"], rows["width"], rows["height"]])
         wrong = (sizes <= 0.0).any(axis=0) | (radii_m > self._radius_m)
         wrong |= rows["height"] > self._height_m
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "length", "and with width and height fits no type")
+        return _of(rows[np.argmax(wrong)], "length", "fits no type with width and height")
 
     def _wrong_goals(self, rows: NDArray[np.void]) -> str:
         """Check that `goal` names a plan, a detour or a frame of a script, as the driver needs."""
@@ -141,7 +141,7 @@ class RowCheck:
         wrong |= rows["stop"] > rows["stops_end"]
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "goal", "which does not fit its driver, agent or stops")
+        return _of(rows[np.argmax(wrong)], "goal", "does not fit its driver, agent or stop")
 
     def _wrong_identity(self, rows: NDArray[np.void], num_orders: int) -> str:
         for name, numbers in (
@@ -151,9 +151,7 @@ class RowCheck:
             if len(np.unique(numbers)) < len(numbers):
                 return f"two vehicles have the same {name}"
         wrong = (rows["id"] < 0) | (rows["tick"] < 0) | (rows["order"] >= num_orders)
-        if not wrong.any():
-            return ""
-        return _of(rows[np.argmax(wrong)], "order", "which is invalid, or its id or tick is")
+        return _of(rows[np.argmax(wrong)], "order", "is bad, or id or tick") if wrong.any() else ""
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
         """Check that a route begins with a step of its lane. Follow it if its lanes may differ."""
@@ -182,11 +180,11 @@ class RowCheck:
             goes_on = step["next"] >= 0
             rows, step, way = rows[goes_on], step[goes_on], way[goes_on] + step["shift"][goes_on]
             if (step["next"] >= lanes).any():
-                return _of(rows[np.argmax(step["next"] >= lanes)], "way", "which leads to no lane")
+                return _of(rows[np.argmax(step["next"] >= lanes)], "way", "leads to no lane")
             lane = self._own_lanes(step["next"])
             if wrong := self._wrong_places(rows, lane, way):
                 return wrong
-        return _of(rows[0], "way", "which does not end")
+        return _of(rows[0], "way", "does not end")
 
     def _steps(self, at: Numbers, tail: NDArray[np.void] | None) -> NDArray[np.void]:
         steps = self._travel.steps
@@ -201,9 +199,7 @@ class RowCheck:
         edges = self._roads.edges[self._roads.lanes["edge"][lane]]
         first = way + edges["first_lane"]
         wrong = (first < 0) | (first + edges["num_lanes"] > len(self._travel.steps))
-        if not wrong.any():
-            return ""
-        return _of(rows[np.argmax(wrong)], "way", "which leads out of the table of routes")
+        return _of(rows[np.argmax(wrong)], "way", "leads out of all routes") if wrong.any() else ""
 
     def _own_lanes(self, lane: NDArray[np.int32]) -> Numbers:
         """Return the lanes whose steps apply: inside a junction, the lane after it."""
@@ -221,4 +217,4 @@ def _diagonals_m(bodies: NDArray[np.void]) -> NDArray[np.float64]:
 
 
 def _of(row: np.void, name: str, problem: str) -> str:
-    return f"vehicle {int(row['id'])} has {name} = {row[name].item()}, {problem}"
+    return f"vehicle {int(row['id'])} has {name} = {row[name].item()}, which {problem}"

@@ -68,8 +68,5 @@ def names_of(bundle: type[tuple[Any, ...]], use: Use) -> tuple[str, ...]:
 
 
 def arrays_of(source: Any, bundle: type[tuple[Any, ...]], use: Use) -> Iterator[NDArray[Any]]:
-    """Return the arrays of an object with the fields of a bundle that have a use.
-
-    Any shard's worlds have the fields of `SharedState`.
-    """
+    """Return a source's arrays of a bundle with a use; any shard has those of `SharedState`."""
     return (getattr(source, name) for name in names_of(bundle, use))

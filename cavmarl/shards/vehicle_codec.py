@@ -140,11 +140,7 @@ class TransferCodec:
     def unpack(
         self, data: bytes, vehicle: int, tick: int, rows: NDArray[np.void], world: int, i: int
     ) -> None:
-        """Write a state to `rows[world, i]` and to the arrays of its agent.
-
-        Raises:
-            MessageError: the state is damaged or not the expected one; nothing is written.
-        """
+        """Write a state to `rows[world, i]` and its agent's arrays; nothing if it is refused."""
         header = self.header(data)
         if (header.vehicle, header.tick) != (vehicle, tick):
             raise MessageError(

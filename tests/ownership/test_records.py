@@ -110,11 +110,11 @@ def changed(**change: object) -> dict[str, object]:
     ("change", "why"),
     [
         ({"schema": "cavmarl.ownership/9"}, "schema"),
-        ({"kind": "BLESS"}, "kind 'BLESS'"),
-        ({"zone": "one"}, "zone = 'one'"),
-        ({"zone": True}, "zone = True"),
-        ({"zone": 1 << 70}, "zone = "),
-        ({"kind": ["HOST"]}, "the kinds are RESET"),
+        ({"kind": "BLESS"}, "unknown kind 'BLESS'"),
+        ({"zone": "one"}, "zone = .*one.*must be int"),
+        ({"zone": True}, "zone = True: must be int"),
+        ({"zone": 1 << 70}, "zone = .*: must be int, below"),
+        ({"kind": ["HOST"]}, "unknown kind"),
     ],
 )
 def test_a_line_of_another_kind_is_refused(change: dict[str, object], why: str) -> None:
@@ -130,9 +130,9 @@ def test_lines_that_are_no_objects_are_refused() -> None:
 
 def test_a_log_that_no_coordinator_writes_cannot_be_replayed(log: str) -> None:
     records = records_from_lines(log)
-    with pytest.raises(JournalError, match="not begin with the RESET"):
+    with pytest.raises(JournalError, match="must begin with a RESET"):
         replay(records[1:])
-    with pytest.raises(JournalError, match="not begin with the RESET"):
+    with pytest.raises(JournalError, match="must begin with a RESET"):
         replay(())
     kinds = [type(record).__name__ for record in records]
     begin, commit = kinds.index("Begin"), kinds.index("Commit")
@@ -166,7 +166,7 @@ def test_a_log_whose_vehicles_do_what_they_cannot_is_refused() -> None:
             replay([*bench.log[:k], wrong])
     with pytest.raises(JournalError, match="zones \\[0\\]"):
         replay([*bench.log[: k + 1], replace(commit, zones=commit.zones[:1])])
-    with pytest.raises(JournalError, match="must have 16"):
+    with pytest.raises(JournalError, match="not 16"):
         replay([Reset(0, 0, b"short")])
     with pytest.raises(ProtocolError):
         replay([*bench.log[: k + 1], replace(commit, removed=(Removed(9, 0),))])

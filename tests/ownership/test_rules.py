@@ -88,7 +88,7 @@ def test_r04_a_logged_decision_is_not_taken_anew() -> None:
     with pytest.raises(ProtocolError, match="not committed"):
         again.begin([])
     for log in ([], bench.log[1:]):
-        with pytest.raises(JournalError, match="not begin with the RESET"):
+        with pytest.raises(JournalError, match="must begin with a RESET"):
             Directory.restore(log, range(2), bench)
 
 

@@ -111,10 +111,7 @@ class OwnersOnRecord:
             _add(sums, zone, int(owner_hash(vehicle, epoch)))
 
     def sums(self, births: Sequence[Birth], gone: Sequence[Departed] = ()) -> NDArray[np.uint64]:
-        """Return the sum (k,) of `owner_hash` of each zone's vehicles.
-
-        `births` and `gone` are changes that are not recorded yet.
-        """
+        """Return sums (k,) of `owner_hash` by zone, including changes not recorded yet."""
         if not (births or gone):
             return self._current
         sums = self._current.copy()

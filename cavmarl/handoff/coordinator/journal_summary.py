@@ -102,10 +102,7 @@ def _zones(path: Path) -> set[int]:
     zones = set()
     for record in reader:
         if reader.lines == 1 and not isinstance(record, Reset):
-            raise JournalError(
-                f"{path}: the first line is not a RESET with the id of the run; use the journal "
-                "of a coordinator"
-            )
+            raise JournalError(f"{path}: the first line is not a RESET, which has the run's id")
         if isinstance(record, Host):
             zones.add(record.zone)
     if not reader.lines:

@@ -260,10 +260,7 @@ class LocalCoordinator(Coordinator):
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
     def _settle(self, tick: int, changes: NDArray[np.void], news: _News, is_told: bool) -> None:
-        """Apply the changes of one tick, or of all ticks up to it, to the table.
-
-        `is_told`: also make the records of the tick for watchers.
-        """
+        """Apply changes up to a tick to the table and, if `is_told`, make records for watchers."""
         table = self._directory.table
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
         switches = tuple(map(Switch, *columns, repeat(False)))

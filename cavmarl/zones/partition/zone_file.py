@@ -54,10 +54,7 @@ def read_zones(path: str | Path) -> ZonePartition:
         raise ConfigError(f"{path}: there are {count} zones; use at most {MAX_ZONES}")
     for number in ids:
         if ids.count(number) > 1:
-            raise ConfigError(
-                f"{path}: {ids.count(number)} zones have the id {number}; number the zones from 0 "
-                f"to {count - 1}"
-            )
+            raise ConfigError(f"{path}: {ids.count(number)} zones have the id {number}; renumber")
     missing = sorted(set(range(count)) - set(ids))
     if missing:
         raise ConfigError(
@@ -71,10 +68,7 @@ def read_zones(path: str | Path) -> ZonePartition:
 
 
 def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> ZonePartition:
-    """Return the partition in a zone file.
-
-    Raises ConfigError if it does not cover this map or does not have `count` zones.
-    """
+    """Return a zone file's partition, if it covers this map and has `count` zones, if given."""
     partition = read_zones(path)
     if count is not None and partition.count != count:
         raise ConfigError(
