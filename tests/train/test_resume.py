@@ -219,7 +219,7 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(
         patch.setattr(os, "fsync", fsync_on_a_full_disk)
         said = refusal(*words, "--name", "cut")
     assert f"runs/cut/{full}: cannot be written (No space left on device); free some space" in said
-    assert "go on from the last checkpoint: --resume runs/cut" in said
+    assert "resume the last checkpoint: --resume runs/cut" in said
     assert not list((here / "runs" / "cut").glob(".build-*"))
     assert read_checkpoint(here / "runs" / "cut").updates == 0
     assert ippo.main(["--resume", "runs/cut"]) == 0
