@@ -46,8 +46,8 @@ def parallel_env(
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         lenient: for libraries that act for absent agents or beyond the bounds. Values are clipped,
-        actions of absent agents are ignored, and a missing action repeats the agent's last one,
-        or 0. Sets action.out_of_range, .missing_action, .late_actions; traffic_stats() counts.
+            actions of absent agents are ignored, and a missing action repeats the agent's last one,
+            or 0. Sets action.out_of_range, .missing_action, .late_actions; traffic_stats() counts.
         world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
             sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
 
