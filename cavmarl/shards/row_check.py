@@ -151,7 +151,9 @@ class RowCheck:
             if len(np.unique(numbers)) < len(numbers):
                 return f"two vehicles have the same {name}"
         wrong = (rows["id"] < 0) | (rows["tick"] < 0) | (rows["order"] >= num_orders)
-        return _of(rows[np.argmax(wrong)], "order", "is bad, or id or tick") if wrong.any() else ""
+        if not wrong.any():
+            return ""
+        return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id or tick is")
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
         """Check that a route begins with a step of its lane. Follow it if its lanes may differ."""

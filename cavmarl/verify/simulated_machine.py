@@ -204,7 +204,7 @@ class SimulatedMachine:
                 heapq.heappop(self._events)[2]()
 
     def outlived(self, patience_s: float) -> list[str]:
-        """Return the names of processes that still run a time after the end of the caller."""
+        """Return the names of processes that still run `patience_s` after the caller has ended."""
         caller, until_s = self.caller, self.now_s + patience_s
         caller.is_ended = False
         for one in caller.sockets:

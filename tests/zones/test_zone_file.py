@@ -60,7 +60,7 @@ def document() -> dict[str, Any]:
         (lambda it: it["zones"][2].update(rect=1), r"zones\.2\.rect: unknown key; use rect_m"),
         (lambda it: it["zones"][2].pop("id"), r"zones\.2\.id: missing"),
         (lambda it: it["zones"][2].update(id=True), r"zones\.2\.id = True"),
-        (lambda it: it["zones"][2].update(id=0), r"2 zones have the id 0"),
+        (lambda it: it["zones"][2].update(id=0), r"2 zones have id 0"),
         (lambda it: it["zones"][2].update(id=7), r"no zone has the id 2; .* 0 to 4"),
         (lambda it: it["zones"][4]["rect_m"].append(1.0), r"zones\.4\.rect_m"),
         (lambda it: it["zones"][4].update(rect_m=[10, 10, "20", 20]), r"zones\.4\.rect_m\.2"),

@@ -155,7 +155,7 @@ class HandoffLog:
         return taken
 
     def take_counts(self) -> tuple[int, int]:
-        """Return and clear the numbers of vehicles near a border, over ticks, and turned away."""
+        """Return and clear two sums over ticks: vehicles near borders, and those turned away."""
         acknowledged, aborted = self._book.acknowledged, self._book.aborted
         counts = acknowledged.item(self._world), aborted.item(self._world)
         acknowledged[self._world] = aborted[self._world] = 0

@@ -22,7 +22,7 @@ _SIGN = np.int64(1 << 31)
 
 @inlined_kernel
 def _half(word: int, bit: int) -> int:
-    """Return the signed number in 32 bits of a word, from a bit on."""
+    """Return the signed 32-bit number that begins at a bit of a word."""
     return int(((word >> bit & _LOW) ^ _SIGN) - _SIGN)
 
 

@@ -54,7 +54,7 @@ def read_zones(path: str | Path) -> ZonePartition:
         raise ConfigError(f"{path}: there are {count} zones; use at most {MAX_ZONES}")
     for number in ids:
         if ids.count(number) > 1:
-            raise ConfigError(f"{path}: {ids.count(number)} zones have the id {number}; renumber")
+            raise ConfigError(f"{path}: {ids.count(number)} zones have id {number}; renumber them")
     missing = sorted(set(range(count)) - set(ids))
     if missing:
         raise ConfigError(
