@@ -132,7 +132,7 @@ def test_faster_drives_faster_and_is_rewarded(make: Any) -> None:
         ({"action": {"type": "Meta"}}, "must be one of DiscreteMetaAction"),
         ({"vehicle_count": 5}, "vehicle_count: no such key"),
         ({"controlled_vehicles": 2}, "drives many"),
-        ({"lanes_count": 7}, "maps of 3, 4 lanes"),
+        ({"lanes_count": 7}, "must be one of 3, 4"),
         ({"policy_frequency": 20}, "not be below the first"),
         ({"duration": -1}, "duration = -1: must be above 0"),
         ({"action": {"type": "ContinuousAction", "steering_range": [-1, 2]}}, "symmetric"),

@@ -61,7 +61,7 @@ def test_swapped_coordinates_are_named(tmp_path: Path) -> None:
 
 def test_voids_everywhere_are_refused(tmp_path: Path) -> None:
     path = write_geotiff(tmp_path / "g.tif", GROUND, holes=lambda heights: heights.fill(np.nan))
-    with pytest.raises(MapError, match="100% of the roads lie in voids"):
+    with pytest.raises(MapError, match="100% of the roads are in voids"):
         HeightModel([path]).at(PLACES)
 
 
