@@ -162,7 +162,7 @@ def test_attributes_and_methods_are_those_of_the_worlds(rows: Any) -> None:
     assert not rows.has_attr("nonsense")
     assert rows.env_method("state_hash", 1, indices=[0]) == [rows.env_method("state_hash", 1)[0]]
     assert rows.env_is_wrapped(object) == [False] * rows.num_envs
-    with pytest.raises(NotImplementedError, match="max_cycles: .*rows share"):
+    with pytest.raises(NotImplementedError, match=r"max_cycles: .*rows share"):
         rows.set_attr("max_cycles", 3)
 
 
