@@ -55,7 +55,7 @@ def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals
     assert "Traceback" not in errors.read_text()
     if ended_by is signal.SIGINT:
         assert program.returncode == 130
-        assert errors.read_text().startswith("interrupted: the same command goes on")
+        assert errors.read_text().startswith("interrupted: the same command resumes")
     else:
         assert program.returncode == -ended_by
 
