@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +40,8 @@ from cavmarl.traffic.sumo.sumo_input import read_input
 from cavmarl.zones.partition.zone_file import zones_for
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
+
+log = logging.getLogger(__name__)
 
 # Networks that are in use in this process. The key is whether there are agents, followed by the
 # names and hashes of the map files.
@@ -162,7 +165,10 @@ def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
             refused.append(str(error))
     if refused:
         raise MapError("\n".join(refused))
-    return _LOADED.setdefault((has_agents, *contents), join(networks))
+    network = join(networks)
+    for note in network.notes:
+        log.warning("%s: %s", network.name, note)
+    return _LOADED.setdefault((has_agents, *contents), network)
 
 
 def _refuse_of_one_map(config: EnvConfig) -> None:

@@ -14,12 +14,13 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.net_document import NetDocument, points_of
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.sumo_net.road_corners import find_corners
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 CAR_WIDTH_M = 1.8
 LEVEL_M = 3.0  # lanes with a larger difference in height are a bridge and the road below it
 STEP_M = 0.1  # in height, between lanes that lead into each other
-SEARCHES = ("crossings", "signals", "lanes", "steps", "parts", "stop lines", "buildings")
+SEARCHES = ("crossings", "signals", "lanes", "steps", "parts", "stop lines", "corners", "buildings")
 _DEEP_M = 1.0  # maximum distance of a stop line inside its junction
 
 Points = NDArray[np.float64]
@@ -65,6 +66,7 @@ def find_defects(
         lambda: _steps(network),
         lambda: _unreachable_parts(network),
         lambda: _stop_lines_inside(network, document),
+        lambda: _tight_corners(network),
     ]
     if buildings is not None:
         searches.append(lambda: _buildings_on_roads(with_buildings(network, buildings)))
@@ -229,6 +231,17 @@ def _stop_lines_inside(network: RoadNetwork, document: NetDocument) -> Iterator[
             deep = f"{_to_rim(end, rim[:, :2]):.1f} m inside {junction}"
             x, y = end.tolist()
             yield Defect("stop line inside a junction", network.lane_ids[lane], x, y, deep)
+
+
+def _tight_corners(network: RoadNetwork) -> Iterator[Defect]:
+    """Find corners inside roads that the reader has no room to round."""
+    cars = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
+    for lane in np.flatnonzero(cars).tolist():
+        shape = network.lane_polyline(lane)
+        for corner in find_corners(shape):
+            x, y = shape[(corner.first + corner.last) // 2, :2].tolist()
+            angle = f"{abs(np.degrees(corner.turn)):.0f} degrees"
+            yield Defect("corner too tight for a car", network.lane_ids[lane], x, y, angle)
 
 
 def _inside(place: Points, rim: Points) -> bool:

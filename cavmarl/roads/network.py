@@ -268,6 +268,7 @@ class RoadNetwork:
     junction_kinds: tuple[str, ...]  # SUMO's junction types, by `JUNCTION["kind"]`
     geo: GeoReference | None = None  # position on the earth; None: the map does not say
     left_hand: bool = False  # whether the map has left-hand traffic
+    notes: tuple[str, ...] = ()  # where the lanes differ from those of the source, and why
     joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # if several
     map_names: tuple[str, ...] = ()  # if there are several maps
     # WALL (num_walls,) of the buildings, if they were requested; see `maps.buildings`

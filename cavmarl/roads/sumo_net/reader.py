@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ from cavmarl.roads.sumo_net.conflicts import (
     stop_back,
 )
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
+from cavmarl.roads.sumo_net.road_corners import round_corners
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
 from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows, unfed_beside
@@ -46,6 +48,7 @@ APPROACH_M = 12.0  # before a junction, where bodies are still oblique to waitin
 FORK_WATCHED_M = 5.0  # after a junction, where vehicles that turn off beside a rear watch it
 MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the square
 MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable for another limit
+_NAMED = 5  # maximum number of changed lanes that are named
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
 
 
@@ -105,7 +108,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
 
     num_normal = sum(lane.getEdge().getFunction() == "" for lane in chosen.lanes)
     lane_ids = tuple(lane.getID() for lane in chosen.lanes)
-    shapes = _shapes(chosen, lane_row, lane_ids[:num_normal])
+    shapes, notes = _shapes(chosen, lane_row, lane_ids[:num_normal])
     edges = _edge_rows(chosen, net, node_row)
     outer = _outer_rows(chosen, edges)
     split_beside_ends(shapes, outer[outer < num_normal])
@@ -158,18 +161,41 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         junction_kinds=kinds,
         geo=_geo_reference(net),
         left_hand=parsed.left_hand,
+        notes=notes,
     )
 
 
 def _shapes(
     chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str]
-) -> list[Shape]:
-    """Return the drivable centre line of each lane, (n, 3) in m; lanes of roads come first."""
+) -> tuple[list[Shape], tuple[str, ...]]:
+    """Return the drivable centre line of each lane, (n, 3) in m, and notes on changed lanes.
+
+    Lanes of roads come first.
+    """
     shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
     refuse_points(shapes[: len(normal_ids)], normal_ids)
+    widths_m = [lane.getWidth() for lane in chosen.lanes]
+    rounded = round_corners(shapes, widths_m, _lanes_of_edges(chosen, len(normal_ids)))
+    notes = []
+    if rounded:
+        ids = _some([normal_ids[row] for row in rounded])
+        notes.append(
+            f"rounded the corners of {len(rounded)} lanes, which are too tight for a car: {ids}"
+        )
     mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
     extend_stubs(shapes, _before(chosen, lane_row))
-    return shapes
+    return shapes, tuple(notes)
+
+
+def _some(ids: Sequence[str]) -> str:
+    return ", ".join(ids[:_NAMED]) + (", …" if len(ids) > _NAMED else "")
+
+
+def _lanes_of_edges(chosen: NetworkSelection, num_normal: int) -> list[range]:
+    """Return the lane rows of each edge that is not inside a junction."""
+    edges = [id(lane.getEdge()) for lane in chosen.lanes[:num_normal]]
+    starts = [row for row in range(num_normal) if row == 0 or edges[row] != edges[row - 1]]
+    return [range(*bounds) for bounds in pairwise([*starts, num_normal])]
 
 
 def _geo_reference(net: Any) -> GeoReference | None:
