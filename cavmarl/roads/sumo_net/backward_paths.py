@@ -83,7 +83,7 @@ def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
             mended.add(way)  # the part removed from its lanes runs backwards
     for way in ways:
         if way in mended:
-            _redraw(shapes, way)
+            redraw(shapes, way)
 
 
 def _is_broken(shapes: Sequence[Shape], way: Way) -> bool:
@@ -130,7 +130,7 @@ def _needed_cut(
     return best[1:]
 
 
-def _redraw(shapes: list[Shape], way: Way) -> None:
+def redraw(shapes: list[Shape], way: Way) -> None:
     """Replace the internal lanes of a way by a curve, divided in proportion to their lengths."""
     curve = smooth_curve(shapes[way.before], shapes[way.after])
     lengths = [max(shape_length(shapes[lane]), SAME_POINT_M) for lane in way.inside]

@@ -37,6 +37,7 @@ from cavmarl.roads.sumo_net.conflicts import (
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
 from cavmarl.roads.sumo_net.road_corners import round_corners
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
+from cavmarl.roads.sumo_net.shared_strips import Road, find_strips, move_apart
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
 from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows, unfed_beside
 from cavmarl.roads.sumo_net.xml_source import limit
@@ -108,7 +109,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
 
     num_normal = sum(lane.getEdge().getFunction() == "" for lane in chosen.lanes)
     lane_ids = tuple(lane.getID() for lane in chosen.lanes)
-    shapes, notes = _shapes(chosen, lane_row, lane_ids[:num_normal])
+    shapes, notes = _shapes(chosen, lane_row, lane_ids[:num_normal], parsed.left_hand)
     edges = _edge_rows(chosen, net, node_row)
     outer = _outer_rows(chosen, edges)
     split_beside_ends(shapes, outer[outer < num_normal])
@@ -166,7 +167,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
 
 
 def _shapes(
-    chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str]
+    chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str], left_hand: bool
 ) -> tuple[list[Shape], tuple[str, ...]]:
     """Return the drivable centre line of each lane, (n, 3) in m, and notes on changed lanes.
 
@@ -175,14 +176,27 @@ def _shapes(
     shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
     refuse_points(shapes[: len(normal_ids)], normal_ids)
     widths_m = [lane.getWidth() for lane in chosen.lanes]
-    rounded = round_corners(shapes, widths_m, _lanes_of_edges(chosen, len(normal_ids)))
+    ways = [_way(move, lane_row) for move in chosen.movements]
+    roads = _roads(chosen, len(normal_ids))
     notes = []
+    strips = find_strips(shapes, widths_m, roads, left_hand)
+    if strips:
+        move_apart(shapes, strips, ways, left_hand)
+        ids = _some(
+            [f"{normal_ids[a]} and {normal_ids[b]}" for one in strips for a, b in one.lanes]
+        )
+        most_m = max(strip.apart_m for strip in strips)
+        notes.append(
+            f"moved {len(strips)} pairs of opposite edges by up to {most_m:.1f} m, because their "
+            f"lanes were on the same strip: {ids}"
+        )
+    rounded = round_corners(shapes, widths_m, [road.lanes for road in roads])
     if rounded:
         ids = _some([normal_ids[row] for row in rounded])
         notes.append(
             f"rounded the corners of {len(rounded)} lanes, which are too tight for a car: {ids}"
         )
-    mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
+    mend_backward_paths(shapes, ways)
     extend_stubs(shapes, _before(chosen, lane_row))
     return shapes, tuple(notes)
 
@@ -191,11 +205,15 @@ def _some(ids: Sequence[str]) -> str:
     return ", ".join(ids[:_NAMED]) + (", …" if len(ids) > _NAMED else "")
 
 
-def _lanes_of_edges(chosen: NetworkSelection, num_normal: int) -> list[range]:
-    """Return the lane rows of each edge that is not inside a junction."""
+def _roads(chosen: NetworkSelection, num_normal: int) -> list[Road]:
+    """Return the edges that are not inside a junction."""
     edges = [id(lane.getEdge()) for lane in chosen.lanes[:num_normal]]
     starts = [row for row in range(num_normal) if row == 0 or edges[row] != edges[row - 1]]
-    return [range(*bounds) for bounds in pairwise([*starts, num_normal])]
+    owners = [chosen.lanes[row].getEdge() for row in starts]
+    return [
+        Road(range(*bounds), id(edge.getFromNode()), id(edge.getToNode()))
+        for edge, bounds in zip(owners, pairwise([*starts, num_normal]), strict=True)
+    ]
 
 
 def _geo_reference(net: Any) -> GeoReference | None:
