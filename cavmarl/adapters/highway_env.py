@@ -150,7 +150,7 @@ class HighwayEnv(CavEgoEnv):
         return float((total - worst) / (best - worst)) if best > worst else float(total)
 
     def _lane_and_merging(self) -> tuple[float, float]:
-        """Return how far right the lane is, 0 to 1, and the sum of merging cars' relative delays."""
+        """Return how far right the lane is, 0 to 1, and the sum of merging cars' speed deficits."""
         network = self._env.network
         rows = self._env.worlds.simulation.vehicles(0)
         own = rows[rows["driver"] == DRIVER_AGENT]
