@@ -214,7 +214,7 @@ def test_rows_of_a_world_begin_anew_together() -> None:
     rows = make(autoreset_mode="Disabled")
     rows.reset(seed=5)
     first = np.arange(ROWS) == 0
-    with pytest.raises(ConfigError, match="row 0, which has not ended: its world continues"):
+    with pytest.raises(ConfigError, match="row 0, which has not ended, but not all rows"):
         rows.reset(options={"reset_mask": first})
     with pytest.raises(ConfigError, match=r"must be \(8,\) and bool, one value per row"):
         rows.reset(options={"reset_mask": first[:WORLDS]})

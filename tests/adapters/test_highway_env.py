@@ -130,8 +130,8 @@ def test_faster_drives_faster_and_is_rewarded(make: Any) -> None:
     [
         ({"observation": {"type": "Grayscale"}}, "must be one of Kinematics"),
         ({"action": {"type": "Meta"}}, "must be one of DiscreteMetaAction"),
-        ({"vehicle_count": 5}, "vehicle_count: no such key"),
-        ({"controlled_vehicles": 2}, "drives many"),
+        ({"vehicle_count": 5}, "vehicle_count: unknown key"),
+        ({"controlled_vehicles": 2}, "for several agents"),
         ({"lanes_count": 7}, "must be one of 3, 4"),
         ({"policy_frequency": 20}, "not be below the first"),
         ({"duration": -1}, "duration = -1: must be above 0"),

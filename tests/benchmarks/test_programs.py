@@ -219,7 +219,7 @@ def test_every_sensor_of_the_rig_is_measured() -> None:
         (splits.measure, {"env": "ring", "vehicles": "many"},
          "--vehicles many: must be"),
         (splits.measure, {"env": "ring", "vehicles": "2", "agents": 3},
-         "2 vehicles: agents alone are 3"),
+         "2 vehicles: must be at least the 3 agents"),
         (vectorization.measure, {"agents": 5, "workers": 2}, "5 agents over 2 workers"),
         (node_latencies.measure, {"env": "ring", "nodes": 1}, "--nodes 1"),
         (node_limit.measure, {"vehicles": 1}, "--vehicles 1: must be at least 800"),

@@ -198,7 +198,7 @@ def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None
         (["--env", "merg"], "did you mean merge"),
         (["--num-envs", "0"], "--num-envs 0: must be at least 1"),
         (["--learning-rate", "nan"], "--learning-rate nan: must be above 0"),
-        (["--mappo", "--shared"], "--shared: not with --mappo"),
+        (["--mappo", "--shared"], "--shared: leave out --mappo"),
         (["--keep", "0"], "--keep 0.0: must be above 0"),
         (["--gamma", "1.5"], "--gamma 1.5: must be from 0 to 1"),
         (["--agents", "-1"], "--agents -1: must be at least 0"),
