@@ -38,7 +38,7 @@ def divide_row(
     return placement
 
 
-def slide(
+def shift_ends(
     placement: Placement,  # changed and returned
     *,
     until_s: float,  # a makespan that is good enough
@@ -58,9 +58,9 @@ def slide(
         for step in (-1, 1):
             homes = list(placement.homes)
             for moves, giver in enumerate(_towards(source, step, len(ticks)), start=1):
-                if moves > left or not _give(placement, homes, giver, step):
+                if moves > left or not _pass_to_next(placement, homes, giver, step):
                     break
-                worst_s = _worst_s(placement, homes, source, giver + step)
+                worst_s = _slowest_s(placement, homes, source, giver + step)
                 found.append((worst_s, moves, step, list(homes)))
         if not found:
             break
@@ -77,7 +77,7 @@ def _towards(source: int, step: int, count: int) -> range:
     return range(source, count - 1) if step > 0 else range(source, 0, -1)
 
 
-def _give(placement: Placement, homes: list[int], giver: int, step: int) -> bool:
+def _pass_to_next(placement: Placement, homes: list[int], giver: int, step: int) -> bool:
     """Give the shard at one end of a piece to the next worker; return whether this is allowed."""
     taker = giver + step
     if homes.count(giver) < 2 or not placement.workers.is_open[taker]:
@@ -87,7 +87,7 @@ def _give(placement: Placement, homes: list[int], giver: int, step: int) -> bool
     return True
 
 
-def _worst_s(placement: Placement, homes: list[int], first: int, last: int) -> float:
+def _slowest_s(placement: Placement, homes: list[int], first: int, last: int) -> float:
     shards, speeds = placement.problem.shards, placement.workers.speeds
     between = range(min(first, last), max(first, last) + 1)
     return max(

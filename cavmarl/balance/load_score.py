@@ -192,12 +192,12 @@ def select(
     left = admissible(candidates, rejections)
     scores = {candidate.worker: load_score(candidate.use, rule.weights) for candidate in left}
     best = min(left, key=lambda one: (scores[one.worker], one.hosted, one.worker)).worker
-    outcome = _judge(preferred, best, scores, rejections, rule)
+    outcome = _outcome_of(preferred, best, scores, rejections, rule)
     chosen = preferred if outcome == "preferred" and preferred is not None else best
     return Selection(chosen, preferred, outcome, tuple(scores.items()), rejections)
 
 
-def _judge(
+def _outcome_of(
     preferred: int | None,
     best: int,
     scores: dict[int, float],

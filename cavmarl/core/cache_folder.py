@@ -18,7 +18,7 @@ def cache_dir() -> Path:
     return (Path(shared) if os.path.isabs(shared) else Path.home() / ".cache") / "cavmarl"
 
 
-def tell_unwritable(error: OSError) -> None:
+def report_unwritable(error: OSError) -> None:
     """Report once, on standard error, that the cache cannot be written."""
     folder = cache_dir()
     if folder not in _REPORTED:

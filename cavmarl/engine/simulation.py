@@ -133,7 +133,7 @@ class Simulation(WorldViews):
         tick.traffic.populate(tick.departures, worlds, chosen)
         tick.sumo.reset(chosen, worlds)
         tick.division.distribute(chosen)
-        tick.peers.keep_own(chosen)
+        tick.peers.drop_foreign_rows(chosen)
         tick.coordination.reset(chosen)
         tick.sumo.switch_signals(tick)
         for part in tick.attached:
@@ -212,8 +212,8 @@ class Simulation(WorldViews):
         self._put_back(saved)
         tick = self._tick
         tick.sumo.catch_up(self._shard.worlds)
-        tick.peers.keep_own(self.everywhere)
-        tick.peers.take_up(tick.departures, tick.division.side)
+        tick.peers.drop_foreign_rows(self.everywhere)
+        tick.peers.resume_from(tick.departures, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
         """Resume like `load` where each process holds some zones; `home` is a zone of this one."""
@@ -221,7 +221,7 @@ class Simulation(WorldViews):
         tick = self._tick
         tick.sumo.catch_up(self._shard.worlds)
         tick.departures.num_passing[:] = 0
-        tick.peers.take_up(tick.departures, tick.division.side)
+        tick.peers.resume_from(tick.departures, tick.division.side)
         tick.peers.share_rows(tick.departures, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:

@@ -99,7 +99,7 @@ def load(
             np.split(np.concatenate(zones), np.cumsum(one.counts)[:-1])
             for zones, one in zip(vehicles, ownership, strict=True)
         ]
-        goes_on = _has_its_journals(parts, ownership)
+        goes_on = _can_continue_journals(parts, ownership)
         parts.division.put_back(owned, contacts, 0, keeps_epochs=goes_on)
         ownership = ownership if goes_on else None
     parts.coordination.go_on(ownership)
@@ -142,7 +142,7 @@ def ownership_of(parts: Parts, saved: Sequence[Array]) -> list[SavedOwnership] |
     return found
 
 
-def _has_its_journals(parts: Parts, ownership: Sequence[SavedOwnership]) -> bool:
+def _can_continue_journals(parts: Parts, ownership: Sequence[SavedOwnership]) -> bool:
     """Return whether all journals, if any, can continue from their position in a saved state.
 
     A state from a file has no position; the journal then begins a new episode.

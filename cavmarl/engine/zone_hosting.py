@@ -96,9 +96,9 @@ class ZoneHosting:
         everywhere = np.ones(len(contacts), dtype=np.bool_)
         self.set_zones(partition)
         tick.division.place(vehicles, contacts)
-        tick.peers.keep_own(everywhere)
+        tick.peers.drop_foreign_rows(everywhere)
         tick.coordination.reset(everywhere)
-        tick.peers.take_up(tick.departures, tick.division.side)
+        tick.peers.resume_from(tick.departures, tick.division.side)
 
     def measure_costs(self, every: int = 1) -> ShardClock:
         """Measure the processor time of each zone from now on, in one tick of `every`."""

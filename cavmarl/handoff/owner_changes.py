@@ -38,10 +38,10 @@ class OwnerChanges:
         self.hand_over_all = specialized(hand_over)
         self.release_all = specialized(release)
 
-    def near(self, w: int, everybody: bool) -> list[Near]:
-        """Return vehicles near a border, by committed rows; `everybody`: check all rows anew."""
+    def near(self, w: int, check_all: bool) -> list[Near]:
+        """Return vehicles near a border, by committed rows. `check_all`: search all rows anew."""
         division = self._division
-        if everybody:
+        if check_all:
             self._look(
                 division.zones, division.borders, division.zoned, division.side, w, True, 0,
                 division.book,

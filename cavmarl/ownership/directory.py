@@ -99,7 +99,7 @@ class Directory:
             directory.table.apply(record)
         return directory
 
-    def know(self, neighbours: Neighbours) -> None:
+    def set_neighbours(self, neighbours: Neighbours) -> None:
         """Set the zones between which vehicles may change."""
         self._decisions.neighbours = neighbours
 
@@ -260,7 +260,7 @@ class Directory:
 
     def on_message(self, message: Message) -> Output:
         """Process a message. Late and foreign messages are dropped and counted."""
-        reason = self._misfit(message)
+        reason = self._reason_to_drop(message)
         if reason is not None:
             self.dropped[type(message).__name__, reason] += 1
             return SILENCE
@@ -277,7 +277,7 @@ class Directory:
 
     # Inside
 
-    def _misfit(self, message: Message) -> str | None:
+    def _reason_to_drop(self, message: Message) -> str | None:
         table = self.table
         if message.run != self.run:
             return "run"

@@ -123,13 +123,13 @@ class TraceChecker:
         self._incarnations: dict[int, int] = {}
         self._fenced: set[int] = set()
         self._fences: dict[tuple[int, int], tuple[int, int]] = {}
-        self._heard: defaultdict[int, set[tuple[int, int]]] = defaultdict(set)  # tick → fences
+        self._fenced_at: defaultdict[int, set[tuple[int, int]]] = defaultdict(set)  # tick → fences
         self._holdings: defaultdict[int, set[Holding]] = defaultdict(set)  # by tick
         self._ready: set[tuple[int, int, int, int, int]] = set()  # acknowledged, with the tick
         self._begun: Begin | None = None
         self._orders: defaultdict[int, _Orders] = defaultdict(_Orders)  # by zone, of that BEGIN
         self._dones: dict[int, Done] = {}
-        self._judges: dict[type, Callable[[Any], None]] = {
+        self._checks: dict[type, Callable[[Any], None]] = {
             Reset: self._reset, Host: self._host, Fence: self._fence, Begin: self._begin,
             Commit: self._commit, Step: self._step, Prepare: self._prepare, Abort: self._abort,
             Ack: self._ack, Done: self._done,
@@ -137,15 +137,15 @@ class TraceChecker:
 
     def take(self, entry: TraceEntry) -> None:
         item = entry.item
-        judge = self._judges.get(type(item))
+        judge = self._checks.get(type(item))
         if isinstance(item, Record):
             _require(judge is not None, "unknown record")
-        elif self._foreign(item) or (type(item) is Ack and entry.destination != COORDINATOR):
+        elif self._is_foreign(item) or (type(item) is Ack and entry.destination != COORDINATOR):
             return
         if judge is not None:
             judge(item)
 
-    def _foreign(self, message: Message) -> bool:
+    def _is_foreign(self, message: Message) -> bool:
         return message.run != self._run or message.episode != self._episode
 
     def _reset(self, record: Reset) -> None:
@@ -156,7 +156,7 @@ class TraceChecker:
         self._tallies.clear()
         self._begun, self._dones = None, {}
         self._fences, self._ready = {}, set()
-        self._heard.clear()
+        self._fenced_at.clear()
         self._holdings.clear()
 
     def go_on(self, table: KnownOwners) -> None:
@@ -242,19 +242,19 @@ class TraceChecker:
     def _prepare(self, message: Prepare) -> None:
         process = (message.target, self._incarnations.get(message.target, 0))
         for vehicle, epoch, digest, state in message.entries:
-            if state_digest(state) == digest and self._hear(
+            if state_digest(state) == digest and self._raise_fence(
                 message.target, vehicle, epoch, message.tick
             ):
                 self._holdings[message.tick].add((*process, vehicle, epoch, digest))
 
     def _abort(self, message: Abort) -> None:
         for vehicle, epoch in message.entries:
-            self._hear(message.target, vehicle, epoch, message.tick)
+            self._raise_fence(message.target, vehicle, epoch, message.tick)
 
-    def _hear(self, zone: int, vehicle: int, epoch: int, tick: int) -> bool:
+    def _raise_fence(self, zone: int, vehicle: int, epoch: int, tick: int) -> bool:
         newest = self._fences.get((zone, vehicle), (-1, -1))
         kept = self._fences[zone, vehicle] = max(newest, (epoch, tick))
-        self._heard[kept[1]].add((zone, vehicle))
+        self._fenced_at[kept[1]].add((zone, vehicle))
         return (epoch, tick) > newest
 
     def _ack(self, message: Ack) -> None:
@@ -337,8 +337,8 @@ class TraceChecker:
         oldest = self._tick - self._lifetime
         for tick in [tick for tick in self._holdings if tick < oldest]:
             del self._holdings[tick]
-        for tick in [tick for tick in self._heard if tick < oldest]:
-            for key in self._heard.pop(tick):
+        for tick in [tick for tick in self._fenced_at if tick < oldest]:
+            for key in self._fenced_at.pop(tick):
                 if self._fences.get(key, (0, oldest))[1] < oldest:
                     del self._fences[key]
         self._ready = {ready for ready in self._ready if ready[4] >= self._tick}

@@ -38,7 +38,7 @@ class Executor(Protocol):
 class TeamExecutor(Executor, Protocol):
     """Runs phases in several processes. Some phases return before all shards have run them."""
 
-    def meet(self) -> None:
+    def finish_phase(self) -> None:
         """Wait until all shards have run the last phase."""
         ...
 

@@ -137,7 +137,7 @@ class Shard:
         )
         self.outputs = outputs
         self.mail: Mail | None = None  # messages that agents have received; None: no messages
-        self.untold = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)
+        self.no_reports = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)
         self.messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
@@ -153,9 +153,9 @@ class Shard:
 
     def align(self) -> None:
         """Use the first buffer for all rows, after a tick that was abandoned."""
-        self.face(0, 0)
+        self.set_sides(0, 0)
 
-    def face(self, side: int, next_side: int) -> None:
+    def set_sides(self, side: int, next_side: int) -> None:
         self.side, self.next_side = side, next_side
         self.row_sides[:] = side, next_side
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])

@@ -46,7 +46,7 @@ class _Connection:
 
 
 class FaultyNetwork:
-    """A proxy for connections; `strike` injects a fault into one of them.
+    """A proxy for connections; `inject` injects a fault into one of them.
 
     Attributes:
         done: number of injected faults of each kind.
@@ -73,7 +73,7 @@ class FaultyNetwork:
         found: Place = listener.getsockname()
         return found
 
-    def strike(self, kind: NetworkFault) -> None:
+    def inject(self, kind: NetworkFault) -> None:
         """Inject a fault into a random connection."""
         with self._lock:
             if not self._connections:

@@ -127,7 +127,7 @@ class SimulatedFaults:
         """
         self._calm_until_s = self._machine.now_s
 
-    def happen(self, fault: Fault) -> None:
+    def inject(self, fault: Fault) -> None:
         """Inject a fault into a random process or connection, now or soon."""
         drawn = self._drawn
         match fault:
@@ -146,9 +146,9 @@ class SimulatedFaults:
                 self._change_next_frame(fault, self._connection_end())
             case _:
                 if node := self._node():
-                    self._happen_to_node(fault, node)
+                    self._inject_into_node(fault, node)
 
-    def _happen_to_node(self, fault: Fault, node: SimulatedProcess) -> None:
+    def _inject_into_node(self, fault: Fault, node: SimulatedProcess) -> None:
         drawn, machine = self._drawn, self._machine
         match fault:
             case Fault.SLOW:
@@ -205,7 +205,7 @@ class SimulatedFaults:
         """End the caller while it sends a command, or orders the recovery from a node's death."""
         drawn, kind = self._drawn, self._drawn.choice(CALLER_KINDS)
         if kind is FrameKind.RECOVER:
-            self.happen(Fault.KILL)
+            self.inject(Fault.KILL)
         share, left = drawn.choice((0.0, 0.5, 1.0)), drawn.randrange(2)
         self._end_at_frame(Fault.END_CALLER_AT_POINT, self._machine.caller, kind, share, left)
 
@@ -275,7 +275,7 @@ class SimulatedFaults:
             case Fault.LOST_HEARTBEAT:
                 end.due = self._held(fault, end, drawn.uniform(3.0, 30.0))
             case Fault.REORDER:
-                end.due = partial(self._kept_back, end)
+                end.due = partial(self._swapped, end)
             case _:
                 change = {
                     Fault.SPLIT: _split,
@@ -305,7 +305,7 @@ class SimulatedFaults:
 
         return hold
 
-    def _kept_back(self, end: SimulatedSocket, data: bytes) -> list[bytes]:
+    def _swapped(self, end: SimulatedSocket, data: bytes) -> list[bytes]:
         end.due = self._counted(Fault.REORDER, lambda following: [following, data])
         return []
 
@@ -322,10 +322,10 @@ class SimulatedFaults:
         for fault, rate in self._rates:
             value -= rate
             if value < 0.0:
-                self._happen_at_frame(fault, end)
+                self._inject_at_frame(fault, end)
                 return
 
-    def _happen_at_frame(self, fault: Fault, end: SimulatedSocket) -> None:
+    def _inject_at_frame(self, fault: Fault, end: SimulatedSocket) -> None:
         machine, drawn = self._machine, self._drawn
         process = end.owner
         if fault in SEVERE:

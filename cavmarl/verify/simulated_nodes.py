@@ -262,7 +262,7 @@ def verify_simulated_nodes(
     with _quiet():
         for n, line in enumerate(lines):
             for k in range(seeds):
-                _Run(world, base_dir, reference, line, first_seed + k).whole()
+                _Run(world, base_dir, reference, line, first_seed + k).execute()
                 if progress is not None:
                     progress(n * seeds + k + 1, len(lines) * seeds)
     return SimulatedCampaign(given.env, count, steps, tuple(lines))
@@ -284,7 +284,7 @@ class _Run:
         # numbers of lost and of living nodes at the last state that all nodes have kept
         self._losses_before, self._living = 0, line.nodes
 
-    def whole(self) -> None:
+    def execute(self) -> None:
         """Do the run, and add its result to its line."""
         line, machine = self._line, self._machine
         line.runs += 1
@@ -298,7 +298,7 @@ class _Run:
         finally:
             machine.close()
             line.injected += self._faults.injected
-        if not wrong and self._losses and self._bears_all:
+        if not wrong and self._losses and self._must_lose_no_node:
             wrong = f"{self._losses} nodes were lost to faults that must be tolerated"
         if wrong:
             line.wrong.append(f"{counts_by_name(self._faults.injected.items())}: {wrong}")
@@ -326,7 +326,7 @@ class _Run:
         return "equal"
 
     @property
-    def _bears_all(self) -> bool:
+    def _must_lose_no_node(self) -> bool:
         """Whether no fault of this run may cost a node."""
         return self._line.mix in (NONE, MANY_TOLERATED, *TOLERATED)
 

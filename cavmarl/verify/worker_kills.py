@@ -177,11 +177,11 @@ class _Killer:
         """Return the median duration of the steps without a death, in ms."""
         return 1000.0 * statistics.median(self._calm_s)
 
-    def watch(self, run: Callable[[], Arrays], step: int, strikes: bool) -> Arrays:
+    def watch(self, run: Callable[[], Arrays], step: int, sends_signal: bool) -> Arrays:
         timer = None
-        if strikes:
+        if sends_signal:
             delay_s = self.random.uniform(0.0, LATEST * statistics.median(self._calm_s))
-            timer = Timer(delay_s, self._strike, (self._choose(),))
+            timer = Timer(delay_s, self._signal, (self._choose(),))
             timer.start()
         began = time.monotonic()
         result = run()
@@ -201,7 +201,7 @@ class _Killer:
         how = signal.SIGSTOP if self.random.random() < STOPS else signal.SIGKILL
         return self.random.choice(alive or [0]), how
 
-    def _strike(self, target: tuple[int, signal.Signals]) -> None:
+    def _signal(self, target: tuple[int, signal.Signals]) -> None:
         worker, how = target
         self._sent[worker] = how, time.monotonic()
         os.kill(self.pool.pids[worker], how)

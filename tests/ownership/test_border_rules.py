@@ -87,7 +87,7 @@ def test_r36_a_change_to_a_zone_that_is_no_neighbour_is_refused() -> None:
     in_a_row = tuple(map(frozenset, ({0, 1}, {0, 1, 2}, {1, 2})))
     for may_teleport in (False, True):
         bench = Bench(zones=3)
-        bench.directory.know(Neighbours(in_a_row, may_teleport))
+        bench.directory.set_neighbours(Neighbours(in_a_row, may_teleport))
         bench.tick(births=[(7, 0), (8, 1)], offers=[(7, 2), (8, 2)])
         if may_teleport:
             bench.begin([(7, 2), (8, 2)])

@@ -64,7 +64,7 @@ def test_what_comes_is_late_or_damaged(
     ends: tuple[FaultyNetwork, socket.socket, socket.socket], fault: NetworkFault, wanted: int
 ) -> None:
     network, one, other = ends
-    network.strike(fault)
+    network.inject(fault)
     first = exchanged(one, other)
     bits = sum(
         (mine ^ theirs).bit_count()
@@ -82,14 +82,14 @@ def test_one_direction_is_silent_for_good(
     network, one, other = ends
     for end in (one, other):
         end.settimeout(0.2)
-    network.strike(NetworkFault.SILENCE)
+    network.inject(NetworkFault.SILENCE)
     assert sorted(exchanged(one, other)) == [b"", b"word"]
     assert sorted(exchanged(one, other)) == [b"", b"word"]
 
 
 def test_a_cut_ends_both_ends(ends: tuple[FaultyNetwork, socket.socket, socket.socket]) -> None:
     network, one, other = ends
-    network.strike(NetworkFault.CUT)
+    network.inject(NetworkFault.CUT)
     assert one.recv(100) == other.recv(100) == b""
 
 

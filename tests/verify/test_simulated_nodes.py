@@ -101,8 +101,8 @@ def test_bytes_that_are_held_arrive_in_the_order_in_which_they_were_sent(world: 
     for data in sent:
         machine.now_s += 0.0004 / 3.0
         sender.send([data])
-    machine.wait(machine.caller, lambda: len(receiver.come) == len(sent), None)
-    assert list(receiver.come) == sent
+    machine.wait(machine.caller, lambda: len(receiver.received) == len(sent), None)
+    assert list(receiver.received) == sent
 
 
 def test_a_connection_without_answers_ends(world: World) -> None:

@@ -35,7 +35,7 @@ def test_who_has_crossed_or_soon_will_is_told_of(
     partition: ZonePartition,
     hysteresis_m: float,
     ahead_s: float,
-    everybody: bool,
+    check_all: bool,
 ) -> None:
     draw = np.random.default_rng(data.draw(st.integers(0, 1000)))
     parts = []
@@ -51,10 +51,10 @@ def test_who_has_crossed_or_soon_will_is_told_of(
     reach_m = MAX_SPEED_MPS * ahead_s  # as far as anybody can drive by then
     borders = Borders(hysteresis_m, ahead_s, MAX_SPEED_MPS)
     zoned = exchanged(partition, reach_m, parts, borders=borders)
-    if everybody:
+    if check_all:
         zoned.num_border[:] = 0
     out = np.zeros(2 * zoned.rows.shape[-1] * partition.count, dtype=NEAR)
-    found = find_near(partition.arrays, borders, zoned, SIDE, 0, everybody, out)
+    found = find_near(partition.arrays, borders, zoned, SIDE, 0, check_all, out)
     for zone, rows in enumerate(parts):
         told = [
             (int(e["row"]), int(e["target"]), bool(e["crossed"]))

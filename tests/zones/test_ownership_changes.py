@@ -36,9 +36,9 @@ def world(
     return exchanged(PARTITION, 60.0, parts, borders=BORDERS, book=book), book
 
 
-def call(zoned: ZoneState, book: BorderRecords, everybody: bool = False, newborn: int = 0) -> int:
+def call(zoned: ZoneState, book: BorderRecords, check_all: bool = False, newborn: int = 0) -> int:
     arguments = (PARTITION.arrays, BORDERS, zoned, SIDE, 0)
-    return int(hand_over(*arguments, everybody, newborn, book))
+    return int(hand_over(*arguments, check_all, newborn, book))
 
 
 def next_tick(zoned: ZoneState, book: BorderRecords) -> None:
@@ -125,7 +125,7 @@ def test_looking_again_at_the_same_tick_counts_nothing_twice() -> None:
     next_tick(zoned, book)
     zoned.num_owned[0, 0] = 1  # the other one has left
     for _ in range(3):
-        assert call(zoned, book, everybody=True) == 0
+        assert call(zoned, book, check_all=True) == 0
         assert coming(book) == [(3, 1)]
         assert book.owned[0] == 1
     next_tick(zoned, book)
@@ -135,7 +135,7 @@ def test_looking_again_at_the_same_tick_counts_nothing_twice() -> None:
 def test_whoever_has_just_entered_stays_for_a_tick() -> None:
     zoned, book = world((13.0, 5.0, 0.0), (14.0, 5.0, 0.0), ids=[3, 4])
     book.newborn[0, 0] = 3
-    assert call(zoned, book, everybody=True, newborn=1) == 1
+    assert call(zoned, book, check_all=True, newborn=1) == 1
     assert changes(book)["vehicle"].tolist() == [4]
     next_tick(zoned, book)
     assert call(zoned, book) == 1

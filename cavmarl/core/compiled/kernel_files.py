@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cavmarl.core.atomic_file import write_whole
-from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.cache_folder import cache_dir, report_unwritable
 from cavmarl.core.compiled.arguments import accepts
 from cavmarl.core.compiled.sources import module_digest
 
@@ -110,7 +110,7 @@ class KernelFile:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(self._path, pack(kernel))
         except OSError as error:
-            tell_unwritable(error)
+            report_unwritable(error)
 
 
 def _digest_of(*parts: str) -> str:

@@ -59,7 +59,7 @@ class Grid(NamedTuple):
     """Square cells over a map and the bodies in them; rebuilt in each tick."""
 
     corner: NDArray[np.float64]  # (2,) m, corner of cell (0, 0)
-    floating: bool  # whether `aim` moves it
+    floating: bool  # whether `move_area` moves it
     cells_per_m: float
     num_x: int
     num_y: int
@@ -132,7 +132,7 @@ def cell_rows(grid: Grid, y: float, distance_m: float) -> tuple[int, int]:
 
 
 @kernel
-def aim(grid: Grid, rows: NDArray[np.void], num: int) -> None:
+def move_area(grid: Grid, rows: NDArray[np.void], num: int) -> None:
     """Move the area of a floating grid to where VEHICLE rows[:num] begin."""
     if not grid.floating or num == 0:
         return
@@ -176,7 +176,7 @@ def fill_grid(
     start = grid.start
     cell = grid.cell
     start[:] = 0
-    aim(grid, rows, num)
+    move_area(grid, rows, num)
     for i in range(num):
         c = cell_at(grid, rows[i]["x"], rows[i]["y"])
         cell[i] = c

@@ -88,7 +88,7 @@ class Coordinator(ABC):
     @abstractmethod
     def begin(
         self,
-        everybody: bool,  # check all rows, because rows have changed since ghosts were renewed
+        check_all: bool,  # check all rows, because rows have changed since ghosts were renewed
         inputs: bytes = b"",  # digest of the actions
     ) -> None:
         """Decide the owners for the next tick, and move rows between owners.

@@ -42,7 +42,7 @@ class Violations:
         """Raise ProtocolError with the first violation that is found."""
         expected = {**owners, **{birth.vehicle: (birth.zone, 0) for birth in births}}
         for words in (
-            self._doubled(),
+            self._duplicates(),
             self._finding(kind, vehicle),
             self._clocks(),
             self._owners(expected),
@@ -55,7 +55,7 @@ class Violations:
             "do not: rows have changed during the check"
         )
 
-    def _doubled(self) -> Iterator[str]:
+    def _duplicates(self) -> Iterator[str]:
         for vehicle, places in sorted(self._places.items()):
             if len(places) > 1:
                 zones = [zone for zone, _ in places]

@@ -145,7 +145,7 @@ def _place(table: NDArray[np.void], vehicle: int) -> int:
 
 
 @kernel
-def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
+def _record_missing(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
     """Record the former row of a missing vehicle. Return the new number of missing vehicles."""
     place = _place(strays.table, vehicle)
     entry = strays.table[place]
@@ -158,7 +158,7 @@ def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
 
 
 @inlined_kernel
-def _note(found: np.void, kind: int, vehicle: int) -> None:
+def _record_finding(found: np.void, kind: int, vehicle: int) -> None:
     """Record a finding, if it is about a lower id than the present one."""
     if found["kind"] == KIND_NONE or vehicle < found["vehicle"]:
         found["kind"] = kind
@@ -166,14 +166,14 @@ def _note(found: np.void, kind: int, vehicle: int) -> None:
 
 
 @inlined_kernel
-def _judge(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
+def _check_motion(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
     """Compare a vehicle with its state at the last check."""
     dx = now["x"] - last["x"]
     dy = now["y"] - last["y"]
     if now["late"] != last["late"]:
-        _note(found, KIND_TICK, now["id"])
+        _record_finding(found, KIND_TICK, now["id"])
     elif not dx * dx + dy * dy <= limit_m * limit_m:  # true for NaN, too
-        _note(found, KIND_FAR, now["id"])
+        _record_finding(found, KIND_FAR, now["id"])
 
 
 @kernel
@@ -219,17 +219,17 @@ def watch(
             owned += owner_hash(row["id"], row["epoch"])
             last = before.rows[zone, i]
             if i < num_before and last["id"] == entry["id"]:
-                _judge(finding, last, entry, clock.limit_m)
+                _check_motion(finding, last, entry, clock.limit_m)
             else:
                 if i < num_before:
-                    missing = _miss(strays, last["id"], zone, i, missing)
+                    missing = _record_missing(strays, last["id"], zone, i, missing)
                 strays.rows[moved, 0] = zone
                 strays.rows[moved, 1] = i
                 moved += 1
             if not is_inside(inner, row["x"], row["y"]):
-                _owe_ghosts(zones, halo, zone, row, own_words, i, masks, factors, tallies)
+                _add_due_ghosts(zones, halo, zone, row, own_words, i, masks, factors, tallies)
         for i in range(num_owned, num_before):
-            missing = _miss(strays, before.rows[zone, i]["id"], zone, i, missing)
+            missing = _record_missing(strays, before.rows[zone, i]["id"], zone, i, missing)
         now.num[zone] = num_owned
         tallies[zone]["vehicles"] = num_owned
         tallies[zone]["owned"] = owned
@@ -266,12 +266,12 @@ def _match(
         stood = table[_place(table, entry["id"])]
         if stood["state"] == MISSING:
             stood["state"] = FOUND
-            _judge(finding, before.rows[stood["zone"], stood["row"]], entry, clock.limit_m)
+            _check_motion(finding, before.rows[stood["zone"], stood["row"]], entry, clock.limit_m)
         else:
             strays.entered[entered] = entry["id"]
             entered += 1
             if clock.new_late != ANY_LATE and entry["late"] != clock.new_late:
-                _note(finding, KIND_TICK, entry["id"])
+                _record_finding(finding, KIND_TICK, entry["id"])
     left = 0
     for n in range(missing):
         stood = table[strays.places[n]]
@@ -284,7 +284,7 @@ def _match(
 
 
 @inlined_kernel
-def _owe_ghosts(
+def _add_due_ghosts(
     zones: ZoneArrays,
     halo: Halo,
     zone: int,

@@ -1,7 +1,7 @@
 """Distribution of sensing over sensor workers: round robin, or by cost.
 
-A unit is one sensor of some agents. Agents of one sensor cost about the same, so many agents form a
-unit. By cost, frames are divided as well if whole frames overload a worker: then several workers
+A unit is one sensor of some agents. Agents of one sensor cost about the same, so a unit has many
+agents. By cost, frames are divided as well if whole frames overload a worker: then several workers
 write lines of the same frames.
 """
 

@@ -43,7 +43,7 @@ def find_near(
     side: int,  # the buffer of rows, 0 or 1
     w: int,
     # whether to check all owned rows, or only those that `exchange` has found near a border
-    everybody: bool,
+    check_all: bool,
     # NEAR (2 C,) is written, in the order of zones and rows; a crossing precedes an approach
     out: NDArray[np.void],
 ) -> int:  # number of entries
@@ -56,8 +56,8 @@ def find_near(
     found = 0
     for zone in range(zones.rects.shape[0]):
         owned = zoned.num_owned[zone, w]
-        for n in range(owned if everybody else zoned.num_border[zone, w]):
-            i = n if everybody else zoned.border[zone, w, n]
+        for n in range(owned if check_all else zoned.num_border[zone, w]):
+            i = n if check_all else zoned.border[zone, w, n]
             if i < owned:
                 row = zoned.rows[side, zone, w, i]
                 found = _add_near(zones, borders, row, zone, i, out, found)

@@ -20,9 +20,9 @@ from cavmarl.zones.kernels.ownership_changes import BorderRecords, look_on
 from cavmarl.zones.kernels.zone_lookup import (
     Halo,
     ZoneArrays,
-    is_asked_about,
     is_inside,
     is_seen,
+    may_be_considered,
     note_outer,
     squared_distance,
     zone_of,
@@ -184,7 +184,7 @@ def _publish(
                 if other == zone:
                     continue
                 squared = squared_distance(zones.rects, other, x, y)
-                sought = (squared <= sure_limit) | is_asked_about(halo, watch, outer)
+                sought = (squared <= sure_limit) | may_be_considered(halo, watch, outer)
                 _note_due(due[num_due], outer, other, squared, near_limit, border_limit)
                 num_due += int((squared <= seen_limit) & sought)
         else:

@@ -122,13 +122,13 @@ def look(
     zoned: ZoneState,  # the rows of all zones
     side: int,  # the buffer of rows, 0 or 1
     w: int,
-    everybody: bool,  # whether to check all owned rows, see `find_near`
+    check_all: bool,  # whether to check all owned rows, see `find_near`
     num_newborn: int,  # vehicles in `book.newborn[w, :num_newborn]` are left out
     book: BorderRecords,  # `near` and `coming` are written
 ) -> None:
     """Record vehicles that are near a border or have crossed it."""
     near = book.near[w]
-    found = find_near(zones, borders, zoned, side, w, everybody, near)
+    found = find_near(zones, borders, zoned, side, w, check_all, near)
     num = 0
     crossed = 0
     for n in range(found):
@@ -165,7 +165,7 @@ def hand_over(
     zoned: ZoneState,  # the rows of all zones
     side: int,  # the buffer of rows, 0 or 1
     w: int,
-    everybody: bool,  # whether rows have changed since `look_on`
+    check_all: bool,  # whether rows have changed since `look_on`
     num_newborn: int,  # see `look`
     book: BorderRecords,  # is written
 ) -> int:
@@ -175,7 +175,7 @@ def hand_over(
         The number of changes, which are at the end of `book.changes` by rising ids; or NOT_OWNED or
         NOT_SEEN, with the failed change after them.
     """
-    if everybody:
+    if check_all:
         look(zones, borders, zoned, side, w, True, num_newborn, book)
     near = book.near[w]
     changed = 0

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.codes import COUNT_REROUTED
-from cavmarl.zones.kernels.ghost_forecast import Forecast, foresee, is_told
+from cavmarl.zones.kernels.ghost_forecast import Forecast, is_known, write_forecast
 from cavmarl.zones.kernels.row_bounds import is_bounded
 
 ID = 0  # the word of a row with the vehicle's id
@@ -84,7 +84,7 @@ def pack_frame(
     both: Both,
     side: int,
     passing: Passing,
-    law: Forecast,
+    forecast: Forecast,
     before: Ghosts,  # of the frame before
     slots: NDArray[np.int32],  # scratch; its size is a power of two above the number of `before`
     now: Ghosts,  # the first rows are written: the ghosts
@@ -120,7 +120,7 @@ def pack_frame(
         for i in range(passing.num[w]):
             _copy(passing.rows[w, i], 0, frame, at, row)
             at += row
-    frame[0] = at + _pack_ghosts(both, side, law, before, slots, now, frame, first, total, at)
+    frame[0] = at + _pack_ghosts(both, side, forecast, before, slots, now, frame, first, total, at)
     return int(total)
 
 
@@ -128,7 +128,7 @@ def pack_frame(
 def _pack_ghosts(
     both: Both,
     side: int,
-    law: Forecast,
+    forecast: Forecast,
     before: Ghosts,
     slots: NDArray[np.int32],
     now: Ghosts,
@@ -158,12 +158,12 @@ def _pack_ghosts(
                     _copy(ghost, 0, frame, at, ghost.size)
                     at += ghost.size
                 else:
-                    _copy(before.words[found], 0, law.words, 0, ghost.size)
-                    foresee(
-                        law, before.floats[found], before.words[found],
-                        now.floats[n], ghost, np.uint64(0), law.floats, law.words,
+                    _copy(before.words[found], 0, forecast.words, 0, ghost.size)
+                    write_forecast(
+                        forecast, before.floats[found], before.words[found],
+                        now.floats[n], ghost, np.uint64(0), forecast.floats, forecast.words,
                     )  # fmt: skip
-                    bits, at = _pack_differences(law.words, ghost, frame, at)
+                    bits, at = _pack_differences(forecast.words, ghost, frame, at)
                 frame[first + n] = found
                 frame[first + total + n] = np.int64(bits)
                 n += 1
@@ -240,7 +240,7 @@ def take_frame(
     both: Both,
     side: int,
     passing: Passing,  # is written
-    law: Forecast,
+    forecast: Forecast,
     before: Ghosts,  # of the frame before
     now: Ghosts,  # the first rows are written: the ghosts
     frame: Words,
@@ -268,13 +268,15 @@ def take_frame(
         if passing.num[w] + leaving > passing.rows.shape[1]:
             return NO_FRAME
         for _ in range(leaving):
-            if not is_bounded(frame[words : words + row], law.row_bounds):
+            if not is_bounded(frame[words : words + row], forecast.row_bounds):
                 return NO_FRAME
             words += row
-    if not _unpack(law, before, now, total, frame, like, words):
+    if not _unpack(forecast, before, now, total, frame, like, words):
         return NO_FRAME
     for n in range(total):
-        if not is_bounded(now.words[n], law.bounds) or not _is_of_world(now.words[n], num_worlds):
+        if not is_bounded(now.words[n], forecast.bounds) or not _is_of_world(
+            now.words[n], num_worlds
+        ):
             return NO_FRAME
     for w in range(num_worlds):
         both.running[w] += frame[1 + w]
@@ -330,7 +332,7 @@ def _copy(source: Words, first: int, target: Words, to: int, num: int) -> None:
 
 @inlined_kernel
 def _unpack(
-    law: Forecast,
+    forecast: Forecast,
     before: Ghosts,
     now: Ghosts,
     num: int,
@@ -356,13 +358,13 @@ def _unpack(
         for first in range(0, size, GROUP):
             if bits >> np.uint64(first) & _every_bit(GROUP):
                 for c in range(first, min(first + GROUP, size)):
-                    if is_told(bits, c):
+                    if is_known(bits, c):
                         if at == frame.size:
                             return False
                         ghost[c] = frame[at]
                         at += 1
-        foresee(
-            law, before.floats[found], before.words[found],
+        write_forecast(
+            forecast, before.floats[found], before.words[found],
             now.floats[n], ghost, bits, now.floats[n], ghost,
         )  # fmt: skip
     return at == frame.size

@@ -207,13 +207,13 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
         own = scratch.first[lane] <= scratch.last[lane]
         if row["internal"]:
             if own:
-                _ask(roads, roads.links[row["link"]]["from_lane"], scratch)
+                _mark_links_after(roads, roads.links[row["link"]]["from_lane"], scratch)
         elif (own and row["length_m"] - scratch.last[lane] <= see_m) or (
             scratch.ahead[lane] + row["length_m"] <= see_m
         ):
-            _ask(roads, lane, scratch)
+            _mark_links_after(roads, lane, scratch)
         if own and not row["internal"] and scratch.first[lane] <= SWEPT_BEYOND_M + half_m:
-            _ask_behind(roads, lane, scratch)
+            _mark_links_beside(roads, lane, scratch)
     for link in range(roads.links.shape[0]):
         if scratch.asked[link]:
             first = roads.links[link]["first_conflict"]
@@ -241,7 +241,7 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
 
 
 @kernel
-def _ask(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
+def _mark_links_after(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
     """Mark all links that lead on from the edge of a lane."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
@@ -251,12 +251,12 @@ def _ask(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
 
 
 @kernel
-def _ask_behind(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
+def _mark_links_beside(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
     """Mark links beside those that lead to a lane: their vehicles may obstruct its start."""
     for k in range(roads.lanes[lane]["num_into"]):
         before = roads.lanes[roads.into[roads.lanes[lane]["first_into"] + k]]
         if before["internal"]:
-            _ask(roads, roads.links[before["link"]]["from_lane"], scratch)
+            _mark_links_after(roads, roads.links[before["link"]]["from_lane"], scratch)
 
 
 @kernel

@@ -151,7 +151,7 @@ def note_outer(outer: np.void, row: np.void, i: int) -> None:
 
 
 @inlined_kernel
-def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
+def may_be_considered(halo: Halo, watch: np.void, row: np.void) -> bool:
     """Return whether a driver of a zone that watches a vehicle's lane may consider the vehicle."""
     # The results are unpredictable, so branches would cost more than the work that they save.
     s = row["s"]
@@ -163,8 +163,10 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
     merges = (watch["merge"] - s < MERGES_M) & (not stands)
     follows = watch["back"] - s < reach_m
     swept = watch["room"] - s < reach_m  # waiting drivers leave room even if it may be ignored
-    asked: bool = (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | merges | swept
-    return asked
+    considered: bool = (
+        (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | merges | swept
+    )
+    return considered
 
 
 @inlined_kernel
@@ -181,5 +183,5 @@ def is_seen(
         return True
     for k in range(halo.watcher_start[row["lane"]], halo.watcher_start[row["lane"] + 1]):
         if halo.watchers[k]["zone"] == zone:
-            return is_asked_about(halo, halo.watchers[k], row)
+            return may_be_considered(halo, halo.watchers[k], row)
     return False
