@@ -162,7 +162,8 @@ class ZonedShards:
     def let_gather(self, executor: Executor) -> bool:
         """Let the shards renew their ghosts in the phase `gather`. Return whether they do.
 
-        A shard that gathers reads all others. So this is used only if all zones see each other.
+        A shard that gathers reads all other shards. So this is used only if all zones see each
+        other.
         """
         if len(self._halo.near) == self.count**2:
             self._gatherers = executor
@@ -194,7 +195,7 @@ class ZonedShards:
         vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world
         contacts: NDArray[np.int64],  # (W,) as `contacts` counts them
     ) -> None:
-        """Give every vehicle to the zone in which it is, independent of its former owner."""
+        """Give every vehicle to the zone that contains it, independent of its former owner."""
         first = self._shards[0].worlds
         # Steps of an unfinished tick may belong to other rows.
         self._zoned.step_at[...] = 0

@@ -106,7 +106,7 @@ class OwnerChanges:
         )
 
     def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
-        """Give vehicles that are not recorded yet to the zones in which they are now."""
+        """Give vehicles that are not recorded yet to the zones that contain them now."""
         settled = []
         for vehicle, zone, state in births:
             _, row = self.find(w, vehicle)

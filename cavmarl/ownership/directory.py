@@ -49,7 +49,9 @@ class StoreError(ProtocolError):
     """The rows in the store differ from the rows that zones reported."""
 
     def __init__(self, zones: tuple[int, ...]) -> None:
-        super().__init__(f"zones {list(zones)} stored other rows than reported; host them anew")
+        super().__init__(
+            f"the stored rows of zones {list(zones)} differ from the reported rows; host them anew"
+        )
         self.zones = zones  # zones that need a new host, which repeats the tick
 
 
@@ -176,8 +178,8 @@ class Directory:
 
     def resend(
         self,
-        zones: Iterable[int] | None = None,  # only these
-        # needed only after `restore`; else the payloads of `begin` are used
+        zones: Iterable[int] | None = None,  # only to these zones; None: to all
+        # needed after `restore`; None: the payloads of `begin`
         payloads: Mapping[int, bytes] | None = None,
     ) -> Output:
         """Return the STEPs of zones that have not answered, to send them again."""
@@ -275,7 +277,7 @@ class Directory:
                 return self._on_need(message)
         return SILENCE
 
-    # Inside
+    # Internal
 
     def _reason_to_drop(self, message: Message) -> str | None:
         table = self.table
@@ -335,7 +337,7 @@ class Directory:
 def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -> Step:
     """Return the lease of a zone's present host for the tick in progress.
 
-    States are attached for vehicles whose switch is forced, and for those that must be sent again.
+    States are attached for vehicles whose switch is forced or whose state must be sent again.
     """
     plan = table.planned
     enter = tuple(

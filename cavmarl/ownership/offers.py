@@ -1,4 +1,4 @@
-"""The source's side of an approach: its offers to other zones, and offers without an answer.
+"""The source's side of an approach: its offers to other zones, answered or not.
 
 For each vehicle and target, a tick has at most one PREPARE or ABORT. A PREPARE without an answer is
 sent at most A times in its tick. After a refusal, the target gets no offer for some ticks.
@@ -43,7 +43,7 @@ class Offers:
     def renew(
         self, tick: int, approaches: Iterable[Approach], epochs: Mapping[int, int]
     ) -> tuple[dict[int, tuple[Offer, ...]], dict[int, tuple[Withdrawn, ...]]]:
-        """Replace the offers by those of a new tick.
+        """Replace the offers by offers of a new tick.
 
         Returns:
             Target → offers, and target → earlier offers that are withdrawn.

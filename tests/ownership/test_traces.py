@@ -195,13 +195,13 @@ def test_the_judge_refuses_another_switch(
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
-        (Prepare, "which that host never held so"),
+        (Prepare, "acknowledges an unknown state"),
         (Ack, "without an ACK"),
-        (Done, "has not said DONE"),
+        (Done, "has sent no DONE"),
         (Begin, "was sent before it was logged"),
         (Commit, "a tick is decided twice"),
         (Host, "has the zones"),
-        (Reset, "has not said DONE"),
+        (Reset, "has sent no DONE"),
     ],
 )
 def test_the_judge_misses_what_is_left_out(
@@ -266,7 +266,7 @@ def test_the_judge_refuses_a_stale_acknowledgement() -> None:
     ack = acks[0].item
     assert isinstance(ack, Ack)
     bench.trace.delivered(COORDINATOR, replace(ack, tick=2))
-    with pytest.raises(ProtocolError, match="never held so"):
+    with pytest.raises(ProtocolError, match="acknowledges an unknown state"):
         bench.judge()
 
 

@@ -37,7 +37,7 @@ class Watcher(Protocol):
 
 
 class Coordinator(ABC):
-    """Decides ownership, tick by tick: `begin`, then the zones compute, then `end`."""
+    """Decides ownership, tick by tick: `begin`, then the zones advance, then `end`."""
 
     def __init__(self, directory: Directory, journal: Journal | None) -> None:
         self._directory = directory

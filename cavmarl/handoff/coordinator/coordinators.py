@@ -34,7 +34,7 @@ class OwnershipRuntime(Protocol):
     def reset(self, chosen: NDArray[np.bool_]) -> None: ...
 
     def save(self, w: int) -> SavedOwnership | None:
-        """Return the state that the next changes of owner depend on; None: not known here."""
+        """Return the state that the next changes of owner depend on; None: unknown here."""
         ...
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
@@ -61,7 +61,7 @@ class OwnershipRuntime(Protocol):
 
 
 class NoOwnershipRuntime:
-    """The replacement where one zone owns all vehicles."""
+    """The `OwnershipRuntime` where one zone owns all vehicles."""
 
     coordinators: tuple[LocalCoordinator, ...] = ()
     needs_ghosts = False
@@ -181,7 +181,7 @@ class WorldCoordinators:
         """Commit the tick that all zones have computed.
 
         Raises:
-            ProtocolError: an invariant does not hold in it.
+            ProtocolError: an invariant does not hold in this tick.
         """
         for w, coordinator in enumerate(self.coordinators):
             coordinator.end(self._rows[w])

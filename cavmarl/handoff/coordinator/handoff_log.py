@@ -47,7 +47,7 @@ class SavedBorders(NamedTuple):
 
 
 class HandoffLog:
-    """Hands vehicles over to the zones in which they are, and keeps unread changes."""
+    """Hands vehicles over to the zones that contain them, and keeps unread changes."""
 
     def __init__(self, division: ZonedShards, world: int) -> None:
         self._division = division
@@ -155,7 +155,7 @@ class HandoffLog:
         return taken
 
     def take_counts(self) -> tuple[int, int]:
-        """Return and clear two sums over ticks: vehicles near borders, and those turned away."""
+        """Return and clear two sums over ticks: vehicles near borders, vehicles turned away."""
         acknowledged, aborted = self._book.acknowledged, self._book.aborted
         counts = acknowledged.item(self._world), aborted.item(self._world)
         acknowledged[self._world] = aborted[self._world] = 0

@@ -59,8 +59,8 @@ def _nothing() -> None:
 class OwnersOnRecord:
     """The owners according to the records of a coordinator, with a check of the records.
 
-    It receives the same records as a `Trace`. A coordinator that makes records later announces
-    changes of owner meanwhile with `foretold`.
+    This class receives the same records as a `Trace`. A coordinator that makes its records later
+    announces changes of owner with `foretold` until then.
 
     Attributes:
         entered: number of vehicles that have entered.
@@ -81,7 +81,7 @@ class OwnersOnRecord:
 
     @property
     def owners(self) -> dict[int, Owner]:
-        """(zone, epoch) of each vehicle at the committed tick, by id."""
+        """The (zone, epoch) of each vehicle at the committed tick, by id."""
         self.ask()
         return self._checker.owners
 

@@ -262,7 +262,7 @@ class LocalCoordinator(Coordinator):
     def _settle(
         self, tick: int, changes: NDArray[np.void], news: _News, has_watchers: bool
     ) -> None:
-        """Apply changes up to a tick to the table and, if `has_watchers`, make records for watchers."""
+        """Apply changes up to a tick to the table, and make records if `has_watchers`."""
         table = self._directory.table
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
         switches = tuple(map(Switch, *columns, repeat(False)))

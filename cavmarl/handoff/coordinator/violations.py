@@ -1,6 +1,6 @@
 """Description of a violated invariant, with the tick, the zone, the vehicle and the values.
 
-It runs only after the monitor has found a violation, so it may search all vehicles.
+This code runs only after the monitor has found a violation, so it may search all vehicles.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Violations:
                 raise ProtocolError(f"tick {self._clock.tick} of world {self._w}: {word}")
         raise ProtocolError(
             f"tick {self._clock.tick} of world {self._w}: the sums of hashes differ, but the rows "
-            "do not: rows have changed during the check"
+            "do not, because rows have changed during the check"
         )
 
     def _duplicates(self) -> Iterator[str]:

@@ -1,8 +1,8 @@
 """Checks of the invariants of ownership in one pass over all rows of a world after a tick.
 
-Sets are compared by sums of hashes, so neither the order of rows nor that of zones matters. The
-comparison of a vehicle with its last tick needs its last row. Nearly all vehicles keep their row;
-the others are searched among the vehicles that are missing from their former rows.
+Sets are compared by sums of hashes, so the order of rows and zones does not matter. A vehicle is
+compared with its row in the last tick. Nearly all vehicles keep their row. Other vehicles are
+searched among the vehicles that are missing from their former rows.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ FINDING = np.dtype(
     [
         ("kind", np.int64),
         ("vehicle", np.int64),
-        ("entered", np.int64),  # number of vehicles that were not there at the last check
-        ("left", np.int64),  # number of vehicles that are not there at this check
+        ("entered", np.int64),  # number of vehicles that were not in the world at the last check
+        ("left", np.int64),  # number of vehicles that are not in the world at this check
     ],
     align=True,
 )
@@ -93,8 +93,8 @@ class Strays(NamedTuple):
     table: NDArray[np.void]  # LOST (a power of two,), a hash table; blank between two checks
     places: NDArray[np.int64]  # (n,) indices in the table of missing vehicles
     rows: NDArray[np.int64]  # (n, 2) zone and row of vehicles that are new in their row
-    entered: NDArray[np.int64]  # (n,) ids that were not there at the last check
-    left: NDArray[np.int64]  # (n,) ids that are not there at this check
+    entered: NDArray[np.int64]  # (n,) ids that were not in the world at the last check
+    left: NDArray[np.int64]  # (n,) ids that are not in the world at this check
 
 
 def make_kept(zones: int, capacity: int) -> Kept:
@@ -304,7 +304,7 @@ def _add_due_ghosts(
     for n in range(halo.near_start[here], halo.near_start[here + 1]):
         other = halo.near[n]
         if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
-            if sought:  # many outer rows are seen by no zone and need no digest
+            if sought:  # no other zone sees most outer rows, and these need no digest
                 digest = row_digest(words, i, masks, factors)
                 sought = False
             tallies[other]["due"] += digest
