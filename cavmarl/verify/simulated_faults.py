@@ -341,7 +341,7 @@ class SimulatedFaults:
         elif fault is Fault.STALE_HEARTBEAT:
             self._stale.add(process)
         elif fault in (*NODE_DEATHS, Fault.STOP, Fault.PARTITION, Fault.LOST_HEARTBEAT):
-            machine.at(0.0, partial(self.happen, fault))
+            machine.at(0.0, partial(self.inject, fault))
         else:
             self._change_next_frame(fault, end, SHORT_DELAY_S)
 

@@ -368,7 +368,7 @@ class _Run:
             for step, wanted in enumerate(reference.results):
                 for fault in planned.get(step, ()):
                     delay_s = self._drawn.uniform(0.0, WITHIN_S)
-                    machine.at(delay_s, partial(self._faults.happen, fault))
+                    machine.at(delay_s, partial(self._faults.inject, fault))
                 before = worlds.pool.losses, worlds.pool.replacements
                 living = len(worlds.pool.pids)
                 until_s = machine.now_s + self._drawn.uniform(0.0, THOUGHT_S)
