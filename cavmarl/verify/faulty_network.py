@@ -120,7 +120,7 @@ class FaultyNetwork:
                     self._start(partial(self._carry, connection, direction))
 
     def _late(self, source: socket.socket) -> Iterator[bytes]:
-        """Yield the received pieces, each after the latency."""
+        """Yield the received pieces, each delayed by the latency."""
         due: deque[tuple[float, bytes]] = deque()
         while True:
             wait_s = max(due[0][0] - time.perf_counter(), 0.0) if due else None

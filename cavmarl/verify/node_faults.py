@@ -23,8 +23,8 @@ KILL, STOP, ANY = "kill", "stop", "any"
 SIGNALS = {KILL: signal.SIGKILL, STOP: signal.SIGSTOP}
 FAULTS = (*map(str, NetworkFault), KILL, STOP)
 PER_RUN = {NetworkFault.DELAY: 10, KILL: 35, ANY: 5}  # number of faults in a run, by kind
-OTHERS = 2  # number of faults in a run of any other kind
-APART = 4  # steps between two faults that may cost a node, and after the last of them
+OTHERS = 2  # number of faults in a run, for all other kinds
+APART = 4  # steps between two faults that may cost a node, and after the last such fault
 WAIT_S = 0.05  # between two steps, while a lost node is replaced
 REPLACED_S = 60.0  # limit for the replacement of a lost node
 TIMEOUT_S = 1.0  # time without a frame, after which a node gets a ping
@@ -182,7 +182,7 @@ def _run(
 
 
 class _PlannedFaults:
-    """The faults of a run. Each happens while all nodes live, some steps after the one before."""
+    """The faults of a run. Each happens while all nodes live, some steps after the last fault."""
 
     def __init__(
         self,
@@ -217,7 +217,7 @@ class _PlannedFaults:
         return partial(self._network.inject, NetworkFault(kind))
 
     def _is_replaced_later(self, step: int) -> bool:
-        """Wait shortly if a lost node is not replaced yet. Return whether to wait more.
+        """Wait shortly if a lost node is not replaced yet. Return whether to wait longer.
 
         After the replacement, `APART` steps follow, so that two nodes keep each state again. After
         `REPLACED_S` without a replacement, the faults continue.

@@ -1,4 +1,4 @@
-"""Check that worlds over nodes equal undivided worlds, also if nodes are killed."""
+"""Check that worlds over nodes equal undivided worlds, even if nodes are killed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import DrivenRun, same_bytes
 
 FIRST_STEPS = 5  # steps without kills, to measure the duration of a step
-LATEST = 1.5  # latest time of a kill, in durations of a step: some kills are between two steps
+LATEST = 1.5  # latest time of a kill, in durations of a step; some kills happen between two steps
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class ComparedWorlds:
         zones: int,
         worlds: int,
         policy: str | Path,
-        route: Route = straight,  # from a place to the place that nodes call to reach it
+        route: Route = straight,  # maps a place to the place that nodes call to reach it
     ) -> None:
         self._nodes = nodes
         self._signalled: set[int] = set()  # processes that have got a signal
@@ -190,7 +190,7 @@ class ComparedWorlds:
         )
 
     def signal_node(self, drawn: random.Random, number: signal.Signals) -> bool:
-        """Send a signal to a random node that has not got one. Return whether there is one."""
+        """Send a signal to a random node that has got none. Return whether there is such a node."""
         living = [pid for pid in self.worlds.pool.pids if pid not in self._signalled]
         if living:
             pid = drawn.choice(living)

@@ -34,11 +34,11 @@ ADDRESS = "node"
 ALIVE_S = 25.0  # time without an answer, after which the system ends a connection
 LATEST_S = 0.002  # longest delay of bytes
 JOIN_S = 5.0  # limit for the end of a thread
-MAX_MOVES = 2_000_000  # largest number of turns of all processes in a run
+MAX_MOVES = 2_000_000  # limit of the turns of all processes in a run
 
 
 class ProcessEndedError(BaseException):
-    """Unwinds the thread of a process that was ended from outside."""
+    """Unwinds the thread of a process that another process has ended."""
 
 
 class SimulatedProcess:
@@ -65,7 +65,7 @@ class SimulatedProcess:
         self.sockets: list[SimulatedSocket | SimulatedListener] = []
         self.on_send: Callable[[bytes], int | None] = lambda data: None
         self.failure: BaseException | None = None
-        self.newest_received = -1  # largest number of the received frames, in the order of sending
+        self.newest_received = -1  # number of the newest received frame, in the order of sending
         self._machine = machine
 
     def clock_s(self) -> float:
@@ -222,7 +222,7 @@ class SimulatedMachine:
         for thread in self._threads:
             thread.join(JOIN_S)
             if thread.is_alive():
-                raise AssertionError("a process does not end")
+                raise AssertionError(f"a process does not end within {JOIN_S:g} s")
 
 
 class SimulatedSocket:
@@ -234,7 +234,7 @@ class SimulatedSocket:
         due: the fault of the next frame; it returns the pieces that are delivered.
         on_arrival: called when the next frame arrives, with whether the receiver already has a
             frame that was sent later over another connection.
-        held_until_s: no bytes of this direction arrive before this time.
+        held_until_s: no bytes in this direction arrive before this time.
         is_mute: whether no sent bytes arrive, without notice to the sender.
     """
 
@@ -283,7 +283,7 @@ class SimulatedSocket:
         return len(data)
 
     def fall_silent(self) -> None:
-        """Deliver no more bytes of this direction. Both ends break off after `ALIVE_S`."""
+        """Deliver no more bytes in this direction. Both ends close after `ALIVE_S`."""
         assert self.other is not None
         self.is_mute = True
         for end in (self, self.other):
@@ -314,7 +314,7 @@ class SimulatedSocket:
                     arrived(receiver.newest_received > number)
                 receiver.newest_received = max(receiver.newest_received, number)
 
-        # A delay from now could round to a time before that of the bytes sent earlier.
+        # Now plus the delay could round to a time before the arrival of earlier bytes.
         machine.at_time(self._last_s, arrive)
 
     def receive(self, room: memoryview) -> int:

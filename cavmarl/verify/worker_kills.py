@@ -25,7 +25,7 @@ from cavmarl.verify.differences import Arrays, DrivenRun, same_bytes
 
 FIRST_STEPS = 10  # steps without kills, to measure the duration of a step
 PINGS = 500
-LATEST = 1.5  # latest time of a kill, in durations of a step: some workers are idle then
+LATEST = 1.5  # latest time of a kill, in durations of a step; some workers are idle then
 STOPS = 0.25  # share of workers that are stopped instead of killed
 
 
@@ -36,12 +36,12 @@ class Kill:
     signal: str  # name of the signal
     worker: int  # index of the worker
     step: int  # after which the death was noticed
-    idle: bool  # whether the worker was idle; then the next command to it noticed the death
+    idle: bool  # whether the worker was idle; if so, its next command noticed the death
     cause: str  # of the death, according to the pool
     # from the signal, or from the next command to an idle worker, until the pool noticed the death
     noticed_ms: float
-    replaced_ms: float  # from then until the successor had its command
-    recovered_ms: float  # from the notice until the successor had completed the command
+    replaced_ms: float  # from that time until the successor had its command
+    recovered_ms: float  # from the same time until the successor had completed the command
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from cavmarl.handoff.coordinator.journal_summary import owners_at
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.ownership.log_records import replay as replay_records
 from cavmarl.ownership.messages import Begin
-from cavmarl.zones.kernels.ownership_changes import LATE
+from cavmarl.zones.kernels.ownership_changes import UNREAD_LIMIT
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.cli.test_main import run as command
@@ -115,7 +115,7 @@ def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
             vec.step(vec.suggest_actions())
         most = max(most, int(book.num_changes[0]))
     assert most > 3 * divided.simulation.capacity
-    assert LATE - 1 + divided.simulation.capacity <= book.changes.shape[1]
+    assert UNREAD_LIMIT - 1 + divided.simulation.capacity <= book.changes.shape[1]
     assert whole.state_hash() == divided.state_hash()
 
 
@@ -123,7 +123,7 @@ def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     late = 16  # so many changes are soon there
-    monkeypatch.setattr(direct, "LATE", late)
+    monkeypatch.setattr(direct, "UNREAD_LIMIT", late)
     vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
     vec.reset(seed=1)
     simulation = vec.simulation

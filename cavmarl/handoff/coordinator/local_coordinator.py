@@ -30,7 +30,7 @@ from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import SeenIds, world_digest
 from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Reset, Switch, ZoneLedger
 from cavmarl.ownership.transfers import Transfer, TransferLog
-from cavmarl.zones.kernels.ownership_changes import LATE
+from cavmarl.zones.kernels.ownership_changes import UNREAD_LIMIT
 
 
 class _News(NamedTuple):
@@ -222,7 +222,7 @@ class LocalCoordinator(Coordinator):
         has_news = bool(self._new or removed)
         if has_news:
             self._news[self._tick] = _News(self._new, removed)
-        is_late = self._late >= LATE or len(self._news) >= LATE
+        is_late = self._late >= UNREAD_LIMIT or len(self._news) >= UNREAD_LIMIT
         if self.journal is not None or is_late or (has_news and self._watchers):
             self.catch_up()
             self._check(self._births)

@@ -117,7 +117,7 @@ def note_own(
     mine: Flags,  # (W · A,) is written: these agents in the chosen worlds
     owner: Owners,  # (W · A,) is written: the number, or `UNOWNED`
 ) -> None:
-    """Record which agents belong to this process, as far as it knows."""
+    """Record which agents belong to this process, as far as this process knows."""
     at = 0
     for w in range(own.shape[0]):
         for agent in range(own.shape[1]):
@@ -202,7 +202,7 @@ def take_actions(
 
 
 class Outcome(NamedTuple):
-    """The arrays with results of agents."""
+    """The arrays with the results of agents."""
 
     common: tuple[Bytes, ...]  # data that all processes share
     sensed: tuple[Table, ...]  # observations

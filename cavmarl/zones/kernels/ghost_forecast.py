@@ -1,7 +1,7 @@
 """Forecast of a row one tick later: nodes send only the words of a ghost that differ from it.
 
 Sender and receiver compute the same forecast, with the same operations on the same numbers. So rows
-arrive bit for bit whatever a driver does; a good forecast only saves bytes.
+arrive bit for bit in any case; a good forecast only saves bytes.
 
 A background driver chooses an acceleration (`throttle`). Speed, rates and sums follow from it, as
 in `motion.move_background` and `motion.account`. The position on the map depends on the roads, and
@@ -38,7 +38,7 @@ class Forecast(NamedTuple):
 
     dt: float  # s of a tick
     ticks_per_step: int
-    way_to_go: int  # in a row followed by its step, the word with the step's `to_go`
+    way_to_go: int  # index of the step's `to_go` among the words of a row and its step
     limits: Floats  # (lanes,) m/s
     beyond: Floats  # (lanes,) m from a lane's start to the end of the link that it is in
     row_bounds: Bounds  # of the indices in a row
@@ -60,7 +60,7 @@ def write_forecast(
     before_words: Words,  # the same memory
     row: Floats,  # the present row; a word of the forecast is read only after it is written
     row_words: Words,  # the same memory
-    known: np.uint64,  # bits of words that are known, and are not written
+    known: np.uint64,  # a bit per word; known words are not written
     found: Floats,  # is written: a copy of the row before, or `row` itself
     found_words: Words,  # the same memory
 ) -> None:

@@ -1,7 +1,8 @@
 """Frames that two processes exchange about the rows of a tick: ghosts and vehicles that leave.
 
 If another process hosts a zone, the zone has no owned rows here, and `exchange` writes only its
-ghosts. If a ghost was in the frame before, only the words that differ from their forecast are sent.
+ghosts. For a ghost that was in the frame before, only words that differ from their forecast are
+sent.
 A ghost has V + S + 2 words: its row, its step, the place of the step, its world.
 
 A frame for a process with k zones in W worlds has these words:
@@ -38,7 +39,7 @@ NO_FRAME = -(1 << 62)
 Words = NDArray[np.int64]
 
 
-class Both(NamedTuple):
+class ExchangeState(NamedTuple):
     """The state that a process exchanges with another process."""
 
     rows: Words  # (2, k, W, C, V) of all zones
@@ -81,7 +82,7 @@ def count_own(
 
 @kernel
 def pack_frame(
-    both: Both,
+    both: ExchangeState,
     side: int,
     passing: Passing,
     forecast: Forecast,
@@ -126,7 +127,7 @@ def pack_frame(
 
 @inlined_kernel
 def _pack_ghosts(
-    both: Both,
+    both: ExchangeState,
     side: int,
     forecast: Forecast,
     before: Ghosts,
@@ -205,7 +206,7 @@ def _differ(known: Words, ghost: Words, first: int) -> bool:
 
 
 @inlined_kernel
-def _count_ghosts(both: Both, frame: Words) -> int:
+def _count_ghosts(both: ExchangeState, frame: Words) -> int:
     """Return the number of ghosts in a frame; -1 if `pack_frame` has not made the frame.
 
     The caller must not read more of the frame if the result is -1, or if there is no room for the
@@ -237,7 +238,7 @@ def _count_ghosts(both: Both, frame: Words) -> int:
 
 @kernel
 def take_frame(
-    both: Both,
+    both: ExchangeState,
     side: int,
     passing: Passing,  # is written
     forecast: Forecast,
@@ -251,7 +252,7 @@ def take_frame(
 
     Returns:
         The number n of ghosts; -1 - n if there is no room for them; `NO_FRAME` if `pack_frame` has
-        not made the frame. If the result is below 0, no rows are appended.
+        not made the frame. If the result is negative, no rows are appended.
     """
     total = _count_ghosts(both, frame)
     if total < 0:
@@ -260,8 +261,8 @@ def take_frame(
         return int(-1 - total)
     num_worlds = both.num_owned.shape[1]
     first = 1 + 3 * num_worlds
-    like = first + both.mine.size * num_worlds * 2
-    at = words = like + 2 * total
+    before_at = first + both.mine.size * num_worlds * 2
+    at = words = before_at + 2 * total
     row = passing.rows.shape[2]
     for w in range(num_worlds):
         leaving = frame[1 + 2 * num_worlds + w]
@@ -271,7 +272,7 @@ def take_frame(
             if not is_bounded(frame[words : words + row], forecast.row_bounds):
                 return NO_FRAME
             words += row
-    if not _unpack(forecast, before, now, total, frame, like, words):
+    if not _unpack(forecast, before, now, total, frame, before_at, words):
         return NO_FRAME
     for n in range(total):
         if not is_bounded(now.words[n], forecast.bounds) or not _is_of_world(
@@ -302,7 +303,7 @@ def _is_of_world(ghost: Words, num_worlds: int) -> bool:
 
 
 @inlined_kernel
-def _put(both: Both, side: int, zone: int, w: int, ghost: Words, is_near: bool) -> None:
+def _put(both: ExchangeState, side: int, zone: int, w: int, ghost: Words, is_near: bool) -> None:
     """Append a ghost to the rows of a zone."""
     rows = both.rows[side, zone, w]
     steps = both.steps[zone, w]
@@ -337,14 +338,14 @@ def _unpack(
     now: Ghosts,
     num: int,
     frame: Words,
-    like: int,  # start of the ghosts' indices in the frame before
+    before_at: int,  # start in `frame` of the ghosts' indices in the frame before
     at: int,  # start of the ghosts' words
 ) -> bool:
     """Write the ghosts of a frame to `now`. Return whether the frame is valid."""
     size = now.words.shape[1]
     for n in range(num):
-        found = frame[like + n]
-        bits = np.uint64(frame[like + num + n])
+        found = frame[before_at + n]
+        bits = np.uint64(frame[before_at + num + n])
         if found >= before.words.shape[0] or bits > _every_bit(size):
             return False
         ghost = now.words[n]
