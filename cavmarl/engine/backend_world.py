@@ -27,13 +27,13 @@ class BackendWorld:
         self._zones, self._count = partition.arrays, partition.count
         self.resume(backends)
         self._ghost_ids: list[set[int]] = [set() for _ in backends]  # ids of each backend's ghosts
-        self._controls: dict[int, VehicleControl] = {}  # the latest of each vehicle
+        self._controls: dict[int, VehicleControl] = {}  # the latest control of each vehicle
         self._seen: dict[int, NDArray[np.float32]] = {}
         self.tick = 0
         self.handed_over = 0
 
     def reset(self, seed: int, vehicles: NDArray[np.void]) -> None:
-        """Begin with the vehicles VEHICLE (n,), each owned by the zone in which it is."""
+        """Begin with the vehicles VEHICLE (n,), each owned by the zone that contains it."""
         zones = np.array([zone_of(self._zones, row["x"], row["y"]) for row in vehicles], dtype=int)
         self.tick = self.handed_over = 0
         self._controls.clear()
@@ -47,7 +47,7 @@ class BackendWorld:
         self._sense()
 
     def resume(self, backends: Sequence[ShardBackend]) -> None:
-        """Replace the backends by others that have restored the snapshots of the former ones."""
+        """Replace the backends by others, which have restored their snapshots."""
         if [one.zone for one in backends] != [*range(self._count)]:
             raise ConfigError(
                 f"the backends run the zones {[one.zone for one in backends]}; pass one for each "

@@ -78,8 +78,9 @@ class KinematicShard:
         for feature, is_used in wrong.items():
             if is_used:
                 raise ConfigError(
-                    f"{feature}: a world over backends cannot have it, because its zones share "
-                    "only vehicles; turn it off, or run the zones on nodes (make_vec(..., nodes=k))"
+                    f"{feature}: worlds over backends do not support this, because their zones "
+                    "share only vehicles; turn it off, or run the zones on nodes "
+                    "(make_vec(..., nodes=k))"
                 )
 
     def reset(self, seed: int) -> None:

@@ -57,7 +57,7 @@ class Simulation(WorldViews):
         frames: Frames | None = None,
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
         zeros: Zeros = huge_zeros,  # allocates the arrays that shards write
-        like: Simulation | None = None,  # of the same environment; its tables are shared
+        like: Simulation | None = None,  # of the same environment, to share its tables
         runs: Sequence[OpenRun] | None = None,  # one per world; None: made as `config.zones` says
         late_ticks: int = 0,  # extra ticks that a vehicle across a border may stay with its owner
     ) -> None:
@@ -177,7 +177,7 @@ class Simulation(WorldViews):
         self._tick.instrument(wrap)
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
-        """Report the phases of a tick: the executor's by `wrap(executor)`, components' by `note`.
+        """Report the phases of a tick: shards' phases to `wrap(executor)`, components' to `note`.
 
         A component with phases of its own (such as another simulator's step) has a method `trace`.
         """
@@ -216,7 +216,7 @@ class Simulation(WorldViews):
         tick.peers.resume_from(tick.departures, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
-        """Resume like `load` where each process holds some zones; `home` is a zone of this one."""
+        """Resume like `load` if zones are divided among processes; `home` is a zone of this one."""
         self._put_back(saved, home)
         tick = self._tick
         tick.sumo.catch_up(self._shard.worlds)

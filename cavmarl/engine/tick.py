@@ -39,7 +39,7 @@ class Tick:
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # one a zone
+        shards: Sequence[Shard],  # one per zone
         division: ZonedShards,  # of all shards
         traffic: NativeTraffic,  # departures, routes and arrivals
         shared: SharedOutputs,  # signals and outputs of all shards
@@ -209,7 +209,7 @@ class Tick:
             self.sumo = SumoPhases(wrap(self.sumo.traffic))
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
-        """Report phases: the executor's by `wrap(executor)`, components' by `note`.
+        """Report phases: shards' phases to `wrap(executor)`, components' phases to `note`.
 
         A component with phases of its own has a method `trace`.
         """

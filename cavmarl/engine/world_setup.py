@@ -95,7 +95,7 @@ def load_world(
 
 
 def make_world(config: EnvConfig, base_dir: Path) -> World:
-    """Load the world of a configuration, and derive its horizon from the map if it asks for that.
+    """Load the world of a configuration, whose horizon may be derived from the map.
 
     Raises the errors of `load_world`.
     """
@@ -135,7 +135,7 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
 
 
 def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
-    """Return the network of map files. Worlds of one process share the network of the same files.
+    """Return the network of map files. Worlds of one process share a network of the same files.
 
     With agents, the network includes the swept areas of steered vehicles.
 

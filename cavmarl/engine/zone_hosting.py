@@ -91,7 +91,7 @@ class ZoneHosting:
         vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world, of all zones
         contacts: NDArray[np.int64],  # (W,) counted in all zones
     ) -> None:
-        """Change the zones where peers run some of them. Call `host_zones` afterwards."""
+        """Change the zones if peers run some of the zones. Call `host_zones` afterwards."""
         tick = self._tick
         everywhere = np.ones(len(contacts), dtype=np.bool_)
         self.set_zones(partition)

@@ -32,7 +32,7 @@ from cavmarl.zones.kernels.zone_lookup import squared_distance
 
 AT_LINE_M = 0.2  # a vehicle within this distance of a line may be about to cross it
 ASIDE_M = 10.0  # bound of the distance, and of the difference in s, of adjacent places on an edge
-BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # largest distance from a vehicle to its follower
+BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # distance back to the end of lanes with followers
 ROUNDING_M = 0.1  # bound of the rounding of sums over lanes and of float32
 
 
