@@ -47,8 +47,8 @@ def shift_ends(
     """Shorten the piece of the slowest worker repeatedly.
 
     The slowest worker gives the shard at one of its ends to the adjacent worker. This worker may
-    pass one on to the next, and so on, until all are faster than the slowest was. The change with
-    the shortest makespan is made; on a tie, the one that moves fewer shards.
+    pass a shard on to the next worker, and so on, until all are faster than the slowest was. The
+    change with the shortest makespan is made; on a tie, the change that moves fewer shards.
     """
     left = max_moves
     while left > 0 and placement.makespan_s > until_s:
@@ -73,7 +73,7 @@ def shift_ends(
 
 
 def _towards(source: int, step: int, count: int) -> range:
-    """Return the workers that may give a shard on in a direction, from `source` on."""
+    """Return the workers that may pass a shard on in a direction, from `source` on."""
     return range(source, count - 1) if step > 0 else range(source, 0, -1)
 
 

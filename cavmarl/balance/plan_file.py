@@ -23,7 +23,7 @@ LONGEST = 40  # maximum number of characters of a wrong value in a message
 def read_plan(path: Path) -> Plan:
     plans = read_plans(path)
     if len(plans) != 1:
-        raise ConfigError(f"{path}: has {len(plans)} plans; give a file with one plan")
+        raise ConfigError(f"{path}: has {len(plans)} plans; use a file with one plan")
     return plans[0]
 
 

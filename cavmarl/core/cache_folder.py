@@ -24,8 +24,8 @@ def report_unwritable(error: OSError) -> None:
     if folder not in _REPORTED:
         _REPORTED.add(folder)
         print(
-            f"cavmarl: {folder} cannot be written ({error.strerror or error}): every process has "
-            "to compile kernels and read maps again; set CAVMARL_CACHE_DIR to a writable folder",
+            f"cavmarl: {folder} cannot be written ({error.strerror or error}), so every process "
+            "must compile kernels and read maps again; set CAVMARL_CACHE_DIR to a writable folder",
             file=sys.stderr,
             flush=True,
         )

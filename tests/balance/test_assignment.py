@@ -245,7 +245,7 @@ def test_a_jam_that_stays_is_taken_apart() -> None:
         ({"shards": row([1.0, -1.0])}, "zone 1: cost_s = -1"),
         ({"shards": row([1.0, math.inf])}, "zone 1: cost_s = inf"),
         ({"shards": row([1.0, 1.0, 1.0])}, "zone 2: the zone must be below 2"),
-        ({"shards": (*row([1.0]), *row([2.0]))}, "world 0, zone 0: is named twice"),
+        ({"shards": (*row([1.0]), *row([2.0]))}, "world 0, zone 0: is repeated"),
         ({"snapshot": idle_snapshot(3)}, "3 workers for 2 shards"),
         ({"present": (0,)}, "1 present workers of 2 shards"),
     ],

@@ -113,7 +113,7 @@ def test_a_fork_does_not_write_its_mothers_journal(tmp_path: Path) -> None:
     with Journal(path) as journal:
         journal.append(log[:3])
         said = said_in_fork(lambda: journal.append(log[3:]), journal.close)
-        assert f"the lines of {path} are those of process" in said
+        assert f"the lines of {path} belong to process" in said
         journal.append(log[3:])
     assert list(JournalReader(path)) == log
 

@@ -136,7 +136,7 @@ def unpack(content: bytes) -> CompiledKernel | None:
 
 @cache
 def _machine() -> tuple[str, ...]:
-    """Return what the machine code depends on besides the sources: compiler and processor."""
+    """Return the compiler, the processor and the settings that determine machine code."""
     from llvmlite import binding
 
     processor = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
@@ -149,7 +149,7 @@ def _machine() -> tuple[str, ...]:
 
 @cache
 def machine_digest() -> str:
-    """Return a digest of what the code depends on besides the sources."""
+    """Return a digest of the compiler, the processor and the settings of kernels."""
     return _digest_of(*_machine())
 
 

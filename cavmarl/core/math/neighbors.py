@@ -1,8 +1,8 @@
 """A grid with the vehicles of one world in square cells, and searches for the nearest of them.
 
 `fill_grid` sorts the vehicles into cells once per tick. It copies the data that neighbours read
-into `bodies`: compact records with sine and cosine of the heading computed once. Within a cell they
-are in row order; readers must not depend on this and break ties by id.
+into `bodies`: compact records with sine and cosine of the heading computed once. Within a cell,
+bodies are in row order; readers must not depend on this order, and break ties by id.
 
 The border cells extend to infinity: they contain everything outside of the grid's area. If worlds
 drive on one of several maps, the area floats: it begins where their vehicles are.
@@ -59,7 +59,7 @@ class Grid(NamedTuple):
     """Square cells over a map and the bodies in them; rebuilt in each tick."""
 
     corner: NDArray[np.float64]  # (2,) m, corner of cell (0, 0)
-    floating: bool  # whether `move_area` moves it
+    floating: bool  # whether `move_area` moves the area
     cells_per_m: float
     num_x: int
     num_y: int
@@ -70,7 +70,7 @@ class Grid(NamedTuple):
     cell: NDArray[np.int32]  # (capacity,) the cell of each row
     largest: NDArray[np.float64]  # (1,) the largest radius of all bodies, m
     newest: NDArray[np.int32]  # (num_x * num_y,) the VEHICLE row last put into each cell, or -1
-    spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; only `contacts` uses these two
+    spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; only `contacts` uses this and newest
 
 
 def make_grid(
