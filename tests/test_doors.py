@@ -175,7 +175,7 @@ def drive(env: cavmarl.CavEnv) -> None:
         env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
 
 
-def test_what_depends_on_the_order_of_others_is_refused() -> None:
+def test_functions_that_depend_on_the_order_of_vehicles_are_refused() -> None:
     def first(view: cavmarl.AgentView) -> float:
         return float(view.others["x"][0]) if view.others.size else 0.0
 

@@ -217,7 +217,7 @@ def test_other_worlds_keep_their_ghosts() -> None:
 
 
 @given(st.data(), partitions(3), st.sampled_from([0.0, 7.5, 30.0]))
-def test_rows_that_are_noted_are_enough(
+def test_listed_rows_suffice_for_the_exchange(
     data: st.DataObject, partition: ZonePartition, halo_m: float
 ) -> None:
     parts = spread(data, partition)
@@ -232,7 +232,7 @@ def test_rows_that_are_noted_are_enough(
     assert partition.count == 1 or (zoned.num_outer == -1).all(), "rows may change from here on"
 
 
-def test_others_than_those_that_are_noted_are_not_looked_at() -> None:
+def test_unlisted_rows_are_not_read() -> None:
     zoned = zoned_of([cars(3)] * 4)
     zoned.num_outer[:] = 0
     halo, book = zone_halo(four(), 50.0), make_book(1, 12)
@@ -264,7 +264,7 @@ def test_background_vehicles_leave_when_they_have_arrived() -> None:
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=9))
-def test_who_leaves_is_no_longer_noted_and_the_others_are_where_they_are(
+def test_a_leaving_vehicle_is_unlisted_and_other_rows_stay_listed(
     fates: list[tuple[bool, bool]],
 ) -> None:
     rows = cars(len(fates))
