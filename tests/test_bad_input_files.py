@@ -147,7 +147,7 @@ def demanding(write: Write, body: str, **more: str) -> CavEnv:
     ],
     ids=["edge", "map", "route", "trip", "type", "times", "many"],
 )
-def test_demand_that_cannot_be_is_refused_with_its_line(
+def test_invalid_demand_is_refused_with_its_line(
     write: Write, body: str, error: type[Exception], words: tuple[str, ...]
 ) -> None:
     with pytest.raises(error) as caught:

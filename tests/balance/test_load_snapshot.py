@@ -83,7 +83,7 @@ def test_a_snapshot_goes_to_json_and_back() -> None:
     assert snapshot_from_dict(json.loads(json.dumps(taken.to_dict()))) == taken
 
 
-def test_no_worker_or_one_twice_is_no_snapshot() -> None:
+def test_a_snapshot_needs_distinct_workers() -> None:
     with pytest.raises(ConfigError, match="no workers"):
         idle_snapshot(0)
     with pytest.raises(ConfigError, match="must be named once"):

@@ -66,7 +66,7 @@ def test_the_program_compares_workers(tmp_path: Path, capsys: pytest.CaptureFixt
         (("--at-least", "-1"), "--at-least -1: must be a number above 0"),
     ],
 )
-def test_numbers_that_cannot_be_are_refused(
+def test_invalid_numbers_are_refused(
     words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:

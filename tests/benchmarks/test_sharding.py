@@ -42,7 +42,7 @@ def test_the_phases_are_the_tick(make: Callable[[int], Simulation]) -> None:
         assert not {"suggest", "loads", "vehicles"} & row["calls"].keys()
 
 
-def test_what_zones_hold_is_counted(make: Callable[[int], Simulation]) -> None:
+def test_vehicles_and_ghosts_of_zones_are_counted(make: Callable[[int], Simulation]) -> None:
     one, four = measure_sharding(make, [4], after_s=20, repeats=2).rows
     alone = {"ghosts": 0.0, "imbalance": 1.0, "largest_share": 1.0, "ratio": 1.0}
     alone_too = {"migrations": 0.0, "migration_us": None}
@@ -144,7 +144,7 @@ def test_the_command_says_that_worlds_differ(
         (("-d", "none.rou.xml", "--agents", "2"), "omit --agents and --background"),
     ],
 )
-def test_the_command_refuses(
+def test_the_command_refuses_invalid_options(
     capsys: pytest.CaptureFixture[str], words: tuple[str, ...], said: str
 ) -> None:
     assert _run("ring", *words) == 2

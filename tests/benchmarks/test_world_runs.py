@@ -204,7 +204,9 @@ def test_without_sumo_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.slow
-def test_two_worlds_are_run_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_program_runs_and_shows_two_worlds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     document = tmp_path / "all.json"
     words = ("--worlds", "2", "--first-seed", "11", "--seconds", "30", "--dt", "0.2")
     with pytest.raises(SystemExit) as ended:

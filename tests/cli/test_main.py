@@ -342,7 +342,7 @@ def test_a_window_without_a_display_is_refused(
     assert "use --video FILE" in refusal(capsys, "view", "ring", "--seconds", "0.1")
 
 
-def test_a_window_opens_where_sdl_is_told_how(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_opens_with_the_video_driver_of_sdl(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert run("view", "merge", "--seconds", "0.1", *QUICK) == 0

@@ -122,7 +122,7 @@ def test_events_between_two_frames() -> None:
     ]
 
 
-def test_frames_that_cannot_be_had() -> None:
+def test_unavailable_frames_are_refused() -> None:
     world = parallel_env("ring")
     with pytest.raises(EpisodeError, match="reset"):
         world.world_frames()

@@ -387,7 +387,7 @@ def test_meta_actions_step_through_the_target_speeds() -> None:
 
 @pytest.mark.parametrize("env_name", ["ring", "merge", "grid4x4", "town"])
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_what_is_suggested_is_allowed_and_leads_to_the_goal(env_name: str, kind: str) -> None:
+def test_suggested_actions_are_valid_and_lead_to_the_goal(env_name: str, kind: str) -> None:
     env = make(env_name, background=0, max_cycles=2500, overrides={"action.kind": kind})
     env.reset()
     fate = dict.fromkeys(env.agents, "cut")

@@ -122,17 +122,17 @@ def test_its_pictures_have_a_size_and_text(told: dict[str, Any]) -> None:
     assert told["texts"] > 40
 
 
-def test_it_fits_the_screen(told: dict[str, Any]) -> None:
+def test_the_page_fits_the_screen(told: dict[str, Any]) -> None:
     assert told["wide"] <= 1280
 
 
-def test_it_can_be_photographed(page: Path, browse: Browse, tmp_path: Path) -> None:
+def test_screenshots_of_the_page_can_be_taken(page: Path, browse: Browse, tmp_path: Path) -> None:
     shot = tmp_path / "page.png"
     browse(page, f"--screenshot={shot}")
     assert shot.stat().st_size > 50_000
 
 
-def test_it_shows_the_figures_and_the_manifest(folder: Path, page: Path) -> None:
+def test_the_page_shows_the_figures_and_the_manifest(folder: Path, page: Path) -> None:
     text, report = page.read_text(encoding="utf-8"), load_report(folder)
     success = report["built in"]["success"].mean
     assert success is not None

@@ -116,7 +116,7 @@ def test_a_meeting_after_ten_seconds_is_none() -> None:
     np.testing.assert_array_equal(worlds.trips["least_pet_s"], [9.9, np.nan])
 
 
-def test_who_has_touched_another_or_left_the_road_does_not_arrive_any_more() -> None:
+def test_collided_and_off_road_vehicles_do_not_arrive() -> None:
     worlds = Worlds()
     worlds.add(collision=(1.0, 0.0), off_road=(0.0, 1.0))
     worlds.add(done=(True, True), arrival=(1.0, 1.0))

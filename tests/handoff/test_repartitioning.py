@@ -52,7 +52,7 @@ def test_a_world_that_is_cut_anew_is_the_undivided_one(env: str, mode: str, zone
     )
 
 
-def test_who_enters_in_the_last_tick_before_the_cut_goes_to_its_new_zone() -> None:
+def test_a_vehicle_that_enters_just_before_repartitioning_gets_its_new_zone() -> None:
     repartitioned = worlds("merge", 4, "open", **OFTEN)
     entered = 0
     for _ in range(120):
@@ -116,7 +116,9 @@ def test_worlds_of_workers_are_cut_anew_too() -> None:
         ({"zones.repartition_tolerance": float("nan")}, "zones.repartition_tolerance"),
     ],
 )
-def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: str) -> None:
+def test_worlds_that_cannot_be_repartitioned_are_refused(
+    overrides: dict[str, Any], words: str
+) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec("grid4x4", zones=2, overrides=overrides)
 

@@ -127,7 +127,7 @@ def test_the_summary_counts_and_ranks() -> None:
     assert found.release_depth_m == (52.0, 97.0, 102.0)
 
 
-def test_the_summary_of_nothing_has_no_figures() -> None:
+def test_the_summary_without_transfers_has_no_figures() -> None:
     found = TransferSummary.of([], {})
     assert (found.transfers, found.failure_rate) == (0, None)
     assert found.latency_ticks == (None, None, None)

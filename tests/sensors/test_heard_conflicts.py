@@ -71,7 +71,7 @@ def hidden_from(rows: NDArray[np.void], me: np.void) -> list[int]:
     return [int(row["id"]) for row in rows if blocked(me["x"], me["y"], float(row["x"]), row["y"])]
 
 
-def test_who_is_seen_or_heard_of_counts_and_is_where_the_message_says() -> None:
+def test_seen_and_heard_vehicles_count_at_their_reported_position() -> None:
     vec = made({"v2x.channel.loss": 0.3})
     simulation = vec.worlds.simulation
     heard = old = 0

@@ -122,7 +122,7 @@ def test_every_class_of_vehicles_has_a_semantic_class() -> None:
         ({"type": "radar", "range_m": 1e9}, r"rig\.wrong\.range_m"),
     ],
 )
-def test_what_cannot_be_seen_is_refused(sensor: dict[str, Any], words: str) -> None:
+def test_invalid_camera_settings_are_refused(sensor: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec("merge", overrides={"rig": {"wrong": {"rate_hz": 5, **sensor}}})
 

@@ -247,7 +247,7 @@ def test_distances_that_cannot_be_are_refused(wrong: tuple[float, ...]) -> None:
         WayConfig(distances_m=wrong)
 
 
-def test_what_is_not_seen_is_off_where_only_messages_are_told() -> None:
+def test_sensors_without_sight_omit_visible_vehicles() -> None:
     config = SensorsConfig(
         way=WayConfig(distances_m=(5.0,), lines=2),
         conflicts=ConflictsConfig(count=3),

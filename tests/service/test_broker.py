@@ -233,7 +233,7 @@ def test_a_job_waits_for_a_node_and_is_run_again_when_that_is_lost(fleet: Fleet)
     assert (job.state, fleet.beat("b")["jobs"]) == ("done", [])
 
 
-def test_what_no_one_asks_for_ends_and_is_forgotten(fleet: Fleet) -> None:
+def test_unused_sessions_end_and_are_forgotten(fleet: Fleet) -> None:
     fleet.join("a")
     session = fleet.open()
     fleet.broker.save(session, 3, b"state")

@@ -98,7 +98,7 @@ def test_a_store_of_another_version_is_left_alone(tmp_path: Path) -> None:
         ("/proc/none/store.sqlite", "cannot be opened"),
     ],
 )
-def test_a_store_that_cannot_be_is_refused(where: str, words: str) -> None:
+def test_an_invalid_place_of_a_store_is_refused(where: str, words: str) -> None:
     with pytest.raises(ServiceError, match=words):
         EventStore(where)
 

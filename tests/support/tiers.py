@@ -39,7 +39,7 @@ RAY_FILES = (
     "tests/parallel/test_ray_worlds.py",
 )
 
-_IN_RAY = "test_in_an_actor_of_ray"  # begins the name of a test that starts a cluster
+_IN_RAY = "test_worlds_run_in_a_ray_actor"  # begins the name of a test that starts a cluster
 
 # They measure time, memory or cores, or count on being let run at once.
 ALONE_FILES: tuple[str, ...] = (

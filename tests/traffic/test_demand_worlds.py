@@ -88,7 +88,7 @@ def test_a_reset_with_the_seed_repeats_the_episode_and_without_it_goes_on(make: 
     assert second[-1] != first[-1]
 
 
-def test_nobody_is_lost(make: Make) -> None:
+def test_no_vehicle_is_lost_or_duplicated(make: Make) -> None:
     simulation = make()
     start(simulation, seed=3)
     departures = simulation.departures

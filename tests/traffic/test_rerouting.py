@@ -111,7 +111,9 @@ def test_rerouters_send_whom_they_name_where_they_say(
     assert found["out"] == 150 - (found["long1"] if ends else 0)
 
 
-def test_who_has_a_stop_or_an_edge_to_pass_keeps_its_way(net: Path, tmp_path: Path) -> None:
+def test_vehicles_with_a_stop_or_an_edge_to_pass_keep_their_route(
+    net: Path, tmp_path: Path
+) -> None:
     simulation = two_ways(
         net,
         tmp_path,

@@ -228,7 +228,9 @@ def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
         ({"workers.balance_steps": 8}, "workers.balance_steps"),
     ],
 )
-def test_what_cannot_be_is_refused(tmp_path: Path, wanted: dict[str, object], words: str) -> None:
+def test_invalid_arguments_are_refused(
+    tmp_path: Path, wanted: dict[str, object], words: str
+) -> None:
     both = settings(tiny_file(tmp_path), "sumo-traffic") | wanted
     with pytest.raises(ConfigError, match=words):
         load_world("grid4x4", overrides=both)

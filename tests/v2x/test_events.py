@@ -38,7 +38,7 @@ def run(workers: int, zones: int = 1, steps: int = 6) -> np.ndarray[Any, Any]:
     return np.array(seen)
 
 
-def test_what_one_declares_all_others_are_told() -> None:
+def test_declared_events_reach_all_other_agents() -> None:
     seen = run(workers=0)
     assert (seen[:2] == 0.0).all()
     assert seen[2:, [0, 2, 3], PRESENT].all()

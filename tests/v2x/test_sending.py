@@ -111,7 +111,7 @@ def test_events_are_told_by_the_worst_cause() -> None:
 
 
 @pytest.mark.parametrize("units", [False, True], ids=["vehicles", "roadside"])
-def test_what_is_seen_is_told(units: bool) -> None:
+def test_seen_vehicles_are_reported(units: bool) -> None:
     settings: dict[str, Any] = {"perception__rate_hz": 10.0, "perception__objects": 5}
     if units:
         settings = {

@@ -45,7 +45,7 @@ from cavmarl.engine.world_setup import load_world
         ({"observation.mode": "messages"}, r"observation\.mode.*set sensors\.messages\.objects"),
     ],
 )
-def test_what_cannot_be_is_refused(settings: dict[str, Any], words: str) -> None:
+def test_invalid_arguments_are_refused(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         parallel_env("grid4x4", overrides={"v2x.enabled": True} | settings)
 

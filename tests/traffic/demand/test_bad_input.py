@@ -37,7 +37,7 @@ def refused(demand: Reader, body: str, *words: str, error: type[Exception] = Dem
         'speedFactor="normc(1)"', 'vClass="boat"', 'carFollowModel="Foo"',
     ],
 )  # fmt: skip
-def test_types_that_cannot_exist(demand: Reader, attribute: str) -> None:
+def test_invalid_types_are_refused(demand: Reader, attribute: str) -> None:
     refused(demand, f'<vType id="t" {attribute}/>', "line 2", '<vType id="t">')
 
 
@@ -172,7 +172,7 @@ def test_endless_repetition_is_refused(demand: Reader) -> None:
         ('<?xml version="1.0" encoding="foo"?><routes/>', ("UTF-8",)),
     ],
 )
-def test_files_that_are_none(
+def test_files_without_demand_are_refused(
     town: RoadNetwork, tmp_path: Path, text: str, words: tuple[str, ...]
 ) -> None:
     path = tmp_path / "x.rou.xml"
