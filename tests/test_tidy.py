@@ -83,7 +83,7 @@ PERSONS_AT_MOST = {"cavmarl": 2, "docs": 2}
 PHRASES = re.compile(
     r"\b(likewise|one that|those that|so many|everybody|of which)\b|\bas of `", re.IGNORECASE
 )
-PHRASES_AT_MOST = 350
+PHRASES_AT_MOST = 40
 
 WORDS_OF_A_PAGE = 2500  # outside of tables, generated blocks and code
 LONG_PAGES: set[str] = set()

@@ -49,9 +49,7 @@ class StoreError(ProtocolError):
     """The rows in the store differ from the rows that zones reported."""
 
     def __init__(self, zones: tuple[int, ...]) -> None:
-        super().__init__(
-            f"the stored rows of zones {list(zones)} differ from the reported rows; host them anew"
-        )
+        super().__init__(f"zones {list(zones)}: stored and reported rows differ; host them anew")
         self.zones = zones  # zones that need a new host, which repeats the tick
 
 

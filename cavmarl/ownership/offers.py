@@ -43,14 +43,12 @@ class Offers:
     def renew(
         self, tick: int, approaches: Iterable[Approach], epochs: Mapping[int, int]
     ) -> tuple[dict[int, tuple[Offer, ...]], dict[int, tuple[Withdrawn, ...]]]:
-        """Replace the offers by offers of a new tick.
+        """Replace the offers of the last tick.
 
         Returns:
             Target → offers, and target → earlier offers that are withdrawn.
         """
-        self.refused_until = {
-            pair: until for pair, until in self.refused_until.items() if until > tick
-        }
+        self.refused_until = {pair: t for pair, t in self.refused_until.items() if t > tick}
         before, self.open, self.unanswered, self.attempts = self.open, {}, {}, 1
         for vehicle, target, state in approaches:
             if vehicle not in epochs:

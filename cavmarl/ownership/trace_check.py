@@ -125,9 +125,7 @@ class TraceChecker:
         self._fences: dict[tuple[int, int], tuple[int, int]] = {}
         self._fenced_at: defaultdict[int, set[tuple[int, int]]] = defaultdict(set)  # tick → fences
         self._holdings: defaultdict[int, set[Holding]] = defaultdict(set)  # by tick
-        self._ready: set[tuple[int, int, int, int, int]] = (
-            set()
-        )  # acknowledged states, with the tick
+        self._ready: set[tuple[int, int, int, int, int]] = set()  # states of ACKs, and their tick
         self._begun: Begin | None = None
         self._orders: defaultdict[int, _Orders] = defaultdict(_Orders)  # by zone, of that BEGIN
         self._dones: dict[int, Done] = {}
@@ -195,10 +193,7 @@ class TraceChecker:
             owner = self.owners.get(vehicle)
             _require(owner == (source, epoch - 1), f"v{vehicle} is owned by {owner}")
             known = self.near is None or target in self.near[source]
-            _require(
-                known or vehicle in record.teleports,
-                f"v{vehicle} changes to a zone that is no neighbour",
-            )
+            _require(known or vehicle in record.teleports, f"{target} is no neighbour of {source}")
             waited = self._deferred.get(vehicle, 0)
             if forced:
                 _require(waited >= self._longest, f"v{vehicle} is forced after {waited} ticks")
@@ -206,9 +201,7 @@ class TraceChecker:
                 self._require_ready(vehicle, target, epoch - 1)
         for vehicle, ticks in record.deferred:
             follows = ticks == self._deferred.get(vehicle, 0) + 1
-            _require(
-                follows and vehicle in self.owners, f"v{vehicle} cannot be deferred {ticks} ticks"
-            )
+            _require(follows and vehicle in self.owners, f"v{vehicle}: wrong deferral {ticks}")
             _require(ticks <= self._longest, f"v{vehicle} is deferred too long")
         for vehicle, _, _ in record.births:
             _require(vehicle not in self._born, f"v{vehicle} is born twice")
@@ -294,9 +287,7 @@ class TraceChecker:
             removed: list[Removed] = []
             for zone in zones:
                 removed += self._confirmed(zone, changed)
-            _require(
-                record.removed == tuple(sorted(removed)), "its removals differ from the zones'"
-            )
+            _require(record.removed == tuple(sorted(removed)), "differs from the zones' removals")
         self.changes = [
             OwnerStep(vehicle, self.owners.get(vehicle), after)
             for vehicle, after in changed.items()

@@ -148,9 +148,8 @@ class ComparedWorlds:
         steps: int,
         due: Callable[[int], Callable[[], object] | None],  # step → fault during it, or None
         note: Callable[[int], None],  # called with the number of completed steps
-        must_continue: Callable[[int], bool] = lambda step: (
-            False
-        ),  # whether to run more than `steps`
+        # whether to run more than `steps`
+        must_continue: Callable[[int], bool] = lambda step: False,
     ) -> NodeRun:
         """Drive and compare the worlds, then close the nodes."""
         different: int | None = None

@@ -103,7 +103,7 @@ def test_an_excluded_worker_gets_no_more_shards() -> None:
         make_plan(replace(problem, present=None))
 
 
-def test_a_worker_that_is_lost_begins_a_new_row() -> None:
+def test_the_loss_of_a_worker_starts_a_new_row() -> None:
     balancer = Balancer(worlds([1.0] * 6, idle_snapshot(3)))
     left = LoadSnapshot(idle_snapshot(3).workers[1:], "none", "")
     assert balancer.round(left).homes == (1, 1, 1, 2, 2, 2)

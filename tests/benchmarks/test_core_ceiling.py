@@ -34,7 +34,7 @@ def test_more_programs_than_worlds() -> None:
         measure_ceiling("ring", worlds=2, programs=3)
 
 
-def test_a_program_that_cannot_begin(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_program_that_cannot_start_is_an_error(capfd: pytest.CaptureFixture[str]) -> None:
     before = {*multiprocessing.active_children()}
     with pytest.raises(WorkerError, match="has ended"):
         measure_ceiling("no such place", worlds=2)

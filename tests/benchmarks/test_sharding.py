@@ -58,7 +58,7 @@ def test_vehicles_and_ghosts_of_zones_are_counted(make: Callable[[int], Simulati
     assert four["migration_us"] is not None
 
 
-def test_agents_are_driven_and_their_deciding_is_no_phase() -> None:
+def test_agents_are_driven_and_their_policy_is_no_phase() -> None:
     make = world_maker("ring", agents=3, background=2, seconds=60)
     (found,) = measure_sharding(make, [1], after_s=1, repeats=1).rows
     assert found["vehicles"] == 5.0
@@ -124,7 +124,7 @@ def test_the_command_shows_and_writes(
     assert [row["zones"] for row in json.loads(path.read_text())["rows"]] == [1, 4]
 
 
-def test_the_command_says_that_worlds_differ(
+def test_the_command_reports_worlds_that_differ(
     capsys: pytest.CaptureFixture[str], demand: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Simulation, "state_hash", lambda self: hex(id(self)))

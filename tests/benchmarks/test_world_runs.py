@@ -54,7 +54,7 @@ def test_a_deviation_is_ours_over_the_mean_of_sumos_seeds() -> None:
     assert deviation(a_row(mean_delay_s=None), "mean_delay_s") is None
 
 
-def test_worlds_that_differ_by_design_are_told_by_their_features() -> None:
+def test_worlds_that_differ_by_design_are_identified_by_their_features() -> None:
     rows = [a_row() | {"features": ["grid", name]} for name in ("priority_stop", "stub_lanes")]
     assert comparable(rows) == rows[:1]
 

@@ -256,13 +256,13 @@ NESTED_BOMB = "a: &a [x]\n" + "".join(
     ],
     ids=lambda value: repr(value[:24]),
 )
-def test_a_file_that_is_no_plain_yaml_is_refused(
+def test_a_file_that_is_not_plain_yaml_is_refused(
     tmp_path: Path, text: str | bytes, expected: str
 ) -> None:
     assert re.search(expected, refusal(tmp_path, text))
 
 
-def test_a_file_that_cannot_be_read_says_why(tmp_path: Path) -> None:
+def test_the_error_for_an_unreadable_file_gives_the_reason(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"absent\.yaml: No such file"):
         read_yaml(tmp_path / "absent.yaml")
 

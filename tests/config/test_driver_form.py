@@ -196,7 +196,7 @@ def test_a_spec_keeps_the_sensors_as_overrides() -> None:
     assert WorldSpec(**json.loads(json.dumps(asdict(spec)))).env == "ring"
 
 
-def test_a_world_gets_the_sensors_of_the_drivers_and_says_so(
+def test_a_world_gets_the_sensors_of_the_drivers_and_reports_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     spec = WorldSpec.of("ring", agents=2)

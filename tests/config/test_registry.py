@@ -160,7 +160,7 @@ def test_a_map_that_is_not_in_the_wheel_is_named(source: str) -> None:
         resolve_map(config, base_dir)
 
 
-def test_without_the_wheel_its_maps_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_the_maps_wheel_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(module: str) -> None:
         raise ModuleNotFoundError(name=module)
 

@@ -82,7 +82,7 @@ def _mapping(memory: object) -> mmap.mmap:
 
 
 @pytest.mark.parametrize("own", ["", "glibc.malloc.hugetlb=0"])
-def test_a_heap_in_huge_pages_unless_the_user_says_otherwise(
+def test_the_heap_is_in_huge_pages_unless_the_user_sets_otherwise(
     monkeypatch: pytest.MonkeyPatch, own: str
 ) -> None:
     monkeypatch.setenv("GLIBC_TUNABLES", own)

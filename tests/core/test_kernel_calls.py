@@ -198,7 +198,7 @@ ARGUMENTS = [
 ]
 
 
-def test_arguments_have_one_type_exactly_if_numba_says_so() -> None:
+def test_arguments_have_the_same_type_exactly_if_numba_agrees() -> None:
     for one in ARGUMENTS:
         for other in ARGUMENTS:
             is_same = _typeof(one) == _typeof(other)

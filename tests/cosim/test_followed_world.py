@@ -164,7 +164,7 @@ def test_a_slow_follower_holds_the_world_and_misses_no_frame(address: Path, star
     assert frames == [0, 1, 2, 3, 4]
 
 
-def test_a_silent_follower_is_let_go_and_the_world_goes_on(address: Path) -> None:
+def test_a_silent_follower_is_dropped_and_the_world_continues(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address, timeout_s=0.2) as world:
         silent = seated(world, ["car_0"], "silent")

@@ -289,6 +289,6 @@ def test_stages_are_chosen_by_name() -> None:
     assert StackConfig(perception="blind").planning == "lane_route"
 
 
-def test_a_stack_without_gnss_says_what_it_lacks(grid: HdMap) -> None:
+def test_a_stack_without_gnss_is_refused(grid: HdMap) -> None:
     with pytest.raises(ConfigError, match="there is no gnss among the sensors"):
         Stack(vehicle_of(grid, [], TICK_S))

@@ -150,7 +150,9 @@ OVERPASS = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 @pytest.mark.parametrize(("z", "collide"), [(0.0, True), (7.0, False)])
-def test_a_bridge_is_no_crossing(tmp_path: Path, z: float, collide: bool) -> None:
+def test_vehicles_on_a_bridge_and_below_do_not_interact(
+    tmp_path: Path, z: float, collide: bool
+) -> None:
     roads = tmp_path / "overpass.net.xml"
     roads.write_text(OVERPASS.format(z=z), encoding="utf-8")
     simulation = make_traffic(roads, background=24)

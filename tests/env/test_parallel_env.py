@@ -275,7 +275,7 @@ def test_a_sensor_can_be_switched_off_and_leaves_the_others_alone(key: str, sens
         np.testing.assert_array_equal(rest[agent], expected)
 
 
-def test_the_state_tells_where_every_vehicle_is() -> None:
+def test_the_global_state_has_the_position_of_every_vehicle() -> None:
     env = make("grid4x4", "respawn")
     env.reset()
     for _ in range(50):

@@ -160,7 +160,7 @@ def test_its_ids_are_unique(page: Path) -> None:
     assert not {name for name in doubled if "_" in name}
 
 
-def test_one_run_says_that_there_is_no_interval(tmp_path: Path) -> None:
+def test_the_page_of_one_run_states_that_there_is_no_interval(tmp_path: Path) -> None:
     evaluate("merge", "idm", out=tmp_path / "one", **SMALL)
     write_page(tmp_path / "one", tmp_path / "one.html")
     assert "no interval between runs" in (tmp_path / "one.html").read_text(encoding="utf-8")

@@ -109,7 +109,7 @@ def test_trips_of_less_than_a_metre_do_not_share_in_how_even_delays_are() -> Non
     assert uneven > 0.1
 
 
-def test_a_meeting_after_ten_seconds_is_none() -> None:
+def test_an_encroachment_after_ten_seconds_does_not_count() -> None:
     worlds = Worlds()
     worlds.recorder.least_pet_s[:, 0] = 9.9, 10.1
     worlds.add(done=(True, True))

@@ -100,7 +100,7 @@ def test_a_refusal_names_the_map_of_a_configuration() -> None:
         run_sumo(job(read_input([GAME / "cross_demo.sumocfg"])))
 
 
-def test_without_sumo_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     demand = read_input([ROUTES])
 
     def absent(module: str) -> None:

@@ -161,7 +161,7 @@ def test_what_is_changed_in_all_next_rows_goes_back_to_their_shards() -> None:
             assert (after == part).all()
 
 
-def test_a_reset_of_one_world_leaves_the_others_as_they_are() -> None:
+def test_a_reset_of_one_world_does_not_change_other_worlds() -> None:
     simulation = divided()
     for _ in range(20):
         drive(simulation)

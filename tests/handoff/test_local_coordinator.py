@@ -170,7 +170,7 @@ def test_a_lost_vehicle_is_detected(busy: Recorded) -> None:
             vec.step(vec.suggest_actions())
 
 
-def test_the_journal_tells_actions_apart(tmp_path: Path) -> None:
+def test_the_journal_distinguishes_actions(tmp_path: Path) -> None:
     told = []
     for name, throttle in (("one", 0.0), ("again", 0.0), ("other", 0.5)):
         path = tmp_path / f"{name}.jsonl"

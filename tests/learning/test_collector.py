@@ -98,7 +98,7 @@ def test_seats_of_opponents_are_not_trained_and_drive_as_their_policy() -> None:
     assert batch.acted[:, ~theirs].float().mean() > 0.5
 
 
-def test_nothing_is_expected_after_a_red_light() -> None:
+def test_no_return_is_expected_after_a_red_light() -> None:
     found = {}
     for end_at_red in (False, True):
         vec = make_vec("grid4x4", num_envs=4, seed=0)

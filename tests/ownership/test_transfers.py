@@ -33,7 +33,7 @@ def test_a_prepared_transfer_has_its_row() -> None:
     assert log.counts == {"switched": 1, "acknowledged": 2, "deferred": 0}
 
 
-def test_a_forced_transfer_tells_how_long_it_waited() -> None:
+def test_a_forced_transfer_has_its_deferral() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)])
     for _ in range(2):

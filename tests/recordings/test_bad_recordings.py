@@ -173,7 +173,7 @@ def test_worlds_of_workers_with_a_journal_are_recorded(tmp_path: Path) -> None:
     assert (tmp_path / "journal.jsonl").stat().st_size > 0
 
 
-def test_a_full_disk_is_told_at_the_next_step(
+def test_a_full_disk_is_reported_in_the_next_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path, content: bytes) -> None:

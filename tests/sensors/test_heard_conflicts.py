@@ -110,7 +110,7 @@ def test_without_a_message_those_in_sight_alone_are_known() -> None:
     sight.close()
 
 
-def test_what_a_hidden_vehicle_does_changes_nothing_until_it_says_so() -> None:
+def test_a_hidden_vehicle_has_no_effect_until_its_message_arrives() -> None:
     vec = made()
     for _ in driven(vec, 60):
         pass

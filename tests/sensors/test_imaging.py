@@ -90,7 +90,7 @@ def test_a_wall_at_ten_metres_reads_ten_metres(before_a_wall: CavVectorEnv) -> N
     assert set(middle[first + 1 :].tolist()) <= {ROAD, LANE_LINE}
 
 
-def test_bodies_look_the_same_to_those_who_begin_at_different_sides() -> None:
+def test_bodies_look_the_same_from_any_first_side() -> None:
     fan = lidar_fan(LidarRigConfig(rate_hz=5, rays=5, fov_deg=90.0))
     angles = np.degrees(np.arctan2(fan.rays[:, 0, 1], fan.rays[:, 0, 0]))
     assert angles == pytest.approx([-45.0, -22.5, 0.0, 22.5, 45.0])

@@ -404,7 +404,7 @@ def test_every_field_belongs_to_one_group() -> None:
     assert sorted(sum(GROUPS.values(), ())) == sorted(VEHICLE.names or ())
 
 
-def test_the_page_says_what_stands_in_a_state() -> None:
+def test_the_page_describes_the_content_of_a_state() -> None:
     apart = {
         "control and route": "commands that wait for `clock.control_latency_ticks`",
         "agent logic": "the frames that the next observation repeats (`sensors.stack`)",

@@ -141,7 +141,7 @@ def test_two_processes_agree(tmp_path: Path) -> None:
     assert int(said[0][2]) > 5
 
 
-def test_the_hash_covers_who_waits_and_how_many_orders_were_called(tmp_path: Path) -> None:
+def test_the_hash_covers_waiting_vehicles_and_called_orders(tmp_path: Path) -> None:
     simulation = tiny("merge", tmp_path)
     start(simulation, seed=1)
     departures = simulation.departures

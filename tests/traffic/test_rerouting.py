@@ -99,7 +99,7 @@ def test_a_closed_edge_is_driven_around_as_in_sumo(net: Path, tmp_path: Path) ->
         ('<routeProbReroute id="far"/><routeProbReroute id="near" probability="3"/>', "", 8, 30),
     ],
 )
-def test_rerouters_send_whom_they_name_where_they_say(
+def test_rerouters_send_their_vehicles_to_their_goals(
     net: Path, tmp_path: Path, inside: str, attrs: str, least: int, most: int
 ) -> None:
     types = cars() + '<vType id="truck" vClass="truck"/>'

@@ -320,7 +320,7 @@ def test_a_sumo_of_a_worker_that_dies_runs_again_with_the_next_step(
         vec.close()
 
 
-def test_a_worker_dies_whose_sumo_was_told_too_much_to_keep(tmp_path: Path) -> None:
+def test_a_worker_dies_whose_sumo_log_exceeds_its_limit(tmp_path: Path) -> None:
     both = settings(tiny_file(tmp_path), "sumo-traffic") | {"sumo.replay_mib": 0}
     vec = make_vec("grid4x4", num_envs=2, agents=3, background=0, workers=2, overrides=both)
     try:

@@ -51,7 +51,7 @@ def test_invalid_arguments_are_refused(settings: dict[str, Any], words: str) -> 
 
 
 @pytest.mark.parametrize("name", ["objects", "events", "signal"])
-def test_messages_that_nobody_sends_cannot_be_observed(name: str) -> None:
+def test_messages_that_no_station_sends_cannot_be_observed(name: str) -> None:
     value = True if name == "signal" else 1
     with pytest.raises(ConfigError, match=rf"sensors\.messages\.{name} = .*set v2x\.enabled"):
         load_world("grid4x4", overrides={f"sensors.messages.{name}": value})

@@ -297,7 +297,7 @@ def test_agents_leave_when_their_trip_has_ended_and_they_have_acted() -> None:
     assert set(ids(worlds.rows[0, : worlds.num_rows[0]])) == {102, 103}
 
 
-def test_ghosts_of_those_who_left_are_dropped_once() -> None:
+def test_ghosts_of_vehicles_that_left_are_dropped_once() -> None:
     worlds, departures = world(cars(6), owned=2)
     departures.passing[0, :3]["id"] = [105, 102, 999]
     departures.num_passing[0] = 3

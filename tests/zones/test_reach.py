@@ -62,7 +62,7 @@ def widest_junction_m(roads: RoadNetwork) -> float:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_reach_covers_view_junction_and_those_who_come_to_it(name: str) -> None:
+def test_reach_covers_view_junction_and_approaching_vehicles(name: str) -> None:
     roads = network(name)
     reach_m = driving_reach_m(roads, travel(name))
     rest_m = reach_m - VIEW_M - APPROACH_M - 2.0 * LENGTH_M - ASIDE_M

@@ -136,7 +136,7 @@ def test_the_ignoring_and_the_allowed_drive_everywhere(demand: Reader) -> None:
         ('lane="AB_0" duration="-5"', ("negative time",)),
     ],
 )
-def test_stops_that_cannot_be_made(demand: Reader, stop: str, words: tuple[str, ...]) -> None:
+def test_invalid_stops_are_refused(demand: Reader, stop: str, words: tuple[str, ...]) -> None:
     body = f'<vehicle id="a" depart="0"><route edges="AB BC"/>\n<stop {stop}/></vehicle>'
     refused(demand, body, "line 3", *words)
 
@@ -205,7 +205,7 @@ def test_includes_gzip_and_byte_order_marks_are_read(town: RoadNetwork, tmp_path
     assert [Path(name).name for name in file.report.files] == ["a.rou.xml", "b.rou.xml.gz"]
 
 
-def test_what_is_no_demand_is_counted(demand: Reader) -> None:
+def test_elements_other_than_demand_are_counted(demand: Reader) -> None:
     file = demand(
         '<person id="p" depart="0"><walk from="AB" to="BC"/></person>'
         '<e1Detector id="e" lane="AB_0" pos="1" file="x"/><foo><vehicle id="inside"/></foo>'

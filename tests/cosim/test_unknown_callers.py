@@ -134,7 +134,7 @@ def test_a_crowd_does_not_keep_a_follower_out(address: Path) -> None:
             connection.close()
 
 
-def test_a_world_without_descriptors_lets_the_oldest_caller_go(address: Path) -> None:
+def test_without_descriptors_the_oldest_caller_is_dropped(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
         first = call(address)
@@ -264,7 +264,7 @@ def test_a_port_needs_a_secret_that_callers_know() -> None:
         assert world.seats == ()
 
 
-def test_a_name_that_steers_the_terminal_is_refused(address: Path) -> None:
+def test_a_name_with_control_characters_is_refused(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         caller = threading.Thread(target=lambda: said.append(refusal_of(world)))
         said: list[str] = []
@@ -281,7 +281,7 @@ def refusal_of(world: FollowedWorld) -> str:
     return str(error.value)
 
 
-def test_a_port_of_this_machine_will_do_too() -> None:
+def test_followers_can_connect_by_a_local_port() -> None:
     with FollowedWorld(make_env(), 0, secret="of this world") as world:
         assert isinstance(world.address, int)
         follower = seated(world, ["car_0"], secret="of this world")
