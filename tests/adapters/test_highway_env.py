@@ -133,7 +133,7 @@ def test_faster_drives_faster_and_is_rewarded(make: Any) -> None:
         ({"vehicle_count": 5}, "vehicle_count: unknown key"),
         ({"controlled_vehicles": 2}, "for several agents"),
         ({"lanes_count": 7}, "must be one of 3, 4"),
-        ({"policy_frequency": 20}, "not be below the first"),
+        ({"policy_frequency": 20}, "not be below policy_frequency"),
         ({"duration": -1}, "duration = -1: must be above 0"),
         ({"action": {"type": "ContinuousAction", "steering_range": [-1, 2]}}, "symmetric"),
     ],

@@ -228,7 +228,7 @@ BROKEN = {
         "'e_0', which ends elsewhere",
     ),
     "bits": ('foes="110"', 'foes="1x0"', "request.*foes"),
-    "too few bits": ('foes="110"', 'foes="1"', "'c' has 3 requests"),
+    "too few bits": ('foes="110"', 'foes="1"', "'c' has more links than its 3 requests"),
     "unclosed": ("</net>", "", "line .*broken XML"),
     "not a net": ("<net ", "<map ", "broken XML|not the root"),
     "nothing to drive": (

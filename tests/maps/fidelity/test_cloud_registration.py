@@ -116,7 +116,7 @@ def test_wrong_numbers_are_refused() -> None:
         drop_outliers(cloud, float("nan"))
     with pytest.raises(ConfigError, match="keep 2"):
         align(cloud.points, Target(cloud.points), keep=2.0)
-    with pytest.raises(MapError, match="must be at least 50"):
+    with pytest.raises(MapError, match="at least 50 are needed"):
         Target(cloud.points[:10])
     with pytest.raises(ConfigError, match="x,y,z,yaw"):
         start_transform("1,2")

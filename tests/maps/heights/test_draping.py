@@ -211,7 +211,7 @@ def test_without_a_model_bridges_and_tunnels_leave_flat_ground_where_they_cross_
         crossed = [n for n, name in enumerate(network.lane_ids) if re.match(r"-?14_", name)]
         assert crossed
         assert not any(network.lane_polyline(lane)[:, 2].any() for lane in crossed)
-    with pytest.raises(MapError, match="give it with the source"):
+    with pytest.raises(MapError, match="build the map again"):
         built(over.path, write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05)))
 
 
