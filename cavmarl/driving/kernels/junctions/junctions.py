@@ -43,6 +43,7 @@ from cavmarl.driving.kernels.junctions.gaps import (
 )
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
 from cavmarl.driving.kernels.junctions.swept_areas import MOST_BACK_M, wait_place
+from cavmarl.driving.kernels.junctions.zippers import is_zipper, passes_first
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
@@ -91,6 +92,7 @@ def _hold_for_foes(
     if row["driver"] == DRIVER_AGENT:
         limit = min(limit, STEERED_MPS)
     equal = resolves_deadlocks(roads, travel, row, link)
+    zipper, front = is_zipper(roads, link), distance - 0.5 * row["length"]
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
@@ -98,9 +100,14 @@ def _hold_for_foes(
         end = scratch.link_end[conflict["foe"]]
         if begin == end or (conflict["enter_m"] >= wait_m - LINE_MARGIN_M) != inside:
             continue
+        in_turn = zipper and is_zipper(roads, conflict["foe"])
+        if in_turn and conflict["merging"]:
+            continue  # the driver follows the foes that pass first, see `zippers`
         for k in range(begin, end):
             foe = scratch.approach[k]
             if foe["row"] == i:
+                continue
+            if in_turn and not passes_first(roads, travel, rows, row, link, front, foe):
                 continue
             other = rows[foe["row"]]
             both = equal and resolves_deadlocks(roads, travel, other, conflict["foe"])
