@@ -120,6 +120,7 @@ LINK = record(
     ("signal_index", np.int32),  # index of the letter in the signal's state
     ("direction", np.uint8),  # ord of SUMO's dir: s t l r L R
     ("state", np.uint8),  # ord of SUMO's link state without a signal: M m = s w Z o …
+    ("may_block", np.bool_),  # vehicles enter without room beyond the junction (keepClear="0")
     ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
     ("num_conflicts", np.int32),
     ("first_sweep", np.int32),  # SWEEP rows, sorted by the foe's LINK row and sizes

@@ -47,6 +47,7 @@ from cavmarl.driving.kernels.junctions.swept_areas import (
     room_m,
     stop_before_foe_sweep,
 )
+from cavmarl.driving.kernels.junctions.zippers import behind_in_zipper, is_zipper
 from cavmarl.driving.kernels.lanes.adjacent_leaders import (
     behind_adjacent_leader,
     behind_askew,
@@ -167,6 +168,9 @@ def decide_at_line(
     merging = no_constraint(kind)
     if row["driver"] == DRIVER_AGENT or speed > FAST_MPS:
         merging = behind_merging(roads, kind, row, link, distance, scratch)
+    if is_zipper(roads, link):
+        zipper = behind_in_zipper(roads, travel, rows, i, kind, link, distance, scratch)
+        merging = max(merging, zipper)
     hold = hold_at_line(roads, travel, rows, i, link, distance, way, phase, scratch)
     waits = HOLD_NONE
     if hold == HOLD_NONE:

@@ -355,6 +355,7 @@ def _link_rows(
         # In left-hand traffic, SUMO writes T for U-turns to the right.
         link["direction"] = ord(connection.getDirection()[0].replace("T", "t"))
         link["state"] = ord(connection.getState()[0])
+        link["may_block"] = connection.getParam("keepClear") == "false"
     return links
 
 

@@ -62,6 +62,7 @@ ARRIVES_M = 1.0  # a trip that ends at most this far behind a line does not cros
 STATE_MAJOR = ord("M")
 STATE_STOP = ord("s")
 STATE_ALLWAY_STOP = ord("w")
+STATE_ZIPPER = ord("Z")
 
 
 @kernel
@@ -75,7 +76,7 @@ def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
 
 
 @kernel
-def _earliest(distance: float, speed: float, limit: float, accel: float) -> float:
+def earliest(distance: float, speed: float, limit: float, accel: float) -> float:
     """Return the time in s to drive `distance` m with an acceleration up to `limit` m/s."""
     if distance <= 0.0:
         return 0.0
@@ -103,7 +104,7 @@ def is_minor(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
     signal = link_signal(roads, link, phase)
     gives_way: bool = signal == SIGNAL_GREEN_MINOR
     if signal == SIGNAL_NONE:
-        gives_way = target["state"] != STATE_MAJOR
+        gives_way = target["state"] != STATE_MAJOR and target["state"] != STATE_ZIPPER
     return gives_way
 
 
@@ -227,7 +228,7 @@ def _is_harmless(
 
 
 @inlined_kernel
-def _assumed_accel(travel: TripTables, row: np.void) -> float:
+def assumed_accel_of(travel: TripTables, row: np.void) -> float:
     """Return the assumed acceleration of a vehicle in m/s², at most that of its type."""
     assumed_accel: float = BRISK_ACCEL
     if row["driver"] != DRIVER_AGENT:
@@ -288,7 +289,7 @@ def _comes(
     to_line = foe["dist"] - foe["half"]
     if other["accel"] > SPEEDING_UP_MPS2:
         top = roads.lanes[roads.links[conflict["foe"]]["from_lane"]]["speed_mps"]
-        arrives = _earliest(to_line, foe["speed"], top, other["accel"])
+        arrives = earliest(to_line, foe["speed"], top, other["accel"])
     else:
         arrives = to_line / max(foe["speed"], STANDING_MPS)
     if conflict["merging"]:
@@ -327,8 +328,8 @@ def _blocks_inside(
     target, half = roads.links[link], 0.5 * row["length"]
     to_area = distance + conflict["enter_m"] - half
     cleared = to_clear / max(foe["speed"], 0.1)
-    assumed_accel = _assumed_accel(travel, row)
-    time_in = _earliest(to_area, row["speed"], limit, assumed_accel)
+    assumed_accel = assumed_accel_of(travel, row)
+    time_in = earliest(to_area, row["speed"], limit, assumed_accel)
     if stays_inside(other):
         return HOLD_EXIT_BLOCKED
     if equal and conflict["merging"]:
@@ -339,8 +340,8 @@ def _blocks_inside(
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # A foe that has just started will accelerate; a foe that brakes may have to stop.
-        cleared = _earliest(
-            to_clear, foe["speed"], top, GENTLE_SHARE * _assumed_accel(travel, other)
+        cleared = earliest(
+            to_clear, foe["speed"], top, GENTLE_SHARE * assumed_accel_of(travel, other)
         )
     elif foe["speed"] * foe["speed"] < -2.0 * other["accel"] * to_clear:
         cleared = math.inf  # the foe brakes so hard that it stops before it clears the area
@@ -351,9 +352,9 @@ def _blocks_inside(
             time_in = min(SET_OFF_S, time_in)
         else:  # in turn: the row starts so that it need not brake before the area
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
-            time_in = _earliest(free, row["speed"], limit, assumed_accel)
+            time_in = earliest(free, row["speed"], limit, assumed_accel)
             if other["accel"] > SPEEDING_UP_MPS2:
-                cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
+                cleared = earliest(to_clear, foe["speed"], top, other["accel"])
     return HOLD_YIELD if cleared > time_in else HOLD_NONE
 
 
@@ -404,12 +405,12 @@ def hold_for_foe(
             roads, travel, row, link, distance, limit, conflict, foe, other, to_clear, equal
         )
     # The foe is before its line: both vehicles are assumed to need the whole junction.
-    over, assumed_accel = target["length_m"], _assumed_accel(travel, row)
+    over, assumed_accel = target["length_m"], assumed_accel_of(travel, row)
     if conflict["enter_m"] < target["wait_m"] - LINE_MARGIN_M:
         over = min(over, target["wait_m"])
     passed = (foe["dist"] + foe_link["length_m"] + foe["half"]) / max(foe["speed"], 0.1)
     after_s = GAP_S if conflict["merging"] else 0.0
-    if passed + after_s < _earliest(distance - half, row["speed"], limit, assumed_accel):
+    if passed + after_s < earliest(distance - half, row["speed"], limit, assumed_accel):
         return HOLD_NONE
     speed, to_line = row["speed"], distance - half
     if not (steered or conflict["merging"]) and speed <= STANDING_MPS:
@@ -420,12 +421,12 @@ def hold_for_foe(
     over += min(to_line, 0.0)  # from a waiting position, only the rest counts
     reached = math.sqrt(speed * speed + 2.0 * assumed_accel * max(over, 0.0))
     leaves_mps = min(reached, max(limit, speed))
-    time_line = _earliest(to_line, speed, limit, GENTLE_SHARE * assumed_accel)
+    time_line = earliest(to_line, speed, limit, GENTLE_SHARE * assumed_accel)
     time_out = time_line + 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
     if steered:
         comes = _comes_to_steered(row, conflict, foe, front, leaves_mps, time_out)
     else:
-        time_in = _earliest(
+        time_in = earliest(
             distance - half - LINE_MARGIN_M, speed, limit, GENTLE_SHARE * assumed_accel
         )
         comes = _comes(roads, row, conflict, foe, other, time_in, time_out, leaves_mps)
