@@ -69,7 +69,7 @@ PACKET = record(
     ("tick", np.int64),  # tick of sending
     ("x", np.float64),  # m, position of the sender
     ("y", np.float64),
-    ("word", np.uint64),  # its half of random numbers
+    ("word", np.uint64),  # the packet's half of random numbers, see `packet_word`
     ("kind", np.int32),
     ("first", np.int32),  # index of its first report
     ("count", np.int64),
