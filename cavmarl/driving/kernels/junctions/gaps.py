@@ -119,7 +119,7 @@ def _has_turn(row: np.void, link: int) -> bool:
 
 @inlined_kernel
 def _is_yielding(row: np.void, link: int) -> bool:
-    """Return whether a standing vehicle yields at `link`; an agent's does so at its stop line."""
+    """Return whether a standing vehicle yields at `link`; an agent stopped at its line does."""
     stands: bool = row["driver"] == DRIVER_AGENT and row["wait_s"] > 0.0
     return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
 
@@ -144,7 +144,7 @@ def may_ignore(
     """Return whether a driver at `link` may ignore a foe at `foe_link` with the right of way.
 
     `signal` is the state of the foe's signal; `state` and `foe_state` are those of the links. After
-    a wait of `stuck_s` s, the driver also may_ignore a foe that stands and yields.
+    a wait of `stuck_s` s, the driver may also ignore a foe that stands and yields.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
@@ -335,7 +335,7 @@ def _blocks_inside(
         apart = distance + conflict["leave_m"] - half - to_clear
         return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # wait until there is room behind it
     if _in_turn(target["state"]) and _has_turn(row, link) and to_area > ROOM_M:
-        return HOLD_NONE  # it would lose its turn by stopping again, and can wait before the area
+        return HOLD_NONE  # stopping again would lose the turn; the row can wait before the area
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # A foe that has just started will accelerate; a foe that brakes may have to stop.
@@ -413,7 +413,7 @@ def hold_for_foe(
         return HOLD_NONE
     speed, to_line = row["speed"], distance - half
     if not (steered or conflict["merging"]) and speed <= STANDING_MPS:
-        # A waiting vehicle counts as being at its line or waiting position, where SUMO's stand.
+        # A waiting vehicle counts as being at its line or waiting position, as it would in SUMO.
         inside = to_line < 0.0 and target["wait_m"] < math.inf
         ahead = to_line + target["wait_m"] if inside else to_line
         to_line -= min(max(ahead, 0.0), LINE_MARGIN_M)

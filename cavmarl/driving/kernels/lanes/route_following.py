@@ -20,7 +20,7 @@ MOST_CHANGES = 8  # lane changes at the end of one lane
 
 @inlined_kernel
 def own_step(roads: RoadArrays, row: np.void) -> int:
-    """Return the index in `TripTables.steps`: of its lane, or in a junction of the next lane."""
+    """Return the `TripTables.steps` row of a vehicle's lane; in a junction, of the next lane."""
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
