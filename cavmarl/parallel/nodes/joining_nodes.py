@@ -23,7 +23,7 @@ from cavmarl.parallel.worlds.world_errors import original_error
 
 log = logging.getLogger("cavmarl.nodes")
 
-LOOK_MS = 20.0  # between looks for callers, before the worlds start
+LOOK_MS = 20.0  # time between checks for callers, before the worlds start
 END_S = 1.0  # time for waiting nodes to end
 ANYONE = (1 << 32) - 1  # number of a node that accepts any number
 
@@ -132,7 +132,7 @@ class JoiningNodes:
         try:
             with reading(number):
                 self._apply(number, node, frame)
-        except LinkLostError as lost:  # it is no node
+        except LinkLostError as lost:  # the caller is not a node
             log.warning("a caller is rejected: %s", lost)
             self._forget(number)
 

@@ -31,7 +31,7 @@ Route: TypeAlias = Callable[[Place], Place]
 
 
 def straight(place: Place) -> Place:
-    """Return the place itself: the route without a detour."""
+    """Return the place unchanged: the default `Route`."""
     return place
 
 
@@ -178,7 +178,7 @@ class RayNodes:
             self._actors.trouble()
 
     def stopped(self) -> set[int]:
-        return set()  # Ray does not tell
+        return set()  # Ray does not report it
 
     def close(self) -> None:
         self._actors.close()

@@ -90,7 +90,7 @@ class NodeWorlds(CommandedWorlds):
         route: Route = straight,  # maps a place to the place that nodes of this machine call
         system: NodeSystem = MACHINE,
         start: Start = start_nodes,  # starts the nodes
-        share: WorldShare | None = None,  # part of more worlds; None: these are all worlds
+        share: WorldShare | None = None,  # part of the worlds of `NodeGroups`; None: all worlds
     ) -> None:
         config, count = world.config, world.partition.count
         nodes = 1 if share else backend.count or 1

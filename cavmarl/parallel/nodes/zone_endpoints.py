@@ -371,7 +371,7 @@ class ZoneEndpoints:
             return
         if (w, vehicle) not in self._arrived_agents:
             others = {node for zone, node in enumerate(self._node_of) if zone not in self._zones}
-            self._links.wanted = others  # all but a silent node have sent their next share
+            self._links.wanted = others  # only a silent node has not sent its next share
             while (w, vehicle) not in self._arrived_agents:
                 self._links.check_recovery()
                 self._links.pump(None)

@@ -158,7 +158,7 @@ class CommandedWorlds(ABC):
         return self._ask(task, number, number if more is None else [number, more])
 
     def _command(self, task: Task, payload: Any = None, commits: bool = True) -> None:
-        """`_send`, with the errors that worlds of this process would raise."""
+        """Call `_send`, but raise the errors that worlds of this process would raise."""
         try:
             self._send(task, payload, commits)
         except WorkerFailureError as failure:

@@ -214,18 +214,18 @@ def load_kernels() -> None:
 
 
 def post(mine: Words, number: int) -> None:
-    """Set the number of this side; the other side must not sleep while it waits for it."""
+    """Set the number of this side; the other side must not sleep while it waits for the number."""
     _set(mine, NUMBER, number, mine)
 
 
 def wait_for(
     theirs: Words,  # (WORDS,) line of the other side
-    number: int,  # to wait for
+    number: int,  # the awaited number
     # whether the other side was last seen on another core. Then this side does not yield at first,
     # since another program could keep the core for milliseconds
     is_apart: bool = False,
 ) -> None:
-    """Wait until the other side reaches a number, which it does soon unless it is dead."""
+    """Wait until the other side reaches a number; only a dead side takes long."""
     if look(theirs, number, False):
         return
     now = time.perf_counter()
@@ -259,7 +259,7 @@ class WakeSignal:
             _pass()  # the other side may poll or wake up on this core
 
     def announce(self, number: int) -> int:
-        """Set the number of this side; return not 0 if the other side has to be woken."""
+        """Set the number of this side; the result is not 0 if the other side has to be woken."""
         return _set(self.mine, NUMBER, number, self.theirs)
 
     def wake_peer(self) -> None:

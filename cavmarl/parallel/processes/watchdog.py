@@ -20,7 +20,7 @@ class Watchdog:
     def __init__(
         self,
         pid: int,
-        timeout_s: float,  # limit on the work, without times in which nothing checks
+        timeout_s: float,  # limit on the work; times without calls of `verdict` do not count
     ) -> None:
         self._pid = pid
         self._timeout_s = timeout_s

@@ -85,12 +85,12 @@ class _Sharing:
 
     @property
     def is_settled(self) -> bool:
-        """Whether there are enough measurements to keep the shares for long."""
+        """True if there are enough measurements to keep the shares for long."""
         return self.uses >= SHARED_ANEW
 
     @property
     def is_over(self) -> bool:
-        """Whether it is time to evaluate the measurements."""
+        """True if it is time to evaluate the measurements."""
         often = self.uses % SHARED_ANEW == 0 if self.is_settled else self.uses.bit_count() == 1
         return often and self.agents > 0
 
