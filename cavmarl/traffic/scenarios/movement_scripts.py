@@ -40,8 +40,8 @@ class Shadow(NamedTuple):
     """A stretch of a lane that a body covers."""
 
     start: float  # in m along the lane
-    end: float  # m/s of the body along the lane, at least 0
-    speed: float  # of the body along the lane in m/s, not below 0
+    end: float  # in m along the lane
+    speed: float  # of the body along the lane in m/s, at least 0
 
     def joined(self, other: Shadow) -> Shadow:
         """Return the smallest stretch that contains both stretches."""

@@ -61,7 +61,7 @@ class RouteBook:
         return self._worlds[w].arrays(self._nowhere)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert the ways of rows, VEHICLE or departures, to the world `worlds` later."""
+        """Convert the ways of rows, VEHICLE or departures, to those of world w + `worlds`."""
         own = rows["way"] >= self._first - len(self._network.lanes)
         rows["way"] += own * (worlds * self._of_world)
 
@@ -240,7 +240,7 @@ class StopBook:
         return StopRange(first, end)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert the stops of rows, VEHICLE or departures, to the world `worlds` later."""
+        """Convert the stops of rows, VEHICLE or departures, to those of world w + `worlds`."""
         has_some = rows["stop"] >= 0
         for name in ("stop", "stops_end"):
             rows[name] += has_some * (worlds * self._of_world)
