@@ -18,7 +18,7 @@ Place: TypeAlias = tuple[str, int]
 
 READS = select.POLLIN
 READS_AND_WRITES = select.POLLIN | select.POLLOUT
-MOST_PIECES = 512  # in one call of `Connection.send`
+MOST_PIECES = 512  # limit in one call of `Connection.send`
 
 
 class Connection(Protocol):

@@ -34,7 +34,7 @@ class JoiningNode:
 
     asked: int  # the number that it was started with, or ANYONE
     machine: str = "a machine"
-    pid: int = 0  # on its machine
+    pid: int = 0  # process id on the machine of the node
     is_accepted: bool = False  # it runs the same code as the caller
     place: Place | None = None  # where other nodes can call, once it has loaded the world
     neighbours: Neighbours | None = None  # zones between which vehicles change, in that world
@@ -127,7 +127,7 @@ class JoiningNodes:
 
     def _receive(self, number: int, frame: NodeFrame) -> None:
         node = self._all.get(number)
-        if node is None:  # it was rejected
+        if node is None:  # the node was rejected
             return
         try:
             with reading(number):

@@ -53,7 +53,7 @@ class NodePeers:
         simulation: Simulation,
         links: Links,  # to all other nodes
         zones: Sequence[Sequence[int]],  # of each node
-        number: int,  # of this one
+        number: int,  # of this node
         first_share: int = 0,  # number of the first share, the same at all nodes
     ) -> None:
         shard = simulation.shards[0]

@@ -84,7 +84,7 @@ class NodeProgram:
         zones: hosted by this node.
     """
 
-    _replicas: StateReplicas  # after the first RECOVER
+    _replicas: StateReplicas  # set by the first RECOVER
 
     def __init__(self, system: NodeSystem, links: Links, address: str, secret: bytes) -> None:
         self.zones: tuple[int, ...] = ()

@@ -101,7 +101,7 @@ class LocalNodes:
 
     def trouble(self, begun: Collection[int]) -> str | None:
         stopped = {n for n in self.stopped() if self._processes[n].pid not in begun}
-        for number in stopped & self._seen_stopped:  # at two checks in a row
+        for number in stopped & self._seen_stopped:  # stopped at two checks in a row
             self._processes[number].kill()
             self._processes[number].wait()
         self._seen_stopped = stopped

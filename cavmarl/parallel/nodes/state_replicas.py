@@ -139,7 +139,7 @@ class StateReplicas:
             self._links.wanted = (donor,)
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
-                check()  # it may receive the awaited frame
+                check()  # this call may receive the awaited frame
             self._links.wanted = ()
             with reading(donor):
                 given = self._read(self._given.pop(donor).data, like)

@@ -259,7 +259,7 @@ class ZoneEndpoints:
         kept: dict[int, int] = {}
         for vehicle, reason in gone.items():
             zone = next((z for z, e in self._endpoints[w].items() if vehicle in e.owned), None)
-            if zone is None:  # it was born during the lease
+            if zone is None:  # the vehicle was born during the lease
                 kept[vehicle] = reason
             else:
                 left.setdefault(zone, []).append(Removed(vehicle, reason))

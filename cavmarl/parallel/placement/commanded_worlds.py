@@ -24,7 +24,7 @@ from cavmarl.parallel.worlds.world_errors import copy_error, network_error, orig
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
-MAX_AGENTS = 500  # in one request, since an answer is one message
+MAX_AGENTS = 500  # limit in one request, since an answer is one message
 
 log = logging.getLogger("cavmarl.workers")
 

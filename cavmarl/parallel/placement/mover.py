@@ -38,7 +38,7 @@ class Mover:
         self._every = every
         self._spent_s = spent_s
         self._steps = 0
-        self.moves = 0  # of shards, up to now
+        self.moves = 0  # number of moved shards so far
         self.moved_s = 0.0  # total duration of the moves
 
     def before_step(

@@ -95,7 +95,7 @@ class ForkServer:
         self,
         program: str,  # module that the server runs, which calls `worker_loop.serve`
         start: Mapping[str, Any],  # JSON message for the server, with numbers of descriptors
-        descriptors: tuple[int, ...],  # that the server and its workers inherit
+        descriptors: tuple[int, ...],  # inherited by the server and its workers
     ) -> None:
         ours, theirs = _wires()
         start_message = {

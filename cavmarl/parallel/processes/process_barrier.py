@@ -28,17 +28,17 @@ from cavmarl.core.compiled.intrinsic import intrinsic
 
 Words = NDArray[np.int64]
 
-WORDS = 8  # of a line, which is one cache line
+WORDS = 8  # words of a line, which is one cache line
 NUMBER, ASLEEP = 0, 1  # words of this module; callers define the others
 
 SHORT_S = 20e-6  # a side polls for this time before it sleeps
-LONG_S = 200e-6  # it polls for this time, if the previous wait was not longer
-LONG_WORK_S = 500e-6  # after a longer wait, or more work, it does not poll for `LONG_S`
+LONG_S = 200e-6  # a side polls for this time if its previous wait was not longer
+LONG_WORK_S = 500e-6  # after a longer wait or more work, a side does not poll for `LONG_S`
 PAUSES = 4  # polls before it yields the core
 ROUNDS = 16  # yields before it reads the clock
 ALONE_S = 300e-6  # a side with a core of its own polls without yielding for this time
 AWAKE_S = 10e-3  # within a command, a side polls and yields for this time
-NAP_S = 100e-6  # after that, it sleeps for this time between polls
+NAP_S = 100e-6  # after `AWAKE_S`, a side sleeps for this time between polls
 WAKE = b"!"
 
 _PAUSE = {"x86_64": "llvm.x86.sse2.pause", "AMD64": "llvm.x86.sse2.pause"}.get(platform.machine())
@@ -271,7 +271,7 @@ class WakeSignal:
 
     def watch(
         self,
-        number: int,  # to wait for
+        number: int,  # the awaited number
         last_s: float,  # duration of the previous wait
         work_s: float = 0.0,  # duration of the work since then
         is_soon: bool = False,  # the caller knows that it does not take long
