@@ -17,7 +17,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand.demand_records import STOP, UNTIL_ABSOLUTE
 from cavmarl.traffic.kernels.mirroring import Paths
 
-MAX_WAY_STEPS = 8_000_000  # of all worlds; memory that is never written takes no space
+MAX_WAY_STEPS = 8_000_000  # limit for all worlds; memory that is never written takes no space
 
 
 class RouteBook:
@@ -161,7 +161,7 @@ def _with_room(array: NDArray[Any], used: int, wanted: int) -> NDArray[Any]:
     return larger
 
 
-MAX_STOPS = 2_000_000  # of all worlds; memory that is never written takes no space
+MAX_STOPS = 2_000_000  # limit for all worlds; memory that is never written takes no space
 OF_WORLD = 200_000
 
 ReportedStop = tuple[int, float, float, float, float, bool]
