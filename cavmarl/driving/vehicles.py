@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 RECORD_VERSION = 2
 
-# The fields are ordered by use: those that drivers read of other vehicles come first and share two
+# The fields are ordered by use: fields that drivers read of others come first and share two
 # cache lines; fields that are rarely read come last.
 VEHICLE = np.dtype(
     [

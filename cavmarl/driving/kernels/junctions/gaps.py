@@ -39,12 +39,12 @@ from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 
 BRISK_ACCEL = 2.5  # m/s²: assumed acceleration of a driver towards a shared area
 GENTLE_ACCEL = 1.8  # m/s²: to be safe, assumed acceleration out of a shared area
-GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # the same for vehicles with a lower acceleration
+GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # relative to the acceleration of any vehicle
 HARD_STOP = 5.0  # m/s²: a vehicle that needs more to stop before the line will not stop
 AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the own line)
 STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the own driver has waited long
 STEERED_AHEAD_S = 3.0  # time gap if one of both vehicles is steered, which may take longer
-STEERED_MERGE_AHEAD_S = 1.5  # the same if both drive into the same lane, where one can follow
+STEERED_MERGE_AHEAD_S = 1.5  # time gap if both then drive into one lane, where one can follow
 SPEEDING_UP_MPS2 = 0.1  # from this acceleration on, a foe is assumed to keep accelerating
 GAP_S = 1.0  # time between the exit of one vehicle from a shared area and the entry of another
 SET_OFF_S = 0.5  # a standing vehicle starts this long before another vehicle leaves the area
@@ -55,9 +55,9 @@ FORCED_STOP = 4.5  # m/s²: the deceleration that such a driver expects
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a slower stream lets others merge
 STUCK_S = 90.0  # after this wait, a driver may also pass stopped vehicles that must yield to it
-RESCUED_S = 300.0  # the same if both drive as in SUMO, which would teleport a vehicle then
+RESCUED_S = 300.0  # `STUCK_S` if both drive as in SUMO, which would teleport a vehicle then
 STOP_SIGN_S = 0.5  # time to stand at a stop sign, and before a tie is broken
-STOOD_S = 0.1  # the same for background vehicles, as in SUMO
+STOOD_S = 0.1  # `STOP_SIGN_S` of background vehicles, as in SUMO
 ARRIVES_M = 1.0  # a trip that ends at most this far behind a line does not cross the junction
 STATE_MAJOR = ord("M")
 STATE_STOP = ord("s")

@@ -255,7 +255,7 @@ def rear_is_inside(lane: np.void, row: np.void) -> bool:
     spare = lane["length_m"] - 2.0 * row["length"] - room
     near_m = min(TURN_IN_M, max(spare - SPARE_M, 0.0))
     if row["driver"] == DRIVER_AGENT and row["speed"] < CREEP_MPS:
-        near_m = 0.0  # it may have stopped there for the lane change
+        near_m = 0.0  # the agent may have stopped there for the lane change
     inside: bool = spare > 0.0 and row["s"] < 0.5 * row["length"] + near_m
     return inside
 
