@@ -104,7 +104,7 @@ RECEIVER = record(
     ("id", np.int64),  # -1: none
     ("x", np.float64),
     ("y", np.float64),
-    ("word", np.uint64),  # its half of random numbers
+    ("word", np.uint64),  # the receiver's half of random numbers, see `receiver_word`
 )
 
 
