@@ -55,7 +55,7 @@ class JoiningNodes:
         listener: TransportListener,
         job: Any,  # JSON value for the nodes
         files: Sequence[WorldFile],  # of the world
-        room: Callable[[], int],  # returns how many more nodes are of use
+        room: Callable[[], int],  # returns how many more nodes can be used
         zones: int,  # of each world
         system: NodeSystem = MACHINE,
     ) -> None:

@@ -79,7 +79,7 @@ class NodeWatch:
         raise WorkerError(f"{silence}, {VAIN} times, although all nodes are alive") from silence
 
     def _wait(self, timeout_s: float, wait: Callable[[float], Found]) -> Found:
-        """Wait, and check now and then whether a process is stopped."""
+        """Wait, and check from time to time whether a process is stopped."""
         stopped: set[int] = set()
         left_s = timeout_s
         while left_s > LOOK_S:

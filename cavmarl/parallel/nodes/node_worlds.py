@@ -271,7 +271,7 @@ class NodeWorlds(CommandedWorlds):
         return self.ask(task, payload)
 
     def ask(self, task: Task, payload: Any = None) -> Any:
-        """Return the answer of the first node, which has the whole worlds for that."""
+        """Return the answer of the first node, which gets the whole worlds for the task."""
         read = self._read_proposal if task == Task.PROPOSE else _ANSWERS[task]
         first = self._of_first(lambda data: read(json.loads(bytes(data))))
         return self._run(task, payload, first)[0]

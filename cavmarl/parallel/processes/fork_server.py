@@ -32,7 +32,7 @@ _ONE_THREAD = dict.fromkeys(
 def has_ended(pidfds: Iterable[int], limit_s: float | None) -> bool:
     """Wait until one of the processes has ended; return False after the limit (None: no limit).
 
-    It uses `poll`, since `select` accepts no descriptor above 1,023.
+    The function uses `poll`, since `select` accepts no descriptor above 1,023.
     """
     waiting = select.poll()
     for pidfd in pidfds:

@@ -294,7 +294,7 @@ class WakeSignal:
 
     def announce_sleep(self) -> None:
         """Mark this side as asleep before its next number: its wait will be long."""
-        self.mine[ASLEEP] = 1  # the other side sees it before or with that number
+        self.mine[ASLEEP] = 1  # the other side sees this word before or with that number
 
     def sleep(self, number: int) -> bool:
         """Mark this side as asleep; return False if the number is already there."""

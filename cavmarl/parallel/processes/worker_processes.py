@@ -179,7 +179,7 @@ class WorkerProcesses:
     def _none_has_finished(self, pending: Sequence[int]) -> bool:
         """Drain late wake-ups; return False if a worker has finished.
 
-        It is called after the workers got their command. If it drains a wake-up that belongs to
+        Call this after the workers got their command. If it drains a wake-up that belongs to
         this command, the number of that worker is already set.
         """
         for fd, _ in self._poll.poll(0):

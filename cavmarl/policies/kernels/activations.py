@@ -1,6 +1,6 @@
 """Activation functions in float32, built from IEEE additions, multiplications and divisions only.
 
-Library functions such as `tanhf` differ between processors. These do not.
+Library functions such as `tanhf` differ between processors. The functions here do not.
 """
 
 from __future__ import annotations

@@ -242,7 +242,7 @@ def _right_of_way(
 ) -> float:
     """Return 1 if the other vehicle has priority over `link`, -1 if it must yield, else 0.
 
-    It has priority if it is on a link, or may take one, that goes before `link`.
+    The other vehicle has priority if its link, or a link that it may take, goes before `link`.
     """
     if link < 0 or is_off_lanes(other):
         return 0.0

@@ -94,8 +94,8 @@ def next_step_of_plan(
 def route_time_s(roads: RoadArrays, travel: TripTables, row: np.void, begin_s: float) -> float:
     """Return the time in s after which a trip counts as too long.
 
-    It is the time at the speed limits times `TripTables.trip_horizon`, plus for each signal one
-    cycle of the program that is active at `begin_s`.
+    The result is the time at the speed limits times `TripTables.trip_horizon`, plus for each signal
+    one cycle of the program that is active at `begin_s`.
     """
     lane, way = row["lane"], row["way"]
     free_s = -row["s"] / roads.lanes[lane]["speed_mps"]
