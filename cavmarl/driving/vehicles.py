@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 RECORD_VERSION = 2
 
-# The order is that of use: the fields that every driver reads of others come first and share two
+# The fields are ordered by use: fields that drivers read of others come first and share two
 # cache lines; fields that are rarely read come last.
 VEHICLE = np.dtype(
     [

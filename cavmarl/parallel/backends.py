@@ -43,7 +43,7 @@ _REGISTERED: dict[str, MakeWorlds] = {}
 
 
 def register_backend(name: str, make: MakeWorlds) -> None:
-    """Add a backend, which the argument `backend` of `make_vec` and `parallel_env` can name.
+    """Register a backend for the argument `backend` of `make_vec` and `parallel_env`.
 
     Args:
         name: of the backend.

@@ -297,8 +297,8 @@ class NativeTraffic:
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
         """Return the largest distance that any driver looks ahead, in m.
 
-        If all drivers brake as SUMO's do, it follows from the fastest of them. IDM reacts to any
-        leader, and agents may drive at any speed; then it is `VIEW_M`.
+        If all drivers brake as in SUMO, the fastest driver determines the distance. Otherwise it is
+        `VIEW_M`: IDM reacts to any leader, and agents may drive at any speed.
         """
         own = self.population
         if self.file is None or own.agents + own.background + own.insertions > 0:

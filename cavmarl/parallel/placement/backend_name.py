@@ -43,12 +43,12 @@ class BackendName:
 
     @property
     def is_local(self) -> bool:
-        """Whether the worlds run in the process of the caller."""
+        """True if the worlds run in the process of the caller."""
         return self.kind == LOCAL
 
     @property
     def is_mpi(self) -> bool:
-        """Whether the nodes are the other ranks of an MPI run."""
+        """True if the nodes are the other ranks of an MPI run."""
         return self.address == MPI
 
     def is_split(self, num_worlds: int) -> bool:

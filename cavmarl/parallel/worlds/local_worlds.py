@@ -148,7 +148,7 @@ class LocalWorlds:
         )
 
     def _end(self, over: NDArray[np.bool_], some_over: bool) -> None:
-        """Keep the last observations of what has ended, and start new episodes."""
+        """Keep the last observations of ended agents and episodes, and start new episodes."""
         arrays = self.arrays
         self._keep_observations()
         if arrays.frames:
@@ -398,7 +398,7 @@ def _made_again(
 
 
 def kept_elsewhere(config: EnvConfig) -> str:
-    """Return a key that gives the worlds state outside of their arrays; empty: there is none."""
+    """Return a configuration key whose value puts state outside of the arrays; empty: none does."""
     kept = {
         "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
         "workers.sensors": config.workers.sensors,

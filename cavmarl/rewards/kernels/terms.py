@@ -35,7 +35,8 @@ CIRCLE_MARGIN_M = 0.01  # margin around two circles that do not touch; larger th
 def _progress(row: np.void, step_s: float) -> float:
     """Return the progress towards the goal in m.
 
-    After a wrong turn the new way may be much longer; the loss is limited to that of driving back.
+    After a wrong turn the new way may be much longer, so progress and loss are limited to twice the
+    distance at the present speed (at least 1 m/s).
     """
     if row["step_to_go"] == math.inf:
         return 0.0  # before the step, no way led to the goal

@@ -149,7 +149,7 @@ class DefinitionCollector:
         begin_ms: int,
         end_ms: int,
         max_departures: int,
-        departs: Mapping[str, str],  # attributes of departures without their own
+        departs: Mapping[str, str],  # attributes of departures that have none of their own
     ) -> None:
         self.report = report
         self.named: dict[str, dict[str, Element]] = {}

@@ -135,7 +135,7 @@ class DemandFile:
 
     @property
     def may_look(self) -> bool:
-        """Whether any vehicle may have a rerouting device."""
+        """True if any vehicle may have a rerouting device."""
         return any(
             bool((chance > 0.0).any())
             for chance in (self.elements["reroute"], self.types["reroute"])

@@ -72,8 +72,8 @@ def _regular(
 def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]:
     """Return times as sums of random gaps after the start, one draw per vehicle.
 
-    Gaps are exponential, -ln(1 - u) / rate, or count trials: with a probability p in each full
-    second, the next success comes after 1 + floor(ln(1 - u) / ln(1 - p)) trials, for any step.
+    Gaps are exponential, -ln(1 - u) / rate; or they are numbers of trials, one in each full second
+    whatever the step: with probability p, 1 + floor(ln(1 - u) / ln(1 - p)) until a success.
     """
     trials = flow["pattern"] == FLOW_PROBABILITY
     rate, wanted = float(flow["rate"]), int(flow["number"])

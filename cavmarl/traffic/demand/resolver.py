@@ -27,7 +27,7 @@ from cavmarl.traffic.demand.type_table import TypeTable
 from cavmarl.traffic.trip_ways import TripWays
 
 log = logging.getLogger(__name__)
-NAMED = 5  # maximum number of left-out ids that are named
+NAMED = 5  # maximum number of ids in the warning about left-out vehicles
 
 # Classes whose own lanes are missing in road networks: see `sumo_net.selection`.
 _PARTLY_MAPPED = sum(1 << VEHICLE_CLASSES.index(name) for name in ("bicycle", "tram"))
@@ -170,7 +170,7 @@ class Resolver:
         return some
 
     def _gap(self, route: int, permissions: int) -> str | None:
-        """Return why a class cannot drive a route; if bad routes are skipped, also search ways."""
+        """Return why a class cannot drive a route; to skip bad routes, also find ways of trips."""
         edges, exact = self.routes.edges(route), self.routes.exact(route)
         gap = self._index.gap(edges, exact, permissions)
         if gap is None and self._skip and not exact:
@@ -207,13 +207,13 @@ class Resolver:
         if lane < 0:
             return True
         name = self._missing_lane(routes, lane, 0)
-        problem = f"which edge '{name}' does not have or not for road vehicles" if name else ""
+        problem = f"but edge '{name}' has no such lane for road vehicles" if name else ""
         lanes = self._index.network.lanes
         for vtype in self._options(self._type_options, types).rows:
             for route in self._options(self._route_options, routes).rows if not name else ():
                 row = self._index.lane_table[self.routes.edges(route)[0], lane]
                 if not int(lanes[row]["permissions"]) & self.types.permissions(vtype):
-                    problem = f"which is closed to type '{self.types.names[vtype]}'"
+                    problem = f"but the lane is closed to type '{self.types.names[vtype]}'"
             if problem and not self._tolerates(vtype, user):
                 raise user.error(
                     f"has departLane='{lane}', {problem}",

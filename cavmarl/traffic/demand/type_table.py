@@ -153,7 +153,7 @@ def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: flo
     record["speed_dev"] = values.number("speedDev", deviation, least=0.0)
     record["min_speed_factor"] = least = values.number("least", MIN_SPEED_FACTOR, least=0.0)
     record["max_speed_factor"] = most = values.number("most", MAX_SPEED_FACTOR, above=0.0)
-    # A fixed factor may be any; for a distribution, the mean must lie between the bounds.
+    # A fixed factor has no bounds; for a distribution, the mean must lie between the bounds.
     if record["speed_dev"] > 0.0 and not least <= mean <= most:
         raise element.error(
             f"has speedFactor='{text}', whose mean is not between {least:g} and {most:g}",

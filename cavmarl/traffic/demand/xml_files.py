@@ -52,7 +52,7 @@ class _Handler(ContentHandler):
         self._report = report
         self._take = take
         self._including = (*including, path.resolve())
-        self._depth = 0  # of the element around the next one
+        self._depth = 0  # number of open elements
         self._skipping = 0  # depth of the outermost skipped element
         self._tree: list[Element] = []  # from the definition to the innermost open element
         self._inside = 0  # elements of this definition so far

@@ -24,7 +24,7 @@ from cavmarl.driving.kernels.motion.tracking import side_lane
 BODY_LANES = 8  # maximum number of lanes between the front and the centre of a body
 BLINKS_RIGHT = 1  # bits of SUMO's vehicle signals
 BLINKS_LEFT = 2
-EDGES_BEHIND = 2  # edges from the front's edge back to the centre's, at most; or one ahead
+EDGES_BEHIND = 2  # the centre is at most this many edges behind the front's edge, or one ahead
 
 
 class Paths(NamedTuple):

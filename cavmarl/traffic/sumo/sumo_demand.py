@@ -49,7 +49,7 @@ class SumoDemand:
     content_hash: str  # hash of all files
 
     def setup(self) -> dict[str, Any]:
-        """Return what a process receives once; types by VTYPE row of the world's table."""
+        """Return the setup that a process receives once, with VTYPE rows of the world's table."""
         return _names(self.network, self.interface) | {
             "drives": self.drives,
             "types": {

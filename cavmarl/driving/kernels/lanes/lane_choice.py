@@ -41,7 +41,7 @@ MAX_BRAKING_ACCEPTED = 4.0  # m/s², largest deceleration that a driver accepts 
 MAX_BRAKING_NEEDED = 4.0  # m/s², largest deceleration that a mandatory change imposes
 QUEUED_M = 7.5  # length of lane per vehicle in a queue
 TURN_IN_M = 5.0  # distance behind a junction where long vehicles still turn into adjacent lanes
-SPARE_M = 2.0  # this rule holds on lanes longer, by this, than two vehicles need to swap lanes
+SPARE_M = 2.0  # on a short lane, `TURN_IN_M` is reduced so that this much room is left
 SLOW_MPS = 2.0  # below this speed, a lane change needs side clearance to stopped vehicles
 CREEP_MPS = 1.0  # up to this speed, a mandatory change is possible to the very end of the lane
 SIDEWAYS_S = 2.5  # duration of a lane change, which has to end before the lane does
@@ -255,7 +255,7 @@ def rear_is_inside(lane: np.void, row: np.void) -> bool:
     spare = lane["length_m"] - 2.0 * row["length"] - room
     near_m = min(TURN_IN_M, max(spare - SPARE_M, 0.0))
     if row["driver"] == DRIVER_AGENT and row["speed"] < CREEP_MPS:
-        near_m = 0.0  # it may have stopped there for the lane change
+        near_m = 0.0  # the agent may have stopped there for the lane change
     inside: bool = spare > 0.0 and row["s"] < 0.5 * row["length"] + near_m
     return inside
 

@@ -29,7 +29,7 @@ from cavmarl.driving.kernels.motion.tracking import locate, side_lane
 
 LATERAL_MPS = 1.4  # largest lateral speed of a lane change
 LATERAL_RATIO = 0.35  # largest lateral speed as a share of the speed
-LATERAL_MIN_MPS = 0.5  # but at least this, so that no vehicle is stuck between two lanes
+LATERAL_MIN_MPS = 0.5  # least value of that limit, so that no vehicle is stuck between two lanes
 MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle that changes lanes and its lane
 MAX_SWING_M = 0.3  # largest distance by which its corners swing out
 MAX_BODY_LANES = 8  # lanes that a body can cover, in each direction from its centre
