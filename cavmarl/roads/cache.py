@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.core.atomic_file import write_whole
-from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.cache_folder import cache_dir, report_unwritable
 from cavmarl.core.mapped_file import mapped
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import (
@@ -89,7 +89,7 @@ def _cached(path: Path, what: str, make: Callable[[Path], RoadNetwork]) -> RoadN
         try:
             _store(entry, network)
         except OSError as error:
-            tell_unwritable(error)
+            report_unwritable(error)
     return network
 
 

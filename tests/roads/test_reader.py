@@ -115,7 +115,7 @@ def test_crossing_paths_share_the_middle_and_merging_paths_the_end(crossing: Cro
         assert mirrored[f"foe_{end}"] == cross[end]
 
 
-def test_a_bridge_is_no_conflict(crossing: Crossing) -> None:
+def test_paths_over_and_under_a_bridge_do_not_conflict(crossing: Crossing) -> None:
     network = read_network(crossing(('shape="0,-5 0,-5 0,5"', 'shape="0,-5,6 0,5,6"')))
     assert network.conflicts["foe"].tolist() == [2, 0]
 

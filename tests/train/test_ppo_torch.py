@@ -142,7 +142,7 @@ def test_zones_over_workers_change_nothing_that_is_learnt(ippo: ModuleType, here
     assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "split")
 
 
-def test_a_central_critic_is_no_part_of_what_drives(ippo: ModuleType, here: Path) -> None:
+def test_a_central_critic_is_not_part_of_the_driver(ippo: ModuleType, here: Path) -> None:
     words = [*TINY, "--mappo", "--total-agent-steps", "20", "--name", "run"]
     assert ippo.main(words) == 0
     network, config = load_network(here / "runs" / "run")

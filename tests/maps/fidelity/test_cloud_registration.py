@@ -79,7 +79,7 @@ def test_other_places_do_not_converge() -> None:
     assert any("more than" in problem for problem in found.problems)
 
 
-def test_a_plane_is_told_to_slide() -> None:
+def test_a_plane_is_reported_as_underdetermined() -> None:
     rng = np.random.default_rng(7)
     plane = np.column_stack([rng.uniform(0.0, 50.0, (5000, 2)), np.zeros(5000)])
     found = align(moved(plane, motion(0.5, 0.0, 0.0, 0.0)), Target(plane))

@@ -152,7 +152,7 @@ def test_steep_roads_are_named(town: Path, tmp_path: Path, grade: float, steep: 
     assert bool(check_map(result.path).steep_lanes) is steep
 
 
-def test_steeper_roads_are_refused_unless_told(town: Path, tmp_path: Path) -> None:
+def test_steeper_roads_are_refused_unless_allowed(town: Path, tmp_path: Path) -> None:
     model = write_geotiff(tmp_path / "steep.tif", plane(0.0, 0.3))
     with pytest.raises(MapError, match=r"(?s)30%, more than 25%.*Hill Road.*--limit-grade"):
         built(town, model)
