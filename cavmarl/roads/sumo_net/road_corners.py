@@ -151,16 +151,20 @@ def _fillet(shape: Shape, corner: Corner) -> _Fillet | None:
     before = (end - start) / hypot_all(*(end - start))
     after = (stop - begin) / hypot_all(*(stop - begin))
     sine = float(before[0] * after[1] - before[1] * after[0])
-    cosine = float(before[0] * after[0] + before[1] * after[1])
+    cosine = _dot(before, after)
     turn = float(atan2_all(np.float64(sine), np.float64(cosine)))
     if abs(turn) > MOST_RAD or turn * corner.turn <= 0.0 or abs(turn) < 0.5 * CORNER_RAD:
         return None
     across = begin - end
     along = float(across[0] * after[1] - across[1] * after[0]) / sine
     apex = end + along * before
-    if float((apex - start) @ before) <= 0.0 or float((stop - apex) @ after) <= 0.0:
+    if _dot(apex - start, before) <= 0.0 or _dot(stop - apex, after) <= 0.0:
         return None
     return _Fillet(corner, apex, before, after, (1.0 - cosine) / abs(sine))
+
+
+def _dot(one: Vector, other: Vector) -> float:
+    return float(one[0] * other[0] + one[1] * other[1])
 
 
 def _apart(one: Vector, other: Vector) -> float:
@@ -180,7 +184,7 @@ def _radii(
     wanted = [list(radii) for radii in fits]
     for number, fillet in enumerate(lanes[0]):
         inwards = (fillet.after - fillet.before) / hypot_all(*(fillet.after - fillet.before))
-        places = [float(fillets[number].apex @ inwards) for fillets in lanes]
+        places = [_dot(fillets[number].apex, inwards) for fillets in lanes]
         # The cosine of half of the turn, from its tangent.
         share = 1.0 / np.sqrt(1.0 + fillet.tangent**2)
         for radii, place in zip(wanted, places, strict=True):
