@@ -125,6 +125,8 @@ _NO_DEPARTURE = ("triggered", "containerTriggered", "split", "now")
 _WAY = ("from", "to", "via", "fromJunction", "toJunction", "viaJunctions", "fromTaz", "toTaz")
 _OFF_MAP = ("fromXY", "toXY", "viaXY", "fromLonLat", "toLonLat", "viaLonLat")
 _UNUSED = ("departEdge", "arrivalEdge", "departPosLat", "arrivalPosLat", "insertionChecks")
+# Checked, but without effect: a trip ends near the end of its last edge. The values are defaults.
+_ARRIVAL = {"arrivalLane": "current", "arrivalPos": "max", "arrivalSpeed": "current"}
 # Attributes of routes and stops that do not define the way.
 _LOOKS = frozenset(("color", "cost", "savings", "exitTimes", "routeLength", "reason"))
 # SUMO's old names, which its own files still contain.
@@ -226,6 +228,10 @@ class DefinitionCollector:
         for key in _UNUSED:
             if key in element.attrs:
                 what = f"attribute {key} of {element.name} is not modelled"
+                self.report.tolerate(what, element.place)
+        for key, default in _ARRIVAL.items():
+            if element.attrs.get(key, default) != default:
+                what = f"{key} of {element.name} has no effect: trips end near the last edge's end"
                 self.report.tolerate(what, element.place)
         timing = self._timing(element, flow, start)
         self._check_room(element, timing)
