@@ -70,7 +70,7 @@ def start_worlds(
     """Make the worlds that the arguments describe, after a check of all arguments.
 
     Args:
-        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        env: name of an entry of `envs/`, a folder with an env.yaml, a map file, or a .sumocfg.
         num_worlds: number of worlds.
         in_next_step: whether worlds reset in the next step; see `SteppedWorlds`.
         render_modes: allowed render modes.

@@ -74,7 +74,7 @@ def compare_traffic(
     """Run and measure both simulators; SUMO gets only the demand that cavmarl supports.
 
     Args:
-        map_name: name or folder of an environment, or a map file.
+        map_name: name or folder of an environment, a map file or a .sumocfg.
         demand: route files and additional files, or one `.sumocfg`.
         seconds: duration from the beginning of the demand.
         dt_s: step length; a second is a whole number of steps.

@@ -46,7 +46,7 @@ APPROACH_M = 12.0  # before a junction, where bodies are still oblique to waitin
 FORK_WATCHED_M = 5.0  # after a junction, where vehicles that turn off beside a rear watch it
 MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the square
 MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable for another limit
-_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
+_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr", ".sumocfg")
 
 
 def map_name(path: Path) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import DemandError
+from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.driving.vehicle_types import STATED_FIELDS, VTYPE
 from cavmarl.roads.network import RoadNetwork, content_of
 from cavmarl.traffic.demand.definition_collector import DefinitionCollector
@@ -21,7 +22,9 @@ from cavmarl.traffic.demand.drawing import (
     DRAW_ROUTE,
     DRAW_TYPE,
     chances,
+    copied,
     departures_ms,
+    scaled_flows,
 )
 from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport
 from cavmarl.traffic.demand.map_index import MapIndex
@@ -67,8 +70,10 @@ class DemandFile:
     # (num_edges, n) LANE row by SUMO's index on the edge, -1 if there is none
     lane_table: NDArray[np.int32]
     begin_ms: int  # start of the simulation that the files are meant for
+    has_begin: bool  # whether the files state it; otherwise it is 0; not part of the hash
     end_ms: int  # end of the simulation; `MAX_TIME_MS` if the files name none
     step_ms: int
+    scale: float  # number of vehicles that depart for one departure of the files
     report: DemandReport  # counts of elements that were read and tolerated
 
     def __post_init__(self) -> None:
@@ -95,7 +100,9 @@ class DemandFile:
                 digest.update(content_of(stated))
             elif isinstance(value, tuple):
                 digest.update("\0".join(value).encode())
-            elif isinstance(value, int):
+            elif isinstance(value, float) and value != 1.0:
+                digest.update(f"{field.name}={value!r}".encode())
+            elif isinstance(value, int) and not isinstance(value, bool):
                 digest.update(f"{field.name}={value}".encode())
         return digest.hexdigest()
 
@@ -109,6 +116,8 @@ class DemandFile:
         """
         end_ms = self.end_ms if until_s is None else min(self.end_ms, round(until_s * 1000.0))
         rows, numbers, times = departures_ms(self.elements, key, self.begin_ms, end_ms)
+        if self.scale != 1.0:
+            rows, numbers, times = copied(self.elements, rows, numbers, times, self.scale)
         order = np.lexsort((numbers, rows, times))
         rows, numbers, times = rows[order], numbers[order], times[order]
         types = self._pick(self.type_choices, "types", rows, numbers, key, DRAW_TYPE)
@@ -165,7 +174,8 @@ class DemandFile:
         """Return SUMO's name of the vehicle of one ORDER ()."""
         row = int(order["element"])
         name = self.element_ids[row]
-        return f"{name}.{order['number']}" if self.elements[row]["flow"] else name
+        numbered = self.elements[row]["flow"] or order["number"] > 0
+        return f"{name}.{order['number']}" if numbered else name
 
     def place(self, row: int) -> str:
         element = self.elements[row]
@@ -198,16 +208,18 @@ def read_demand(
     *,
     on_bad_route: Literal["error", "skip"] = "error",
     max_departures: int = MAX_DEPARTURES,
+    programs: Sequence[Path] = (),
 ) -> DemandFile:
     """Read SUMO's files of vehicles, routes, types and stopping places.
 
     Args:
-        paths: `.rou.xml` and `.add.xml` files, plain or gzipped, in any order; a `.sumocfg` stands
-            for the files and the times that it names.
+        paths: `.rou.xml` and `.add.xml` files, plain or gzipped, in any order; a configuration of
+            SUMO (`.sumocfg`) stands for the files and options that it names.
         network: the map.
         on_bad_route: how to handle vehicles whose class cannot drive their route, and stops off
             the route: refuse the file, or leave them out and count them in the report.
         max_departures: maximum number of vehicles.
+        programs: files whose signal programs are read elsewhere, so that they are not counted.
 
     Raises:
         DemandError: files are missing, broken, contradictory, or made for another map.
@@ -216,15 +228,20 @@ def read_demand(
     """
     if on_bad_route not in ("error", "skip"):
         raise DemandError(f"on_bad_route='{on_bad_route}': choose 'error' or 'skip'")
-    report = DemandReport()
-    config = _configuration(paths)
-    begin_ms, end_ms = config.begin_ms, config.end_ms
-    collector = DefinitionCollector(report, begin_ms, end_ms, max_departures, config.departs)
+    report = DemandReport(program_files=frozenset(path.resolve() for path in programs))
+    config = _configuration(paths, report)
+    begin_ms, end_ms = config.begin_ms or 0, config.end_ms
+    collector = DefinitionCollector(
+        report, begin_ms, end_ms, max_departures, config.departs, config.scale
+    )
     for path in config.files:
         read_elements(path, report, collector.take)
     index = MapIndex(network)
-    resolver = Resolver(collector, index, skip=on_bad_route == "skip")
+    skip = on_bad_route == "skip" or config.skips_bad_routes
+    resolver = Resolver(collector, index, skip, config.types)
     elements = resolver.elements()
+    if config.scale != 1.0:
+        elements = scaled_flows(elements, config.scale)
     rerouters = resolver.rerouters()
     routes, route_edges, stops = resolver.routes.arrays()
     return DemandFile(
@@ -244,22 +261,27 @@ def read_demand(
         device=config.rerouting,
         lane_table=index.lane_table,
         begin_ms=begin_ms,
+        has_begin=config.begin_ms is not None,
         end_ms=end_ms if end_ms >= 0 else MAX_TIME_MS,
         step_ms=config.step_ms,
+        scale=config.scale,
         report=report,
     )
 
 
-def _configuration(paths: Sequence[Path]) -> SumoConfigFile:
-    """Return the last configuration among `paths`, with all files to read."""
+def _configuration(paths: Sequence[Path], report: DemandReport) -> SumoConfigFile:
+    """Return the configuration among `paths`, with all files to read."""
     files: list[Path] = []
-    config = SumoConfigFile(None, (), 0, -1, 1000, DeviceOptions(), {})
+    config: SumoConfigFile | None = None
     for path in map(Path, paths):
-        if path.suffix == ".sumocfg":
-            config = read_sumo_config(path)
-            files.extend(config.files)
-        else:
+        if not is_sumo_config(path):
             files.append(path)
+            continue
+        if config is not None:
+            raise DemandError(f"{path}: is the second SUMO configuration; give one, or its files")
+        config = read_sumo_config(path, report)
+        files.extend(config.files)
     if not files:
         raise DemandError("no demand file is given; name a .rou.xml or a .sumocfg")
+    config = config or SumoConfigFile()
     return replace(config, files=tuple(files))

@@ -87,6 +87,8 @@ FLOW_REGULAR = 0  # also single vehicles, as flows of one
 FLOW_EXPONENTIAL = 1  # gaps are exponentially distributed
 FLOW_PROBABILITY = 2  # one vehicle in each second with this probability
 
+MAX_NUMBER = 1 << 40  # of flows without a number: larger than every cap
+
 _ENTRY_AND_EXIT = [
     ("depart_lane", np.int32),  # LANE_* or a lane, see above
     ("depart_pos_code", np.int8),  # POS_*

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from pathlib import Path
 
 from cavmarl.core.errors import CavmarlError, DemandError
 
@@ -159,6 +160,7 @@ class DemandReport:
     read: dict[str, int] = field(default_factory=dict)
     # things left out or replaced, by a phrase that describes them
     tolerated: dict[str, Tally] = field(default_factory=dict)
+    program_files: frozenset[Path] = frozenset()  # files whose signal programs are read elsewhere
 
     def count(self, kind: str) -> None:
         self.read[kind] = self.read.get(kind, 0) + 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,13 +46,19 @@ class Resolver:
         ids: ids of the remaining elements, by row.
     """
 
-    def __init__(self, collector: DefinitionCollector, index: MapIndex, skip: bool) -> None:
+    def __init__(
+        self,
+        collector: DefinitionCollector,
+        index: MapIndex,
+        skip: bool,
+        type_defaults: Mapping[str, str],  # attributes of types without their own
+    ) -> None:
         self._index = index
         self._skip = skip
         self._ways = TripWays(index.network)
         self._report = collector.report
         self._named = named = collector.named
-        self.types = TypeTable(named, self._report)
+        self.types = TypeTable(named, self._report, type_defaults)
         places = named.get("stopping place", {})
         stop_reader = StopReader(index, places, self._report, skip)
         self.routes = RouteTable(index, named, stop_reader, self._report)
