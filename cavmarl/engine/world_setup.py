@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -43,6 +44,8 @@ from cavmarl.zones.partition.zone_file import zones_for
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
+log = logging.getLogger(__name__)
+
 # Networks that are in use in this process. The key is whether there are agents, followed by the
 # names and hashes of the map files.
 _LOADED: WeakValueDictionary[tuple[object, ...], RoadNetwork] = WeakValueDictionary()
@@ -56,6 +59,12 @@ class World(NamedTuple):
     # vehicles in addition to the generator's, from a demand file or from SUMO
     demand: DemandFile | SumoDemand | None
     partition: ZonePartition
+
+    def tell_tolerated(self) -> None:
+        """Log what was left out or replaced in the demand, with counts; once per call."""
+        if self.demand is not None and self.demand.tolerated:
+            lines = "\n".join(self.demand.tolerated)
+            log.warning("%s: tolerated in the demand:\n%s", self.config.name, lines)
 
     @property
     def capacity(self) -> int:
@@ -118,7 +127,7 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
             network,
             on_bad_route=config.traffic.on_bad_route,
             programs=_program_files(config, base_dir),
-        )
+        ).begun(config.horizon_s)
     scene = plan_scene(config.scenario, network)
     if scene is not None and scene.outages:
         network = with_outages(network, dict(scene.outages))

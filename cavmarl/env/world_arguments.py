@@ -103,4 +103,5 @@ def start_worlds(
     check_rendering(config, given.get("render_mode"), backend, render_modes)
     check_recording(config, given.get("record"), backend)
     world = make_world(config, base_dir)
+    world.tell_tolerated()
     return make_worlds(world, base_dir, num_worlds, backend, in_next_step)

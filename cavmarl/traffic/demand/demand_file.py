@@ -16,7 +16,7 @@ from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.driving.vehicle_types import STATED_FIELDS, VTYPE
 from cavmarl.roads.network import RoadNetwork, content_of
 from cavmarl.traffic.demand.definition_collector import DefinitionCollector
-from cavmarl.traffic.demand.demand_records import ORDER, POS_GIVEN, Choices
+from cavmarl.traffic.demand.demand_records import FLOW_REGULAR, ORDER, POS_GIVEN, Choices
 from cavmarl.traffic.demand.drawing import (
     DRAW_REROUTE,
     DRAW_ROUTE,
@@ -26,7 +26,7 @@ from cavmarl.traffic.demand.drawing import (
     departures_ms,
     scaled_flows,
 )
-from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport
+from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, late_begin
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.rerouters import Rerouters
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
@@ -180,6 +180,43 @@ class DemandFile:
     def place(self, row: int) -> str:
         element = self.elements[row]
         return f"{self.report.files[int(element['file'])]}, line {element['line']}"
+
+    @property
+    def tolerated(self) -> tuple[str, ...]:
+        """What was left out or replaced in the files, one line each with its count."""
+        return tuple(self.report.lines())
+
+    def begun(self, horizon_s: float) -> DemandFile:
+        """Return this demand with a begin at which vehicles depart within an episode.
+
+        If the files state no begin, and no vehicle departs in the first `horizon_s`, the demand
+        begins in the second of its first departure. The report says so, and also if no vehicle
+        departs within an episode nevertheless.
+        """
+        if self._departs_within(horizon_s):
+            return self
+        elements = self.elements
+        some = elements[(elements["number"] > 0) & (elements["end_ms"] > elements["begin_ms"])]
+        if not len(some):
+            return self
+        first = some[np.argmin(some["begin_ms"])]
+        first_ms = int(first["begin_ms"])
+        place = f"{self.report.files[int(first['file'])]}, line {first['line']}"
+        begun = self if self.has_begin else replace(self, begin_ms=first_ms // 1000 * 1000)
+        stays = not begun._departs_within(horizon_s)
+        what = late_begin(self.begin_ms / 1000.0, horizon_s, first_ms, stays)
+        self.report.tolerate(what, place)
+        return self if stays else begun
+
+    def _departs_within(self, horizon_s: float) -> bool:
+        """Return whether a vehicle may depart within an episode."""
+        end_ms = min(self.begin_ms + round(horizon_s * 1000.0), self.end_ms)
+        elements = self.elements
+        random = elements[elements["pattern"] != FLOW_REGULAR]
+        may = (random["begin_ms"] < end_ms) & (random["end_ms"] > self.begin_ms)
+        may &= random["number"] > 0
+        regular = elements[elements["pattern"] == FLOW_REGULAR]
+        return bool(may.any()) or len(departures_ms(regular, 0, self.begin_ms, end_ms)[0]) > 0
 
     def to_report(self) -> str:
         """Return lines for a terminal: counts of read and tolerated elements."""

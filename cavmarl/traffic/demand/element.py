@@ -42,6 +42,18 @@ def near(name: str, known: Iterable[str]) -> str:
     return f"similar names: {', '.join(matches)}" if matches else "the files have none"
 
 
+def late_begin(begin_s: float, horizon_s: float, first_ms: int, stays: bool) -> str:
+    """Describe a demand of which no vehicle departs in the `horizon_s` from `begin_s`.
+
+    `first_ms`: time of the first departure. `stays`: whether the episode begins at `begin_s`
+    nevertheless, instead of at the first departure.
+    """
+    none = f"no vehicle departs in the {horizon_s:g} s from {begin_s:g} s"
+    if stays:
+        return f"{none}, but from {first_ms // 1000} s: change horizon_s, or begin in the .sumocfg"
+    return f"the demand begins at {first_ms // 1000} s, as {none}"
+
+
 def _or(words: Iterable[str]) -> str:
     return "".join(f" or {word}" for word in words)
 

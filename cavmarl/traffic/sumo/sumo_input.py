@@ -8,8 +8,8 @@ from __future__ import annotations
 import gzip
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -18,13 +18,16 @@ from xml.etree.ElementTree import Element, ParseError, tostring
 import defusedxml.ElementTree
 from defusedxml.common import DefusedXmlException
 
-from cavmarl.core.errors import ConfigError, SumoError, require
+from cavmarl.core.errors import ConfigError, DemandError, SumoError, require
 from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.roads.sumo_net.sumo_options import files_of, known_options, read_options
 from cavmarl.roads.sumo_net.xml_source import declared_encoding, read_bytes, read_tree
-from cavmarl.traffic.demand.element import DemandReport, parse_time_ms
+from cavmarl.traffic.demand.element import DemandReport, late_begin, parse_time_ms
+from cavmarl.traffic.demand.element import Element as DemandElement
 from cavmarl.traffic.demand.sumo_config import tell_ignored
+from cavmarl.traffic.demand.xml_files import read_elements
 
+_BEGINS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # attribute of the begin
 # Kinds of options that are passed to SUMO.
 _PASSED = ("read", "traffic", "beyond")
 # A file without these words makes SUMO write nothing. A character reference may hide them.
@@ -76,6 +79,31 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
                 ".sumocfg alone"
             )
     return SumoInput(tuple(routes), tuple(additional))
+
+
+def begun(given: SumoInput, horizon_s: float) -> SumoInput:
+    """Return an input with a begin at which vehicles depart within an episode; see `DemandFile`.
+
+    Files that cannot be read are left to SUMO.
+    """
+    firsts: list[tuple[int, str]] = []
+    begin_ms = round(1000.0 * given.begin_s)
+
+    def take(element: DemandElement) -> None:
+        if element.name in _BEGINS:
+            time_ms = parse_time_ms(element.attrs.get(_BEGINS[element.name], "0"))
+            firsts.append((begin_ms if time_ms is None else time_ms, element.place))
+
+    with suppress(DemandError):
+        for path in (*given.route_files, *given.additional_files):
+            read_elements(path, DemandReport(), take)
+    first_ms, place = min(firsts, default=(begin_ms, ""))
+    if first_ms < begin_ms + 1000.0 * horizon_s:
+        return given
+    report = DemandReport()
+    report.tolerate(late_begin(given.begin_s, horizon_s, first_ms, given.has_begin), place)
+    begin_s = given.begin_s if given.has_begin else float(first_ms // 1000)
+    return replace(given, begin_s=begin_s, tolerated=(*given.tolerated, *report.lines()))
 
 
 def without_outputs(path: Path, folder: Path) -> Path:

@@ -14,6 +14,7 @@ from cavmarl.core.errors import CapacityError, DemandError, RouteError
 from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import DemandFile, read_demand
+from cavmarl.traffic.sumo.sumo_input import begun, read_input
 from tests.traffic.demand.conftest import sumo_binary
 
 CARS = "".join(
@@ -158,3 +159,49 @@ def test_two_configurations_are_refused(read: Read, town: RoadNetwork, tmp_path:
     read("")
     with pytest.raises(DemandError, match="is the second SUMO configuration"):
         read_demand([tmp_path / "x.cfg", tmp_path / "x.cfg"], town)
+
+
+LATE = '<flow id="f" begin="25200" end="25260" number="6" from="AB" to="BC"/>'
+
+
+def test_a_demand_of_later_begins_with_its_first_departure(read: Read) -> None:
+    file = read("", LATE).begun(60.0)
+    assert (file.begin_ms, len(file.draw(0, 25260.0))) == (25_200_000, 6)
+    ((what, tally),) = file.report.tolerated.items()
+    assert what == "the demand begins at 25200 s, as no vehicle departs in the 60 s from 0 s"
+    assert tally.first.endswith("x.rou.xml, line 1")
+    assert read("", LATE).begun(25300.0).begin_ms == 0, "a vehicle departs within the horizon"
+    random = LATE.replace('number="6"', 'period="exp(0.1)"')
+    assert read("", random).begun(60.0).begin_ms == 25_200_000
+
+
+@pytest.mark.parametrize("option", ['<begin value="0"/>', '<end value="60"/>'])
+def test_a_demand_without_departures_is_told(read: Read, option: str) -> None:
+    file = read(option, LATE).begun(60.0)
+    assert file.begin_ms == 0
+    (what,) = file.report.tolerated
+    assert what.startswith("no vehicle departs in the 60 s from 0 s, but from 25200 s: change")
+
+
+def test_a_begin_of_the_configuration_is_kept(read: Read) -> None:
+    file = read('<begin value="7:0:10"/>', LATE).begun(60.0)
+    assert file.begin_ms == 25_210_000
+    assert not file.report.tolerated
+
+
+@pytest.mark.parametrize(
+    ("option", "begin_s", "words"),
+    [
+        ("", 25_200.0, "the demand begins at 25200 s, as no vehicle"),
+        ('<begin value="0"/>', 0.0, "no vehicle departs in the 60 s from 0 s, but from 25200 s"),
+        ('<begin value="25190"/>', 25_190.0, None),
+    ],
+)
+def test_sumo_begins_with_the_first_departure_too(
+    read: Read, tmp_path: Path, option: str, begin_s: float, words: str | None
+) -> None:
+    read(option, LATE)
+    given = begun(read_input([tmp_path / "x.cfg"]), 60.0)
+    assert given.begin_s == begin_s
+    assert [words in line for line in given.tolerated if words] == ([True] if words else [])
+    assert words or not given.tolerated
