@@ -114,13 +114,22 @@ Workers = Annotated[
     about("Short form of --backend processes:N; 0 means local.", metavar="N", panel=RUN),
 ]
 Environment = Annotated[
-    str, typer.Argument(metavar="ENV", help="Environment: its name, its folder, or a map file.")
+    str,
+    typer.Argument(
+        metavar="ENV", help="Environment: its name, its folder, a map file or a .sumocfg."
+    ),
 ]
 OptionalEnvironment = Annotated[
-    str, typer.Argument(metavar="[ENV]", help="Environment: its name, its folder, or a map file.")
+    str,
+    typer.Argument(
+        metavar="[ENV]", help="Environment: its name, its folder, a map file or a .sumocfg."
+    ),
 ]
 MapName = Annotated[
-    str, typer.Argument(metavar="MAP", help="Map file, or the name or folder of an environment.")
+    str,
+    typer.Argument(
+        metavar="MAP", help="Map file, .sumocfg, or the name or folder of an environment."
+    ),
 ]
 PolicyName = Annotated[
     str,

@@ -70,7 +70,10 @@ def run(
     env: Annotated[
         str,
         about(
-            "Environment: its name, its folder, or a map file.", "--map", metavar="ENV", panel=WORLD
+            "Environment: its name, its folder, a map file or a .sumocfg.",
+            "--map",
+            metavar="ENV",
+            panel=WORLD,
         ),
     ] = "grid4x4",
     place: Annotated[

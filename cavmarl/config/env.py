@@ -32,8 +32,9 @@ class MapConfig(Section, key="map"):
 
     Attributes:
         source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
-            the eclipse-sumo wheel. Or a list of map files, or a folder of them; the seed then draws
-            a map for each episode of each world.
+            the eclipse-sumo wheel. A `.sumocfg` stands for its network and signal programs. Or a
+            list of map files, or a folder of them; the seed then draws a map for each episode of
+            each world.
         programs: additional files with signal programs, named like `source`. If a signal has
             several programs, the last one runs.
         program: the program of each signal named here, whatever was loaded; may be `off`.

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from cavmarl.config.env import BY_MAP, EnvConfig, MapConfig
+from cavmarl.config.population import PopulationConfig
 from cavmarl.config.scenario import path_of_code
+from cavmarl.config.traffic import TrafficConfig
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import (
     CavmarlError,
@@ -26,6 +28,7 @@ from cavmarl.core.errors import (
     UnknownEnvironmentError,
     require,
 )
+from cavmarl.core.xml_root import SUMO_CONFIG_SUFFIX, is_sumo_config
 
 MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
 
@@ -79,7 +82,8 @@ def find_entry(env: str | Path) -> Path:
     """Return the entry folder or the map file that `env` means.
 
     Args:
-        env: a name from `entries()`, a folder with an `env.yaml`, or a map file.
+        env: a name from `entries()`, a folder with an `env.yaml`, a map file, or a configuration of
+            SUMO.
 
     Raises:
         UnknownEnvironmentError: nothing has that name; the message lists all names.
@@ -95,9 +99,10 @@ def find_entry(env: str | Path) -> Path:
     if isfile(path / "env.yaml"):  # unlike Path.is_file, isfile accepts names that no file can have
         return path
     if isfile(path):
-        if not path.name.endswith(MAP_SUFFIXES):
+        if not path.name.endswith(MAP_SUFFIXES) and not is_sumo_config(path):
             raise UnknownEnvironmentError(
-                f"{path}: not a map file; the name must end in {' or '.join(MAP_SUFFIXES)}"
+                f"{path}: not a map file; the name must end in {' or '.join(MAP_SUFFIXES)}, or its "
+                "root element must be the <configuration> of SUMO"
             )
         return path
     if isdir(path):
@@ -121,7 +126,8 @@ def load_config(
 
     Args:
         env: see `find_entry`. A map file gets a default environment, whose horizon depends on the
-            map: see `make_world`.
+            map: see `make_world`. A configuration of SUMO also sets `traffic.demand`, and no
+            background vehicles are generated.
         zones: sets `zones.count`.
         sensor_workers: sets `workers.sensors`.
         agents: sets `population.agents`.
@@ -146,9 +152,7 @@ def load_config(
         config = validate(EnvConfig, keys, where)
     else:
         base_dir, where = found.parent, str(found)
-        config = EnvConfig(
-            name=_map_name(found), map=MapConfig(source=found.name), horizon_s=BY_MAP
-        )
+        config = _config_of_file(found)
     keywords = {
         "zones.count": zones,
         "workers.sensors": sensor_workers,
@@ -174,6 +178,18 @@ def load_config(
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
         config = validate(EnvConfig, raw, f"{where}, overridden")
     return config, base_dir
+
+
+def _config_of_file(path: Path) -> EnvConfig:
+    """Return the default configuration of a map file, or of a configuration of SUMO."""
+    config = EnvConfig(name=_map_name(path), map=MapConfig(source=path.name), horizon_s=BY_MAP)
+    if not is_sumo_config(path):
+        return config
+    return dataclasses.replace(
+        config,
+        traffic=TrafficConfig(demand=(path.name,)),
+        population=PopulationConfig(background=0),
+    )
 
 
 def find_settings(what: str, name: str) -> Path:
@@ -360,7 +376,8 @@ def _advice(env: str | Path, known: Mapping[str, Path]) -> str:
 
 def _map_name(path: Path) -> str:
     """Return a map file's name without its suffix."""
-    ending = max((s for s in MAP_SUFFIXES if path.name.endswith(s)), key=len)
+    suffixes = (*MAP_SUFFIXES, SUMO_CONFIG_SUFFIX)
+    ending = max((s for s in suffixes if path.name.endswith(s)), key=len, default="")
     return path.name.removesuffix(ending)
 
 

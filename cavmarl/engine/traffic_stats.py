@@ -33,7 +33,7 @@ class TrafficStats:
     mean_speed_mps: float  # over the vehicles in the world now
     mean_trip_m: float  # over the arrived vehicles
     mean_trip_s: float  # over the arrived vehicles
-    # over the arrived vehicles, time in excess of the route at the speed of limits and driver
+    # over the arrived vehicles, time in excess of the route at the speed of limit, driver and type
     mean_delay_s: float
 
 

@@ -21,7 +21,10 @@ def describe_world(
     demand: DemandFile | SumoDemand | None,
     partition: ZonePartition,
 ) -> dict[str, Any]:
-    """Return the configuration, and the hashes of the roads, demand, zones and kernels."""
+    """Return the configuration, and the hashes of the roads, demand, zones and kernels.
+
+    `demand_tolerated` lists what was left out or replaced in the demand, with counts.
+    """
     resolved = asdict(config)
     text = json.dumps(resolved, sort_keys=True)
     return {
@@ -33,6 +36,7 @@ def describe_world(
         "map_source_sha256": network.source_hash,
         "map_content_sha256": network.content_hash,
         "demand_content_sha256": None if demand is None else demand.content_hash,
+        "demand_tolerated": [] if demand is None else list(demand.tolerated),
         "sumo": demand.version if isinstance(demand, SumoDemand) else None,
         "kernels": sources_digest(),
         "zones": partition.count,

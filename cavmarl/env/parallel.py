@@ -44,7 +44,7 @@ def parallel_env(
     """Make a PettingZoo parallel environment.
 
     Args:
-        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        env: name of an entry of `envs/`, a folder with an env.yaml, a map file, or a .sumocfg.
         lenient: for libraries that act for absent agents or beyond the bounds. Values are clipped,
             actions of absent agents are ignored, and a missing action repeats the agent's last one,
             or 0. Sets action.out_of_range, .missing_action, .late_actions; traffic_stats() counts.

@@ -48,7 +48,7 @@ def make_vec(
     """Make `num_envs` worlds of one environment that are stepped together.
 
     Args:
-        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        env: name of an entry of `envs/`, a folder with an env.yaml, a map file, or a .sumocfg.
         num_envs: number of worlds.
         autoreset_mode: when a world begins its next episode; see `CavVectorEnv`.
         copy: False returns observations without a copy; see `CavVectorEnv`.

@@ -70,7 +70,7 @@ def start_worlds(
     """Make the worlds that the arguments describe, after a check of all arguments.
 
     Args:
-        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        env: name of an entry of `envs/`, a folder with an env.yaml, a map file, or a .sumocfg.
         num_worlds: number of worlds.
         in_next_step: whether worlds reset in the next step; see `SteppedWorlds`.
         render_modes: allowed render modes.
@@ -103,4 +103,5 @@ def start_worlds(
     check_rendering(config, given.get("render_mode"), backend, render_modes)
     check_recording(config, given.get("record"), backend)
     world = make_world(config, base_dir)
+    world.tell_tolerated()
     return make_worlds(world, base_dir, num_worlds, backend, in_next_step)

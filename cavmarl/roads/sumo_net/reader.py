@@ -50,7 +50,7 @@ FORK_WATCHED_M = 5.0  # after a junction, drivers that turn off watch rears up t
 MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the squared length
 MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that changes this limit
 _NAMED = 5  # maximum number of changed lanes that are named
-_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
+_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr", ".sumocfg")
 
 
 def map_name(path: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +65,12 @@ def vehicle_class(element: Element) -> str:
     return name
 
 
-def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | None:
+def vtype_record(
+    element: Element, report: DemandReport, defaults: Mapping[str, str] | None = None
+) -> NDArray[np.void] | None:
     """Return VTYPE () of a <vType>; None for a class that does not use roads.
+
+    `defaults`: attributes of types without their own.
 
     Raises DemandError: a value is impossible.
     """
@@ -74,6 +79,10 @@ def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | N
         if child.name.startswith(_MODEL_PREFIX):
             attrs = {**child.attrs, **attrs}
             attrs.setdefault("carFollowModel", child.name.removeprefix(_MODEL_PREFIX))
+    for key, value in (defaults or {}).items():
+        # A distribution of speed factors has its own deviation.
+        if key != "speedDev" or not _SPEED_FACTOR.fullmatch(attrs.get("speedFactor", "").strip()):
+            attrs.setdefault(key, value)
     element = Element(element.name, attrs, element.path, element.line, element.children)
     name = vehicle_class(element)
     if name in NO_ROAD_CLASSES:
@@ -168,13 +177,19 @@ class TypeTable:
         names: id by row.
     """
 
-    def __init__(self, named: dict[str, dict[str, Element]], report: DemandReport) -> None:
+    def __init__(
+        self,
+        named: dict[str, dict[str, Element]],
+        report: DemandReport,
+        defaults: Mapping[str, str],  # attributes of types without their own
+    ) -> None:
         self.names: list[str] = []
         self._types = dict(named.get("vType", {}))
         self._distributions = named.get("vTypeDistribution", {})
         self._rows: list[NDArray[np.void]] = []
         self._row: dict[str, int] = {}
         self._report = report
+        self._defaults = defaults
         # Invalid types are refused even if no vehicle uses them.
         for name, element in self._types.items():
             self._resolve(name, element)
@@ -208,7 +223,7 @@ class TypeTable:
 
     def _resolve(self, name: str, element: Element) -> int:
         if name not in self._row:
-            record = vtype_record(element, self._report)
+            record = vtype_record(element, self._report, self._defaults)
             self._row[name] = -1 if record is None else len(self._rows)
             if record is not None:
                 self._rows.append(record)

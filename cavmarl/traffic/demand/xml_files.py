@@ -111,12 +111,14 @@ class _Handler(ContentHandler):
             )
 
     def _skip(self, element: Element) -> None:
+        self._skipping = self._depth
+        if element.name in _PROGRAMS and self._including[-1] in self._report.program_files:
+            return
         known = element.name in _SKIPPED
         what = f"<{element.name}> is not read" if known else f"unknown element <{element.name}>"
         if element.name in _PROGRAMS:
             what += " as demand (signal programs: `map.programs`)"
         self._report.tolerate(what, element.place)
-        self._skipping = self._depth
 
     def _include(self, element: Element) -> None:
         path = self._path.parent / element.text("href")

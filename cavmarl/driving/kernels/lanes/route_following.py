@@ -90,6 +90,13 @@ def next_step_of_plan(
     return -1, way, -1
 
 
+@inlined_kernel
+def free_speed(lane: np.void, kind: np.void, speed_factor: float) -> float:
+    """Return the speed in m/s of a vehicle alone on a LANE, by its VTYPE and speed factor."""
+    limit = min(lane["speed_mps"], kind["desired_max_speed"])
+    return float(min(limit * speed_factor, kind["max_speed"]))
+
+
 @kernel
 def route_time_s(roads: RoadArrays, travel: TripTables, row: np.void, begin_s: float) -> float:
     """Return the time in s after which a trip counts as too long.
