@@ -59,8 +59,8 @@ class ScenarioRun:
     agents: int  # number of agents
     background: int  # number of vehicles other than agents and actors
     # `passed`: all agents reached their goals without a collision; `collided`, `off road` or
-    # `stuck`: the worst verdict of an agent; `actors collided`: two actors touched each other, so
-    # the scene was not as intended
+    # `stuck`: the worst verdict of an agent; `actors collided`: two actors touched each other, and
+    # no agent collided, so the scene was not as intended
     verdict: str
     verdicts: tuple[str, ...]  # verdict of each agent, the agent in the conflict first
     clash: str  # the first contact of two actors, with its time; empty: none
