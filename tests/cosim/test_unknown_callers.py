@@ -68,10 +68,10 @@ def oversized() -> bytes:
 @pytest.mark.parametrize(
     ("raw", "match"),
     [
-        (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" + bytes(40), "begins no frame"),
-        (hello_in(2), "a frame of version 2, this is 1: install the same version"),
-        (oversized(), "bytes is none"),
-        (hello_in(1)[:-3] + b"\xff\xff\xff", "not what was sent"),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" + bytes(40), "does not begin a frame"),
+        (hello_in(2), "a frame has version 2, this end has 1: install the same version"),
+        (oversized(), "bytes is too large"),
+        (hello_in(1)[:-3] + b"\xff\xff\xff", "does not match its checksum"),
     ],
     ids=["another protocol", "another version", "too large", "damaged"],
 )
@@ -154,7 +154,7 @@ def test_without_descriptors_the_oldest_caller_is_dropped(address: Path) -> None
     ("speak", "match"),
     [
         (lambda wire: wire.send(Say.HELLO, 0, payload_of(Hello("again", []))), "sent HELLO"),
-        (lambda wire: os.write(wire.fileno(), b"garbage " * 20), "begins no frame"),
+        (lambda wire: os.write(wire.fileno(), b"garbage " * 20), "does not begin a frame"),
         (lambda wire: wire.send(Say.CONTROL, 0, {"frame": "x"}), "not a Control"),
         (lambda wire: wire.send(Say.CONTROL, 0, None), "not a Control"),
         (lambda wire: wire.send(Say.CONTROL, 0, {"frame": 0, "controls": {}, "more": 1}), "more"),

@@ -25,15 +25,15 @@ class TrafficComparison:
     """Result of the comparison."""
 
     map_name: str  # the map's name
-    seconds: int  # how long both ran
+    seconds: int  # duration of both runs
     dt_s: float  # step length of both
-    seed: int  # of both
+    seed: int  # seed of both
     ours: TrafficRun  # our run
     sumo: TrafficRun  # SUMO's
-    edge_ids: tuple[str, ...]  # of the map, by the rows that `edge_minutes` name
+    edge_ids: tuple[str, ...]  # ids of the map's edges, by EDGE row
     # parts of the demand that were left out or approximated, with counts
     tolerated: tuple[str, ...] = ()
-    sumo_others: tuple[TrafficFigures, ...] = ()  # SUMO's with further seeds, contacts not counted
+    sumo_others: tuple[TrafficFigures, ...] = ()  # SUMO with further seeds, without contacts
 
     def ratio(self, figure: str) -> float | None:
         """Return our value over SUMO's; None if SUMO's is zero or a value is missing."""
