@@ -20,6 +20,7 @@ from typer.core import TyperCommand
 from cavmarl.bench.harness import check_positive
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.extensions import import_plugins
 from cavmarl.core.seeds import check_seed
 
 if TYPE_CHECKING:
@@ -57,6 +58,12 @@ def check_bound(value: float | None) -> float | None:
     """Return the value of `--at-least`; raise ConfigError unless it is positive."""
     check_positive("--at-least", value)
     return value
+
+
+def _import_all(modules: list[str] | None) -> list[str] | None:
+    """Import the modules before any other option uses what they register."""
+    import_plugins(modules or ())
+    return modules
 
 
 # Groups of options in the help.
@@ -168,6 +175,17 @@ Zones = Annotated[
         panel=WORLD,
     ),
 ]
+Imports = Annotated[
+    list[str] | None,
+    about(
+        "Import this module first, for terms, sensors, driver models and backends of your own. "
+        "Repeat it for more modules.",
+        "--import",
+        metavar="MODULE",
+        callback=_import_all,
+        panel=WORLD,
+    ),
+]
 Settings = Annotated[
     list[str] | None,
     about(
@@ -238,12 +256,12 @@ def recorded(path: Path | None, also: str) -> RecordOptions | None:
 def with_world(*names: str) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
     """Return a decorator for commands that take a `world: WorldSpec`.
 
-    The command line gets the options from which the WorldSpec is made instead: ENV and the options
-    called `names`, by default all of them. A parameter of the function with the name of such an
-    option replaces that option, and the function receives its value, too.
+    The command line gets the options from which the WorldSpec is made instead: ENV, --import and
+    the options called `names`, by default all of them. A parameter of the function with the name
+    of such an option replaces that option, and the function receives its value, too.
     """
     chosen = names or ("agents", "background", "seed", "settings", "sensors_of")
-    return partial(_with_world, ("env", *chosen))
+    return partial(_with_world, ("env", *chosen, "imports"))
 
 
 def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callable[..., Made]:
@@ -256,6 +274,7 @@ def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callabl
         "background": (Background, None),
         "settings": (Settings, None),
         "sensors_of": (SensorsOf, None),
+        "imports": (Imports, None),
     }
     wanted = {
         name: Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
@@ -268,9 +287,10 @@ def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callabl
 
     @wraps(command)
     def program(**options: Any) -> Made:
-        keys = {name: options[name] for name in names if name != "settings"}
+        keys = {name: options[name] for name in names if name not in ("settings", "imports")}
         env = keys.pop("env") or ""
-        spec = WorldSpec.of(env, overrides=parse_settings(options["settings"]), **keys)
+        overrides = parse_settings(options["settings"], options["imports"])
+        spec = WorldSpec.of(env, overrides=overrides, **keys)
         return command(spec, **{name: options[name] for name in own})
 
     program.__annotations__ = {name: one.annotation for name, one in wanted.items()}
@@ -278,8 +298,10 @@ def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callabl
     return program
 
 
-def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
-    """Return overrides from texts like `sensors.lidar.rays=32`.
+def parse_settings(
+    settings: Sequence[str] | None, imports: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """Return overrides from texts like `sensors.lidar.rays=32`, with the imports as `plugins`.
 
     A value that is not JSON is text. Raises ConfigError if a text is not KEY=VALUE, has no value,
     or names a key that another text has named.
@@ -299,6 +321,10 @@ def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
             overrides[key] = text
         if overrides[key] == "":
             raise ConfigError(f"--set {key}=: the value is missing; write KEY=VALUE")
+    if imports:
+        if "plugins" in overrides:
+            raise ConfigError("--set plugins with --import: name all modules with --import")
+        overrides["plugins"] = list(imports)
     return overrides
 
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from cavmarl.cli.output import (
     OUTPUT,
     PAGE,
+    Imports,
     JsonPath,
     about,
     about_file,
@@ -54,6 +55,7 @@ def replay(
     token: WebToken = "",
     watch_token: WatchToken = "",
     watch_only: Annotated[bool, flag("Browsers may not pause or search.", panel=PAGE)] = False,
+    imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
     """Show a recording from above, or export it."""

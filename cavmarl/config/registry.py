@@ -26,6 +26,7 @@ from cavmarl.core.errors import (
     UnknownEnvironmentError,
     require,
 )
+from cavmarl.core.extensions import load_plugins
 
 MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
 
@@ -128,14 +129,17 @@ def load_config(
         background: sets `population.background`.
         max_cycles: sets `horizon_s` to this number of steps.
         overrides: dotted key → value, for all other keys: `{"sensors.lidar.rays": 64}`. As in an
-            env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file.
+            env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file. `plugins` are
+            added to those of the environment.
 
     Raises:
         UnknownEnvironmentError: nothing has that name.
-        ConfigError: a key, a type or a value is not allowed; the message suggests the nearest one.
+        ConfigError: a key, a type or a value is not allowed, or a plugin cannot be imported; the
+            message suggests the nearest one.
     """
     from cavmarl.config.io import read_yaml, validate
 
+    load_plugins_of(env, overrides)
     found = find_entry(env)
     if found.is_dir():
         base_dir, where = found, str(found / "env.yaml")
@@ -167,6 +171,9 @@ def load_config(
     values |= {key: value for key, value in given.items() if key != "horizon_s"}
     if values or max_cycles is not None:
         raw = dataclasses.asdict(config)
+        if isinstance(plugins := values.get("plugins"), list | tuple):
+            more = [name for name in plugins if name not in config.plugins]
+            values["plugins"] = [*config.plugins, *more]
         for key, value in values.items():
             is_named = key == "rig" and isinstance(value, str)
             shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
@@ -174,6 +181,27 @@ def load_config(
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
         config = validate(EnvConfig, raw, f"{where}, overridden")
     return config, base_dir
+
+
+def load_plugins_of(env: str | Path, overrides: Mapping[str, object] | None = None) -> None:
+    """Import the plugins that the env.yaml of an environment and overrides name.
+
+    Raises:
+        UnknownEnvironmentError: nothing has that name.
+        ConfigError: env.yaml cannot be read, or a plugin cannot be imported.
+    """
+    from cavmarl.config.io import read_yaml
+
+    file = find_entry(env) / "env.yaml"
+    named = {str(file): read_yaml(file) if isfile(file) else None, "overrides": overrides}
+    for where, keys in named.items():
+        plugins = keys.get("plugins") if isinstance(keys, Mapping) else None
+        if not isinstance(plugins, list | tuple):
+            continue  # `validate` reports a value of another type
+        try:
+            load_plugins(name for name in plugins if isinstance(name, str))
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
 
 
 def find_settings(what: str, name: str) -> Path:

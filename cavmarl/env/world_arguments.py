@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
 from cavmarl.config.driver_form import with_sensors_of
-from cavmarl.config.registry import load_config
+from cavmarl.config.registry import load_config, load_plugins_of
 from cavmarl.config.removed_keys import removed_argument
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.seeds import check_seed
@@ -87,9 +87,9 @@ def start_worlds(
         raise TypeError(
             f"unexpected keyword argument {unknown[0]!r}: must be one of {', '.join(known)}"
         )
-    backend = find_backend(given.get("backend"), given.get("workers"), given.get("nodes"))
     if (seed := given.get("seed")) is not None:
         check_seed(seed)
+    load_plugins_of(env, given.get("overrides"))  # the driver may have their sensors
     config, base_dir = load_config(
         env,
         zones=given.get("zones"),
@@ -99,6 +99,7 @@ def start_worlds(
         max_cycles=given.get("max_cycles"),
         overrides=with_sensors_of(given.get("overrides"), given.get("sensors_of")),
     )
+    backend = find_backend(given.get("backend"), given.get("workers"), given.get("nodes"))
     check_agents(config)
     check_rendering(config, given.get("render_mode"), backend, render_modes)
     check_recording(config, given.get("record"), backend)
