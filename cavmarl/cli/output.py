@@ -132,7 +132,8 @@ MapName = Annotated[
 PolicyName = Annotated[
     str,
     about(
-        "Driver of the agents: a name from `cavmarl list`, a .py file or a folder.",
+        "Driver of the agents: a name from `cavmarl list`, a folder, a .py file, or a model file "
+        "(.zip of stable-baselines3, .pt of TorchScript, .onnx).",
         "--policy",
         "-p",
         metavar="POLICY",
@@ -141,8 +142,9 @@ PolicyName = Annotated[
 Policies = Annotated[
     list[str] | None,
     about(
-        "Driver to evaluate: a name from `cavmarl list`, a .py file or a folder. Repeat the option "
-        "to compare drivers with the first one [default: idm].",
+        "Driver to evaluate: a name from `cavmarl list`, a folder, a .py file, or a model file "
+        "(.zip of stable-baselines3, .pt of TorchScript, .onnx). Repeat the option to compare "
+        "drivers with the first one [default: idm].",
         "--policy",
         "-p",
         metavar="POLICY",

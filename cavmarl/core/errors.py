@@ -38,6 +38,9 @@ A message says what is wrong, where, and what to do.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 
@@ -273,9 +276,31 @@ class RegisteredFunctionError(CavmarlError):
 
 def missing(module: str | None, extra: str) -> MissingExtraError:
     """Return the error for a `module` that cannot be imported; it names the `extra` to install."""
-    return MissingExtraError(
-        f"'{module}' is not installed: pip install '.[{extra}]' in a checkout of cavmarl"
-    )
+    return MissingExtraError(f"'{module}' is not installed: {_installation([extra])}")
+
+
+def require_all(needed: Mapping[str, str]) -> None:
+    """Check optional modules without importing them; `needed`: module → extra.
+
+    Raises:
+        MissingExtraError: names all modules that are not installed, and one command for them.
+    """
+    absent = {module: extra for module, extra in needed.items() if find_spec(module) is None}
+    if absent:
+        names = " and ".join(f"'{module}'" for module in absent)
+        verb = "is" if len(absent) == 1 else "are"
+        extras = sorted(set(absent.values()))
+        raise MissingExtraError(f"{names} {verb} not installed: {_installation(extras)}")
+
+
+def _installation(extras: Sequence[str]) -> str:
+    """Return the command that adds extras to this installation: of a checkout, or of a wheel."""
+    checkout = Path(__file__).resolve().parents[2]
+    wanted = f"[{','.join(extras)}]"
+    if not (checkout / "pyproject.toml").is_file():
+        return f"pip install 'cavmarl{wanted}'"
+    place = "." if Path.cwd() == checkout else str(checkout)
+    return f"pip install -e '{place}{wanted}'"
 
 
 def require(module: str, extra: str) -> ModuleType:
