@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -18,8 +18,10 @@ from rich.text import Text
 from typer.core import TyperCommand
 
 from cavmarl.bench.harness import check_positive
+from cavmarl.config.driver_names import ONNX_FILE, SB3_FILE, TORCH_SCRIPT_FILES, drivers_in
+from cavmarl.config.registry import SUMO_PREFIX, is_converted, load_config
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, require_all
 from cavmarl.core.extensions import import_plugins
 from cavmarl.core.seeds import check_seed
 
@@ -65,6 +67,18 @@ def _import_all(modules: list[str] | None) -> list[str] | None:
     import_plugins(modules or ())
     return modules
 
+
+# Optional modules of outputs, with their extras.
+PAGE_EXTRAS = {"matplotlib": "report", "jinja2": "report"}
+WINDOW_EXTRAS = {"pygame": "render"}
+VIDEO_EXTRAS = WINDOW_EXTRAS | {"imageio_ffmpeg": "render"}
+WEB_EXTRAS = dict.fromkeys(("starlette", "uvicorn", "httptools", "websockets"), "viewer")
+RECORD_EXTRAS = {"pyarrow": "record"}
+DRIVER_EXTRAS: dict[str, dict[str, str]] = {  # by the suffix of a model file
+    SB3_FILE: {"stable_baselines3": "train", "torch": "train"},
+    **{suffix: {"torch": "train"} for suffix in TORCH_SCRIPT_FILES},
+    ONNX_FILE: {"onnxruntime": "onnx"},
+}
 
 # Groups of options in the help.
 WORLD, RUN, OUTPUT, PAGE, SERVICE = "World", "Where it runs", "Output", "Page", "Service"
@@ -253,6 +267,30 @@ def recorded(path: Path | None, also: str) -> RecordOptions | None:
     from cavmarl.recordings.extra_tables import RecordOptions
 
     return RecordOptions(path, include)
+
+
+def check_extras(
+    world: WorldSpec, policies: Iterable[str], *needed: tuple[object, Mapping[str, str]]
+) -> None:
+    """Raise one MissingExtraError for all modules that a command lacks, before it does any work.
+
+    Args:
+        world: the world to make, which may need SUMO.
+        policies: drivers, which may need the library of a model file.
+        needed: values of options, with the modules and extras that they need if they are set.
+    """
+    config, _ = load_config(world.env, **world.keywords)
+    modules: dict[str, str] = {}
+    if any(name.startswith(SUMO_PREFIX) or is_converted(name) for name in config.map.sources):
+        modules["sumo"] = "sumo"
+    if config.traffic.source != "native":
+        modules["libsumo"] = "sumo"
+    for policy in policies:
+        for driver in drivers_in(policy):
+            modules |= DRIVER_EXTRAS.get(Path(driver).suffix, {})
+    for value, extras in needed:
+        modules |= extras if value else {}
+    require_all(modules)
 
 
 def with_world(*names: str) -> Callable[[Callable[..., Made]], Callable[..., Made]]:

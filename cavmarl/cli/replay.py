@@ -13,6 +13,10 @@ from rich.console import Console
 from cavmarl.cli.output import (
     OUTPUT,
     PAGE,
+    RECORD_EXTRAS,
+    VIDEO_EXTRAS,
+    WEB_EXTRAS,
+    WINDOW_EXTRAS,
     Imports,
     JsonPath,
     about,
@@ -59,7 +63,15 @@ def replay(
     json_path: JsonPath = None,
 ) -> None:
     """Show a recording from above, or export it."""
-    from cavmarl.core.errors import ConfigError, RecordingError
+    from cavmarl.core.errors import ConfigError, RecordingError, require_all
+
+    shows = video is not None or not (web or fcd or csv or mcap)
+    require_all(
+        RECORD_EXTRAS
+        | (WEB_EXTRAS if web else {})
+        | (VIDEO_EXTRAS if video else WINDOW_EXTRAS if shows else {})
+        | ({"mcap": "record"} if mcap else {})
+    )
     from cavmarl.recordings.recording import Recording
     from cavmarl.recordings.recording_exports import EXPORTS
 

@@ -28,10 +28,11 @@ from cavmarl.core.errors import (
 )
 from cavmarl.core.extensions import load_plugins
 
-MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
+_NATIVE = (".net.xml", ".net.xml.gz")  # read as they are; SUMO's netconvert converts the others
+MAP_SUFFIXES = (*_NATIVE, ".osm", ".osm.gz", ".osm.xml", ".xodr")
 
 PACKAGE = Path(__file__).resolve().parents[1]
-_SUMO_PREFIX = "sumo:"
+SUMO_PREFIX = "sumo:"
 
 
 def places(kind: str) -> list[Path]:
@@ -260,6 +261,11 @@ def _find_rig(name: str, base_dir: Path) -> Path:
     return rigs[name]
 
 
+def is_converted(source: str) -> bool:
+    """Return whether a source in `map.source` is a map file that netconvert converts."""
+    return source.endswith(MAP_SUFFIXES) and not source.endswith(_NATIVE)
+
+
 def resolve_maps(config: EnvConfig, base_dir: Path) -> list[Path]:
     """Return the files of `map.source`; those of a folder are sorted by name.
 
@@ -290,7 +296,7 @@ def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
 
 
 def _maps_of(source: str, base_dir: Path) -> list[Path]:
-    if source.startswith(_SUMO_PREFIX) or not isdir(base_dir / source):
+    if source.startswith(SUMO_PREFIX) or not isdir(base_dir / source):
         return [_resolve("map.source", source, base_dir, MapError)]
     names = sorted(path.name for path in (base_dir / source).iterdir())
     maps = [base_dir / source / name for name in names if name.endswith(MAP_SUFFIXES)]
@@ -335,9 +341,9 @@ def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:
 
 
 def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:
-    if source.startswith(_SUMO_PREFIX):
+    if source.startswith(SUMO_PREFIX):
         home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
-        path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
+        path = (home / source.removeprefix(SUMO_PREFIX)).resolve()
         if not path.is_relative_to(home):
             raise failure(f"{key} = {source!r}: must be inside of the eclipse-sumo wheel")
     else:

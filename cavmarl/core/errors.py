@@ -3,6 +3,7 @@
     CavmarlError
     ├── ConfigError            an invalid key, value, combination or division
     │   ├── UnknownEnvironmentError   no entry, path or map has that name
+    │   ├── UnknownArgumentError      a keyword argument that does not exist
     │   └── ScenarioError         a map without a place for a scenario
     ├── MapError               a map that cannot be read, built or driven on
     │   └── RouteError            there is no route between two places
@@ -58,6 +59,10 @@ class ConfigError(CavmarlError):
 
 class UnknownEnvironmentError(ConfigError):
     """No environment, folder or map file has that name."""
+
+
+class UnknownArgumentError(ConfigError, TypeError):
+    """A keyword argument that does not exist."""
 
 
 class ScenarioError(ConfigError):
