@@ -111,6 +111,8 @@ class EnvConfig(Section, key=""):
         version: increases whenever published results change.
         rig: sensors that are mounted on every agent's vehicle, by name; see
             docs/reference/sensors.md.
+        plugins: modules with terms, sensors, driver models and backends of users
+            (docs/guides/extending.md). They are imported before the world is made.
         horizon_s: time after which an episode is truncated; 0: depends on the size of the map.
     """
 
@@ -130,6 +132,7 @@ class EnvConfig(Section, key=""):
     terms: TermsConfig = field(default_factory=TermsConfig)
     rig: Rig = field(default_factory=dict)
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
+    plugins: tuple[str, ...] = ()
     horizon_s: float = 60.0
 
     def __post_init__(self) -> None:

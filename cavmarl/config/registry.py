@@ -28,12 +28,14 @@ from cavmarl.core.errors import (
     UnknownEnvironmentError,
     require,
 )
+from cavmarl.core.extensions import load_plugins
 from cavmarl.core.xml_root import SUMO_CONFIG_SUFFIX, is_sumo_config
 
-MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
+_NATIVE = (".net.xml", ".net.xml.gz")  # read as they are; SUMO's netconvert converts the others
+MAP_SUFFIXES = (*_NATIVE, ".osm", ".osm.gz", ".osm.xml", ".xodr")
 
 PACKAGE = Path(__file__).resolve().parents[1]
-_SUMO_PREFIX = "sumo:"
+SUMO_PREFIX = "sumo:"
 
 
 def places(kind: str) -> list[Path]:
@@ -134,14 +136,17 @@ def load_config(
         background: sets `population.background`.
         max_cycles: sets `horizon_s` to this number of steps.
         overrides: dotted key → value, for all other keys: `{"sensors.lidar.rays": 64}`. As in an
-            env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file.
+            env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file. `plugins` are
+            added to those of the environment.
 
     Raises:
         UnknownEnvironmentError: nothing has that name.
-        ConfigError: a key, a type or a value is not allowed; the message suggests the nearest one.
+        ConfigError: a key, a type or a value is not allowed, or a plugin cannot be imported; the
+            message suggests the nearest one.
     """
     from cavmarl.config.io import read_yaml, validate
 
+    load_plugins_of(env, overrides)
     found = find_entry(env)
     if found.is_dir():
         base_dir, where = found, str(found / "env.yaml")
@@ -171,6 +176,9 @@ def load_config(
     values |= {key: value for key, value in given.items() if key != "horizon_s"}
     if values or max_cycles is not None:
         raw = dataclasses.asdict(config)
+        if isinstance(plugins := values.get("plugins"), list | tuple):
+            more = [name for name in plugins if name not in config.plugins]
+            values["plugins"] = [*config.plugins, *more]
         for key, value in values.items():
             is_named = key == "rig" and isinstance(value, str)
             shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
@@ -190,6 +198,27 @@ def _config_of_file(path: Path) -> EnvConfig:
         traffic=TrafficConfig(demand=(path.name,)),
         population=PopulationConfig(background=0),
     )
+
+
+def load_plugins_of(env: str | Path, overrides: Mapping[str, object] | None = None) -> None:
+    """Import the plugins that the env.yaml of an environment and overrides name.
+
+    Raises:
+        UnknownEnvironmentError: nothing has that name.
+        ConfigError: env.yaml cannot be read, or a plugin cannot be imported.
+    """
+    from cavmarl.config.io import read_yaml
+
+    file = find_entry(env) / "env.yaml"
+    named = {str(file): read_yaml(file) if isfile(file) else None, "overrides": overrides}
+    for where, keys in named.items():
+        plugins = keys.get("plugins") if isinstance(keys, Mapping) else None
+        if not isinstance(plugins, list | tuple):
+            continue  # `validate` reports a value of another type
+        try:
+            load_plugins(name for name in plugins if isinstance(name, str))
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
 
 
 def find_settings(what: str, name: str) -> Path:
@@ -248,6 +277,11 @@ def _find_rig(name: str, base_dir: Path) -> Path:
     return rigs[name]
 
 
+def is_converted(source: str) -> bool:
+    """Return whether a source in `map.source` is a map file that netconvert converts."""
+    return source.endswith(MAP_SUFFIXES) and not source.endswith(_NATIVE)
+
+
 def resolve_maps(config: EnvConfig, base_dir: Path) -> list[Path]:
     """Return the files of `map.source`; those of a folder are sorted by name.
 
@@ -278,7 +312,7 @@ def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
 
 
 def _maps_of(source: str, base_dir: Path) -> list[Path]:
-    if source.startswith(_SUMO_PREFIX) or not isdir(base_dir / source):
+    if source.startswith(SUMO_PREFIX) or not isdir(base_dir / source):
         return [_resolve("map.source", source, base_dir, MapError)]
     names = sorted(path.name for path in (base_dir / source).iterdir())
     maps = [base_dir / source / name for name in names if name.endswith(MAP_SUFFIXES)]
@@ -323,9 +357,9 @@ def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:
 
 
 def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:
-    if source.startswith(_SUMO_PREFIX):
+    if source.startswith(SUMO_PREFIX):
         home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
-        path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
+        path = (home / source.removeprefix(SUMO_PREFIX)).resolve()
         if not path.is_relative_to(home):
             raise failure(f"{key} = {source!r}: must be inside of the eclipse-sumo wheel")
     else:

@@ -9,6 +9,7 @@ from typing import Any
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import sources_digest
+from cavmarl.core.extensions import plugin_hashes
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
@@ -39,6 +40,7 @@ def describe_world(
         "demand_tolerated": [] if demand is None else list(demand.tolerated),
         "sumo": demand.version if isinstance(demand, SumoDemand) else None,
         "kernels": sources_digest(),
+        "plugins": plugin_hashes(config.registered, config.plugins),  # SHA-256 by module
         "zones": partition.count,
         "zones_content_sha256": partition.content_hash,
         "channel": asdict(config.v2x.channel)

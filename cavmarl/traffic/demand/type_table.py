@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.driving.driver_models import NEAREST_MODEL, model_code, model_names
+from cavmarl.driving.driver_models import NEAREST_MODEL, has_model, model_code, model_names
 from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.vehicle_types import (
     ALL_PERMISSIONS,
@@ -124,8 +124,8 @@ def _model(element: Element, report: DemandReport) -> int:
     name = element.attrs.get("carFollowModel", "Krauss").strip()
     # SUMO 0.x also wrote carFollowing-Krauss here.
     name = name.removeprefix(_MODEL_PREFIX)
-    known = (*model_names(), *NEAREST_MODEL)
-    if name not in known:
+    if name not in NEAREST_MODEL and not has_model(name):
+        known = (*model_names(), *NEAREST_MODEL)
         raise element.error(f"has the unknown carFollowModel '{name}'", near(name, known))
     nearest = NEAREST_MODEL.get(name, name)
     if nearest != name:
