@@ -194,7 +194,7 @@ def follow_plan(
 @kernel
 def _time_of(roads: RoadArrays, plan: NDArray[np.void], lane: int) -> float:
     """Return the time in s from the start of a lane to the end of a plan, without lane changes."""
-    total = 0.0
+    total: float = 0.0
     while True:
         step = plan[lane]
         if step["change"] > 0:
