@@ -178,7 +178,9 @@ def _print_build(console: Console, result: BuildResult) -> None:
             [row.kind, row.guessed, row.value, f"{row.used_for} of {row.edges}"]
             for row in result.defaults
         ]
-        console.print(grid(["kind of road", "missing", "default", "edges"], rows))
+        console.print(grid(["kind of road", "missing", "default", "used for"], rows))
+    for line in result.notes:
+        console.print(Text(f"note: {line}", style="yellow"))
     if result.heights is not None:
         _print_heights(console, result.heights)
 

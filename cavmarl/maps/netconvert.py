@@ -21,6 +21,7 @@ from typing import Any
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.notices import print_once
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument
@@ -32,9 +33,11 @@ from cavmarl.maps.netconvert_process import (
     run_netconvert,
     sumo_home,
 )
+from cavmarl.maps.opendrive_source import OpenDriveSource
 from cavmarl.maps.osm_roads import OsmRoads
 from cavmarl.maps.provenance import (
     NOT_STATED,
+    NOTE_SEPARATOR,
     OSM_ATTRIBUTION,
     OSM_LICENCE,
     RoadDefaults,
@@ -65,6 +68,10 @@ _INPUT = {"sumo": "--sumo-net-file", "osm": "--osm-files", "opendrive": "--opend
 _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.typ.xml"}
 _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
 
+_TOLERANT = "--ignore-errors"
+# Increase the number if a source is converted in another way, so that the cache converts it anew.
+_CONVERSION = "conversion 2"
+
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
 _FAR_M = 100_000.0  # from the origin; farther away, the projection distorts lengths
 
@@ -93,7 +100,8 @@ class BuildResult:
     # with `tolerant`, ignored errors of netconvert; the objects that they name were left out
     dropped: tuple[str, ...]
     provenance: dict[str, str]  # origin of the map, as written in its file
-    defaults: tuple[RoadDefaults, ...] = ()  # missing values of OSM from the type map
+    defaults: tuple[RoadDefaults, ...] = ()  # missing values, from the type map
+    notes: tuple[str, ...] = ()  # what the source contains and the network does not, with counts
     heights: HeightReport | None = None
     levels: int = 0  # lanes that cross on a bridge or in a tunnel, without `heights`
 
@@ -144,7 +152,7 @@ def build_network(
     kind = map_kind(source)
     chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *_centred(source, kind, origin), *options)
     if tolerant and chosen:
-        chosen += ("--ignore-errors",)
+        chosen += (_TOLERANT,)
     if target is None and not chosen and heights is None:
         read_network(source)
         return BuildResult(source, source, kind, (), {}, (), (), read_provenance(source))
@@ -165,6 +173,7 @@ def build_network(
         dropped=made.log.errors(),
         provenance=read_provenance(place),
         defaults=made.defaults,
+        notes=made.notes,
         heights=made.report,
         levels=made.levels,
     )
@@ -172,6 +181,8 @@ def build_network(
 
 def map_file(path: str | Path) -> Path:
     """Return the SUMO network of a map file: the file itself, or the result of netconvert.
+
+    What netconvert had to ignore or to guess is printed once per process.
 
     Raises MapError: see `build_network`.
     """
@@ -182,14 +193,20 @@ def map_file(path: str | Path) -> Path:
     if kind == "sumo":
         return path
     entry = _cache_entry(path, _OPTIONS[kind])
-    return entry if entry.exists() else build_network(path).path
+    if not entry.exists():
+        build_network(path)
+    told = read_provenance(entry)
+    for key in ("defaults", "notes"):
+        if key in told:
+            print_once(f"{path}: {key}: {told[key]}")
+    return entry
 
 
 def _cache_entry(
     source: Path, options: Sequence[str], heights: HeightOptions | None = None
 ) -> Path:
     require("sumo", "sumo")
-    words = [source_hash(source), version("eclipse-sumo"), *options]
+    words = [source_hash(source), version("eclipse-sumo"), _CONVERSION, *options]
     if heights is None:
         words.append("levels 4")  # of bridges and tunnels; the number is the algorithm's version
     else:
@@ -238,6 +255,7 @@ class _Build:
     told: Told
     log: BuildLog = field(default_factory=BuildLog)
     defaults: tuple[RoadDefaults, ...] = ()
+    notes: tuple[str, ...] = ()
     report: HeightReport | None = None
     levels: int = 0
 
@@ -252,7 +270,7 @@ class _Build:
             draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
             if self.options:
-                self.log = _convert(self.kind, self.source, draft, self.options, self.timeout_s)
+                self.log = self._convert(self._prepared(folder), draft)
             else:
                 draft.write_bytes(read_bytes(self.source))
             content = self._finished(draft)
@@ -260,6 +278,32 @@ class _Build:
             self.told(STAGES[3])
             _check_readable(self.source, draft, self.log)
             os.replace(draft, place)
+
+    def _prepared(self, folder: Path) -> Path:
+        """Return the file for netconvert: the source, or a copy of it in a form that it reads."""
+        if self.kind != "opendrive":
+            return self.source
+        roads = OpenDriveSource(self.source, tolerant=_TOLERANT in self.options)
+        self.defaults, self.notes = roads.defaults, roads.notes()
+        if not roads.changed:
+            return self.source
+        copy = folder / "source.xodr"
+        copy.write_bytes(roads.content())
+        return copy
+
+    def _convert(self, prepared: Path, draft: Path) -> BuildLog:
+        arguments = [_INPUT[self.kind], str(prepared), "-o", str(draft), *self.options]
+        if self.kind in _TYPE_MAP:
+            arguments += ["-t", str(sumo_home() / "data" / "typemap" / _TYPE_MAP[self.kind])]
+        cures = Cures(
+            f"crop the map (cavmarl map build {self.source} --bbox …) or allow more time "
+            f"(--timeout-s, or {TIME_LIMIT})",
+            "repair the source"
+            if _TOLERANT in self.options
+            else "repair the source, or drop its broken parts: "
+            f"cavmarl map build {self.source} --tolerant",
+        )
+        return run_netconvert(arguments, self.source, self.timeout_s, cures)
 
     def _finished(self, draft: Path) -> bytes:
         """Return the network with additions to netconvert's output: heights and origin."""
@@ -298,7 +342,11 @@ class _Build:
         if self.origin is not None:
             facts["origin"] = f"latitude {self.origin[0]!r}, longitude {self.origin[1]!r}"
         if self.defaults:
-            facts["defaults"] = defaults_text(self.defaults)
+            facts["defaults"] = defaults_text(
+                self.defaults, "edges" if self.kind == "osm" else "roads"
+            )
+        if self.notes:
+            facts["notes"] = NOTE_SEPARATOR.join(self.notes)
         if self.levels:
             facts["levels"] = f"{self.levels} crossings of lanes on bridges and in tunnels"
         if self.heights is not None and self.report is not None:
@@ -319,22 +367,6 @@ def _check_near(source: Path, document: NetDocument, origin: Origin | None) -> N
             f"--origin {origin[0]:g},{origin[1]:g}: {source} is more than {_FAR_M / 1e3:g} km "
             "away: give LAT,LON in this order, near the roads"
         )
-
-
-def _convert(
-    kind: MapKind, source: Path, draft: Path, options: Sequence[str], timeout_s: float | None
-) -> BuildLog:
-    arguments = [_INPUT[kind], str(source), "-o", str(draft), *options]
-    if kind in _TYPE_MAP:
-        arguments += ["-t", str(sumo_home() / "data" / "typemap" / _TYPE_MAP[kind])]
-    cures = Cures(
-        f"crop the map (cavmarl map build {source} --bbox …) or allow more time (--timeout-s, or "
-        f"{TIME_LIMIT})",
-        "repair the source"
-        if "--ignore-errors" in options
-        else f"repair the source, or drop its broken parts: cavmarl map build {source} --tolerant",
-    )
-    return run_netconvert(arguments, source, timeout_s, cures)
 
 
 def _check_readable(source: Path, draft: Path, log: BuildLog) -> None:
