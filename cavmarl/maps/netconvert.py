@@ -46,6 +46,7 @@ from cavmarl.maps.provenance import (
     read_provenance,
     road_defaults,
 )
+from cavmarl.maps.traffic_sides import NEAR_M, Side, sides_at
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 
@@ -68,7 +69,9 @@ _INPUT = {"sumo": "--sumo-net-file", "osm": "--osm-files", "opendrive": "--opend
 _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.typ.xml"}
 _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
 
+_ISOLATED = "Removed a road without junctions"  # begins a warning
 _TOLERANT = "--ignore-errors"
+_LEFT_HAND = "--lefthand"
 # Increase the number if a source is converted in another way, so that the cache converts it anew.
 _CONVERSION = "conversion 2"
 
@@ -115,6 +118,7 @@ def build_network(
     *,
     options: Sequence[str] = (),
     bbox: Box | None = None,
+    side: Side | None = None,
     origin: Origin | None = None,
     heights: HeightOptions | None = None,
     licences: tuple[str, str] = ("", ""),
@@ -132,6 +136,8 @@ def build_network(
         options: additional options for netconvert.
         bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
             OSM, otherwise metres in the source's own frame.
+        side: side of the road on which vehicles drive; None: OSM: that of the country, OpenDRIVE:
+            the `rule` of the roads. A SUMO network has its own.
         origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
             the roads, in UTM.
         heights: terrain models for the roads; nothing moves in the plane. Without them, the ground
@@ -142,10 +148,11 @@ def build_network(
         told: called with each of `STAGES` as it begins.
 
     Raises:
-        ConfigError: `bbox` is empty, or the origin is not on the earth or far from the map.
+        ConfigError: `bbox` is empty, the origin is not on the earth or far from the map, or the
+            source is a SUMO network and `side` is given.
         MapError: the source is broken, malicious or not a map; netconvert fails (its output is in
-            the message); the result has no drivable lane; the heights cannot be used; or the target
-            cannot be written.
+            the message); the result has no drivable lane; the heights cannot be used; the roads
+            have no common traffic side; or the target cannot be written.
         MissingExtraError: netconvert, or a package for heights and levels, is not installed.
     """
     source = Path(source)
@@ -153,11 +160,18 @@ def build_network(
     chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *_centred(source, kind, origin), *options)
     if tolerant and chosen:
         chosen += (_TOLERANT,)
+    if side is not None and kind == "sumo":
+        raise ConfigError(
+            f"--traffic-side {side}: {source} is a SUMO network, which has its own side "
+            "(lefthand of <net>): remove the option, or build the network from its source again"
+        )
     if target is None and not chosen and heights is None:
         read_network(source)
         return BuildResult(source, source, kind, (), {}, (), (), read_provenance(source))
     place = Path(target) if target else _cache_entry(source, chosen, heights)
-    made = _Build(source, kind, place, chosen, origin, heights, licences, timeout_s, told)
+    made = _Build(
+        source, kind, place, chosen, bbox, side, origin, heights, licences, timeout_s, told
+    )
     try:
         made.run()
     except OSError as error:
@@ -167,7 +181,7 @@ def build_network(
         path=place,
         source=source,
         kind=kind,
-        options=chosen,
+        options=made.options,
         warnings=made.log.warnings(),
         corrections=made.log.corrections(),
         dropped=made.log.errors(),
@@ -196,8 +210,8 @@ def map_file(path: str | Path) -> Path:
     if not entry.exists():
         build_network(path)
     told = read_provenance(entry)
-    for key in ("defaults", "notes"):
-        if key in told:
+    for key in ("traffic side", "defaults", "notes"):
+        if not told.get(key, "right").startswith("right"):
             print_once(f"{path}: {key}: {told[key]}")
     return entry
 
@@ -248,6 +262,8 @@ class _Build:
     kind: MapKind
     place: Path
     options: tuple[str, ...]
+    bbox: Box | None
+    side: Side | None
     origin: Origin | None
     heights: HeightOptions | None
     licences: tuple[str, str]
@@ -256,6 +272,8 @@ class _Build:
     log: BuildLog = field(default_factory=BuildLog)
     defaults: tuple[RoadDefaults, ...] = ()
     notes: tuple[str, ...] = ()
+    roads: OsmRoads | None = None  # of OSM
+    decided: str = ""  # the traffic side, and by what it was decided
     report: HeightReport | None = None
     levels: int = 0
 
@@ -281,15 +299,46 @@ class _Build:
 
     def _prepared(self, folder: Path) -> Path:
         """Return the file for netconvert: the source, or a copy of it in a form that it reads."""
+        if self.kind == "osm":
+            self.roads = OsmRoads(self.source)
+            self.roads.refuse_without_roads()
+            self._drive_on(self.side or self._side_of_place(self.roads), "the place of its roads")
         if self.kind != "opendrive":
             return self.source
         roads = OpenDriveSource(self.source, tolerant=_TOLERANT in self.options)
+        self._drive_on(roads.use_side(self.side), "the rule of its roads")
         self.defaults, self.notes = roads.defaults, roads.notes()
         if not roads.changed:
             return self.source
         copy = folder / "source.xodr"
         copy.write_bytes(roads.content())
         return copy
+
+    def _drive_on(self, side: Side, reason: str) -> None:
+        self.decided = f"{side} (by {'option' if self.side else reason})"
+        if side == "left" and _LEFT_HAND not in self.options:
+            self.options += (_LEFT_HAND,)
+
+    def _side_of_place(self, roads: OsmRoads) -> Side:
+        """Return the traffic side of the country; raises MapError if there are both or neither."""
+        west, south, east, north = self.bbox or (-180.0, -90.0, 180.0, 90.0)
+        ways = (way for way in roads.ways.values() if way.for_cars)
+        nodes = {node for way in ways for node in way.nodes}
+        places = [roads.places[node] for node in sorted(nodes & roads.places.keys())]
+        inside = [(x, y) for x, y in places if west <= x <= east and south <= y <= north]
+        sides = sides_at(inside or [(west, south), (east, north)])
+        if len(sides) == 1:
+            return sides.pop()
+        problem = (
+            "its roads are in places with left-hand and with right-hand traffic"
+            if sides
+            else f"all its roads are within {NEAR_M / 1e3:g} km of a border between left-hand and "
+            "right-hand traffic"
+        )
+        raise MapError(
+            f"{self.source}: {problem}: a network has one side; crop the map (--bbox), or choose "
+            f"the side: cavmarl map build {self.source} --traffic-side left or right"
+        )
 
     def _convert(self, prepared: Path, draft: Path) -> BuildLog:
         arguments = [_INPUT[self.kind], str(prepared), "-o", str(draft), *self.options]
@@ -298,7 +347,10 @@ class _Build:
         cures = Cures(
             f"crop the map (cavmarl map build {self.source} --bbox …) or allow more time "
             f"(--timeout-s, or {TIME_LIMIT})",
-            "repair the source"
+            "keep an area with roads: --bbox WEST,SOUTH,EAST,NORTH, "
+            + ("in degrees" if self.kind == "osm" else "in metres")
+            if self.bbox is not None
+            else "repair the source"
             if _TOLERANT in self.options
             else "repair the source, or drop its broken parts: "
             f"cavmarl map build {self.source} --tolerant",
@@ -310,7 +362,7 @@ class _Build:
         if not self.options and self.heights is None:
             return draft.read_bytes()
         self.told(STAGES[1])
-        roads = OsmRoads(self.source) if self.kind == "osm" else None
+        roads = self.roads
         document = NetDocument(draft)
         _check_near(self.source, document, self.origin)
         if roads is not None:
@@ -341,6 +393,8 @@ class _Build:
             facts |= {"projection": document.geo.projection, "offset": offset}
         if self.origin is not None:
             facts["origin"] = f"latitude {self.origin[0]!r}, longitude {self.origin[1]!r}"
+        if self.decided:
+            facts["traffic side"] = self.decided
         if self.defaults:
             facts["defaults"] = defaults_text(
                 self.defaults, "edges" if self.kind == "osm" else "roads"
@@ -373,6 +427,11 @@ def _check_readable(source: Path, draft: Path, log: BuildLog) -> None:
     try:
         read_network(draft)
     except MapError as error:
+        if any(text.startswith(_ISOLATED) for text in log.warnings()):
+            raise MapError(
+                f"{source}: no two roads for cars meet, and netconvert removes a road without "
+                "junctions: export a larger area, in which streets cross"
+            ) from error
         message = f"{source}: {str(error).removeprefix(f'{draft}: ')}"
         reported = (*log.errors(), *log.warnings())
         if reported:

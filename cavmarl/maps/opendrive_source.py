@@ -1,4 +1,4 @@
-"""Prepares OpenDRIVE files for netconvert, which ignores the speed limits of roads."""
+"""Prepares OpenDRIVE files for netconvert, which ignores limits of roads and left-hand traffic."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from defusedxml.common import DefusedXmlException
 
 from cavmarl.core.errors import MapError
 from cavmarl.maps.provenance import RoadDefaults
+from cavmarl.maps.traffic_sides import Side
 from cavmarl.roads.sumo_net.xml_source import read_tree
 
 NO_LIMIT_MPS = 142.0 / 3.6  # as netconvert reads `maxspeed=none` of OSM
@@ -26,6 +27,7 @@ _TRAVELLED = {
     "driving": 13.89, "entry": 22.22, "exit": 22.22, "onRamp": 22.22, "offRamp": 22.22,
     "mwyEntry": 22.22, "mwyExit": 22.22,
 }  # fmt: skip
+_SIDES: dict[str, Side] = {"RHT": "right", "LHT": "left"}
 _INVALID = "speed limits whose max or unit is invalid"
 
 Limits = list[tuple[float, float | None]]  # position in m, and the limit in m/s from there on
@@ -64,6 +66,56 @@ class OpenDriveSource:
     def content(self) -> bytes:
         text: bytes = tostring(self.root, "utf-8")
         return text
+
+    def use_side(self, given: Side | None) -> Side:
+        """Return the traffic side, and change the roads for it.
+
+        `given`: None: decide by the `rule` of the roads.
+
+        Raises MapError: a rule is invalid, or the rules differ and no side is given.
+        """
+        rules = Counter(road.get("rule", "RHT") for road in self.root.iter("road"))
+        if not rules.keys() <= _SIDES.keys():
+            unknown = ", ".join(repr(rule) for rule in sorted(rules.keys() - _SIDES.keys()))
+            raise MapError(f"{self.path}: roads with rule={unknown}: must be RHT or LHT; repair it")
+        if given is None and len(rules) > 1:
+            raise MapError(
+                f"{self.path}: {rules['RHT']} roads have rule RHT (the default) and {rules['LHT']} "
+                "LHT: a network has one side; split the map, or choose the side: cavmarl map build "
+                f"{self.path} --traffic-side left or right"
+            )
+        side = given or (_SIDES[next(iter(rules))] if rules else "right")
+        for rule, number in rules.items():
+            if _SIDES[rule] != side:
+                self.counts[f"roads with rule {rule} are built for {side}-hand traffic"] += number
+        if side == "left":
+            self._swap_sides()
+            self.changed = True
+        return side
+
+    def _swap_sides(self) -> None:
+        """Exchange the lanes on the left and on the right of all reference lines.
+
+        In left-hand traffic, lanes on the left of the line lead along it. netconvert takes those on
+        the right, and places them on the left if it has `--lefthand`.
+        """
+        for section in self.root.iter("laneSection"):
+            for side in [*section.iterfind("left"), *section.iterfind("right")]:
+                side.tag = "right" if side.tag == "left" else "left"
+                side[:] = reversed(side[:])
+                for lane in side.iterfind("lane"):
+                    _negate(lane, "id")
+                    for link in (
+                        *lane.iterfind("link/predecessor"),
+                        *lane.iterfind("link/successor"),
+                    ):
+                        _negate(link, "id")
+        for link in self.root.iter("laneLink"):
+            _negate(link, "from")
+            _negate(link, "to")
+        for validity in self.root.iter("validity"):
+            _negate(validity, "fromLane")
+            _negate(validity, "toLane")
 
     def _roads(self) -> Iterator[Element]:
         """Yield the roads outside of junctions, where netconvert makes its own paths."""
@@ -157,6 +209,12 @@ class OpenDriveSource:
         except ValueError:
             return 0.0
         return value if math.isfinite(value) else 0.0
+
+
+def _negate(element: Element, key: str) -> None:
+    text = element.get(key, "").strip()
+    if text not in ("", "0"):
+        element.set(key, text[1:] if text[0] == "-" else f"-{text.removeprefix('+')}")
 
 
 def _parts(begin: float, end: float, of_road: Limits, of_lane: Limits) -> Limits:

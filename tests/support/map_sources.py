@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from cavmarl.maps.netconvert import build_network
@@ -30,3 +31,32 @@ def built_from(folder: Path, name: str, text: str) -> RoadNetwork:
     path = folder / name
     path.write_text(text)
     return read_network(build_network(path, folder / "built.net.xml").path)
+
+
+# Four two-way arms on a roundabout that is drawn clockwise.
+_STEPS = ((1, 0), (0.7, -0.7), (0, -1), (-0.7, -0.7), (-1, 0), (-0.7, 0.7), (0, 1), (0.7, 0.7))
+_RING = {100 + k: (20.0 * x, 20.0 * y) for k, (x, y) in enumerate(_STEPS)}
+_ARMS = {200 + k: (250.0 * x, 250.0 * y) for k, (x, y) in enumerate(_STEPS) if k % 2 == 0}
+ROUNDABOUT = (
+    _RING | _ARMS,
+    {400: ([*_RING, 100], {"highway": "secondary", "junction": "roundabout"})}
+    | {300 + k: ([200 + k, 100 + k], {"highway": "secondary"}) for k in range(0, 8, 2)},
+)
+
+Nodes = dict[int, tuple[float, float]]  # metres to the east and north, by id
+Ways = dict[int, tuple[list[int], dict[str, str]]]  # nodes and tags, by id
+
+
+def osm_file(roads: tuple[Nodes, Ways], latitude: float, longitude: float) -> str:
+    """Return the text of an OSM file with these roads around a place in degrees."""
+    nodes, ways = roads
+    east = math.cos(math.radians(latitude)) * 111_320.0
+    lines = [
+        f'<node id="{name}" lat="{latitude + y / 111_320.0:.7f}" lon="{longitude + x / east:.7f}"/>'
+        for name, (x, y) in nodes.items()
+    ]
+    for name, (refs, tags) in ways.items():
+        inside = "".join(f'<nd ref="{ref}"/>' for ref in refs)
+        inside += "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        lines.append(f'<way id="{name}">{inside}</way>')
+    return f'<osm version="0.6">{"".join(lines)}</osm>'
