@@ -22,6 +22,7 @@ from cavmarl.config.registry import (
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.core.huge_pages import trim
+from cavmarl.core.notices import print_once
 from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
@@ -158,6 +159,8 @@ def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
     for file in files:
         try:
             networks.append(load_steered(file) if has_agents else load_network(file))
+            for note in networks[-1].notes:
+                print_once(f"{file}: {note}")
         except MapError as error:
             refused.append(str(error))
     if refused:

@@ -34,7 +34,7 @@ from cavmarl.roads.network import (
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 # Increase this if the reader returns other rows for the same file; record types are hashed, too.
-FORMAT = 49
+FORMAT = 50
 
 _DIGEST_BYTES = 32  # each entry begins with the SHA-256 of the rest; damaged entries are not read
 _ALIGNED = 64  # arrays begin at multiples of this number of bytes
@@ -109,6 +109,7 @@ def pack_network(network: RoadNetwork) -> bytes:
         pieces += [content, bytes(-len(content) % _ALIGNED)]
     facts: dict[str, Any] = {name: getattr(network, name) for name in _IDS}
     facts["left_hand"] = network.left_hand
+    facts["notes"] = network.notes
     facts["geo"] = None if network.geo is None else asdict(network.geo)
     head = json.dumps({"sizes": sizes, "told": facts}).encode()
     start = len(head).to_bytes(8, "little") + head
@@ -144,6 +145,7 @@ def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadN
     values |= {key: tuple(facts[key]) for key in _IDS}
     values["roofs"] = values["roofs"].reshape(-1, 4, 2)
     values["geo"] = None if facts["geo"] is None else GeoReference(**facts["geo"])
+    values["notes"] = tuple(facts["notes"])
     return RoadNetwork(name=name, source_hash=digest, left_hand=facts["left_hand"], **values)
 
 

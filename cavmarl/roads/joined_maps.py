@@ -101,6 +101,7 @@ def join(networks: Sequence[RoadNetwork]) -> RoadNetwork:
         program_ids=tuple(own for one in networks for own in one.program_ids),
         junction_kinds=kinds,
         left_hand=first.left_hand,
+        notes=tuple(f"{one.name}: {note}" for one in networks for note in one.notes),
         joined=_map_rows(networks, starts),
         map_names=names,
     )
