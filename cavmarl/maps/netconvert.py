@@ -33,8 +33,9 @@ from cavmarl.maps.netconvert_process import (
     run_netconvert,
     sumo_home,
 )
-from cavmarl.maps.opendrive_source import OpenDriveSource
+from cavmarl.maps.opendrive_source import TYPE_MAP, OpenDriveSource
 from cavmarl.maps.osm_roads import OsmRoads
+from cavmarl.maps.osm_source import LANE_OPTIONS, prepare_osm
 from cavmarl.maps.provenance import (
     NOT_STATED,
     NOTE_SEPARATOR,
@@ -61,6 +62,7 @@ OSM_OPTIONS = (
     "--tls.join",
     "--keep-edges.by-vclass=passenger",
     "--remove-edges.isolated",
+    *LANE_OPTIONS,
     "--output.original-names",  # of the ways of each lane: for bridges, names, defaults
 )
 OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
@@ -303,6 +305,10 @@ class _Build:
             self.roads = OsmRoads(self.source)
             self.roads.refuse_without_roads()
             self._drive_on(self.side or self._side_of_place(self.roads), "the place of its roads")
+            copy = folder / "source.osm"
+            left_hand = _LEFT_HAND in self.options
+            self.notes = prepare_osm(self.source, self.roads, copy, left_hand)
+            return copy if copy.exists() else self.source
         if self.kind != "opendrive":
             return self.source
         roads = OpenDriveSource(self.source, tolerant=_TOLERANT in self.options)
@@ -343,7 +349,11 @@ class _Build:
     def _convert(self, prepared: Path, draft: Path) -> BuildLog:
         arguments = [_INPUT[self.kind], str(prepared), "-o", str(draft), *self.options]
         if self.kind in _TYPE_MAP:
-            arguments += ["-t", str(sumo_home() / "data" / "typemap" / _TYPE_MAP[self.kind])]
+            types = [sumo_home() / "data" / "typemap" / _TYPE_MAP[self.kind]]
+            if self.kind == "opendrive":
+                types.append(draft.with_name("lanes.typ.xml"))
+                types[-1].write_bytes(TYPE_MAP)
+            arguments += ["-t", ",".join(map(str, types))]
         cures = Cures(
             f"crop the map (cavmarl map build {self.source} --bbox …) or allow more time "
             f"(--timeout-s, or {TIME_LIMIT})",

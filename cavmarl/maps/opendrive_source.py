@@ -25,8 +25,23 @@ _UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6, "kph": 1.0 / 3.6, "mp
 # Lane types that vehicles drive on, with the speed of netconvert's type map in m/s.
 _TRAVELLED = {
     "driving": 13.89, "entry": 22.22, "exit": 22.22, "onRamp": 22.22, "offRamp": 22.22,
-    "mwyEntry": 22.22, "mwyExit": 22.22,
+    "mwyEntry": 22.22, "mwyExit": 22.22, "bus": 13.89, "taxi": 13.89,
 }  # fmt: skip
+# Types that netconvert leaves out without a word, and the type that they are read as.
+_READ_AS = {"slipLane": "driving", "shared": "driving", "connectingRamp": "offRamp"}
+# netconvert would open these lanes to through traffic, or close them without a word.
+_NOT_TRAVELLED = frozenset(("parking", "stop", "HOV", "bidirectional"))
+# Netconvert's type map leaves these out, or closes them to road vehicles, which is meant.
+_NO_LANES = frozenset(
+    "none shoulder border median curb sidewalk walking biking restricted special1 special2 "
+    "special3 rail tram roadWorks".split()
+)
+# In addition to netconvert's type map.
+TYPE_MAP = b"""<types>
+  <type id="bus" priority="1" speed="13.89" width="3.65" allow="bus taxi emergency"/>
+  <type id="taxi" priority="1" speed="13.89" width="3.65" allow="taxi emergency"/>
+</types>
+"""
 _SIDES: dict[str, Side] = {"RHT": "right", "LHT": "left"}
 _INVALID = "speed limits whose max or unit is invalid"
 
@@ -57,6 +72,7 @@ class OpenDriveSource:
             self.root = read_tree(self.path)
         except (ParseError, DefusedXmlException, ValueError, OSError) as error:
             raise MapError(f"{self.path}: cannot be read ({error}): export it again") from error
+        self._set_lane_types()
         self._set_limits()
 
     def notes(self) -> tuple[str, ...]:
@@ -120,6 +136,21 @@ class OpenDriveSource:
     def _roads(self) -> Iterator[Element]:
         """Yield the roads outside of junctions, where netconvert makes its own paths."""
         return (road for road in self.root.iter("road") if road.get("junction", "-1") == "-1")
+
+    def _set_lane_types(self) -> None:
+        """Replace lane types that netconvert does not know, and close lanes to through traffic."""
+        for lane in self.root.iter("lane"):
+            kind = lane.get("type", "none")
+            if kind in _READ_AS:
+                lane.set("type", _READ_AS[kind])
+                self.counts[f"lanes of type {kind} are read as {_READ_AS[kind]}"] += 1
+            elif kind not in _TRAVELLED and kind not in _NO_LANES:
+                lane.set("type", "none")
+                what = "are left out" if kind in _NOT_TRAVELLED else "are unknown and left out"
+                self.counts[f"lanes of type {kind} {what}"] += 1
+            else:
+                continue
+            self.changed = True
 
     def _set_limits(self) -> None:
         """Write the limits of roads to their lanes, and count the roads without a limit."""

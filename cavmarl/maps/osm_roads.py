@@ -13,7 +13,10 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 
 _MOST_KINDS = 5  # in an error message
 _TAGS = frozenset(
-    ("highway", "bridge", "tunnel", "layer", "name", "ref", "lanes", "maxspeed", "width")
+    "highway bridge tunnel layer name ref lanes maxspeed width oneway busway motorcar "
+    "motor_vehicle motor_vehicle:forward motor_vehicle:backward vehicle turn:lanes "
+    "turn:lanes:forward turn:lanes:backward lanes:bus lanes:bus:forward lanes:bus:backward "
+    "lanes:psv lanes:psv:forward lanes:psv:backward".split()
 )
 # Kinds of road that netconvert's type map opens to passenger cars.
 _FOR_CARS = frozenset(
@@ -45,6 +48,12 @@ class RoadWay:
     @property
     def for_cars(self) -> bool:
         return self.tags.get("highway") in _FOR_CARS
+
+    @property
+    def closed_to_cars(self) -> bool:
+        """Whether the most specific tag of access for motor vehicles closes the way."""
+        keys = ("motorcar", "motor_vehicle", "vehicle")
+        return next((self.tags[key] for key in keys if key in self.tags), "yes") == "no"
 
     @property
     def name(self) -> str:

@@ -124,3 +124,36 @@ def test_towns_of_carla_have_their_limits(
     found = {round(value / MPH) for value in limits(read_network(result.path)).values()}
     assert found == mph
     assert result.defaults == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "lanes", "note"),
+    [
+        ("driving", 2, ()),
+        ("sidewalk", 1, ()),
+        ("entry", 2, ()),
+        ("bus", 2, ()),
+        ("slipLane", 2, ("1 lanes of type slipLane are read as driving",)),
+        ("shared", 2, ("1 lanes of type shared are read as driving",)),
+        ("connectingRamp", 2, ("1 lanes of type connectingRamp are read as offRamp",)),
+        ("parking", 1, ("1 lanes of type parking are left out",)),
+        ("stop", 1, ("1 lanes of type stop are left out",)),
+        ("HOV", 1, ("1 lanes of type HOV are left out",)),
+        ("cart", 1, ("1 lanes of type cart are unknown and left out",)),
+    ],
+)
+def test_lane_types_are_read_or_counted(
+    tmp_path: Path, kind: str, lanes: int, note: tuple[str, ...]
+) -> None:
+    path = tmp_path / "map.xodr"
+    beside = (
+        f'<lane id="-2" type="{kind}"><width sOffset="0" a="3" b="0" c="0" d="0"/></lane></right>'
+    )
+    path.write_text(road_file(ROAD.replace("</right>", beside)))
+    result = build_network(path, tmp_path / "map.net.xml")
+    assert result.notes == note
+    network = read_network(result.path)
+    edge = network.edge_ids.index("-1")
+    assert network.edges["num_lanes"][edge] == lanes
+    for_cars = network.lanes["permissions"][network.edges["first_lane"][edge]] & 1
+    assert for_cars == (kind != "bus")
