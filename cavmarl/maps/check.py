@@ -119,7 +119,7 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
         horizon_s=horizon_of(network),
         **findings,
         problems=tuple(cars.problems()),
-        notes=(*network.notes, *_notes(findings, share, grade)),
+        notes=tuple(_notes(network.notes, findings, share, grade)),
     )
 
 
@@ -231,8 +231,10 @@ def _lanes_never_green(network: RoadNetwork) -> tuple[str, ...]:
     return tuple(network.lane_ids[row] for row in sorted(shut))
 
 
-def _notes(findings: dict[str, tuple[str, ...]], share: float, grade: float) -> list[str]:
-    notes = []
+def _notes(
+    of_map: tuple[str, ...], findings: dict[str, tuple[str, ...]], share: float, grade: float
+) -> list[str]:
+    notes = list(of_map)
     if share < _WELL_CONNECTED:
         notes.append(
             f"only {share:.0%} of the edges are in the largest connected part: trips from other "

@@ -21,6 +21,7 @@ from typing import Any
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.notices import print_once
 from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
@@ -33,9 +34,12 @@ from cavmarl.maps.netconvert_process import (
     run_netconvert,
     sumo_home,
 )
+from cavmarl.maps.opendrive_source import TYPE_MAP, OpenDriveSource
 from cavmarl.maps.osm_roads import OsmRoads
+from cavmarl.maps.osm_source import LANE_OPTIONS, prepare_osm
 from cavmarl.maps.provenance import (
     NOT_STATED,
+    NOTE_SEPARATOR,
     OSM_ATTRIBUTION,
     OSM_LICENCE,
     RoadDefaults,
@@ -44,6 +48,7 @@ from cavmarl.maps.provenance import (
     read_provenance,
     road_defaults,
 )
+from cavmarl.maps.traffic_sides import NEAR_M, Side, sides_at
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 from cavmarl.roads.sumo_net.sumo_options import map_of_config
 from cavmarl.roads.sumo_net.xml_source import read_bytes
@@ -59,6 +64,7 @@ OSM_OPTIONS = (
     "--tls.join",
     "--keep-edges.by-vclass=passenger",
     "--remove-edges.isolated",
+    *LANE_OPTIONS,
     "--output.original-names",  # ids of the ways of each lane, for bridges, names, defaults
 )
 OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
@@ -66,6 +72,12 @@ OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
 _INPUT = {"sumo": "--sumo-net-file", "osm": "--osm-files", "opendrive": "--opendrive-files"}
 _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.typ.xml"}
 _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
+
+_ISOLATED = "Removed a road without junctions"  # begins a warning
+_TOLERANT = "--ignore-errors"
+_LEFT_HAND = "--lefthand"
+# Increase the number if a source is converted in another way, so that the cache converts it anew.
+_CONVERSION = "conversion 2"
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
 _FAR_M = 100_000.0  # farther from the origin, the projection distorts lengths
@@ -95,7 +107,8 @@ class BuildResult:
     # with `tolerant`, ignored errors of netconvert; the objects named there were left out
     dropped: tuple[str, ...]
     provenance: dict[str, str]  # origin of the map, as written in its file
-    defaults: tuple[RoadDefaults, ...] = ()  # missing values of OSM from the type map
+    defaults: tuple[RoadDefaults, ...] = ()  # missing values, from the type map
+    notes: tuple[str, ...] = ()  # what the source contains and the network does not, with counts
     heights: HeightReport | None = None
     levels: int = 0  # number of lanes that cross on a bridge or in a tunnel; 0 with `heights`
 
@@ -109,6 +122,7 @@ def build_network(
     *,
     options: Sequence[str] = (),
     bbox: Box | None = None,
+    side: Side | None = None,
     origin: Origin | None = None,
     heights: HeightOptions | None = None,
     licences: tuple[str, str] = ("", ""),
@@ -127,6 +141,8 @@ def build_network(
         options: additional options for netconvert.
         bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
             OSM, otherwise metres in the source's own frame.
+        side: side of the road on which vehicles drive; None: OSM: that of the country, OpenDRIVE:
+            the `rule` of the roads. A SUMO network has its own.
         origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
             the roads, in UTM.
         heights: terrain models for the roads; positions in the plane do not change. Without models,
@@ -137,10 +153,11 @@ def build_network(
         told: called with each of `STAGES` as it begins.
 
     Raises:
-        ConfigError: `bbox` is empty, or the origin is not on the earth, or too far from the map.
+        ConfigError: `bbox` is empty, the origin is not on the earth or too far from the map, or the
+            source is a SUMO network and `side` is given.
         MapError: the source is broken, malicious or not a map; netconvert fails (its output is in
-            the message); the result has no drivable lane; the heights cannot be used; or the target
-            cannot be written.
+            the message); the result has no drivable lane; the heights cannot be used; the roads
+            have no common traffic side; or the target cannot be written.
         MissingExtraError: netconvert, or a package for heights and levels, is not installed.
     """
     source = Path(source)
@@ -149,12 +166,19 @@ def build_network(
     kind = map_kind(source)
     chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *_centred(source, kind, origin), *options)
     if tolerant and chosen:
-        chosen += ("--ignore-errors",)
+        chosen += (_TOLERANT,)
+    if side is not None and kind == "sumo":
+        raise ConfigError(
+            f"--traffic-side {side}: {source} is a SUMO network, which has its own side "
+            "(lefthand of <net>): remove the option, or build the network from its source again"
+        )
     if target is None and not chosen and heights is None:
         read_network(source)
         return BuildResult(source, source, kind, (), {}, (), (), read_provenance(source))
     place = Path(target) if target else _cache_entry(source, chosen, heights)
-    made = _Build(source, kind, place, chosen, origin, heights, licences, timeout_s, told)
+    made = _Build(
+        source, kind, place, chosen, bbox, side, origin, heights, licences, timeout_s, told
+    )
     try:
         made.run()
     except OSError as error:
@@ -164,12 +188,13 @@ def build_network(
         path=place,
         source=source,
         kind=kind,
-        options=chosen,
+        options=made.options,
         warnings=made.log.warnings(),
         corrections=made.log.corrections(),
         dropped=made.log.errors(),
         provenance=read_provenance(place),
         defaults=made.defaults,
+        notes=made.notes,
         heights=made.report,
         levels=made.levels,
     )
@@ -178,7 +203,8 @@ def build_network(
 def map_file(path: str | Path) -> Path:
     """Return the SUMO network of a map file: the file itself, or the result of netconvert.
 
-    A configuration of SUMO stands for the network that it names.
+    A configuration of SUMO stands for the network that it names. What netconvert had to ignore or
+    to guess is printed once per process.
 
     Raises MapError: see `build_network`.
     """
@@ -191,14 +217,20 @@ def map_file(path: str | Path) -> Path:
     if kind == "sumo":
         return path
     entry = _cache_entry(path, _OPTIONS[kind])
-    return entry if entry.exists() else build_network(path).path
+    if not entry.exists():
+        build_network(path)
+    told = read_provenance(entry)
+    for key in ("traffic side", "defaults", "notes"):
+        if not told.get(key, "right").startswith("right"):
+            print_once(f"{path}: {key}: {told[key]}")
+    return entry
 
 
 def _cache_entry(
     source: Path, options: Sequence[str], heights: HeightOptions | None = None
 ) -> Path:
     require("sumo", "sumo")
-    words = [source_hash(source), version("eclipse-sumo"), *options]
+    words = [source_hash(source), version("eclipse-sumo"), _CONVERSION, *options]
     if heights is None:
         words.append("levels 4")  # version of the algorithm for bridges and tunnels
     else:
@@ -240,6 +272,8 @@ class _Build:
     kind: MapKind
     place: Path
     options: tuple[str, ...]
+    bbox: Box | None
+    side: Side | None
     origin: Origin | None
     heights: HeightOptions | None
     licences: tuple[str, str]
@@ -247,6 +281,9 @@ class _Build:
     told: Told
     log: BuildLog = field(default_factory=BuildLog)
     defaults: tuple[RoadDefaults, ...] = ()
+    notes: tuple[str, ...] = ()
+    roads: OsmRoads | None = None  # of OSM
+    decided: str = ""  # the traffic side, and by what it was decided
     report: HeightReport | None = None
     levels: int = 0
 
@@ -261,7 +298,7 @@ class _Build:
             draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
             if self.options:
-                self.log = _convert(self.kind, self.source, draft, self.options, self.timeout_s)
+                self.log = self._convert(self._prepared(folder), draft)
             else:
                 draft.write_bytes(read_bytes(self.source))
             content = self._finished(draft)
@@ -270,12 +307,80 @@ class _Build:
             _check_readable(self.source, draft, self.log)
             os.replace(draft, place)
 
+    def _prepared(self, folder: Path) -> Path:
+        """Return the file for netconvert: the source, or a copy of it in a form that it reads."""
+        if self.kind == "osm":
+            self.roads = OsmRoads(self.source)
+            self.roads.refuse_without_roads()
+            self._drive_on(self.side or self._side_of_place(self.roads), "the place of its roads")
+            copy = folder / "source.osm"
+            left_hand = _LEFT_HAND in self.options
+            self.notes = prepare_osm(self.source, self.roads, copy, left_hand)
+            return copy if copy.exists() else self.source
+        if self.kind != "opendrive":
+            return self.source
+        roads = OpenDriveSource(self.source, tolerant=_TOLERANT in self.options)
+        self._drive_on(roads.use_side(self.side), "the rule of its roads")
+        self.defaults, self.notes = roads.defaults, roads.notes()
+        if not roads.changed:
+            return self.source
+        copy = folder / "source.xodr"
+        copy.write_bytes(roads.content())
+        return copy
+
+    def _drive_on(self, side: Side, reason: str) -> None:
+        self.decided = f"{side} (by {'option' if self.side else reason})"
+        if side == "left" and _LEFT_HAND not in self.options:
+            self.options += (_LEFT_HAND,)
+
+    def _side_of_place(self, roads: OsmRoads) -> Side:
+        """Return the traffic side of the country; raises MapError if there are both or neither."""
+        west, south, east, north = self.bbox or (-180.0, -90.0, 180.0, 90.0)
+        ways = (way for way in roads.ways.values() if way.for_cars)
+        nodes = {node for way in ways for node in way.nodes}
+        places = [roads.places[node] for node in sorted(nodes & roads.places.keys())]
+        inside = [(x, y) for x, y in places if west <= x <= east and south <= y <= north]
+        sides = sides_at(inside or [(west, south), (east, north)])
+        if len(sides) == 1:
+            return sides.pop()
+        problem = (
+            "its roads are in places with left-hand and with right-hand traffic"
+            if sides
+            else f"all its roads are within {NEAR_M / 1e3:g} km of a border between left-hand and "
+            "right-hand traffic"
+        )
+        raise MapError(
+            f"{self.source}: {problem}: a network has one side; crop the map (--bbox), or choose "
+            f"the side: cavmarl map build {self.source} --traffic-side left or right"
+        )
+
+    def _convert(self, prepared: Path, draft: Path) -> BuildLog:
+        arguments = [_INPUT[self.kind], str(prepared), "-o", str(draft), *self.options]
+        if self.kind in _TYPE_MAP:
+            types = [sumo_home() / "data" / "typemap" / _TYPE_MAP[self.kind]]
+            if self.kind == "opendrive":
+                types.append(draft.with_name("lanes.typ.xml"))
+                types[-1].write_bytes(TYPE_MAP)
+            arguments += ["-t", ",".join(map(str, types))]
+        cures = Cures(
+            f"crop the map (cavmarl map build {self.source} --bbox …) or allow more time "
+            f"(--timeout-s, or {TIME_LIMIT})",
+            "keep an area with roads: --bbox WEST,SOUTH,EAST,NORTH, "
+            + ("in degrees" if self.kind == "osm" else "in metres")
+            if self.bbox is not None
+            else "repair the source"
+            if _TOLERANT in self.options
+            else "repair the source, or drop its broken parts: "
+            f"cavmarl map build {self.source} --tolerant",
+        )
+        return run_netconvert(arguments, self.source, self.timeout_s, cures)
+
     def _finished(self, draft: Path) -> bytes:
         """Return the network with the map's origin and heights added to netconvert's output."""
         if not self.options and self.heights is None:
             return draft.read_bytes()
         self.told(STAGES[1])
-        roads = OsmRoads(self.source) if self.kind == "osm" else None
+        roads = self.roads
         document = NetDocument(draft)
         _check_near(self.source, document, self.origin)
         if roads is not None:
@@ -306,8 +411,14 @@ class _Build:
             facts |= {"projection": document.geo.projection, "offset": offset}
         if self.origin is not None:
             facts["origin"] = f"latitude {self.origin[0]!r}, longitude {self.origin[1]!r}"
+        if self.decided:
+            facts["traffic side"] = self.decided
         if self.defaults:
-            facts["defaults"] = defaults_text(self.defaults)
+            facts["defaults"] = defaults_text(
+                self.defaults, "edges" if self.kind == "osm" else "roads"
+            )
+        if self.notes:
+            facts["notes"] = NOTE_SEPARATOR.join(self.notes)
         if self.levels:
             facts["levels"] = f"{self.levels} crossings of lanes on bridges and in tunnels"
         if self.heights is not None and self.report is not None:
@@ -330,26 +441,15 @@ def _check_near(source: Path, document: NetDocument, origin: Origin | None) -> N
         )
 
 
-def _convert(
-    kind: MapKind, source: Path, draft: Path, options: Sequence[str], timeout_s: float | None
-) -> BuildLog:
-    arguments = [_INPUT[kind], str(source), "-o", str(draft), *options]
-    if kind in _TYPE_MAP:
-        arguments += ["-t", str(sumo_home() / "data" / "typemap" / _TYPE_MAP[kind])]
-    cures = Cures(
-        f"crop the map (cavmarl map build {source} --bbox …) or allow more time (--timeout-s, or "
-        f"{TIME_LIMIT})",
-        "repair the source"
-        if "--ignore-errors" in options
-        else f"repair the source, or drop its broken parts: cavmarl map build {source} --tolerant",
-    )
-    return run_netconvert(arguments, source, timeout_s, cures)
-
-
 def _check_readable(source: Path, draft: Path, log: BuildLog) -> None:
     try:
         read_network(draft)
     except MapError as error:
+        if any(text.startswith(_ISOLATED) for text in log.warnings()):
+            raise MapError(
+                f"{source}: no two roads for cars meet, and netconvert removes a road without "
+                "junctions: export a larger area, in which streets cross"
+            ) from error
         message = f"{source}: {str(error).removeprefix(f'{draft}: ')}"
         reported = (*log.errors(), *log.warnings())
         if reported:

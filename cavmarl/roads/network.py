@@ -85,7 +85,9 @@ LANE = record(
     # has them)
     ("first_into", np.int32),
     ("num_into", np.int32),
-    ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
+    # bit k set: VEHICLE_CLASSES[k] may drive here; bit NO_CHANGE_LEFT + k or NO_CHANGE_RIGHT + k
+    # set: it must not change lanes to that side (a solid line)
+    ("permissions", np.uint32),
     ("index", np.int32),  # position on its edge, 0 = at the kerb
     ("min_x", np.float64),  # bounding box of the polyline, m
     ("min_y", np.float64),
@@ -271,7 +273,8 @@ class RoadNetwork:
     junction_kinds: tuple[str, ...]  # SUMO's junction types, by `JUNCTION["kind"]`
     geo: GeoReference | None = None  # position on the earth; None: not given by the map
     left_hand: bool = False  # whether the map has left-hand traffic
-    notes: tuple[str, ...] = ()  # where the lanes differ from those of the source, and why
+    # Where the lanes differ from those of the source, and what is not simulated, with counts
+    notes: tuple[str, ...] = ()
     joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # if several
     map_names: tuple[str, ...] = ()  # if there are several maps
     # WALL (num_walls,) of the buildings, if they were requested; see `maps.buildings`

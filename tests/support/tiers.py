@@ -23,7 +23,7 @@ __all__ = ["ALONE_FILES", "ProcessWatch", "TimeLimit", "is_needed", "mark"]
 _OF_PROCESSES = re.compile(
     r"^import (subprocess|multiprocessing|libsumo)\b"
     r"|^from tests\.support\.(sumo_worlds|netgenerate|junction_scenes|toy_job) import"
-    r"|^from tests\.support\.(dead_ends|local_actors|service) import"
+    r"|^from tests\.support\.(dead_ends|local_actors|map_sources|service) import"
     r"|^from tests\.support\.chromium import"
     r"|importorskip\(\"(libsumo|ray)\""
     r"|\bworkers=(?!0\b)|\bbackend=\"(?!local)|\bnodes=",

@@ -102,3 +102,7 @@ SUM_DISTANCE_M = 0
 SUM_TIME_S = 1
 SUM_DELAY_S = 2  # time in excess of the route's duration at the speed of limit, driver and type
 NUM_SUMS = 3
+
+# First bits of LANE["permissions"] that bar vehicle classes from changes to the left and right.
+NO_CHANGE_LEFT = 12
+NO_CHANGE_RIGHT = 22

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
 
 LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a very long lane, as travel time in s
 LANE_CHANGE_M = 250.0  # the cost doubles on a lane of this length: drivers can barely change there
@@ -46,6 +47,17 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
         if roads.links[link]["next_lane"] == lane and _is_allowed(roads, link):
             return True
     return False
+
+
+@inlined_kernel
+def is_barred(roads: RoadArrays, lane: int, side: int, permission: int) -> bool:
+    """Return whether a solid line bars vehicles from a lane change; side: 1 left, -1 right.
+
+    `permission`: bits of LANE["permissions"]; one that is not barred is enough.
+    """
+    barred = roads.lanes[lane]["permissions"] >> (NO_CHANGE_LEFT if side > 0 else NO_CHANGE_RIGHT)
+    every: bool = (barred & permission) == permission
+    return every
 
 
 @kernel
@@ -89,6 +101,7 @@ def _settle(
     roads: RoadArrays,
     lane: int,
     goal_edge: int,
+    permission: int,
     change_weight: float,
     cost: NDArray[np.float64],
     plan: NDArray[np.void],
@@ -108,11 +121,19 @@ def _settle(
     change = 0
     beside = -1
     sideways = change_cost(roads, lane, change_weight)
-    if row["left"] >= 0 and cost[row["left"]] + sideways < best:
+    if (
+        row["left"] >= 0
+        and cost[row["left"]] + sideways < best
+        and not is_barred(roads, lane, 1, permission)
+    ):
         best = cost[row["left"]] + sideways
         change = 1
         beside = row["left"]
-    if row["right"] >= 0 and cost[row["right"]] + sideways < best:
+    if (
+        row["right"] >= 0
+        and cost[row["right"]] + sideways < best
+        and not is_barred(roads, lane, -1, permission)
+    ):
         change = -1
         beside = row["right"]
     step["change"] = change
@@ -233,15 +254,20 @@ def _search_plan(
         lane = _take_first(search, size)
         size -= 1
         here = search.cost[lane]
-        _settle(roads, lane, goal_edge, change_weight, search.cost, plan)
+        _settle(roads, lane, goal_edge, permission, change_weight, search.cost, plan)
         row = roads.lanes[lane]
         for k in range(row["first_into"], row["first_into"] + row["num_into"]):
             before = roads.into[k]
             other = roads.lanes[before]
             if other["permissions"] & permission and _leads_to(roads, before, lane):
                 size = _offer(search, before, here + other["length_m"] / other["speed_mps"], size)
-        for beside in (row["left"], row["right"]):
-            if beside >= 0 and roads.lanes[beside]["permissions"] & permission:
+        for side in (1, -1):
+            beside = row["left"] if side > 0 else row["right"]
+            if (
+                beside >= 0
+                and roads.lanes[beside]["permissions"] & permission
+                and not is_barred(roads, beside, -side, permission)
+            ):
                 reached = here + change_cost(roads, beside, change_weight)
                 size = _offer(search, beside, reached, size)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.roads.kernels.plans import change_cost
+from cavmarl.roads.kernels.plans import change_cost, is_barred
 
 
 @kernel
@@ -125,6 +125,8 @@ def _go_sideways(
     row = roads.lanes[lane]
     side = int(row["left"] == beside) - int(row["right"] == beside)
     if side == 0 or not row["permissions"] & permission:
+        return
+    if is_barred(roads, lane, side, permission):
         return
     reached = cost[way + beside] + change_cost(roads, lane, 1.0)
     if reached < cost[way + lane]:

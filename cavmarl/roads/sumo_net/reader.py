@@ -15,8 +15,16 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MapError
 from cavmarl.core.math.elementary_arrays import atan2_all
 from cavmarl.core.math.geometry import project
+from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
 from cavmarl.core.records.rows import FORK_BEYOND_M, STEERED, SWEPT_BEYOND_M
-from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
+from cavmarl.roads.network import (
+    EDGE,
+    JUNCTION,
+    LANE,
+    LINK,
+    GeoReference,
+    RoadNetwork,
+)
 from cavmarl.roads.polylines import (
     Shape,
     clean_shape,
@@ -36,7 +44,13 @@ from cavmarl.roads.sumo_net.conflicts import (
 )
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
 from cavmarl.roads.sumo_net.road_corners import round_corners
-from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
+from cavmarl.roads.sumo_net.selection import (
+    ALL_CLASSES,
+    Movement,
+    NetworkSelection,
+    permission_bits,
+    select,
+)
 from cavmarl.roads.sumo_net.shared_strips import Road, find_strips, move_apart
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
 from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows, unfed_beside
@@ -116,6 +130,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     points, first_point = point_rows(shapes)
 
     lanes = _lane_rows(chosen, edges, points, first_point, outer, parsed.left_hand)
+    _bar_changes(lanes, lane_ids, parsed)
     links = _link_rows(movements, lane_row, lanes, node_row, signal_rows)
     into = _connect(lanes, links, movements, lane_row)
     paths = [_path(move, lane_row, lanes, points) for move in movements]
@@ -133,6 +148,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         [_path(move, lane_row, lanes, points, APPROACH_M) for move in movements],
         ways,
     )
+    _add_stop_offsets(lanes, lane_ids, parsed.stop_offsets_m)
     fill_conflicts(lanes, links, conflicts, first_conflict)
     unfed = unfed_beside(links, lanes, points)
     sweeps = _fill_sweeps(Movements(links, conflicts, ways, unfed))
@@ -162,8 +178,34 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         junction_kinds=kinds,
         geo=_geo_reference(net),
         left_hand=parsed.left_hand,
-        notes=notes,
+        notes=(*parsed.notes, *notes),
     )
+
+
+def _bar_changes(lanes: NDArray[np.void], lane_ids: Sequence[str], parsed: ParsedNet) -> None:
+    """Set the bits of classes that must not change lanes.
+
+    SUMO's "left" is towards the middle of the road, which is the right in left-hand traffic.
+    """
+    inwards, outwards = NO_CHANGE_LEFT, NO_CHANGE_RIGHT
+    if parsed.left_hand:
+        inwards, outwards = outwards, inwards
+    for row, name in zip(lanes, lane_ids, strict=True):
+        if name in parsed.changes and not row["internal"]:
+            to_left, to_right = map(permission_bits, parsed.changes[name])
+            row["permissions"] |= (ALL_CLASSES & ~to_left) << inwards
+            row["permissions"] |= (ALL_CLASSES & ~to_right) << outwards
+
+
+def _add_stop_offsets(
+    lanes: NDArray[np.void], lane_ids: Sequence[str], offsets_m: dict[str, float]
+) -> None:
+    """Move stop lines back; those of a lane win over those of its edge."""
+    for row, name in zip(lanes, lane_ids, strict=True):
+        offset_m = offsets_m.get(name, offsets_m.get(name.rpartition("_")[0], 0.0))
+        if offset_m > 0.0 and not row["internal"]:
+            most_m = max(float(row["length_m"]) - 1.0, 0.0)
+            row["stop_back_m"] = max(float(row["stop_back_m"]), min(offset_m, most_m))
 
 
 def _shapes(

@@ -9,7 +9,7 @@ from typing import Any
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import VEHICLE_CLASSES
 
-_ALL = (1 << len(VEHICLE_CLASSES)) - 1
+ALL_CLASSES = (1 << len(VEHICLE_CLASSES)) - 1
 _ROAD = sum(1 << bit for bit, name in enumerate(VEHICLE_CLASSES) if name not in ("tram", "bicycle"))
 
 
@@ -37,7 +37,7 @@ def permission_bits(classes: Iterable[str]) -> int:
     """Return the bits of LANE["permissions"] for SUMO's names of vehicle classes."""
     allowed = set(classes)
     if "all" in allowed:
-        return _ALL
+        return ALL_CLASSES
     return sum(1 << bit for bit, name in enumerate(VEHICLE_CLASSES) if name in allowed)
 
 
