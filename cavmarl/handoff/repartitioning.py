@@ -68,10 +68,10 @@ class Repartitioner:
         self._tolerance = tolerance
 
     def before_step(self, partition: ZonePartition) -> ZonePartition | None:
-        """Count a step that begins. Return its zones if they have changed.
+        """Count a step that begins. Return new zones if the zones change before it.
 
-        After a change, the owners of vehicles may be far away from them until the next tick hands
-        them over. No caller may read vehicles before that.
+        After a change, vehicles may be far from their owners' zones until the next tick hands them
+        over. No caller may read vehicles before that.
         """
         self.steps += 1
         if not is_due(self.steps, self._every):
