@@ -1,8 +1,7 @@
 """`Repartitioner`: new zones for running worlds whose vehicles are unevenly distributed.
 
-This is off by default. The zones change between two
-ticks. In the next tick, each vehicle outside of its owner's new zone is handed over as at any
-border. So no result depends on repartitioning.
+This is off by default. The zones change between two ticks. In the next tick, each vehicle outside
+of its owner's new zone is handed over as at any border. So no result depends on repartitioning.
 """
 
 from __future__ import annotations
