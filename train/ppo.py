@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from cavmarl.cli.output import parse_settings
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.extensions import import_plugins
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning import options
 from cavmarl.learning.actor_critic import ActorCritic
@@ -56,6 +57,7 @@ class Args:
     background: Annotated[int, "background vehicles per world; -1: the environment's"] = -1
     num_envs: Annotated[int, "number of parallel worlds"] = 16
     settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
+    plugins: Annotated[str, "modules with terms, sensors, … of your own, comma-separated"] = ""
     zones: Annotated[int, "zones per world; 0: the environment's"] = 0
     backend: Annotated[str, "place of the worlds: local, processes:N, nodes:N, ray:N, …"] = ""
     workers: Annotated[int, "short form: N for --backend processes:N; 0: see --backend"] = 0
@@ -411,8 +413,11 @@ class Run:
 @contextmanager
 def opened(args: Args) -> Iterator[Run]:
     """Open a run with its worlds and its folder, and close them at the end."""
+    plugins = [word for word in args.plugins.split(",") if word]
+    import_plugins(plugins)
     args = options.with_form_of(args, args.start)
     own = driver_keys(args.start) if args.start else {}
+    given = parse_settings([word for word in args.settings.split(",") if word], plugins)
     vec = make_vec(
         args.env,
         num_envs=args.num_envs,
@@ -421,7 +426,7 @@ def opened(args: Args) -> Iterator[Run]:
         workers=args.workers or None,
         agents=args.agents or None,
         background=None if args.background < 0 else args.background,
-        overrides=own | parse_settings([word for word in args.settings.split(",") if word]),
+        overrides=own | given,
         autoreset_mode=AutoresetMode.NEXT_STEP if args.mappo else AutoresetMode.SAME_STEP,
         copy=False,
     )

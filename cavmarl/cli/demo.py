@@ -14,6 +14,8 @@ from rich.console import Console
 from cavmarl.cli.evaluate import evaluate_showing, report_table
 from cavmarl.cli.output import (
     OUTPUT,
+    PAGE_EXTRAS,
+    VIDEO_EXTRAS,
     JsonPath,
     Seed,
     about,
@@ -23,7 +25,7 @@ from cavmarl.cli.output import (
 from cavmarl.cli.view import drive
 from cavmarl.config.registry import find_settings, programs
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import ConfigError, require
+from cavmarl.core.errors import ConfigError, require_all
 
 EVALUATION_SEED = 1000  # far from the seeds of training
 EPISODES = 32
@@ -49,10 +51,8 @@ def demo(
             f"--minutes {minutes:g}, --seconds {seconds:g}: --minutes must be above 0 and at most "
             "600, --seconds above 0 and at most 3600"
         )
-    require("torch", "train")
-    require("sumo", "sumo")  # the map of town comes with it
-    require("imageio_ffmpeg", "render")
-    require("matplotlib", "report")
+    needed = {"torch": "train", "sumo": "sumo"}  # the map of town comes with SUMO
+    require_all(needed | VIDEO_EXTRAS | PAGE_EXTRAS)
     make_folder(out)
     console = Console()
     console.print(f"[bold]1. train[/] cities_ippo on merge, {minutes:g} min")

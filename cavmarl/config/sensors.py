@@ -390,8 +390,8 @@ class SensorsConfig(Section, key="sensors"):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in self.registered:
-            there = name in REGISTERED_SENSORS
-            check(there, "sensors.registered", name, REGISTERED_SENSORS.advice())
+            if name not in REGISTERED_SENSORS:
+                check(False, "sensors.registered", name, REGISTERED_SENSORS.advice())
         once = len(set(self.registered)) == len(self.registered)
         self.need("registered", once, "must name each sensor once")
         is_any_on = bool(self.registered) or any(one.is_on for one in self._sections().values())

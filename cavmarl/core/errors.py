@@ -3,6 +3,7 @@
     CavmarlError
     ├── ConfigError            an invalid key, value, combination or division
     │   ├── UnknownEnvironmentError   no entry, path or map has that name
+    │   ├── UnknownArgumentError      a keyword argument that does not exist
     │   └── ScenarioError         a map without a place for a scenario
     ├── MapError               a map that cannot be read, built or driven on
     │   └── RouteError            there is no route between two places
@@ -38,6 +39,9 @@ Each message says what is wrong, where, and what to do.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 
@@ -55,6 +59,10 @@ class ConfigError(CavmarlError):
 
 class UnknownEnvironmentError(ConfigError):
     """No environment, folder or map file has that name."""
+
+
+class UnknownArgumentError(ConfigError, TypeError):
+    """A keyword argument that does not exist."""
 
 
 class ScenarioError(ConfigError):
@@ -272,9 +280,31 @@ class RegisteredFunctionError(CavmarlError):
 
 def missing(module: str | None, extra: str) -> MissingExtraError:
     """Return the error for a `module` that cannot be imported; it names the `extra` to install."""
-    return MissingExtraError(
-        f"'{module}' is not installed: pip install '.[{extra}]' in a checkout of cavmarl"
-    )
+    return MissingExtraError(f"'{module}' is not installed: {_installation([extra])}")
+
+
+def require_all(needed: Mapping[str, str]) -> None:
+    """Check optional modules without importing them; `needed`: module → extra.
+
+    Raises:
+        MissingExtraError: names all modules that are not installed, and one command for them.
+    """
+    absent = {module: extra for module, extra in needed.items() if find_spec(module) is None}
+    if absent:
+        names = " and ".join(f"'{module}'" for module in absent)
+        verb = "is" if len(absent) == 1 else "are"
+        extras = sorted(set(absent.values()))
+        raise MissingExtraError(f"{names} {verb} not installed: {_installation(extras)}")
+
+
+def _installation(extras: Sequence[str]) -> str:
+    """Return the command that adds extras to this installation: of a checkout, or of a wheel."""
+    checkout = Path(__file__).resolve().parents[2]
+    wanted = f"[{','.join(extras)}]"
+    if not (checkout / "pyproject.toml").is_file():
+        return f"pip install 'cavmarl{wanted}'"
+    place = "." if Path.cwd() == checkout else str(checkout)
+    return f"pip install -e '{place}{wanted}'"
 
 
 def require(module: str, extra: str) -> ModuleType:

@@ -276,6 +276,7 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
     Returns the runs, and whether worlds have zones.
     """
     world = load_world(job.env, **job.keywords)
+    world.tell_tolerated()
     policies = describe_policies(job.policies)
     config, network, demand, partition = world
     unlogged = replace(config, zones=replace(config.zones, journal=""))

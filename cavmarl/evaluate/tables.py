@@ -51,7 +51,7 @@ TRIP = np.dtype(
         ("duration_s", np.float64),  # from its first decision to its end
         ("distance_m", np.float64),  # progress towards the goal
         ("mean_speed_mps", np.float64),  # distance over duration
-        ("delay_s", np.float64),  # time lost compared with driving at the limit
+        ("delay_s", np.float64),  # time lost compared with driving at `free_speed`
         ("mean_jerk_mps3", np.float64),  # mean |jerk|
         ("mean_speeding", np.float64),  # mean speed above the limit, as a share of it
         ("least_ttc_s", np.float64),  # least time to collision, at most TTC_HORIZON_S

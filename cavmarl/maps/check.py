@@ -119,7 +119,7 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
         horizon_s=horizon_of(network),
         **findings,
         problems=tuple(cars.problems()),
-        notes=tuple(_notes(findings, share, grade)),
+        notes=(*network.notes, *_notes(findings, share, grade)),
     )
 
 

@@ -14,12 +14,18 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.net_document import NetDocument, points_of
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.polylines import clean_shape
+from cavmarl.roads.sumo_net.road_corners import find_corners
+from cavmarl.roads.sumo_net.shared_strips import Road, Strip, find_strips
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 CAR_WIDTH_M = 1.8
 LEVEL_M = 3.0  # lanes with a larger difference in height are a bridge and the road below it
 STEP_M = 0.1  # minimum difference in height of lanes that lead into each other
-SEARCHES = ("crossings", "signals", "lanes", "steps", "parts", "stop lines", "buildings")
+SEARCHES = (
+    "crossings", "signals", "lanes", "steps", "parts", "stop lines", "strips", "corners",
+    "buildings",
+)  # fmt: skip
 _DEEP_M = 1.0  # maximum distance of a stop line inside its junction
 
 Points = NDArray[np.float64]
@@ -65,6 +71,8 @@ def find_defects(
         lambda: _steps(network),
         lambda: _unreachable_parts(network),
         lambda: _stop_lines_inside(network, document),
+        lambda: _shared_strips(network, document),
+        lambda: _tight_corners(network),
     ]
     if buildings is not None:
         searches.append(lambda: _buildings_on_roads(with_buildings(network, buildings)))
@@ -229,6 +237,44 @@ def _stop_lines_inside(network: RoadNetwork, document: NetDocument) -> Iterator[
             deep = f"{_to_rim(end, rim[:, :2]):.1f} m inside {junction}"
             x, y = end.tolist()
             yield Defect("stop line inside a junction", network.lane_ids[lane], x, y, deep)
+
+
+def _shared_strips(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
+    """Find opposite lanes on the same strip, where the file draws them: the reader moves them."""
+    for strip in strips_of(network, document):
+        for one, other in strip.lanes:
+            x, y = network.lane_polyline(one)[0, :2].tolist()
+            words = f"with {network.lane_ids[other]}; driven {strip.apart_m:.1f} m aside"
+            yield Defect("opposite lanes on one strip", network.lane_ids[one], x, y, words)
+
+
+def strips_of(network: RoadNetwork, document: NetDocument) -> list[Strip]:
+    """Return the edges of a network's file that have lanes on the same strip."""
+    drawn = {lane.id: lane.points for lane in document.lanes}
+    lanes = network.lanes[: np.count_nonzero(~network.lanes["internal"])]
+    shapes = [clean_shape(_with_height(drawn[id_])) for id_ in network.lane_ids[: len(lanes)]]
+    roads = [
+        Road(range(first, first + number), begin, end)
+        for first, number, begin, end in network.edges[~network.edges["internal"]][
+            ["first_lane", "num_lanes", "from_junction", "to_junction"]
+        ].tolist()
+    ]
+    return find_strips(shapes, lanes["width_m"].tolist(), roads, network.left_hand)
+
+
+def _with_height(points: Points) -> list[tuple[float, float, float]]:
+    return [(x, y, z[0] if z else 0.0) for x, y, *z in points.tolist()]
+
+
+def _tight_corners(network: RoadNetwork) -> Iterator[Defect]:
+    """Find corners inside roads that the reader has no room to round."""
+    cars = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
+    for lane in np.flatnonzero(cars).tolist():
+        shape = network.lane_polyline(lane)
+        for corner in find_corners(shape):
+            x, y = shape[(corner.first + corner.last) // 2, :2].tolist()
+            angle = f"{abs(np.degrees(corner.turn)):.0f} degrees"
+            yield Defect("corner too tight for a car", network.lane_ids[lane], x, y, angle)
 
 
 def _inside(place: Points, rim: Points) -> bool:

@@ -21,6 +21,7 @@ from typing import Any
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument
@@ -44,6 +45,7 @@ from cavmarl.maps.provenance import (
     road_defaults,
 )
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
+from cavmarl.roads.sumo_net.sumo_options import map_of_config
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 
 Box = tuple[float, float, float, float]
@@ -118,7 +120,8 @@ def build_network(
 
     Args:
         source: OpenStreetMap or OpenDRIVE, which netconvert converts to a network, or a SUMO
-            network, which is copied. May be gzipped.
+            network, which is copied, or a configuration of SUMO, which names a network. May be
+            gzipped.
         target: path of the network, gzipped if it ends in `.gz`. Default: in the cache, or the
             source itself if it needs no changes.
         options: additional options for netconvert.
@@ -141,6 +144,8 @@ def build_network(
         MissingExtraError: netconvert, or a package for heights and levels, is not installed.
     """
     source = Path(source)
+    if is_sumo_config(source):
+        source = map_of_config(source)
     kind = map_kind(source)
     chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *_centred(source, kind, origin), *options)
     if tolerant and chosen:
@@ -173,9 +178,13 @@ def build_network(
 def map_file(path: str | Path) -> Path:
     """Return the SUMO network of a map file: the file itself, or the result of netconvert.
 
+    A configuration of SUMO stands for the network that it names.
+
     Raises MapError: see `build_network`.
     """
     path = Path(path)
+    if is_sumo_config(path):
+        path = map_of_config(path)
     if path.name.endswith((".net.xml", ".net.xml.gz")):
         return path
     kind = map_kind(path)

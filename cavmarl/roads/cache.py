@@ -34,7 +34,7 @@ from cavmarl.roads.network import (
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 # Increase this if the reader returns other rows for a file. Record types are hashed, too.
-FORMAT = 49
+FORMAT = 50
 
 _DIGEST_BYTES = 32  # each entry begins with the SHA-256 of the rest; damaged entries are not read
 _ALIGNED = 64  # arrays begin at multiples of this number of bytes
@@ -59,7 +59,9 @@ _DTYPES = {
     "roofs": np.dtype(np.float64),
     "roof_height": np.dtype(np.float64),
 }
-_IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "junction_kinds")
+_TEXTS = (
+    "lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "junction_kinds", "notes",
+)  # fmt: skip
 
 
 def load_network(path: str | Path) -> RoadNetwork:
@@ -107,7 +109,7 @@ def pack_network(network: RoadNetwork) -> bytes:
         content = getattr(network, name).tobytes()
         sizes[name] = len(content)
         pieces += [content, bytes(-len(content) % _ALIGNED)]
-    facts: dict[str, Any] = {name: getattr(network, name) for name in _IDS}
+    facts: dict[str, Any] = {name: getattr(network, name) for name in _TEXTS}
     facts["left_hand"] = network.left_hand
     facts["geo"] = None if network.geo is None else asdict(network.geo)
     head = json.dumps({"sizes": sizes, "told": facts}).encode()
@@ -141,7 +143,7 @@ def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadN
         values[key] = np.frombuffer(view[at : at + size], dtype=kind)
         at += size
     facts = head["told"]
-    values |= {key: tuple(facts[key]) for key in _IDS}
+    values |= {key: tuple(facts[key]) for key in _TEXTS}
     values["roofs"] = values["roofs"].reshape(-1, 4, 2)
     values["geo"] = None if facts["geo"] is None else GeoReference(**facts["geo"])
     return RoadNetwork(name=name, source_hash=digest, left_hand=facts["left_hand"], **values)

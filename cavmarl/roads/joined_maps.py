@@ -101,6 +101,11 @@ def join(networks: Sequence[RoadNetwork]) -> RoadNetwork:
         program_ids=tuple(own for one in networks for own in one.program_ids),
         junction_kinds=kinds,
         left_hand=first.left_hand,
+        notes=tuple(
+            f"{name}: {note}"
+            for name, one in zip(names, networks, strict=True)
+            for note in one.notes
+        ),
         joined=_map_rows(networks, starts),
         map_names=names,
     )

@@ -120,6 +120,7 @@ LINK = record(
     ("signal_index", np.int32),  # index of the letter in the signal's state
     ("direction", np.uint8),  # ord of SUMO's dir: s t l r L R
     ("state", np.uint8),  # ord of SUMO's link state without a signal: M m = s w Z o …
+    ("may_block", np.bool_),  # vehicles enter without room beyond the junction (keepClear="0")
     ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
     ("num_conflicts", np.int32),
     ("first_sweep", np.int32),  # SWEEP rows, sorted by the foe's LINK row and sizes
@@ -270,6 +271,7 @@ class RoadNetwork:
     junction_kinds: tuple[str, ...]  # SUMO's junction types, by `JUNCTION["kind"]`
     geo: GeoReference | None = None  # position on the earth; None: not given by the map
     left_hand: bool = False  # whether the map has left-hand traffic
+    notes: tuple[str, ...] = ()  # where the lanes differ from those of the source, and why
     joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # if several
     map_names: tuple[str, ...] = ()  # if there are several maps
     # WALL (num_walls,) of the buildings, if they were requested; see `maps.buildings`

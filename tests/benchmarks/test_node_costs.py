@@ -122,5 +122,5 @@ def test_too_few_runs_are_refused() -> None:
     [("2500", "1,2"), ("2500,2500", "1,2"), ("100,2500", "1,2"), ("2500,9000", "2")],
 )
 def test_too_few_runs_are_refused_before_the_first(vehicles: str, nodes: str) -> None:
-    with pytest.raises(ConfigError, match="two sizes from 400 on, and the nodes 1 and 2"):
+    with pytest.raises(ConfigError, match="two sizes of at least 400, and the nodes 1 and 2"):
         benchmark.measure(vehicles, nodes)

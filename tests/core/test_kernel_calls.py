@@ -111,7 +111,7 @@ def test_arguments_may_be_named_and_left_out() -> None:
 
 @compiled_only
 def test_unsupported_arguments_are_type_errors() -> None:
-    with pytest.raises(TypeError, match=r"is a builtins\.str: pass NumPy arrays"):
+    with pytest.raises(TypeError, match=r"is a builtins\.str; pass NumPy arrays"):
         same_number("word")
     with pytest.raises(TypeError, match=r"is a builtins\.list"):
         same_number([1])

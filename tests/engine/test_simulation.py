@@ -64,6 +64,25 @@ def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
         start(simulation, seed=0)
 
 
+@pytest.mark.parametrize(
+    ("agents", "background", "words"),
+    [
+        (
+            100,
+            20,
+            r"is 20, the default.*--background N\) to 0 or less, and use fewer",
+        ),
+        (20, 60, r"the background is 60\).*--background N\) to \d+ or less$"),
+        (100, 0, r"--agents N\) to fewer$"),
+    ],
+)
+def test_a_population_without_room_names_the_keys_to_change(
+    agents: int, background: int, words: str
+) -> None:
+    with pytest.raises(CapacityError, match=words):
+        make_simulation("ring22", mode="closed", agents=agents, background=background)
+
+
 @pytest.mark.parametrize("env", FREE_FLOW)
 @pytest.mark.parametrize(
     ("seed", "worlds", "length"),

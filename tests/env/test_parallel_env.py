@@ -439,6 +439,6 @@ def test_tools_that_look_change_nothing() -> None:
     env.traffic_stats()
     assert env.state_hash() == before
     assert env.step_s == env.config.clock.ctrl_dt_s
-    env.close()
     env.step(env.suggest_actions())
     assert env.state_hash() != before
+    env.close()

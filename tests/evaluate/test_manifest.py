@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from cavmarl.core.errors import ManifestError
+from cavmarl.env.vector import make_vec
 from cavmarl.evaluate import evaluate, load_report
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE, hash_of_file, read_closed
 from tests.support.forked_processes import ForkedProcess
@@ -60,6 +61,32 @@ def test_demand_is_identified_by_its_content(tmp_path: Path) -> None:
         found.append(world["demand_content_sha256"])
     assert found[0] == found[1] != found[2]
     assert manifest()["world"]["demand_content_sha256"] is None
+
+
+PERSON = (
+    "<routes><person id='p' depart='0'/><route id='r' edges='main_in weave main_out'/>"
+    "<flow id='f' route='r' begin='25200' end='25260' period='5'/></routes>"
+)
+
+
+def test_tolerated_demand_is_told_once_and_stated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "x.rou.xml"
+    path.write_text(PERSON)
+    demand = {"traffic.demand": [str(path)]}
+    said = [
+        f"       1 <person> is not read (first: {path}, line 1)",
+        "       1 the demand begins at 25200 s, as no vehicle departs in the 1 s from 0 s "
+        f"(first: {path}, line 1)",
+    ]
+    assert manifest(background=0, overrides=demand)["world"]["demand_tolerated"] == said
+    text = "\n".join(["merge: tolerated in the demand:", *said])
+    assert caplog.messages == [text]
+    caplog.clear()
+    make_vec("merge", num_envs=2, background=0, max_cycles=5, overrides=demand).close()
+    assert caplog.messages == [text]
+    assert manifest()["world"]["demand_tolerated"] == []
 
 
 def test_hardware_and_versions_are_never_empty() -> None:

@@ -160,6 +160,13 @@ def test_the_page_has_the_routes_and_the_problems() -> None:
         ),
         (
             "/configurations",
+            {"environment": "merge", "overrides": {"plugins": ["antigravity"]}},
+            422,
+            "refused",
+            "name modules, which are code",
+        ),
+        (
+            "/configurations",
             {"environment": "merge", "overrides": {"zones.journal": "log"}},
             422, "refused", "zones.journal",
         ),

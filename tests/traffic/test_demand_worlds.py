@@ -14,6 +14,7 @@ import pytest
 from cavmarl.core.records.codes import COUNT_DEPARTED
 from cavmarl.engine.simulation import Simulation
 from tests.engine.test_row_order import shuffle_rows
+from tests.support import demand_worlds
 from tests.support.demand_worlds import TINY, real, tiny
 from tests.support.driving import drive, start
 
@@ -163,3 +164,21 @@ def test_the_hash_covers_waiting_vehicles_and_called_orders(tmp_path: Path) -> N
         assert simulation.state_hash() != before, field
         simulation.vehicles()[field][0] = value
     assert simulation.state_hash() == before
+
+
+@pytest.mark.parametrize("model", ["Krauss", "IDM"])
+def test_a_slow_type_alone_on_its_way_has_no_delay(tmp_path: Path, model: str) -> None:
+    """SUMO's timeLoss of this vehicle is 0, too."""
+    path = tmp_path / "slow.rou.xml"
+    path.write_text(
+        f'<routes><vType id="slow" maxSpeed="4" sigma="0" speedDev="0" carFollowModel="{model}"/>'
+        '<vehicle id="s" type="slow" depart="0" departLane="0" departSpeed="max">'
+        '<route edges="weave main_out"/></vehicle></routes>',
+        encoding="utf-8",
+    )
+    simulation = demand_worlds.make("merge", [path], overrides={"clock.sim_dt_s": 0.1})
+    start(simulation, seed=0)
+    while simulation.traffic_stats().arrived == 0:
+        drive(simulation)
+        assert simulation.vehicles()["speed"].max(initial=0.0) <= 4.0 + 1e-9
+    assert simulation.traffic_stats().mean_delay_s == pytest.approx(0.0, abs=1.0)

@@ -100,5 +100,5 @@ NUM_COUNTS = 4
 # DepartureQueue.sums, over vehicles that arrived
 SUM_DISTANCE_M = 0
 SUM_TIME_S = 1
-SUM_DELAY_S = 2  # time in excess of the route's duration at the speed of limit and driver
+SUM_DELAY_S = 2  # time in excess of the route's duration at the speed of limit, driver and type
 NUM_SUMS = 3

@@ -78,7 +78,7 @@ class _World:
             if (num, total) != (due[zone], sums[zone]):
                 raise ProtocolError(
                     f"world {w}, tick {self.directory.table.tick}: zone {zone} has {num} vehicles, "
-                    f"the records have {due[zone]} or other epochs; zones.journal shows the records"
+                    f"the records {due[zone]}, or epochs differ; zones.journal shows the records"
                 )
 
     def is_silent(self, births: Sequence[Birth]) -> bool:
@@ -102,7 +102,7 @@ class NodeCoordinator:
     """Decides about ownership in W worlds.
 
     Attributes:
-        worlds: what it knows of each world.
+        worlds: ownership in each world.
         switched: number of changes of owner.
         is_late: a vehicle without a record has crossed a border, so a lease of no ticks is due.
     """
@@ -134,7 +134,7 @@ class NodeCoordinator:
         return self._hostings()
 
     def set_neighbours(self, neighbours: Neighbours) -> None:
-        """Let vehicles change between these zones only, from now on."""
+        """From now on, allow changes of owner only between these pairs of zones."""
         for world in self.worlds:
             world.directory.set_neighbours(neighbours)
 
@@ -315,7 +315,7 @@ class NodeCoordinator:
         ]
 
     def lease(self, messages: Mapping[int, bytes], ticks: int) -> None:
-        """Send the leases that `begin` returned; 0 ticks, or the ticks of a lease."""
+        """Send the leases that `begin` returned; `ticks`: their length, 0 or more."""
         for node, data in messages.items():
             self._links.send(node, FrameKind.LEASE, ticks, [data])
 

@@ -104,7 +104,7 @@ class NodePool:
         self._next_state = 1
         self._lost: list[int] = []
         self._is_torn = False
-        self._successions = 0  # in the present command
+        self._successions = 0  # losses of the only node in the present command
         self._max_retries = config.workers.max_retries
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
@@ -135,7 +135,7 @@ class NodePool:
         self._opened: PoolState | None = None
         self._next_state += 1
         self._kept: dict[int, Bytes] = {}  # replicas of the states of a single node, by numbers
-        self._keep_again_s = -math.inf  # by the clock of `_links`
+        self._keep_again_s = -math.inf  # time of the next kept state, by the clock of `_links`
         self._log: list[NodeCommand] = []  # commands since the state
         self.owner = np.full(len(runs) * self._num_ids, UNOWNED, dtype=np.int32)
         self.coordinator = NodeCoordinator(
@@ -292,7 +292,7 @@ class NodePool:
             raise
 
     def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
-        """Carry out a command, or none, and repeat it until no node is lost meanwhile."""
+        """Carry out a command, if any; recover and try again until no node is lost during it."""
         while True:
             try:
                 if self._is_torn:
@@ -312,11 +312,11 @@ class NodePool:
                 found.append(read(number, data))
         return found
 
-    def _replace_lost(self) -> bool:  # whether the worlds go back for that
+    def _replace_lost(self) -> bool:  # whether the worlds go back to the newest state
         """Let nodes that have joined in the meantime replace lost ones.
 
-        They get the zones of the newest state from the nodes that host them now. With SUMO this is
-        impossible, since no state has the commands to SUMO up to now.
+        The new nodes get the zones of the newest state from the nodes that host these zones now.
+        With SUMO this is impossible, since no state has all commands to SUMO so far.
         """
         if not self._is_native:
             return False
@@ -406,7 +406,7 @@ class NodePool:
         return None
 
     def _exchange(self, frame: NodeFrame) -> None:
-        """Send the receptions to all nodes; if a step is repeated, the same as before.
+        """Send the receptions to all nodes; in a repeated step, send the same receptions again.
 
         Raises:
             MessageError: there is no step.
@@ -440,7 +440,7 @@ class NodePool:
         """Remove a lost node, and start another one in its place.
 
         Raises:
-            WorkerError: the node had not begun, and too many were lost like that.
+            WorkerError: the node had not begun, and too many nodes were lost before they had begun.
         """
         is_silent = isinstance(lost, SilentNodeError)
         lost = lost if is_silent else self._watch.most_missed(lost)
@@ -487,7 +487,7 @@ class NodePool:
         self.recoveries += bool(moves.heirs or kept)
 
     def _moves(self) -> tuple[ZoneMoves, Bytes]:
-        """Return the new zones of the nodes, and the replica of the state if it is only here.
+        """Return the new zones of the nodes, and the state's replica if only this process has it.
 
         If the only node is lost, another one takes its place.
 

@@ -259,7 +259,7 @@ class ZoneEndpoints:
         kept: dict[int, int] = {}
         for vehicle, reason in gone.items():
             zone = next((z for z, e in self._endpoints[w].items() if vehicle in e.owned), None)
-            if zone is None:  # it was born during the lease
+            if zone is None:  # the vehicle was born during the lease
                 kept[vehicle] = reason
             else:
                 left.setdefault(zone, []).append(Removed(vehicle, reason))
@@ -371,7 +371,7 @@ class ZoneEndpoints:
             return
         if (w, vehicle) not in self._arrived_agents:
             others = {node for zone, node in enumerate(self._node_of) if zone not in self._zones}
-            self._links.wanted = others  # all but a silent node have sent their next share
+            self._links.wanted = others  # only a silent node has not sent its next share
             while (w, vehicle) not in self._arrived_agents:
                 self._links.check_recovery()
                 self._links.pump(None)

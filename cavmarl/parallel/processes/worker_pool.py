@@ -51,7 +51,7 @@ class Pool:
     """m worker processes.
 
     Raises:
-        WorkerError: no process, or no memory.
+        WorkerError: a process cannot be started, or there is not enough memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 
@@ -195,7 +195,7 @@ class Pool:
         self._note_done(first, pending)
 
     def _note_done(self, first: int, pending: list[int]) -> None:
-        """Note for deaths from a number on when the successors have finished."""
+        """Note the time in `deaths[first:]` whose successors have just finished."""
         for death in self.deaths[first:]:
             if death.worker not in pending and isnan(death.done_s):
                 death.done_s = time.monotonic()

@@ -25,7 +25,7 @@ from cavmarl.balance.shard_placement import Placement
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 
 PIECES_PER_WORKER = 4  # units of one sensor, if there are enough agents
-MIN_GAIN_S = 2e-4  # to divide frames, since two workers then look up the same surroundings
+MIN_GAIN_S = 2e-4  # smaller gains do not pay for looking up the same surroundings in two workers
 
 
 class Unit(NamedTuple):
@@ -57,7 +57,7 @@ class Shares:
 
     @property
     def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
-        """Worker and lines of each part of the sensors that are divided equally for all agents.
+        """For each sensor divided in the same way for all agents: worker and lines of each part.
 
         For other sensors, the time of a worker cannot be attributed to lines.
         """
@@ -134,7 +134,7 @@ def divide(shares: Shares, costs: LineCosts) -> Shares:
             home == taker and other[:3] == unit[:3]
             for other, home in zip(units, homes, strict=True)
         ):
-            break  # a worker writes a single range of lines of a frame
+            break  # the taker already writes a range of these frames, and can write only one
         before = costs.part(unit.sensor, 0, unit.end)
         within = costs.part(unit.sensor, unit.begin, unit.end)
         line = costs.line_at(unit.sensor, before - within * wanted_s / cost_s)

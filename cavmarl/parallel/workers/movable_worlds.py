@@ -28,7 +28,7 @@ MakeWorlds = Callable[[int, int], LocalWorlds]
 
 
 class MovableWorlds(WorkerWorlds):
-    """Worlds with consecutive numbers, which may become others."""
+    """Worlds with consecutive numbers, which may be replaced by other worlds between commands."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class MovableWorlds(WorkerWorlds):
         bounds: Sequence[int],  # first world of each worker, and the number of worlds
         number: int,  # of this worker
         outboxes: Sequence[Image],  # of all workers
-        spent_s: NDArray[np.float64],  # (W,) where the processor time of each world is added up
+        spent_s: NDArray[np.float64],  # (W,) total processor time of each world, updated
     ) -> None:
         self._make = make
         self._number = number

@@ -57,9 +57,9 @@ class Team:
         self,
         shards: Sequence[Shard],  # one per zone, in the order of zones; their arrays are shared
         zones: Sequence[Sequence[int]],  # initial zones of each worker; the first worker leads
-        # arguments of shared phases: all that a phase may be called with, with shared arrays
+        # every tuple of arguments that each shared phase may get; its arrays are shared
         known: Mapping[Phase, Sequence[tuple[Any, ...]]],
-        # (k,) where the processor time of each zone is added up; None: not measured
+        # (k,) total processor time of each zone, updated; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self.known = {phase: tuple(known.get(phase, ((),))) for phase in SHARED}

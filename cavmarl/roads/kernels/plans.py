@@ -18,6 +18,7 @@ from cavmarl.core.records.arrays import RoadArrays
 
 LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a very long lane, as travel time in s
 LANE_CHANGE_M = 250.0  # the cost doubles on a lane of this length: drivers can barely change there
+LEAST_CHANGE_M = 9.0  # on shorter lanes, vehicles hardly change: a change always has its full cost
 TURNAROUND = ord("t")
 
 
@@ -55,9 +56,10 @@ def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
     """
     if roads.lanes[lane]["internal"]:
         return math.inf
-    return (
-        weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
-    )
+    length_m = float(roads.lanes[lane]["length_m"])
+    if length_m < LEAST_CHANGE_M:
+        weight = max(weight, 1.0)
+    return weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / length_m)
 
 
 @kernel

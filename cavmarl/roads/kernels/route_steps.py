@@ -144,7 +144,7 @@ def _go_sideways(
 def trace_edges(
     roads: RoadArrays, plan: NDArray[np.void], first_edge: int, out: NDArray[np.int32]
 ) -> int:
-    """Find the edges along a plan, from the lane of an edge with the shortest way to the goal.
+    """Find the edges along a plan, starting from the lane of an edge with the fastest way.
 
     `plan`: PLAN (L,) of one goal. `out`: memory for EDGE rows, including the first edge.
 
@@ -154,7 +154,7 @@ def trace_edges(
     lane = -1
     for candidate in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         if plan[candidate]["to_go"] < math.inf:
-            if lane < 0 or _is_better(plan, candidate, lane):
+            if lane < 0 or _is_better(roads, plan, candidate, lane):
                 lane = candidate
     if lane < 0:
         return 0
@@ -192,12 +192,27 @@ def follow_plan(
 
 
 @kernel
-def _is_better(plan: NDArray[np.void], lane: int, other: int) -> bool:
-    """Return whether the way from `lane` has fewer changes than from `other`, or is shorter."""
-    one = plan[lane]
-    two = plan[other]
-    if one["changes"] != two["changes"]:
-        fewer: bool = one["changes"] < two["changes"]
-        return fewer
-    shorter: bool = one["to_go"] < two["to_go"]
-    return shorter
+def _time_of(roads: RoadArrays, plan: NDArray[np.void], lane: int) -> float:
+    """Return the time in s from the start of a lane to the end of a plan, without lane changes."""
+    total: float = 0.0
+    while True:
+        step = plan[lane]
+        if step["change"] > 0:
+            lane = roads.lanes[lane]["left"]
+        elif step["change"] < 0:
+            lane = roads.lanes[lane]["right"]
+        else:
+            total += roads.lanes[lane]["length_m"] / roads.lanes[lane]["speed_mps"]
+            if step["next"] < 0:
+                return total
+            lane = step["next"]
+
+
+@kernel
+def _is_better(roads: RoadArrays, plan: NDArray[np.void], lane: int, other: int) -> bool:
+    """Return whether a plan is faster from `lane` than from `other`, or needs fewer changes."""
+    time_s, other_s = _time_of(roads, plan, lane), _time_of(roads, plan, other)
+    if time_s != other_s:
+        return time_s < other_s
+    fewer: bool = plan[lane]["changes"] < plan[other]["changes"]
+    return fewer

@@ -168,7 +168,7 @@ class SumoSimulation:
         return [*compress(names, is_here)], numbers[is_here], rows[is_here], fresh
 
     def _row_of(self, kind: str) -> int:
-        """Return the row of a type; a vehicle's own type, `type@vehicle`, counts as its origin."""
+        """Return the row of a type; a vehicle's own type, `type@vehicle`, has the row of `type`."""
         row = self._type_row.get(kind, self._type_row.get(kind.partition("@")[0]))
         if row is None:
             raise LookupError(f"type '{kind}' is in none of the files")

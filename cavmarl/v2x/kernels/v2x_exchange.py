@@ -109,7 +109,7 @@ def _receive_objects(
     box: NDArray[np.void],
     num: int,
 ) -> int:
-    """Receive reports of vehicles, by the vehicles themselves and by stations that see them."""
+    """Receive reports about vehicles, from the vehicles themselves or stations that see them."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
     refresh_by_cams(channel, me, level, packets, reports, scratch, box, num)

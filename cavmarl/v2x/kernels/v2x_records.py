@@ -69,7 +69,7 @@ PACKET = record(
     ("tick", np.int64),  # tick of sending
     ("x", np.float64),  # m, position of the sender
     ("y", np.float64),
-    ("word", np.uint64),  # its half of random numbers
+    ("word", np.uint64),  # the packet's half of random numbers, see `packet_word`
     ("kind", np.int32),
     ("first", np.int32),  # index of its first report
     ("count", np.int64),
@@ -104,7 +104,7 @@ RECEIVER = record(
     ("id", np.int64),  # -1: none
     ("x", np.float64),
     ("y", np.float64),
-    ("word", np.uint64),  # its half of random numbers
+    ("word", np.uint64),  # the receiver's half of random numbers, see `receiver_word`
 )
 
 
