@@ -1,12 +1,10 @@
 """The client's protocol with a world on a node, including recovery from the loss of the node.
 
 Commands are numbered. A node answers a repeated command from memory, and from time to time stores
-the
-state of its worlds with the service. The client keeps the commands since the last stored state. If
-the
-node is lost, the service selects another node, which loads that state, and the client repeats the
-later
-commands. Equal commands give equal bytes. The address of a node is not used after its lease.
+the state of its worlds with the service. The client keeps the commands since the last stored state.
+If the node is lost, the service selects another node, which loads that state, and the client
+repeats the later commands. Equal commands give equal bytes. The address of a node is not used after
+its lease.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def _fault(module: str, error: Exception) -> str:
 
 
 def extension_modules(names: Iterable[str], plugins: Iterable[str]) -> list[str]:
-    """Return the modules that other processes must import: plugins, then by registration.
+    """Return the modules that other processes must import; plugins come first.
 
     `names`: extensions of the world. Raises ConfigError: one of them is registered by a module that
     cannot be imported.

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-PAGE = 1 << 21  # bytes
+PAGE = 1 << 21  # size of a huge page in bytes
 LEAST = 1 << 16  # bytes; smaller arrays gain nothing
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _TUNABLES = "GLIBC_TUNABLES"
@@ -99,7 +99,7 @@ def _map(size: int) -> NDArray[np.uint8]:
     try:
         memory.madvise(mmap.MADV_HUGEPAGE)
     except OSError:
-        pass  # a kernel without huge pages: small pages work, too
+        pass  # this system has no huge pages; small pages work, too
     whole = np.frombuffer(memory, dtype=np.uint8)
     first = -whole.ctypes.data % PAGE
     return whole[first : first + size]

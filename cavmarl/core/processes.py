@@ -29,11 +29,11 @@ def is_fork(pid: int) -> bool:
 
 
 def refuse_fork(pid: int, things: str) -> None:
-    """Raise an error if this process is a fork of process `pid`, which made some objects.
+    """Raise an error if this process is a fork of process `pid`, which made `things`.
 
     Raises:
-        WorkerError: this is a fork. Both processes would use the same connection or file, which
-            `things` describes.
+        WorkerError: this is a fork. Both processes would use the same connection or file; `things`
+            describes it in the message.
     """
     if is_fork(pid):
         raise WorkerError(

@@ -47,7 +47,7 @@ class BackendWorld:
         self._sense()
 
     def resume(self, backends: Sequence[ShardBackend]) -> None:
-        """Replace the backends by others, which have restored their snapshots."""
+        """Replace the backends by backends that have restored their snapshots."""
         if [one.zone for one in backends] != [*range(self._count)]:
             raise ConfigError(
                 f"the backends run the zones {[one.zone for one in backends]}; pass one for each "

@@ -37,7 +37,7 @@ _ANNOUNCER = _Announcer()
 
 
 def prepare_kernels() -> None:
-    """Compile the kernels of a plain world in two processes, if this machine has none cached.
+    """Compile the kernels of a plain world in two processes, if no kernels are cached here.
 
     Afterwards, the first compilation of a kernel in this process prints a message on standard
     error.
@@ -81,7 +81,7 @@ def _marker(name: str) -> Path:
 
 
 def _can_cache() -> bool:
-    """Return whether compiled kernels can be cached on this machine; if not, print it once."""
+    """Return whether compiled kernels can be cached on this machine; if not, report it once."""
     try:
         _marker("plain").parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

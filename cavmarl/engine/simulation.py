@@ -57,7 +57,7 @@ class Simulation(WorldViews):
         frames: Frames | None = None,
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
         zeros: Zeros = huge_zeros,  # allocates the arrays that shards write
-        like: Simulation | None = None,  # of the same environment, to share its tables
+        like: Simulation | None = None,  # worlds of the same environment, to share tables
         runs: Sequence[OpenRun] | None = None,  # one per world; None: made as `config.zones` says
         late_ticks: int = 0,  # extra ticks that a vehicle across a border may stay with its owner
     ) -> None:

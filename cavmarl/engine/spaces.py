@@ -104,8 +104,8 @@ class ObservationPart:
     """One sensor's part of an observation."""
 
     place: slice  # range of its features in each frame of a flat observation
-    shape: tuple[int, ...]  # in a Dict observation; the frames of a stack are its first axis
-    dtype: DTypeLike  # in a Dict observation
+    shape: tuple[int, ...]  # shape in a Dict observation; frames of a stack come first
+    dtype: DTypeLike  # dtype in a Dict observation
 
 
 def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
@@ -133,7 +133,7 @@ def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
 
 
 def named_observation(
-    parts: Mapping[str, ObservationPart],  # of `observation_parts`
+    parts: Mapping[str, ObservationPart],  # as from `observation_parts`
     frames: NDArray[np.float32],  # (…, stack, frame size): flat observations, reshaped
 ) -> dict[str, NDArray[Any]]:  # one array (…, *shape) per sensor
     """Split flat observations by sensor, as views; images are converted to bytes."""

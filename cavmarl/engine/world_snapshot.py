@@ -33,15 +33,15 @@ Array = NDArray[Any]
 class Parts(NamedTuple):
     """The parts that keep the state of W worlds."""
 
-    worlds: Worlds  # of the first shard
-    division: ZonedShards  # of all shards
-    departures: DepartureQueue  # through which vehicles enter and leave
+    worlds: Worlds  # the worlds of the first shard
+    division: ZonedShards  # all shards
+    departures: DepartureQueue  # queue through which vehicles enter and leave
     traffic: NativeTraffic  # departures, routes and arrivals
-    outputs: Outputs  # of the agents, including the frames that the next observation stacks
+    outputs: Outputs  # agents' outputs, including the frames that the next observation stacks
     coordination: OwnershipRuntime  # decides ownership
     partition: ZonePartition  # the zones
     repartition_steps_done: int  # steps begun so far, which decide when zones are cut anew
-    has_past: bool  # whether an observation depends on the one before
+    has_past: bool  # whether an observation depends on the previous observation
     attached: tuple[Component, ...]  # components that act in each tick
     sumo: SumoTraffic | None  # the other simulator; None: there is none
 

@@ -89,7 +89,7 @@ class ZoneHosting:
         self,
         partition: ZonePartition,
         vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world, of all zones
-        contacts: NDArray[np.int64],  # (W,) counted in all zones
+        contacts: NDArray[np.int64],  # (W,) number of contacts in all zones
     ) -> None:
         """Change the zones if peers run some of the zones. Call `host_zones` afterwards."""
         tick = self._tick

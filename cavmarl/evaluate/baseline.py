@@ -1,9 +1,8 @@
 """Baselines for a map: random actions, the built-in driver, a trained driver and an oracle.
 
 All drive the same trips under the rules of one environment on another map. The oracle is the
-built-in
-driver alone on the road. As nothing hinders it, it bounds what a driver in traffic can reach; the
-difference to it is the cost of traffic.
+built-in driver alone on the road. As nothing hinders it, it bounds what a driver in traffic can
+reach; the difference to it is the cost of traffic.
 """
 
 from __future__ import annotations

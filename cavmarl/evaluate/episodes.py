@@ -154,7 +154,7 @@ def derived_seed(seed: int, number: int) -> int:
 
 
 class _Part:
-    """The episodes of the worlds stepped together; the first `count` of them count."""
+    """The episodes of worlds that are stepped together; only the first `count` are evaluated."""
 
     def __init__(self, vec: CavVectorEnv, seen: RunWatch, count: int, *, tracked: bool) -> None:
         self._vec = vec
@@ -193,7 +193,7 @@ class _Part:
         policy_seed: int,
         step_done: Callable[[int, int], None],
     ) -> None:
-        """Drive until each counting world has finished its episode."""
+        """Drive until each of the first `count` worlds has finished its episode."""
         vec = self._vec
         observations, infos = vec.reset(seed=seed, options={"first_world": first})
         driver.reset(policy_seed)

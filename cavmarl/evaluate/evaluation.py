@@ -100,10 +100,8 @@ def evaluate(
     """Evaluate policies in `repeats` runs of `episodes` seeded episodes.
 
     All policies drive the same episodes: episode e of a run is the first one of world e of its
-    seed. If
-    the trained drivers among the policies need the same sensors, the worlds get these sensors. Two
-    or more
-    runs are driven in new processes, one after the other.
+    seed. If the trained drivers among the policies need the same sensors, the worlds get these
+    sensors. Two or more runs are driven in new processes, one after the other.
 
     Args:
         env: as in `make_vec`, like the keywords that are not listed here.
@@ -318,7 +316,7 @@ def _runs(job: EpisodeJob, seeds: list[int], journal: str, worlds: int) -> list[
             overrides["zones.journal"] = str(own)
             taken = [p for w in range(worlds) if (p := journal_path(str(own), w, worlds)).exists()]
             if taken:
-                raise JournalError(f"{taken[0]}: exists; take it away, or name another journal")
+                raise JournalError(f"{taken[0]}: exists; move it away, or name another journal")
         jobs.append(replace(job, seed=seed, run=run, overrides=overrides))
     return jobs
 

@@ -24,9 +24,8 @@ _TERM = {name: k for k, name in enumerate(TERMS)}
 class Recorder:
     """Records W worlds with A agents through one episode each.
 
-    A trip counts if it began in the first half of its episode. So each counting trip has at least
-    half an
-    episode to end, and which trips count does not depend on how they end.
+    A trip counts if it began in the first half of its episode. So each counted trip has at least
+    half an episode to end, and which trips count does not depend on how they end.
 
     `weights` (T,) are the weights of the terms in the reward. `slowest` is the longest duration of
     a success as a multiple of the free travel time.

@@ -1,10 +1,8 @@
 """`EvaluationReport`: the results of an evaluation as frozen values.
 
 Two kinds of spread are kept apart. *Between runs*: each run has its own seed and gives one mean;
-the
-interval contains the mean of all such runs. *Within a run*: the spread of trips or episodes of one
-run
-says nothing about another run.
+the interval contains the mean of all such runs. *Within a run*: the spread of trips or episodes of
+one run says nothing about another run.
 """
 
 from __future__ import annotations
@@ -76,7 +74,7 @@ class PairedDifference:
 class PolicyReport:
     """All results of one policy."""
 
-    trips: int  # number of counting trips in all runs
+    trips: int  # number of counted trips in all runs
     metrics: Mapping[str, Found]  # by the names of `metrics.METRICS`
     # metric → paired difference from the first policy; empty for the first policy
     minus_first: Mapping[str, PairedDifference]

@@ -54,7 +54,7 @@ TRIP = np.dtype(
         ("delay_s", np.float64),  # time lost compared with driving at `free_speed`
         ("mean_jerk_mps3", np.float64),  # mean |jerk|
         ("mean_speeding", np.float64),  # mean speed above the limit, as a share of it
-        ("least_ttc_s", np.float64),  # least time to collision; TTC_HORIZON_S: that and above
+        ("least_ttc_s", np.float64),  # least time to collision, at most TTC_HORIZON_S
         ("short_ttc_share", np.float64),  # share of the trip with less than SHORT_TTC_S
         ("least_pet_s", np.float64),  # least post-encroachment time; NaN: none up to PET_HORIZON_S
         ("end_x_m", np.float64),  # its place before its last step

@@ -106,7 +106,7 @@ class Cross:
     tables: Mapping[str, Mapping[str, NDArray[np.void]]]
 
     def share(self, driver: str, others: str, column: str) -> float | None:
-        """Return a share of a driver's counting trips among others; None: it had no trips."""
+        """Return a share of a driver's counted trips among others; None: it had no trips."""
         trips = self.tables[driver][others]
         return float(trips[column].mean()) if len(trips) else None
 
@@ -161,8 +161,7 @@ def cross(
     """Evaluate each driver among the vehicles of each other driver.
 
     All pairs drive the same episodes. Agents with even numbers belong to the driver, odd ones to
-    the other
-    driver.
+    the other driver.
 
     Raises:
         ConfigError: the environment has fewer than two agents.

@@ -110,7 +110,7 @@ def halo_m(
     config: EnvConfig,  # its `zones.halo_m` is used if it is set
     reach_m: float,  # the farthest look of any driver
     zones: int,  # number of zones
-    fastest_mps: float = MAX_SPEED_MPS,  # longest move in a tick / tick, with jumps on the map
+    fastest_mps: float = MAX_SPEED_MPS,  # longest move in a tick, jumps included, over its duration
     late_ticks: int = 0,  # see `divide`
 ) -> float:
     """Return how far zones see beyond their borders, in m.
@@ -136,7 +136,8 @@ def halo_m(
 def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
     """Return whether drivers consider only vehicles along the roads, so that halos can be smaller.
 
-    Scripts put vehicles beside the roads, and SUMO anywhere. A configured halo is used as it is.
+    Scripts may place vehicles beside the roads, and SUMO anywhere. A configured halo is not
+    reduced.
     """
     free = traffic.scene is not None or traffic.sumo is not None
     return config.zones.halo_m is None and not free

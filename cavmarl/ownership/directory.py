@@ -176,8 +176,8 @@ class Directory:
 
     def resend(
         self,
-        zones: Iterable[int] | None = None,  # only to these zones; None: to all
-        # needed after `restore`; None: the payloads of `begin`
+        zones: Iterable[int] | None = None,  # zones that get their STEP again; None: all
+        # zone → payload of its STEP, needed after `restore`; None: those given to `begin`
         payloads: Mapping[int, bytes] | None = None,
     ) -> Output:
         """Return the STEPs of zones that have not answered, to send them again."""

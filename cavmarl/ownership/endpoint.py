@@ -121,7 +121,7 @@ class Endpoint:
 
     def _end_lease(self, tick: int) -> None:
         self.tick, self.lease = tick, None
-        self.offers.unanswered.clear()  # unanswered offers are of the tick before
+        self.offers.unanswered.clear()  # the previous tick's offers
 
     def offer(self, approaches: Iterable[Approach]) -> tuple[Message, ...]:
         """Offer all approaching vehicles of a tick to other zones, after `complete`."""

@@ -55,7 +55,7 @@ class Table:
         self.plan: OwnershipPlan | None = None  # of the tick in progress, or None
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())
-        self._moves: list[_Move] = []  # not in the tallies yet
+        self._moves: list[_Move] = []  # moves that the tallies do not include yet
 
     @property
     def tallies(self) -> dict[int, OwnedTally]:
@@ -129,9 +129,9 @@ class Table:
     def go_on(
         self,
         run: bytes,
-        episode: int,  # -1: none has begun
+        episode: int,  # -1: no episode has begun
         tick: int,  # the committed tick
-        owners: dict[int, tuple[int, int]],  # at that tick
+        owners: dict[int, tuple[int, int]],  # owners at `tick`
         seen: SeenIds,
     ) -> None:
         """Resume as the table of a coordinator whose zones are all in one process.

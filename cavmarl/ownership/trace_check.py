@@ -107,14 +107,14 @@ class TraceChecker:
         self,
         longest_deferral: int,  # ticks that a vehicle may have an owner whose zone it has left
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
-        # zones and coordinator are in one process, so that there are only records, and possibly
-        # only records of ticks with changes
+        # whether zones and coordinator are in one process. The trace then has only records, and
+        # possibly only those of ticks with changes
         is_direct: bool = False,
         near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
     ) -> None:
         self._is_direct, self.near = is_direct, near
         self.owners: dict[int, Owner] = {}  # vehicle → owner at the committed tick
-        self.changes: list[OwnerStep] = []  # of the last COMMIT
+        self.changes: list[OwnerStep] = []  # changes in the last COMMIT
         self._longest, self._lifetime = longest_deferral, lifetime
         self._run, self._episode, self._tick = b"", -1, 0
         self._tallies: defaultdict[int, OwnedTally] = defaultdict(OwnedTally)
@@ -124,10 +124,10 @@ class TraceChecker:
         self._fenced: set[int] = set()
         self._fences: dict[tuple[int, int], tuple[int, int]] = {}
         self._fenced_at: defaultdict[int, set[tuple[int, int]]] = defaultdict(set)  # tick → fences
-        self._holdings: defaultdict[int, set[Holding]] = defaultdict(set)  # by tick
+        self._holdings: defaultdict[int, set[Holding]] = defaultdict(set)  # tick → holdings
         self._ready: set[tuple[int, int, int, int, int]] = set()  # states of ACKs, and their tick
         self._begun: Begin | None = None
-        self._orders: defaultdict[int, _Orders] = defaultdict(_Orders)  # by zone, of that BEGIN
+        self._orders: defaultdict[int, _Orders] = defaultdict(_Orders)  # zone → its orders
         self._dones: dict[int, Done] = {}
         self._checks: dict[type, Callable[[Any], None]] = {
             Reset: self._reset, Host: self._host, Fence: self._fence, Begin: self._begin,

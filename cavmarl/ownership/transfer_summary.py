@@ -38,11 +38,11 @@ class TransferSummary:
     deferred: int  # sum over vehicles of ticks with the old owner after the crossing
     refused: int  # states that a target refused
     aborted: int  # approaches that ended without a transfer
-    # by phase: `acknowledge`, no answer by the end of the tick (same as `deferred`); `switch`, no
-    # answer by the deadline (same as `forced`); `replica`, states that were neither used nor
-    # withdrawn in their lifetime
+    # phase → number of timeouts. `acknowledge`: no answer by the end of the tick (same as
+    # `deferred`); `switch`: no answer by the deadline (same as `forced`); `replica`: states that
+    # were neither used nor withdrawn in their lifetime
     timeouts: Mapping[str, int]
-    latency_ticks: Spread  # from the first state at the target to its confirmation
+    latency_ticks: Spread  # ticks from the first state at the target to its confirmation
     waited_ticks: Spread  # the part of `latency_ticks` after the crossing
     latency_ms: Spread  # the same as `latency_ticks`, by the clock
     state_bytes: Spread  # size of a vehicle's state

@@ -81,14 +81,14 @@ class TransferLog:
         self,
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
     ) -> None:
-        self.episode = -1  # of the newest record
+        self.episode = -1  # episode of the newest record
         self.ask: Callable[[], None] = lambda: None
         self._rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
         self._later: deque[tuple[int, Callable[[], Iterable[Transfer]]]] = deque()
         self._num_later = 0
         self._counts: Counter[str] = Counter()
         self._lifetime = lifetime
-        self._approaches: dict[tuple[int, int, int], _Approach] = {}  # vehicle, target, epoch
+        self._approaches: dict[tuple[int, int, int], _Approach] = {}  # by vehicle, target, epoch
         self._waited: dict[int, int] = {}
         self._begun: Begin | None = None
 

@@ -1,8 +1,7 @@
 """The records of the service: nodes, sessions, identities, keys and configurations.
 
 All records follow from the event log: only `Infrastructure.apply` changes them, so replaying the
-log
-gives the same records again. Values of heartbeats are not part of the log.
+log gives the same records again. Values of heartbeats are not part of the log.
 """
 
 from __future__ import annotations

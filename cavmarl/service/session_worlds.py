@@ -36,7 +36,7 @@ class SessionWorld:
     Attributes:
         number: number of commands so far.
         saved: number of commands that the state stored with the service includes.
-        is_changed: whether a page has changed the worlds since then.
+        is_changed: whether a page has changed the worlds since that state was stored.
         is_commanded: whether a command is running, so that pages have to wait.
     """
 

@@ -127,6 +127,6 @@ def test_each_run_has_journals_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "run.0.jsonl").unlink()
     (tmp_path / "run.1.jsonl").unlink()
     out = tmp_path / "out"
-    with pytest.raises(JournalError, match=r"run\.run-1\.0\.jsonl: exists; take it away"):
+    with pytest.raises(JournalError, match=r"run\.run-1\.0\.jsonl: exists; move it away"):
         evaluate("grid4x4", "idm", out=out, **few)
     assert not (out / "manifest.json").exists(), "it is refused before the first run"

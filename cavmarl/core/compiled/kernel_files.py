@@ -140,7 +140,7 @@ def _machine() -> tuple[str, ...]:
     from llvmlite import binding
 
     processor = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
-    features = os.environ.get("NUMBA_CPU_FEATURES")  # empty: by the processor's name
+    features = os.environ.get("NUMBA_CPU_FEATURES")  # empty: the processor's name decides
     if features is None:
         features = binding.get_host_cpu_features().flatten()
     settings = [f"{name}={os.environ.get(name, '')}" for name in ("NUMBA_BOUNDSCHECK", "NUMBA_OPT")]

@@ -143,8 +143,8 @@ class FollowedWorld:
             EpisodeError: the episode is over.
             FollowerLostError: a follower has not answered in time, or has ended; it is dropped. The
                 world has advanced by one step, and the next call continues from there.
-            FollowerError: as before, but the follower's messages are invalid, or its controls
-                cannot be carried out.
+            FollowerError: a follower's messages are invalid, or its controls cannot be carried out;
+                the consequences are those of a FollowerLostError.
             ClockError: another caller has advanced the world.
         """
         if self.is_over:

@@ -1,8 +1,7 @@
 """A run of a demand in SUMO, measured like the run in cavmarl.
 
 libsumo supports one simulation per process, and a second start silently replaces the first.
-Therefore
-every run has its own process.
+Therefore every run has its own process.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ class Coordinator(ABC):
         self.switched = 0  # number of changes of owner
         self._watchers: tuple[Watcher, ...] = ()
         self._births: list[Birth] = []
-        self._gone: list[Removed] = []  # between two ticks
-        self._removed: list[Removed] = []  # in the tick
+        self._gone: list[Removed] = []  # vehicles that left between two ticks
+        self._removed: list[Removed] = []  # vehicles that left in the present tick
 
     @property
     def directory(self) -> Directory:
@@ -59,7 +59,7 @@ class Coordinator(ABC):
     @property
     @abstractmethod
     def is_open(self) -> bool:
-        """Whether a tick has begun and is not committed."""
+        """True if a tick has begun and is not committed."""
 
     def watch(self, watcher: Watcher) -> None:
         """Send all further records also to this watcher."""

@@ -76,7 +76,7 @@ class OwnersOnRecord:
         self.entered = self.left = 0  # since the reset
         self._checker = TraceChecker(limits.deferral, limits.lifetime, is_direct=True)
         self._sums = np.zeros(zones, dtype=np.uint64)
-        self._current = self._sums  # including announced changes
+        self._current = self._sums  # `_sums`, including announced changes
         self.ask: Callable[[], None] = _nothing
 
     @property
