@@ -20,13 +20,13 @@ TOOLS = {"all", "bench", "dev", "fuzz"}
 
 
 def named_extras() -> Iterator[tuple[str, str]]:
-    """Yield (extra, file) of each call of `require` or `missing`."""
+    """Yield (extra, file) of each call of `require`, `require_all` or `missing`."""
     for folder in ("cavmarl", "benchmarks", "docs", "train"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_bytes())):
                 if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
                     continue
-                if node.func.id in ("require", "missing") and len(node.args) == 2:
+                if node.func.id in ("require", "require_all", "missing") and len(node.args) == 2:
                     extra = node.args[1]
                     if isinstance(extra, ast.Constant):
                         yield extra.value, path.relative_to(ROOT).as_posix()

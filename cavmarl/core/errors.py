@@ -38,6 +38,8 @@ A message says what is wrong, where, and what to do.
 from __future__ import annotations
 
 import importlib
+import importlib.util
+from collections.abc import Iterable
 from types import ModuleType
 
 
@@ -273,9 +275,21 @@ class RegisteredFunctionError(CavmarlError):
 
 def missing(module: str | None, extra: str) -> MissingExtraError:
     """Return the error for a `module` that cannot be imported; it names the `extra` to install."""
-    return MissingExtraError(
-        f"'{module}' is not installed: pip install '.[{extra}]' in a checkout of cavmarl"
-    )
+    return MissingExtraError(f"'{module}' is not installed: {_install(extra)}")
+
+
+def require_all(modules: Iterable[str], extra: str) -> None:
+    """Check that optional `modules` are installed, without importing them.
+
+    Raises:
+        MissingExtraError: modules are not installed; the message names all of these.
+    """
+    if absent := [name for name in modules if importlib.util.find_spec(name) is None]:
+        raise MissingExtraError(f"not installed: {', '.join(absent)}; {_install(extra)}")
+
+
+def _install(extra: str) -> str:
+    return f"pip install '.[{extra}]' in a checkout of cavmarl"
 
 
 def require(module: str, extra: str) -> ModuleType:
