@@ -156,13 +156,12 @@ $(READY): pyproject.toml constraints/exact.txt
 
 $(DEMO)/.ready: pyproject.toml constraints/exact.txt
 	$(CHECK_PYTHON)
-	@echo "$(DEMO): installing 1.2 GB and compiling kernels, once; about three minutes on two cores"
+	@echo "$(DEMO): installing 1.2 GB, once; then the demo compiles its kernels: three minutes on two cores"
 	test -x $(DEMO)/bin/pip || "$(PYTHON)" -m venv --clear $(DEMO)
 	$(DEMO)/bin/python -m pip install --quiet --no-compile $(TORCH_INDEX) \
 	    $$(grep '^torch==' constraints/exact.txt) --constraint constraints/exact.txt
 	$(DEMO)/bin/python -m pip install --quiet --no-compile --editable '.[demo]' \
 	    --constraint constraints/exact.txt
-	$(DEMO)/bin/python -m cavmarl.prebuild compile
 	@touch $@
 
 $(TOOLS)/.ready:
