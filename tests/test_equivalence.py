@@ -23,6 +23,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.support.actuated import actuated_grid
 from tests.support.demand_worlds import make, tiny
 from tests.support.driving import drive, start
+from tests.support.narrow_places import signal_pair, zipper
 from tests.support.netgenerate import netgenerate
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, write_demand
 from tests.support.world import traffic_of
@@ -278,7 +279,7 @@ BEHIND_THE_LAST = """<routes>
 </routes>"""
 
 
-def test_who_enters_behind_the_last_enters_once_however_far_the_last_is(tmp_path: Path) -> None:
+def test_a_departure_behind_a_far_last_vehicle_enters_once(tmp_path: Path) -> None:
     # The zone at the end of the road says where, another one sees the last that is far from there.
     on_a_long_road(tmp_path, BEHIND_THE_LAST)
 
@@ -328,6 +329,15 @@ def test_beside_buses_that_turn_round_all_drive_and_enter_alike(
     demand.write_text(TURNING_ROUND.format(flows=flows), encoding="utf-8")
     whole = hashes_agree(lambda zones: make(net, [demand], overrides=FAST | zones), 500)
     assert whole.traffic_stats().departed > 100
+
+
+@pytest.mark.parametrize("narrow", [zipper, signal_pair])
+def test_at_narrow_places_all_drive_alike(
+    narrow: Callable[[Path], tuple[Path, Path]], tmp_path: Path
+) -> None:
+    net, routes = narrow(tmp_path)
+    whole = hashes_agree(lambda zones: make(net, [routes], overrides=FAST | zones), 400, (2, 4))
+    assert whole.traffic_stats().departed > 20
 
 
 SLOW_AT_THE_START = """<routes>

@@ -84,7 +84,7 @@ def demo(
             f"--decisions {task.decisions}, --seconds {seconds:g}: --decisions must be from 1 to "
             "1,000,000,000, --seconds above 0 and at most 120"
         )
-    require_all(NEEDED, "demo")
+    require_all(dict.fromkeys(NEEDED, "demo"))
     make_folder(out)
     console = Console(highlight=False)
     console.print("[bold]1. measure[/] the speed of this machine")

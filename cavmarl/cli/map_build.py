@@ -28,7 +28,9 @@ from cavmarl.roads.sumo_net.reader import map_name
 
 Source = Annotated[
     Path,
-    typer.Argument(help="Map file: a SUMO network, OSM or OpenDRIVE.", exists=True, dir_okay=False),
+    typer.Argument(
+        help="Map file: a SUMO network or .sumocfg, OSM or OpenDRIVE.", exists=True, dir_okay=False
+    ),
 ]
 
 _NETWORK_ENDINGS = (".net.xml", ".net.xml.gz")

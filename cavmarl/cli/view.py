@@ -13,6 +13,10 @@ from rich.console import Console
 from cavmarl.cli.output import (
     OUTPUT,
     PAGE,
+    RECORD_EXTRAS,
+    VIDEO_EXTRAS,
+    WEB_EXTRAS,
+    WINDOW_EXTRAS,
     Backend,
     JsonPath,
     PolicyName,
@@ -21,6 +25,7 @@ from cavmarl.cli.output import (
     Workers,
     Zones,
     about,
+    check_extras,
     flag,
     recorded,
     with_world,
@@ -82,6 +87,10 @@ def view(
     json_path: JsonPath = None,
 ) -> None:
     """Drive a world and show it from above."""
+    check_extras(
+        world, [policy], (web, WEB_EXTRAS), (not web, WINDOW_EXTRAS), (video, VIDEO_EXTRAS),
+        (record, RECORD_EXTRAS),
+    )  # fmt: skip
     from cavmarl.env.parallel import parallel_env
     from cavmarl.render.video import VideoWriter
 

@@ -56,7 +56,7 @@ class WorldFlows:
         self._recovery_s = recovery_s
         self._sent: list[SentCommand] = []  # commands after the stored state
         self._saved = 0  # number of commands that the stored state includes
-        self._is_pending = False  # whether the answer to the last command is missing
+        self._is_pending = False  # True while the answer to the last command is missing
         self._url = ""
         self._renew_s = 0.0
 
@@ -126,7 +126,7 @@ class WorldFlows:
         try:
             yield Ask("DELETE", self._url, token=self.assignment["token"])
         except httpx.TransportError:
-            return  # the node learns it with its next heartbeat
+            return  # the answer to the node's next heartbeat will end the session there
 
     def _command(self, sent: SentCommand) -> Flow[Arrays]:
         self._sent.append(sent)

@@ -31,16 +31,16 @@ from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.zones.partition.zone_statistics import imbalance
 
-MAX_VEHICLES = 100_000  # of the worlds that are stepped together
+MAX_VEHICLES = 100_000  # maximum number in all worlds that are stepped together
 MAX_WORLDS = 128
-TRACK_S = 0.5  # between two points of a track
+TRACK_S = 0.5  # time between two points of a track
 TIMED_TICKS = 16  # one of this many ticks is timed zone by zone
 
 Progress = Callable[
     [str, int, int], None
 ]  # called with policy, steps done, maximum number of steps
 Watcher = Callable[[CavVectorEnv], Callable[[], None]]
-"""Is given the worlds of a run; what it returns is called after each reset and step of them."""
+"""Called with the worlds of a run; returns a function to call after each reset and step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +166,7 @@ class _Part:
             vec.max_cycles,
             vec.step_s,
             np.array(vec.config.terms.weight_of_each),
-            # A trip with its own horizon that arrives is in time.
+            # If trips have a horizon of their own, every arrival is in time.
             math.inf if vec.config.traffic.trip_horizon else SLOWEST,
         )
         self._watch = EncounterWatch(vec, self._recorder)

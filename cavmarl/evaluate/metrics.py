@@ -76,7 +76,8 @@ METRICS = (
            "agents that arrived in an hour of simulated time", "more"),
     Metric("background_arrivals_per_h", "others arriving", "1/h", "episode",
            "background vehicles that arrived in an hour of simulated time", "more"),
-    _arrived("delay_s", "delay", "time lost against driving at the limit", "less"),
+    _arrived("delay_s", "delay", "time lost against driving at the limit, or at the type's maximum "
+             "speed", "less"),
     _arrived("duration_s", "duration", "from the first decision to the goal"),
     Metric("mean_speed_mps", "speed", "m/s", "trip", "way made towards the goal over time"),
     Metric("mean_speeding", "speeding", "%", "trip",

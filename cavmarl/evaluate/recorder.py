@@ -15,7 +15,7 @@ PET_HORIZON_S = 10.0  # a pass after a longer time is no encounter
 SLOWEST = 3.0  # longest duration of a success, as a multiple of the free travel time
 STILL_S = 10.0  # a vehicle that has stood this long when its trip is cut counts as standing
 MIN_DISTANCE_M = 1.0  # shortest trip whose delay per kilometre is compared
-JERK_UNIT_MPS3 = 10.0  # of the term `comfort`
+JERK_UNIT_MPS3 = 10.0  # unit of the term `comfort`
 MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
 
 _TERM = {name: k for k, name in enumerate(TERMS)}
@@ -62,8 +62,8 @@ class Recorder:
         self.still_s = np.zeros(shape)  # written by `StandingWatch`
         self.would_go = np.zeros(
             shape, dtype=np.bool_
-        )  # written by `StandingWatch`: would the built-in driver stand there
-        self.maps = np.zeros(num_worlds, dtype=np.int64)  # of each world
+        )  # written by `StandingWatch`: whether the built-in driver would drive on
+        self.maps = np.zeros(num_worlds, dtype=np.int64)  # map of each world
 
     def add(
         self,

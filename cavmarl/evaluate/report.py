@@ -67,7 +67,7 @@ class PairedDifference:
 
     @property
     def distinct(self) -> bool:
-        """Whether the interval excludes 0."""
+        """True if the interval excludes 0."""
         found = self.between_run_ci95
         return found is not None and not found.low <= 0.0 <= found.high
 
@@ -78,10 +78,10 @@ class PolicyReport:
 
     trips: int  # number of counting trips in all runs
     metrics: Mapping[str, Found]  # by the names of `metrics.METRICS`
-    # by metric, paired differences from the first policy; empty for itself
+    # metric → paired difference from the first policy; empty for the first policy
     minus_first: Mapping[str, PairedDifference]
     speed: tuple[Speed, ...]  # speed of each run; not reproducible
-    # between zones, in all runs; None in undivided worlds. Milliseconds are not repeatable.
+    # transfers between zones in all runs; None: undivided worlds. Their times are not repeatable.
     transfers: TransferSummary | None = None
 
     def __getitem__(self, metric: str) -> Found:

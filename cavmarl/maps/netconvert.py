@@ -2,7 +2,7 @@
 
 The same source and options give the same bytes: netconvert's comment with the date is removed.
 
-Each network file names its source (`maps.provenance`). Heights are added here.
+Each network file names its source (`maps.provenance`). This module also adds heights.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument
@@ -44,6 +45,7 @@ from cavmarl.maps.provenance import (
     road_defaults,
 )
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
+from cavmarl.roads.sumo_net.sumo_options import map_of_config
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 
 Box = tuple[float, float, float, float]
@@ -57,7 +59,7 @@ OSM_OPTIONS = (
     "--tls.join",
     "--keep-edges.by-vclass=passenger",
     "--remove-edges.isolated",
-    "--output.original-names",  # of the ways of each lane: for bridges, names, defaults
+    "--output.original-names",  # ids of the ways of each lane, for bridges, names, defaults
 )
 OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
 
@@ -66,7 +68,7 @@ _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.t
 _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
-_FAR_M = 100_000.0  # from the origin; farther away, the projection distorts lengths
+_FAR_M = 100_000.0  # farther from the origin, the projection distorts lengths
 
 Origin = tuple[float, float]  # latitude and longitude, degrees
 Told = Callable[[str], None]
@@ -83,19 +85,19 @@ class BuildResult:
     """The result of a build."""
 
     path: Path  # the SUMO network
-    source: Path  # the file it was made from
-    kind: MapKind  # of the source
+    source: Path  # the file from which it was built
+    kind: MapKind  # kind of the source
     options: tuple[str, ...]  # netconvert's options; empty if a SUMO network was copied
     # netconvert's warnings, counted by their text without names and numbers
     warnings: dict[str, int]
     # changes that netconvert reports: joined junctions, guessed roundabouts …
     corrections: tuple[str, ...]
-    # with `tolerant`, ignored errors of netconvert; the objects that they name were left out
+    # with `tolerant`, ignored errors of netconvert; the objects named there were left out
     dropped: tuple[str, ...]
     provenance: dict[str, str]  # origin of the map, as written in its file
     defaults: tuple[RoadDefaults, ...] = ()  # missing values of OSM from the type map
     heights: HeightReport | None = None
-    levels: int = 0  # lanes that cross on a bridge or in a tunnel, without `heights`
+    levels: int = 0  # number of lanes that cross on a bridge or in a tunnel; 0 with `heights`
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self) | {"path": str(self.path), "source": str(self.source)}
@@ -118,29 +120,32 @@ def build_network(
 
     Args:
         source: OpenStreetMap or OpenDRIVE, which netconvert converts to a network, or a SUMO
-            network, which is copied. May be gzipped.
-        target: destination of the network, gzipped if it ends in `.gz`. Default: the cache, or
-            the source itself if nothing has to be done.
+            network, which is copied, or a configuration of SUMO, which names a network. May be
+            gzipped.
+        target: path of the network, gzipped if it ends in `.gz`. Default: in the cache, or the
+            source itself if it needs no changes.
         options: additional options for netconvert.
         bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
             OSM, otherwise metres in the source's own frame.
         origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
             the roads, in UTM.
-        heights: terrain models for the roads; nothing moves in the plane. Without them, the ground
-            is flat, and bridges and tunnels of OSM leave it where they cross roads.
-        licences: licences of the source and of the terrain models, if not the default ones.
-        tolerant: let netconvert leave out what it cannot use instead of failing.
+        heights: terrain models for the roads; positions in the plane do not change. Without models,
+            the ground is flat, and bridges and tunnels of OSM have heights where they cross roads.
+        licences: licences of the source and of the terrain models; empty: the default.
+        tolerant: let netconvert leave out objects that it cannot use instead of failing.
         timeout_s: time limit of netconvert; None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
         told: called with each of `STAGES` as it begins.
 
     Raises:
-        ConfigError: `bbox` is empty, or the origin is not on the earth or far from the map.
+        ConfigError: `bbox` is empty, or the origin is not on the earth, or too far from the map.
         MapError: the source is broken, malicious or not a map; netconvert fails (its output is in
             the message); the result has no drivable lane; the heights cannot be used; or the target
             cannot be written.
         MissingExtraError: netconvert, or a package for heights and levels, is not installed.
     """
     source = Path(source)
+    if is_sumo_config(source):
+        source = map_of_config(source)
     kind = map_kind(source)
     chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *_centred(source, kind, origin), *options)
     if tolerant and chosen:
@@ -173,9 +178,13 @@ def build_network(
 def map_file(path: str | Path) -> Path:
     """Return the SUMO network of a map file: the file itself, or the result of netconvert.
 
+    A configuration of SUMO stands for the network that it names.
+
     Raises MapError: see `build_network`.
     """
     path = Path(path)
+    if is_sumo_config(path):
+        path = map_of_config(path)
     if path.name.endswith((".net.xml", ".net.xml.gz")):
         return path
     kind = map_kind(path)
@@ -191,7 +200,7 @@ def _cache_entry(
     require("sumo", "sumo")
     words = [source_hash(source), version("eclipse-sumo"), *options]
     if heights is None:
-        words.append("levels 4")  # of bridges and tunnels; the number is the algorithm's version
+        words.append("levels 4")  # version of the algorithm for bridges and tunnels
     else:
         words += [*map(source_hash, heights.models), repr(heights)]
     digest = hashlib.sha256("\0".join(words).encode())
@@ -213,12 +222,12 @@ def _centred(source: Path, kind: MapKind, origin: Origin | None) -> tuple[str, .
     latitude, longitude = origin
     if kind != "osm":
         raise ConfigError(
-            f"--origin: {source} has its own frame: an origin is only for OpenStreetMap"
+            f"--origin: {source} has its own frame: leave it out; only OpenStreetMap needs it"
         )
     if not (abs(latitude) < 90.0 and abs(longitude) <= 180.0):
         raise ConfigError(
-            f"--origin {latitude:g},{longitude:g}: not a latitude and longitude: give LAT,LON in "
-            "degrees"
+            f"--origin {latitude:g},{longitude:g}: not a latitude and a longitude: give LAT,LON "
+            "in degrees"
         )
     projection = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +x_0=0 +y_0=0"
     projection += " +datum=WGS84 +units=m +no_defs"
@@ -242,12 +251,12 @@ class _Build:
     levels: int = 0
 
     def run(self) -> None:
-        """Make the network beside its destination, and move it there when it is complete."""
+        """Write the network to a folder beside the target, and move it when it is complete."""
         place = self.place
         if place.exists() and place.samefile(self.source):
             raise MapError(f"{place}: the target is the source: give another target")
         place.parent.mkdir(parents=True, exist_ok=True)
-        cache = cache_dir() / "maps"  # shared by all builds, so that one cleans up after another
+        cache = cache_dir() / "maps"  # one folder for all builds, so a build removes old drafts
         with draft_folder(cache if place.is_relative_to(cache) else place.parent) as folder:
             draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
@@ -262,7 +271,7 @@ class _Build:
             os.replace(draft, place)
 
     def _finished(self, draft: Path) -> bytes:
-        """Return the network with additions to netconvert's output: heights and origin."""
+        """Return the network with the map's origin and heights added to netconvert's output."""
         if not self.options and self.heights is None:
             return draft.read_bytes()
         self.told(STAGES[1])
@@ -283,7 +292,7 @@ class _Build:
         return content.replace(b"<net ", facts + b"<net ", 1)
 
     def _facts(self, document: NetDocument) -> dict[str, str]:
-        """Return the map's origin, for its file."""
+        """Return the origin of the map, to be written into its file."""
         facts = read_provenance(self.source) if self.kind == "sumo" else {}
         if not facts:
             facts = {"source": self.source.name, "source sha256": source_hash(self.source)}

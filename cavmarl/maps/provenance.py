@@ -34,8 +34,8 @@ class RoadDefaults:
     kind: str  # OSM's `highway`, as named by netconvert
     edges: int
     guessed: str  # lanes, maxspeed or width
-    value: str  # the most frequent one; speeds in m/s, widths in m
-    used_for: int  # edges
+    value: str  # the most frequent value; speeds in m/s, widths in m
+    used_for: int  # number of edges without the tag
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -49,7 +49,7 @@ def head_of(facts: Mapping[str, str]) -> bytes:
 
 
 def read_provenance(path: Path) -> dict[str, str]:
-    """Return the origin of a map from its file; empty if it has none."""
+    """Return the origin of a map from its file; empty if the file does not give it."""
     try:
         with path.open("rb") as raw:
             head = raw.read(_HEAD_BYTES)

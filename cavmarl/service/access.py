@@ -36,7 +36,7 @@ MOST_VERIFIED = 10_000
 
 
 class Access:
-    """The caller's identity, as the log says."""
+    """The identities, tokens and signing keys of a service, according to its event log."""
 
     def __init__(self, log: EventLog, wall_s: Callable[[], float] = time.time) -> None:
         self._log = log

@@ -51,9 +51,12 @@ class Schedule:
         parts: list[NDArray[np.void]] = []
         begin = first_step
         lanes = [np.zeros(0, dtype=np.int32)]
+        loops: list[int] = []
         self._longest = 0
         for route, mask_row in sorted(self._driven()):
             edges = self._edges(route, int(masks[mask_row]), ways)
+            if self._passes_twice(edges) and route not in loops:
+                loops.append(route)
             steps = self._steps(edges, int(masks[mask_row]))
             first_lane = int(self._network.edges[edges[0]]["first_lane"])
             self._way[route, mask_row] = begin - first_lane
@@ -66,10 +69,22 @@ class Schedule:
                     f"the routes of the demand have over {MAX_STEPS} steps; "
                     "use fewer or shorter routes"
                 )
+        self._report_loops(loops)
         self.first_detour = begin - first_step
         self.step_lanes = np.concatenate(lanes)  # LANE row of each step before the first detour
         parts.append(self._detours(masks, ways))
         self.steps = np.concatenate(parts)
+
+    def _passes_twice(self, edges: NDArray[np.int32]) -> bool:
+        """Return whether a route passes a junction more than once."""
+        passed = self._network.edges["to_junction"][edges[:-1]]
+        return len(np.unique(passed)) < len(passed)
+
+    def _report_loops(self, routes: list[int]) -> None:
+        """Add these routes to the report of the demand, once for all worlds that use it."""
+        what, report = "route passes a junction twice", self.demand.report
+        if routes and what not in report.tolerated:
+            report.tolerate(what, self._place(routes[0]), len(routes))
 
     def _detours(self, masks: NDArray[np.int64], ways: TripWays) -> NDArray[np.void]:
         """Return steps from every lane to the last edges of the routes, with few lane changes.

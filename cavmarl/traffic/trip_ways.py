@@ -14,24 +14,30 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 
 MAX_EDGES = 100_000  # per way
+# A lane change costs next to nothing, so it decides only between ways of equal time. On lanes that
+# are too short for it, `change_cost` keeps its full cost.
+CHANGE_WEIGHT = 1e-6
 
 
 class TripWays:
     """The fastest ways at the speed limits; each pair of goal and class is planned once.
 
-    Vehicles make U-turns at dead ends. If an edge cannot be reached otherwise, they make U-turns
-    wherever the map permits, as SUMO's vehicles do.
+    As SUMO's vehicles do, trips make U-turns wherever the map permits.
 
-    `turned`: pairs (EDGE row of a goal, class) that need such U-turns.
+    `turned`: pairs (EDGE row of a goal, class) with ways that make U-turns.
     """
 
     def __init__(self, network: RoadNetwork) -> None:
         self.turned: set[tuple[int, int]] = set()
         self._network = network
         links = network.arrays.links.copy()
-        links["direction"][links["direction"] == TURNAROUND] = ord("s")
+        turns = links["direction"] == TURNAROUND
+        edge = network.lanes["edge"]
+        ends = (edge[links[end][turns]].tolist() for end in ("from_lane", "to_lane"))
+        self._turns = set(zip(*ends, strict=True))
+        links["direction"][turns] = ord("s")
         self._turning = network.arrays._replace(links=links)
-        self._plans: dict[tuple[int, int, bool], NDArray[np.void]] = {}
+        self._plans: dict[tuple[int, int], NDArray[np.void]] = {}
 
     def edges(self, named: NDArray[np.int32], mask: int) -> NDArray[np.int32]:
         """Return the EDGE rows of a way over the `named` edges for the classes in `mask`.
@@ -41,13 +47,12 @@ class TripWays:
         """
         found = [np.array([named[0]], dtype=np.int32)]
         for start, goal in pairwise(named.tolist()):
-            way = self._way(start, goal, mask, turning=False)
-            if way is None:
-                way = self._way(start, goal, mask, turning=True)
-                self.turned.add((goal, mask))
+            way = self._way(start, goal, mask)
             if way is None:
                 names = self._network.edge_ids
                 raise RouteError(f"no way from edge '{names[start]}' to edge '{names[goal]}'")
+            if not self._turns.isdisjoint(pairwise([start, *way.tolist()])):
+                self.turned.add((goal, mask))
             found.append(way)
         return np.concatenate(found)
 
@@ -58,12 +63,12 @@ class TripWays:
         roads = self._turning if turning else self._network.arrays
         plan_goal(roads, goal, mask, change_weight, out)
 
-    def _way(self, start: int, goal: int, mask: int, turning: bool) -> NDArray[np.int32] | None:
+    def _way(self, start: int, goal: int, mask: int) -> NDArray[np.int32] | None:
         """Return the EDGE rows after the first one; None: there is no way."""
-        key = (goal, mask, turning)
+        key = (goal, mask)
         if key not in self._plans:
             self._plans[key] = np.zeros(len(self._network.lanes), dtype=PLAN)
-            self.plan(goal, mask, 1.0, turning, self._plans[key])
+            self.plan(goal, mask, CHANGE_WEIGHT, True, self._plans[key])
         scratch = np.zeros(MAX_EDGES, dtype=np.int32)
         number = trace_edges(self._network.arrays, self._plans[key], start, scratch)
         return scratch[1:number].copy() if number > 0 else None

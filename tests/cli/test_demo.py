@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shutil
 import subprocess
@@ -116,10 +115,12 @@ def test_its_page_has_the_story_the_pictures_and_the_commands(
 def test_it_names_all_packages_that_are_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr("cavmarl.core.errors.find_spec", lambda _: None)
     assert run("demo", "--out", str(tmp_path)) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "not installed: torch, matplotlib, jinja2, pygame, PIL; pip install '.[demo]'" in said
+    names = " and ".join(f"'{name}'" for name in demo.NEEDED)
+    assert f"{names} are not installed: pip install" in said
+    assert "[demo]'" in said
 
 
 @pytest.mark.parametrize(

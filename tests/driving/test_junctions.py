@@ -428,7 +428,9 @@ def test_vehicles_that_stand_far_beyond_the_junction_do_not_count(
     room = scratch(roads, len(rows))
     index_lanes(roads.arrays, ways, rows, len(rows), room)
     way = int(before[0]["way"])
-    assert exit_blocked(roads.arrays, ways, rows[-1], link, way, room) == blocked
+    phase = np.zeros(len(roads.signals), dtype=np.int32)
+    found = exit_blocked(roads.arrays, ways, rows, rows[-1], link, way, phase, room)
+    assert found == blocked
 
 
 def _beyond(roads: RoadNetwork, lane: int) -> int:

@@ -47,6 +47,7 @@ from cavmarl.driving.kernels.junctions.swept_areas import (
     room_m,
     stop_before_foe_sweep,
 )
+from cavmarl.driving.kernels.junctions.zippers import behind_in_zipper, is_zipper
 from cavmarl.driving.kernels.lanes.adjacent_leaders import (
     behind_adjacent_leader,
     behind_askew,
@@ -72,7 +73,7 @@ from cavmarl.driving.kernels.lanes.lane_ends import (
     misses_last_change,
 )
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M, last_on
-from cavmarl.driving.kernels.lanes.route_following import next_step, next_step_from
+from cavmarl.driving.kernels.lanes.route_following import free_speed, next_step, next_step_from
 from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE, has_to_stay_aside
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import before_line, no_constraint, response, wish
@@ -167,6 +168,9 @@ def decide_at_line(
     merging = no_constraint(kind)
     if row["driver"] == DRIVER_AGENT or speed > FAST_MPS:
         merging = behind_merging(roads, kind, row, link, distance, scratch)
+    if is_zipper(roads, link):
+        zipper = behind_in_zipper(roads, travel, rows, i, kind, link, distance, scratch)
+        merging = max(merging, zipper)
     hold = hold_at_line(roads, travel, rows, i, link, distance, way, phase, scratch)
     waits = HOLD_NONE
     if hold == HOLD_NONE:
@@ -230,8 +234,7 @@ def _road_ahead(
         constraint = behind_entry(kind, speed, gap, leader)
         if constraint == 0.0:
             return constraint, 0.0, HOLD_NONE, -1
-    limit = min(here["speed_mps"], kind["desired_max_speed"])
-    allowed = min(limit * row["speed_factor"], kind["max_speed"])
+    allowed = free_speed(here, kind, row["speed_factor"])
     if steered:
         allowed = min(allowed, bend_speed(roads, lane, lane, -row["s"]))
     constraint = no_constraint(kind)

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 
-LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a long lane, in travel time, s;
-LANE_CHANGE_M = 250.0  # it doubles on a lane of this length, which is hardly enough for a change
+LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a very long lane, as travel time in s
+LANE_CHANGE_M = 250.0  # the cost doubles on a lane of this length: drivers can barely change there
+LEAST_CHANGE_M = 9.0  # on shorter lanes, vehicles hardly change: a change always has its full cost
 TURNAROUND = ord("t")
 
 
@@ -55,9 +56,10 @@ def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
     """
     if roads.lanes[lane]["internal"]:
         return math.inf
-    return (
-        weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
-    )
+    length_m = float(roads.lanes[lane]["length_m"])
+    if length_m < LEAST_CHANGE_M:
+        weight = max(weight, 1.0)
+    return weight * LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / length_m)
 
 
 @kernel
@@ -132,7 +134,7 @@ class _Search(NamedTuple):
 
     cost: NDArray[np.float64]  # (L,) cost of the cheapest known way, s
     heap: NDArray[np.int32]  # (L,) lanes that are reached and not settled
-    place: NDArray[np.int32]  # (L,) index of a lane in the heap; `_UNSEEN`, or `_SETTLED`
+    place: NDArray[np.int32]  # (L,) index of a lane in the heap, `_UNSEEN`, or `_SETTLED`
 
 
 _UNSEEN, _SETTLED = -1, -2
@@ -161,7 +163,7 @@ def _put_up(search: _Search, lane: int, at: int) -> None:
 
 @kernel
 def _put_down(search: _Search, lane: int, size: int) -> None:
-    """Move a lane down in a heap of some size whose first place is empty."""
+    """Insert a lane at the empty root of a heap, and move it down; `size` includes the lane."""
     at = 0
     while True:
         below = 2 * at + 1
@@ -194,7 +196,7 @@ def _offer(search: _Search, lane: int, cost: float, size: int) -> int:
 
 @kernel
 def _take_first(search: _Search, size: int) -> int:
-    """Remove the cheapest lane from a heap of some size, and settle it."""
+    """Remove the cheapest lane from a heap of `size` lanes, and mark it as settled."""
     first = search.heap[0]
     if size > 1:
         _put_down(search, search.heap[size - 1], size - 1)
@@ -252,8 +254,8 @@ def plan_goal(
     Args:
         roads: the road arrays.
         goal_edge: EDGE row to reach.
-        change_weight: multiple of the usual cost of lane changes. If it is large, plans change
-            lanes only if there is no other way.
+        change_weight: factor on the cost of lane changes. If it is large, plans change lanes only
+            where the goal cannot be reached otherwise.
         permission: bit of LANE["permissions"] that a lane needs.
         plan: PLAN records (L,), overwritten. Lanes from which the goal cannot be reached get
             to_go = inf and next = -1.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,9 @@ from cavmarl.roads.sumo_net.conflicts import (
     stop_back,
 )
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
+from cavmarl.roads.sumo_net.road_corners import round_corners
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
+from cavmarl.roads.sumo_net.shared_strips import Road, find_strips, move_apart
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
 from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows, unfed_beside
 from cavmarl.roads.sumo_net.xml_source import limit
@@ -42,15 +45,16 @@ from cavmarl.roads.sumo_net.xml_source import limit
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
-APPROACH_M = 12.0  # before a junction, where bodies are still oblique to waiting vehicles
-FORK_WATCHED_M = 5.0  # after a junction, where vehicles that turn off beside a rear watch it
-MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the square
-MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable for another limit
-_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
+APPROACH_M = 12.0  # before a junction, bodies are oblique to waiting vehicles up to this distance
+FORK_WATCHED_M = 5.0  # after a junction, drivers that turn off watch rears up to this distance
+MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the squared length
+MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that changes this limit
+_NAMED = 5  # maximum number of changed lanes that are named
+_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr", ".sumocfg")
 
 
 def map_name(path: Path) -> str:
-    """Return the file's name without the suffixes of map files."""
+    """Return a map file's name without its suffixes."""
     name = path.name
     for ending in _ENDINGS:
         name = name.removesuffix(ending)
@@ -76,7 +80,7 @@ def read_network(path: str | Path) -> RoadNetwork:
 
     Raises MapError: the file is broken, malicious or inconsistent, or has no drivable lane.
     """
-    # Load sumolib only if the cache does not have the network.
+    # Import sumolib only here: it is not needed for networks in the cache.
     from cavmarl.roads.sumo_net.sumo_xml import parse_net
 
     path = Path(path)
@@ -105,7 +109,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
 
     num_normal = sum(lane.getEdge().getFunction() == "" for lane in chosen.lanes)
     lane_ids = tuple(lane.getID() for lane in chosen.lanes)
-    shapes = _shapes(chosen, lane_row, lane_ids[:num_normal])
+    shapes, notes = _shapes(chosen, lane_row, lane_ids[:num_normal], parsed.left_hand)
     edges = _edge_rows(chosen, net, node_row)
     outer = _outer_rows(chosen, edges)
     split_beside_ends(shapes, outer[outer < num_normal])
@@ -158,18 +162,58 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         junction_kinds=kinds,
         geo=_geo_reference(net),
         left_hand=parsed.left_hand,
+        notes=notes,
     )
 
 
 def _shapes(
-    chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str]
-) -> list[Shape]:
-    """Return the drivable centre line of each lane, (n, 3) in m; lanes of roads come first."""
+    chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str], left_hand: bool
+) -> tuple[list[Shape], tuple[str, ...]]:
+    """Return the drivable centre line of each lane, (n, 3) in m, and notes on changed lanes.
+
+    Lanes of roads come first.
+    """
     shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
     refuse_points(shapes[: len(normal_ids)], normal_ids)
-    mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
+    widths_m = [lane.getWidth() for lane in chosen.lanes]
+    ways = [_way(move, lane_row) for move in chosen.movements]
+    roads = _roads(chosen, len(normal_ids))
+    notes = []
+    strips = find_strips(shapes, widths_m, roads, left_hand)
+    if strips:
+        move_apart(shapes, strips, ways, left_hand)
+        ids = _some(
+            [f"{normal_ids[a]} and {normal_ids[b]}" for one in strips for a, b in one.lanes]
+        )
+        most_m = max(strip.apart_m for strip in strips)
+        notes.append(
+            f"moved {len(strips)} pairs of opposite edges by up to {most_m:.1f} m, because their "
+            f"lanes were on the same strip: {ids}"
+        )
+    rounded = round_corners(shapes, widths_m, [road.lanes for road in roads])
+    if rounded:
+        ids = _some([normal_ids[row] for row in rounded])
+        notes.append(
+            f"rounded the corners of {len(rounded)} lanes, which are too tight for a car: {ids}"
+        )
+    mend_backward_paths(shapes, ways)
     extend_stubs(shapes, _before(chosen, lane_row))
-    return shapes
+    return shapes, tuple(notes)
+
+
+def _some(ids: Sequence[str]) -> str:
+    return ", ".join(ids[:_NAMED]) + (", …" if len(ids) > _NAMED else "")
+
+
+def _roads(chosen: NetworkSelection, num_normal: int) -> list[Road]:
+    """Return the edges that are not inside a junction."""
+    edges = [id(lane.getEdge()) for lane in chosen.lanes[:num_normal]]
+    starts = [row for row in range(num_normal) if row == 0 or edges[row] != edges[row - 1]]
+    owners = [chosen.lanes[row].getEdge() for row in starts]
+    return [
+        Road(range(*bounds), id(edge.getFromNode()), id(edge.getToNode()))
+        for edge, bounds in zip(owners, pairwise([*starts, num_normal]), strict=True)
+    ]
 
 
 def _geo_reference(net: Any) -> GeoReference | None:
@@ -301,9 +345,9 @@ def _link_rows(
             raise MapError(
                 f"from lane '{connection.getFromLane().getID()}' to lane "
                 f"'{connection.getToLane().getID()}' are {link['length_m']:.6g} m over the "
-                f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both"
+                f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both lanes"
             )
-        # netconvert splits a path where drivers wait inside the junction.
+        # netconvert splits the path of a link where drivers wait inside the junction.
         link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf
         link["junction"] = node_row[id(movement.node)]
         link["index"] = movement.index
@@ -311,11 +355,12 @@ def _link_rows(
         # In left-hand traffic, SUMO writes T for U-turns to the right.
         link["direction"] = ord(connection.getDirection()[0].replace("T", "t"))
         link["state"] = ord(connection.getState()[0])
+        link["may_block"] = connection.getParam("keepClear") == "false"
     return links
 
 
 def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
-    """Return the SWEEP rows, and fill the fields of links about them."""
+    """Return the SWEEP rows, and fill the fields of links that refer to them."""
     sweeps, first = sweep_rows(movements)
     links = movements.links
     links["first_sweep"], links["num_sweeps"] = first[:-1], np.diff(first)
@@ -361,7 +406,7 @@ def _connect(
     movements: Sequence[Movement],
     lane_row: dict[int, int],
 ) -> NDArray[np.int32]:
-    """Fill the connections of lanes: links from them, successors of internal ones, lanes before."""
+    """Fill the connections of lanes: links, successors of internal lanes, and preceding lanes."""
     rows = np.arange(len(lanes))
     lanes["first_link"] = np.searchsorted(links["from_lane"], rows, side="left")
     lanes["num_links"] = np.searchsorted(links["from_lane"], rows, side="right")
@@ -398,8 +443,8 @@ def _path(
 ) -> LinkPath | None:
     """Return the sampled path of a link along its chain of internal lanes.
 
-    It may begin `approach_m` before the junction, with negative positions, and end `beyond_m` after
-    it.
+    The path begins `approach_m` before the junction, at a negative position, and ends `beyond_m`
+    after it.
     """
     if not movement.chain:
         return None

@@ -1,7 +1,7 @@
 """Reads SUMO's network files with sumolib, and adds checks that sumolib lacks.
 
 sumolib merges edges of the same name, accepts NaN as a speed, and raises a bare KeyError for
-missing attributes. Here, every element is checked first. Error messages have a place and a remedy.
+missing attributes. This module checks every element first. Messages have a place and a remedy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.programs import ProgramReader, SignalProgram
 from cavmarl.roads.sumo_net.xml_source import limit, read_xml
 
 MAX_LANE_POINTS = 100_000
-MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # environment variable for another limit
+MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # environment variable that changes this limit
 _MAX_COORDINATE_M = 1e8  # more than twice around the Earth
 
 _REQUIRED = {
@@ -59,7 +59,7 @@ class _CheckedReader(ContentHandler):
             if name != "net":
                 raise self._error(name, attrs, "is not the root of a SUMO network, which is <net>")
             self._check_version(attrs)
-            self.left_hand = self._is_left_hand(attrs)
+            self.left_hand = self._is_true(name, attrs, "lefthand", "false")
         self._check(name, attrs)
         self.programs.start(name, attrs, self._locator.getLineNumber())
         try:
@@ -67,6 +67,9 @@ class _CheckedReader(ContentHandler):
         except (KeyError, ValueError, IndexError, AttributeError, TypeError) as error:
             problem = f"does not fit the elements before it ({type(error).__name__}: {error})"
             raise self._error(name, attrs, problem) from error
+        if name == "connection" and not self._is_true(name, attrs, "keepClear", "true"):
+            if self.reader._currentConnection is not None:
+                self.reader._currentConnection.setParam("keepClear", "false")
 
     def endElement(self, name: str) -> None:
         self.programs.end(name)
@@ -110,10 +113,10 @@ class _CheckedReader(ContentHandler):
                 "net", attrs, f"has version='{attrs['version']}', not a version of SUMO's"
             )
 
-    def _is_left_hand(self, attrs: Mapping[str, str]) -> bool:
-        text = attrs.get("lefthand", "false")
+    def _is_true(self, name: str, attrs: Mapping[str, str], key: str, default: str) -> bool:
+        text = attrs.get(key, default)
         if text not in _TRUTH:
-            raise self._error("net", attrs, f"has lefthand='{text}', must be true or false")
+            raise self._error(name, attrs, f"has {key}='{text}', must be true or false")
         return _TRUTH[text]
 
     def _check_number(self, name: str, key: str, attrs: Mapping[str, str]) -> None:

@@ -39,12 +39,12 @@ from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 
 BRISK_ACCEL = 2.5  # m/s²: assumed acceleration of a driver towards a shared area
 GENTLE_ACCEL = 1.8  # m/s²: to be safe, assumed acceleration out of a shared area
-GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # the same for vehicles with a lower acceleration
+GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # relative to the acceleration of any vehicle
 HARD_STOP = 5.0  # m/s²: a vehicle that needs more to stop before the line will not stop
 AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the own line)
 STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the own driver has waited long
 STEERED_AHEAD_S = 3.0  # time gap if one of both vehicles is steered, which may take longer
-STEERED_MERGE_AHEAD_S = 1.5  # the same if both drive into the same lane, where one can follow
+STEERED_MERGE_AHEAD_S = 1.5  # time gap if both then drive into one lane, where one can follow
 SPEEDING_UP_MPS2 = 0.1  # from this acceleration on, a foe is assumed to keep accelerating
 GAP_S = 1.0  # time between the exit of one vehicle from a shared area and the entry of another
 SET_OFF_S = 0.5  # a standing vehicle starts this long before another vehicle leaves the area
@@ -55,13 +55,14 @@ FORCED_STOP = 4.5  # m/s²: the deceleration that such a driver expects
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a slower stream lets others merge
 STUCK_S = 90.0  # after this wait, a driver may also pass stopped vehicles that must yield to it
-RESCUED_S = 300.0  # the same if both drive as in SUMO, which would teleport a vehicle then
+RESCUED_S = 300.0  # `STUCK_S` if both drive as in SUMO, which would teleport a vehicle then
 STOP_SIGN_S = 0.5  # time to stand at a stop sign, and before a tie is broken
-STOOD_S = 0.1  # the same for background vehicles, as in SUMO
+STOOD_S = 0.1  # `STOP_SIGN_S` of background vehicles, as in SUMO
 ARRIVES_M = 1.0  # a trip that ends at most this far behind a line does not cross the junction
 STATE_MAJOR = ord("M")
 STATE_STOP = ord("s")
 STATE_ALLWAY_STOP = ord("w")
+STATE_ZIPPER = ord("Z")
 
 
 @kernel
@@ -75,7 +76,7 @@ def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
 
 
 @kernel
-def _earliest(distance: float, speed: float, limit: float, accel: float) -> float:
+def earliest(distance: float, speed: float, limit: float, accel: float) -> float:
     """Return the time in s to drive `distance` m with an acceleration up to `limit` m/s."""
     if distance <= 0.0:
         return 0.0
@@ -103,7 +104,7 @@ def is_minor(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
     signal = link_signal(roads, link, phase)
     gives_way: bool = signal == SIGNAL_GREEN_MINOR
     if signal == SIGNAL_NONE:
-        gives_way = target["state"] != STATE_MAJOR
+        gives_way = target["state"] != STATE_MAJOR and target["state"] != STATE_ZIPPER
     return gives_way
 
 
@@ -119,7 +120,7 @@ def _has_turn(row: np.void, link: int) -> bool:
 
 @inlined_kernel
 def _is_yielding(row: np.void, link: int) -> bool:
-    """Return whether a standing vehicle yields at `link`; an agent's does so at its stop line."""
+    """Return whether a standing vehicle yields at `link`; an agent stopped at its line does."""
     stands: bool = row["driver"] == DRIVER_AGENT and row["wait_s"] > 0.0
     return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
 
@@ -144,7 +145,7 @@ def may_ignore(
     """Return whether a driver at `link` may ignore a foe at `foe_link` with the right of way.
 
     `signal` is the state of the foe's signal; `state` and `foe_state` are those of the links. After
-    a wait of `stuck_s` s, the driver also may_ignore a foe that stands and yields.
+    a wait of `stuck_s` s, the driver may also ignore a foe that stands and yields.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
@@ -227,7 +228,7 @@ def _is_harmless(
 
 
 @inlined_kernel
-def _assumed_accel(travel: TripTables, row: np.void) -> float:
+def assumed_accel_of(travel: TripTables, row: np.void) -> float:
     """Return the assumed acceleration of a vehicle in m/s², at most that of its type."""
     assumed_accel: float = BRISK_ACCEL
     if row["driver"] != DRIVER_AGENT:
@@ -288,7 +289,7 @@ def _comes(
     to_line = foe["dist"] - foe["half"]
     if other["accel"] > SPEEDING_UP_MPS2:
         top = roads.lanes[roads.links[conflict["foe"]]["from_lane"]]["speed_mps"]
-        arrives = _earliest(to_line, foe["speed"], top, other["accel"])
+        arrives = earliest(to_line, foe["speed"], top, other["accel"])
     else:
         arrives = to_line / max(foe["speed"], STANDING_MPS)
     if conflict["merging"]:
@@ -327,20 +328,20 @@ def _blocks_inside(
     target, half = roads.links[link], 0.5 * row["length"]
     to_area = distance + conflict["enter_m"] - half
     cleared = to_clear / max(foe["speed"], 0.1)
-    assumed_accel = _assumed_accel(travel, row)
-    time_in = _earliest(to_area, row["speed"], limit, assumed_accel)
+    assumed_accel = assumed_accel_of(travel, row)
+    time_in = earliest(to_area, row["speed"], limit, assumed_accel)
     if stays_inside(other):
         return HOLD_EXIT_BLOCKED
     if equal and conflict["merging"]:
         apart = distance + conflict["leave_m"] - half - to_clear
         return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # wait until there is room behind it
     if _in_turn(target["state"]) and _has_turn(row, link) and to_area > ROOM_M:
-        return HOLD_NONE  # it would lose its turn by stopping again, and can wait before the area
+        return HOLD_NONE  # stopping again would lose the turn; the row can wait before the area
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # A foe that has just started will accelerate; a foe that brakes may have to stop.
-        cleared = _earliest(
-            to_clear, foe["speed"], top, GENTLE_SHARE * _assumed_accel(travel, other)
+        cleared = earliest(
+            to_clear, foe["speed"], top, GENTLE_SHARE * assumed_accel_of(travel, other)
         )
     elif foe["speed"] * foe["speed"] < -2.0 * other["accel"] * to_clear:
         cleared = math.inf  # the foe brakes so hard that it stops before it clears the area
@@ -351,9 +352,9 @@ def _blocks_inside(
             time_in = min(SET_OFF_S, time_in)
         else:  # in turn: the row starts so that it need not brake before the area
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
-            time_in = _earliest(free, row["speed"], limit, assumed_accel)
+            time_in = earliest(free, row["speed"], limit, assumed_accel)
             if other["accel"] > SPEEDING_UP_MPS2:
-                cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
+                cleared = earliest(to_clear, foe["speed"], top, other["accel"])
     return HOLD_YIELD if cleared > time_in else HOLD_NONE
 
 
@@ -404,28 +405,28 @@ def hold_for_foe(
             roads, travel, row, link, distance, limit, conflict, foe, other, to_clear, equal
         )
     # The foe is before its line: both vehicles are assumed to need the whole junction.
-    over, assumed_accel = target["length_m"], _assumed_accel(travel, row)
+    over, assumed_accel = target["length_m"], assumed_accel_of(travel, row)
     if conflict["enter_m"] < target["wait_m"] - LINE_MARGIN_M:
         over = min(over, target["wait_m"])
     passed = (foe["dist"] + foe_link["length_m"] + foe["half"]) / max(foe["speed"], 0.1)
     after_s = GAP_S if conflict["merging"] else 0.0
-    if passed + after_s < _earliest(distance - half, row["speed"], limit, assumed_accel):
+    if passed + after_s < earliest(distance - half, row["speed"], limit, assumed_accel):
         return HOLD_NONE
     speed, to_line = row["speed"], distance - half
     if not (steered or conflict["merging"]) and speed <= STANDING_MPS:
-        # A waiting vehicle counts as being at its line or waiting position, where SUMO's stand.
+        # A waiting vehicle counts as being at its line or waiting position, as it would in SUMO.
         inside = to_line < 0.0 and target["wait_m"] < math.inf
         ahead = to_line + target["wait_m"] if inside else to_line
         to_line -= min(max(ahead, 0.0), LINE_MARGIN_M)
     over += min(to_line, 0.0)  # from a waiting position, only the rest counts
     reached = math.sqrt(speed * speed + 2.0 * assumed_accel * max(over, 0.0))
     leaves_mps = min(reached, max(limit, speed))
-    time_line = _earliest(to_line, speed, limit, GENTLE_SHARE * assumed_accel)
+    time_line = earliest(to_line, speed, limit, GENTLE_SHARE * assumed_accel)
     time_out = time_line + 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
     if steered:
         comes = _comes_to_steered(row, conflict, foe, front, leaves_mps, time_out)
     else:
-        time_in = _earliest(
+        time_in = earliest(
             distance - half - LINE_MARGIN_M, speed, limit, GENTLE_SHARE * assumed_accel
         )
         comes = _comes(roads, row, conflict, foe, other, time_in, time_out, leaves_mps)

@@ -32,6 +32,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.junctions.deadlocks import resolves_deadlocks, yields_in_deadlock
 from cavmarl.driving.kernels.junctions.gaps import (
+    HARD_STOP,
     ROOM_M,
     STOOD_S,
     STOP_SIGN_S,
@@ -43,6 +44,7 @@ from cavmarl.driving.kernels.junctions.gaps import (
 )
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
 from cavmarl.driving.kernels.junctions.swept_areas import MOST_BACK_M, wait_place
+from cavmarl.driving.kernels.junctions.zippers import is_zipper, passes_first
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
@@ -91,6 +93,7 @@ def _hold_for_foes(
     if row["driver"] == DRIVER_AGENT:
         limit = min(limit, STEERED_MPS)
     equal = resolves_deadlocks(roads, travel, row, link)
+    zipper, front = is_zipper(roads, link), distance - 0.5 * row["length"]
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
@@ -98,9 +101,14 @@ def _hold_for_foes(
         end = scratch.link_end[conflict["foe"]]
         if begin == end or (conflict["enter_m"] >= wait_m - LINE_MARGIN_M) != inside:
             continue
+        in_turn = zipper and is_zipper(roads, conflict["foe"])
+        if in_turn and conflict["merging"]:
+            continue  # the driver follows the foes that pass first, see `zippers`
         for k in range(begin, end):
             foe = scratch.approach[k]
             if foe["row"] == i:
+                continue
+            if in_turn and not passes_first(roads, travel, rows, row, link, front, foe):
                 continue
             other = rows[foe["row"]]
             both = equal and resolves_deadlocks(roads, travel, other, conflict["foe"])
@@ -132,15 +140,41 @@ def _hold_for_foes(
 
 
 @kernel
-def exit_blocked(
-    roads: RoadArrays, travel: TripTables, row: np.void, link: int, way: int, scratch: Scratch
+def _waits_at(
+    roads: RoadArrays, link: int, road_m: float, needed: float, phase: NDArray[np.int32]
 ) -> bool:
-    """Return whether a row could not clear the junction behind the next standing vehicle ahead.
+    """Return whether a vehicle has to expect to wait before `link`, beyond the next junction.
 
-    The vehicles that move in between need room as well. Vehicles more than `EXIT_LOOK_M` beyond the
-    junction do not count.
+    It does so at red, and where it yields. But if the road before `link`, `road_m` m long, has no
+    room for the vehicle, it cannot wait there until others let it go.
+    """
+    signal = link_signal(roads, link, phase)
+    stops = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
+    yields = must_stop(roads, link, signal) or is_minor(roads, link, phase)
+    waits: bool = stops or (yields and road_m >= needed)
+    return waits
+
+
+@kernel
+def exit_blocked(
+    roads: RoadArrays,
+    travel: TripTables,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    row: np.void,  # VEHICLE
+    link: int,  # that it takes next
+    way: int,  # its `way` beyond the junction
+    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
+    scratch: Scratch,
+) -> bool:
+    """Return whether a row could not clear the junction behind the next vehicle that waits ahead.
+
+    The vehicles that move in between need room as well. The next line at which a vehicle of that
+    road, or the row itself, has to wait ends the room; the inside of a junction is no room.
+    Vehicles more than `EXIT_LOOK_M` beyond the junction do not count.
     """
     target = roads.links[link]
+    if target["may_block"]:
+        return False
     room = 0.0
     lane = target["next_lane"]
     while roads.lanes[lane]["internal"]:
@@ -150,8 +184,9 @@ def exit_blocked(
                 room -= 2.0 * other["half"] + ROOM_M
         lane = roads.lanes[lane]["successor"]
     needed = row["length"] + ROOM_M
-    beyond = 0.0
+    beyond, road_m = 0.0, 0.0
     for _ in range(EXIT_LANES):
+        waits = False
         for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
             other = scratch.entries[k]
             if beyond + other["s"] > EXIT_LOOK_M:
@@ -160,14 +195,21 @@ def exit_blocked(
                 room += other["s"] - other["half"]
                 blocked: bool = room < needed
                 return blocked
+            waits |= rows[other["row"]]["hold"] != HOLD_NONE
             room -= 2.0 * other["half"] + ROOM_M
-        room += roads.lanes[lane]["length_m"]
         beyond += roads.lanes[lane]["length_m"]
+        if not roads.lanes[lane]["internal"]:
+            road_m += roads.lanes[lane]["length_m"]
+            room += roads.lanes[lane]["length_m"]
         if room >= needed or beyond > EXIT_LOOK_M:
             return False
-        lane, way, _ = next_step(roads, travel, lane, way)
+        if waits:
+            return True
+        lane, way, ahead = next_step(roads, travel, lane, way)
         if lane < 0:
             return False
+        if ahead >= 0 and _waits_at(roads, ahead, road_m, needed, phase):
+            return True
     return False
 
 
@@ -212,7 +254,7 @@ def hold_at_line(
     )
     if hold != HOLD_NONE:
         return hold
-    if exit_blocked(roads, travel, row, link, way, scratch):
+    if needed <= HARD_STOP and exit_blocked(roads, travel, rows, row, link, way, phase, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
@@ -271,7 +313,7 @@ def behind_merging(
     roads: RoadArrays,
     kind: np.void,
     row: np.void,
-    link: int,  # that the vehicle takes next
+    link: int,  # LINK that the vehicle takes next
     distance: float,  # from the vehicle's centre to the end of its lane, m
     scratch: Scratch,
 ) -> float:
@@ -328,7 +370,7 @@ def hold_inside(
     )
     if hold != HOLD_NONE:
         return hold
-    if exit_blocked(roads, travel, rows[i], link, way, scratch):
+    if exit_blocked(roads, travel, rows, rows[i], link, way, phase, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
 
@@ -359,7 +401,7 @@ def constraint_inside(
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     i: int,  # row of the vehicle
-    link: int,  # that the vehicle drives on
+    link: int,  # LINK that the vehicle drives on
     place: float,  # distance of its centre beyond the end of the previous lane, m
     way: int,  # the vehicle's `way` beyond the junction
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows

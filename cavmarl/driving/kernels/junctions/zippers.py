@@ -1,0 +1,115 @@
+"""Zipper merging: vehicles of two lanes that become one lane take turns, and none of them stops.
+
+As in SUMO, no vehicle has the right of way. Each driver follows the vehicles that pass before it,
+also while these are on the other lane. Where paths of zipper links cross, drivers yield to the
+vehicles that pass before them. Both drivers of a pair compute the same order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
+from cavmarl.driving.kernels.junctions.gaps import (
+    ARRIVES_M,
+    STATE_ZIPPER,
+    assumed_accel_of,
+    earliest,
+)
+from cavmarl.driving.kernels.junctions.stop_line_registration import can_be_ignored
+from cavmarl.driving.kernels.models.following import behind, no_constraint
+
+FALL_BACK_MPS2 = 0.5  # deceleration with which a driver opens the gap until the other one is ahead
+BRAKES_S = 1.0  # a vehicle ahead goes first if the other one can brake for it within this time
+
+
+@inlined_kernel
+def is_zipper(roads: RoadArrays, link: int) -> bool:
+    """Return whether vehicles on `link` take turns with those of another lane."""
+    target = roads.links[link]
+    zipper: bool = (target["state"] == STATE_ZIPPER) & (target["signal"] < 0)
+    return zipper
+
+
+@inlined_kernel
+def _can_brake_for(to_line: float, row: np.void, decel: float, ahead_m: float, mps: float) -> bool:
+    """Return whether a row stays behind a vehicle `ahead_m` m before its line by braking briefly.
+
+    `mps` is the speed of that vehicle, which has to be nearer to its line than the row.
+    """
+    apart = to_line - ahead_m
+    brakes: bool = apart > 0.0 and apart > BRAKES_S * (row["speed"] - decel * BRAKES_S - mps)
+    return brakes
+
+
+@inlined_kernel
+def _arrival_s(
+    roads: RoadArrays, travel: TripTables, row: np.void, link: int, to_line: float
+) -> float:
+    """Return the time in s in which a vehicle `to_line` m before its line can reach the line."""
+    limit = roads.lanes[roads.links[link]["from_lane"]]["speed_mps"]
+    return earliest(to_line, row["speed"], limit, assumed_accel_of(travel, row))
+
+
+@kernel
+def passes_first(
+    roads: RoadArrays,
+    travel: TripTables,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    row: np.void,  # VEHICLE
+    link: int,  # zipper link that it takes next
+    to_line: float,  # from its front to the line, m
+    foe: np.void,  # APPROACH of a vehicle at another zipper link
+) -> bool:
+    """Return whether a foe passes a zipper before a row whose front is before its own line."""
+    foe_to_line, other = foe["dist"] - foe["half"], rows[foe["row"]]
+    if foe_to_line <= 0.0:
+        return True
+    if can_be_ignored(other) or 0.0 < other["to_go"] < foe["dist"] + ARRIVES_M:
+        return False
+    decel = travel.types[row["vtype"]]["decel"]
+    if _can_brake_for(to_line, row, decel, foe_to_line, other["speed"]):
+        return True
+    decel = travel.types[other["vtype"]]["decel"]
+    if _can_brake_for(foe_to_line, other, decel, to_line, row["speed"]):
+        return False
+    arrives = _arrival_s(roads, travel, row, link, to_line)
+    foe_arrives = _arrival_s(roads, travel, other, foe["link"], foe_to_line)
+    return foe_arrives < arrives or (foe_arrives == arrives and foe["id"] < row["id"])
+
+
+@kernel
+def behind_in_zipper(
+    roads: RoadArrays,
+    travel: TripTables,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    i: int,  # row of the vehicle
+    kind: np.void,  # its VTYPE
+    link: int,  # zipper link that it takes next
+    distance: float,  # from its centre to the end of its lane, m; its front is before the line
+    scratch: Scratch,  # with the lane and link indices of this tick
+) -> float:
+    """Return the constraint of the foes that pass a zipper before row i."""
+    row = rows[i]
+    to_line = distance - 0.5 * row["length"]
+    constraint = no_constraint(kind)
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        conflict = roads.conflicts[c]
+        if not (conflict["merging"] and is_zipper(roads, conflict["foe"])):
+            continue
+        for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
+            foe = scratch.approach[k]
+            to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
+            if foe["row"] == i or to_clear <= 0.0:
+                continue
+            if not passes_first(roads, travel, rows, row, link, to_line, foe):
+                continue
+            other, foe_to_line = rows[foe["row"]], foe["dist"] - foe["half"]
+            left_s = _arrival_s(roads, travel, other, foe["link"], foe_to_line)
+            gap = to_line + conflict["leave_m"] - to_clear + 0.5 * FALL_BACK_MPS2 * left_s * left_s
+            decel = travel.types[other["vtype"]]["decel"]
+            constraint = max(constraint, behind(kind, row["speed"], gap, foe["speed"], decel))
+    return constraint

@@ -1,0 +1,125 @@
+"""Junctions are kept clear: no vehicle enters that would have to stop inside."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MapError
+from cavmarl.core.records.codes import (
+    HOLD_NONE,
+    HOLD_SIGNAL,
+    HOLD_YIELD,
+    SIGNAL_GREEN_MINOR,
+    SIGNAL_RED,
+)
+from cavmarl.driving.kernels.junctions.junctions import exit_blocked
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.evaluate.traffic.native_side import idle_commands, make_world
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import make_plans
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.narrow_places import signal_pair
+from tests.support.traffic import on_lane, scratch, travel_by
+
+
+@pytest.mark.parametrize("apart_m", [18.0, 24.0, 32.0])
+def test_opposing_left_turns_on_a_short_road_do_not_lock(tmp_path: Path, apart_m: float) -> None:
+    net, routes = signal_pair(tmp_path, apart_m)
+    world = make_world(net, [routes], 450, 1, 0.1)
+    lanes, commands = world.network.lanes, idle_commands(world)
+    for _ in range(4500):
+        world.step(commands)
+        rows = world.vehicles()
+        assert (rows["hit"] < 0).all()
+        inside = rows[lanes["internal"][rows["lane"]]]
+        assert inside["wait_s"].max(initial=0.0) < 60.0
+        assert rows["wait_s"].max(initial=0.0) < 150.0
+    assert world.traffic_stats().arrived > 130
+
+
+class Ahead(NamedTuple):
+    """A vehicle before the first of two signals that turns left at the second."""
+
+    network: RoadNetwork
+    left_turns_from: int  # the lane between both signals
+    link: int  # that the vehicle takes next
+    phase: NDArray[np.int32]
+
+
+def ahead(folder: Path, light: int, *, may_block: bool = False, apart_m: float = 24.0) -> Ahead:
+    net, _ = signal_pair(folder, apart_m)
+    if may_block:
+        text = net.read_text()
+        net.write_text(text.replace('from="sj"', 'keepClear="0" from="sj"'))
+    network = read_network(net)
+    lane = network.lane_ids.index("up_1")
+    (link,) = np.flatnonzero(network.links["to_lane"] == lane)
+    turn = network.links[network.lanes[lane]["first_link"]]
+    phase = network.programs["first_phase"][network.signals["program"]].astype(np.int32)
+    program = network.programs[network.signals["program"][turn["signal"]]]
+    for at in range(program["num_phases"]):
+        row = program["first_phase"] + at
+        state = network.phases["first_state"][row] + turn["signal_index"]
+        if network.phase_states[state] == light:
+            phase[turn["signal"]] = row
+            return Ahead(network, lane, int(link), phase)
+    pytest.fail(f"no phase with {light}")
+
+
+def is_blocked(scene: Ahead, *others: tuple[float, float, int]) -> bool:
+    """Whether the way is blocked by cars on the road between: place, speed, reason to stop."""
+    network = scene.network
+    goal = network.edge_ids.index("jw2")
+    travel = travel_by(make_plans(network, [goal]))
+    rows = [
+        on_lane(network, scene.left_turns_from, s, travel, id=k, speed=speed, hold=hold)
+        for k, (s, speed, hold) in enumerate(others)
+    ]
+    before = int(network.links[scene.link]["from_lane"])
+    rows.append(on_lane(network, before, 280.0, travel, id=9, speed=8.0))
+    table = np.concatenate(rows)
+    room = scratch(network, len(table))
+    index_lanes(network.arrays, travel, table, len(table), room)
+    row = table[-1]
+    way = int(row["way"])
+    return exit_blocked(network.arrays, travel, table, row, scene.link, way, scene.phase, room)
+
+
+MOVING, WAITING = (8.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_YIELD)
+
+
+def test_a_full_road_before_a_line_at_which_its_vehicles_wait_is_blocked(tmp_path: Path) -> None:
+    scene = ahead(tmp_path, SIGNAL_GREEN_MINOR)
+    assert not is_blocked(scene)
+    assert not is_blocked(scene, WAITING)
+    assert is_blocked(scene, MOVING, WAITING)
+    assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_SIGNAL))
+    # The vehicles move on, but the own one has to expect to yield at that line.
+    assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
+
+
+@pytest.mark.parametrize(("light", "blocked"), [(SIGNAL_RED, True), (SIGNAL_GREEN_MINOR, False)])
+def test_on_a_road_shorter_than_a_vehicle_red_blocks(
+    tmp_path: Path, light: int, blocked: bool
+) -> None:
+    # At green it cannot wait on that road until others let it turn, so it does not wait before.
+    assert is_blocked(ahead(tmp_path, light, apart_m=14.0)) == blocked
+
+
+def test_a_connection_can_allow_vehicles_to_block_the_junction(tmp_path: Path) -> None:
+    scene = ahead(tmp_path, SIGNAL_GREEN_MINOR, may_block=True)
+    assert scene.network.links[scene.link]["may_block"]
+    assert not is_blocked(scene, MOVING, WAITING)
+
+
+def test_keep_clear_must_be_a_truth_value(tmp_path: Path) -> None:
+    net, _ = signal_pair(tmp_path)
+    net.write_text(net.read_text().replace('from="sj"', 'keepClear="maybe" from="sj"'))
+    with pytest.raises(MapError, match=re.escape("keepClear='maybe', must be true or false")):
+        read_network(net)

@@ -1,0 +1,71 @@
+"""Maps on which few vehicles fit: two lanes that become one, and two signals close together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.support.netgenerate import netconvert
+
+ZIPPER_NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="300" y="0" type="zipper"/>
+<node id="c" x="600" y="0"/></nodes>"""
+ZIPPER_EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2" speed="13.9"/>
+<edge id="bc" from="b" to="c" speed="13.9"/></edges>"""
+ZIPPER_CONNECTIONS = """<connections><connection from="ab" to="bc" fromLane="0" toLane="0"/>
+<connection from="ab" to="bc" fromLane="1" toLane="0"/></connections>"""
+ZIPPER_DEMAND = """<routes><vType id="car"/><vType id="truck" vClass="truck"/>
+<vType id="idm" carFollowModel="IDM"/>
+<vTypeDistribution id="mix" vTypes="car truck idm" probabilities="6 1 3"/>
+<flow id="right" type="{type}" from="ab" to="bc" begin="0" end="900" vehsPerHour="{per_h}"
+  departLane="0" departSpeed="max"/>
+<flow id="left" type="{type}" from="ab" to="bc" begin="0" end="900" vehsPerHour="{per_h}"
+  departLane="1" departSpeed="max"/></routes>"""
+
+PAIR_NODES = """<nodes>
+<node id="n" x="0" y="{north}"/><node id="s" x="0" y="-300"/><node id="w1" x="-300" y="0"/>
+<node id="e1" x="300" y="0"/><node id="w2" x="-300" y="{apart}"/><node id="e2" x="300" y="{apart}"/>
+<node id="j1" x="0" y="0" type="traffic_light"/>
+<node id="j2" x="0" y="{apart}" type="traffic_light"/></nodes>"""
+PAIR_EDGES = """<edges><edge id="sj" from="s" to="j1" numLanes="2"/>
+<edge id="js" from="j1" to="s" numLanes="2"/><edge id="up" from="j1" to="j2" numLanes="2"/>
+<edge id="down" from="j2" to="j1" numLanes="2"/><edge id="nj" from="n" to="j2" numLanes="2"/>
+<edge id="jn" from="j2" to="n" numLanes="2"/><edge id="wj1" from="w1" to="j1"/>
+<edge id="je1" from="j1" to="e1"/><edge id="ej2" from="e2" to="j2"/>
+<edge id="jw2" from="j2" to="w2"/></edges>"""
+PAIR_CONNECTIONS = """<connections>
+<connection from="sj" to="up" fromLane="0" toLane="0"/>
+<connection from="sj" to="up" fromLane="1" toLane="1"/>
+<connection from="up" to="jn" fromLane="0" toLane="0"/>
+<connection from="up" to="jw2" fromLane="1" toLane="0"/>
+<connection from="nj" to="down" fromLane="0" toLane="0"/>
+<connection from="nj" to="down" fromLane="1" toLane="1"/>
+<connection from="down" to="js" fromLane="0" toLane="0"/>
+<connection from="down" to="je1" fromLane="1" toLane="0"/>
+<connection from="wj1" to="je1" fromLane="0" toLane="0"/>
+<connection from="ej2" to="jw2" fromLane="0" toLane="0"/></connections>"""
+PAIR_DEMAND = """<routes>
+<flow id="ns" from="nj" to="js" begin="0" end="900" vehsPerHour="450" departLane="best"/>
+<flow id="ne" from="nj" to="je1" begin="0" end="900" vehsPerHour="300" departLane="best"/>
+<flow id="sn" from="sj" to="jn" begin="0" end="900" vehsPerHour="450" departLane="best"/>
+<flow id="sw" from="sj" to="jw2" begin="0" end="900" vehsPerHour="300" departLane="best"/>
+<flow id="we" from="wj1" to="je1" begin="0" end="900" vehsPerHour="150"/>
+<flow id="ew" from="ej2" to="jw2" begin="0" end="900" vehsPerHour="150"/></routes>"""
+
+
+def zipper(folder: Path, per_h: int = 500, vehicle_type: str = "car") -> tuple[Path, Path]:
+    """A road on which two lanes become one, with `per_h` vehicles/h on each lane."""
+    demand = ZIPPER_DEMAND.format(type=vehicle_type, per_h=per_h)
+    return _made(folder, ZIPPER_NODES, ZIPPER_EDGES, ZIPPER_CONNECTIONS, demand)
+
+
+def signal_pair(folder: Path, apart_m: float = 24.0) -> tuple[Path, Path]:
+    """Two crossings with signals; opposing left turns share the short roads between them."""
+    nodes = PAIR_NODES.format(apart=apart_m, north=apart_m + 300.0)
+    return _made(folder, nodes, PAIR_EDGES, PAIR_CONNECTIONS, PAIR_DEMAND)
+
+
+def _made(folder: Path, nodes: str, edges: str, connections: str, demand: str) -> tuple[Path, Path]:
+    for end, text in {"nod": nodes, "edg": edges, "con": connections}.items():
+        (folder / f"m.{end}.xml").write_text(text, encoding="utf-8")
+    routes = folder / "m.rou.xml"
+    routes.write_text(demand, encoding="utf-8")
+    return netconvert(folder, "m"), routes
