@@ -279,7 +279,7 @@ BEHIND_THE_LAST = """<routes>
 </routes>"""
 
 
-def test_who_enters_behind_the_last_enters_once_however_far_the_last_is(tmp_path: Path) -> None:
+def test_a_departure_behind_a_far_last_vehicle_enters_once(tmp_path: Path) -> None:
     # The zone at the end of the road says where, another one sees the last that is far from there.
     on_a_long_road(tmp_path, BEHIND_THE_LAST)
 

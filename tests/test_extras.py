@@ -42,7 +42,7 @@ def reached(extra: str) -> set[str]:
     return found
 
 
-def test_errors_name_extras_that_there_are() -> None:
+def test_errors_name_existing_extras() -> None:
     named = list(named_extras())
     assert len(named) > 50
     assert not [(extra, file) for extra, file in named if extra not in EXTRAS]
@@ -59,7 +59,7 @@ def extras_of_pages() -> Iterator[tuple[str, str]]:
                 yield extra, path.relative_to(ROOT).as_posix()
 
 
-def test_pages_name_extras_that_there_are() -> None:
+def test_pages_name_existing_extras() -> None:
     named = list(extras_of_pages())
     assert ("train", "README.md") in named
     assert not [(extra, file) for extra, file in named if extra not in EXTRAS]

@@ -105,9 +105,9 @@ class Args:
         options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
         options.check_device(self.device)
         if self.residual and self.imitation_weight:
-            raise ConfigError("--residual: not with --imitation-weight; it starts as that driver")
+            raise ConfigError("--residual: leave out --imitation-weight; it starts as that driver")
         if self.shared and self.mappo:
-            raise ConfigError("--shared: not with --mappo, whose critic has other inputs")
+            raise ConfigError("--shared: leave out --mappo, whose critic has other inputs")
 
     @property
     def folder(self) -> Path:
@@ -146,13 +146,13 @@ class Batch:
 
 
 class Collector:
-    """Drives the worlds with a network and stores the data, with the times.
+    """Drives the worlds with a network, stores the data, and measures times.
 
     If the critic sees states, worlds restart in the next step: otherwise, the last state of an
     episode would be overwritten.
 
     Attributes:
-        opponents: drive some of the vehicles; nothing is learnt from these.
+        opponents: drivers of some vehicles, whose data are not used for training.
     """
 
     def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
@@ -368,7 +368,7 @@ class Run:
             self.learner.scales.start(self.config, policy_files(args.start)[0].parent)
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
         if not folder.began.parts:
-            self.save()  # a run that is killed early restarts from here
+            self.save()  # a run that is killed before its first checkpoint restarts from here
         if parts := folder.resume():
             self.learner.load(parts["learner"])
             self.collector.load(parts["collector"])

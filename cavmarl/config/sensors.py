@@ -403,7 +403,7 @@ class SensorsConfig(Section, key="sensors"):
         return {name: value for name, value in named if isinstance(value, SensorSection)}
 
     def without_sight(self) -> SensorsConfig:
-        """Return the same sensors without those that see other vehicles or signals."""
+        """Return the same sensors, except sensors that see other vehicles or signals."""
         blind: dict[str, Any] = {
             name: section.without_sight() for name, section in self._sections().items()
         }

@@ -17,9 +17,9 @@ def cache_dir() -> Path:
     return (Path(shared) if os.path.isabs(shared) else Path.home() / ".cache") / "cavmarl"
 
 
-def tell_unwritable(error: OSError) -> None:
+def report_unwritable(error: OSError) -> None:
     """Report once, on standard error, that the cache cannot be written."""
     print_once(
-        f"{cache_dir()} cannot be written ({error.strerror or error}): every process has to "
+        f"{cache_dir()} cannot be written ({error.strerror or error}), so every process must "
         "compile kernels and read maps again; set CAVMARL_CACHE_DIR to a writable folder"
     )

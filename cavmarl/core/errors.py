@@ -26,13 +26,13 @@
     │   ├── WorkerFailureError    an exception in a worker, with its traceback
     │   ├── NodeRefusedError      a node that its caller has rejected
     │   └── NoAdmissibleWorkerError   every worker is too busy to get a shard
-    ├── ClockError             a clock that is advanced by another than its master
+    ├── ClockError             a clock that is not advanced by its master
     ├── FollowerError          an external stack that sends invalid data
-    │   └── FollowerLostError     it has ended, or has not answered in time
+    │   └── FollowerLostError     a stack that has ended, or has not answered in time
     ├── ServiceError           the coordination service, one of its nodes, or a request failed
     └── SumoError              SUMO as global traffic cannot continue
 
-A message says what is wrong, where, and what to do.
+Each message says what is wrong, where, and what to do.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ class RecordingError(CavmarlError):
 class TrainingError(CavmarlError):
     """A training run that cannot start, continue or be written.
 
-    Another process writes to its folder, the folder has another run, its checkpoint is damaged, or
-    the disk is full.
+    Causes: another process writes to the folder, the folder has another run, the checkpoint is
+    damaged, or the disk is full.
     """
 
 
@@ -130,8 +130,7 @@ class ProtocolError(CavmarlError):
     """The hand-off protocol was violated, or cannot continue.
 
     For example: an event that is not allowed in a state; a vehicle that is lost, duplicated,
-        created
-    twice or at another epoch than planned; an invariant that does not hold.
+    created twice or at another epoch than planned; an invariant that does not hold.
     """
 
 
@@ -151,8 +150,8 @@ class LostTickError(ProtocolError):
 class MessageError(ProtocolError):
     """Bytes that are not a message of this run, or vehicles that cannot continue here.
 
-    They are truncated, damaged, or of another version, build, environment, run, vehicle or tick.
-    Also raised if the answer of a network simulator fits no packet.
+    The bytes are truncated, damaged, or of another version, build, environment, run, vehicle or
+    tick. Also raised if the answer of a network simulator fits no packet.
     """
 
 
@@ -218,7 +217,7 @@ class NoAdmissibleWorkerError(WorkerError):
 
 
 class ClockError(CavmarlError):
-    """A clock that is advanced by another than its master, or a second master.
+    """A clock that is not advanced by its master, or a second master.
 
     Also raised if a world is not at the tick at which its time master left it.
     """
@@ -227,7 +226,7 @@ class ClockError(CavmarlError):
 class FollowerError(CavmarlError):
     """An external stack has sent data that is invalid, not executable or not expected.
 
-    The world is intact and can be stepped on.
+    The world is intact and can continue.
     """
 
 
@@ -262,8 +261,8 @@ class ServiceError(CavmarlError):
 class SumoError(CavmarlError):
     """SUMO as global traffic cannot continue.
 
-    A second simulation in one process, a SUMO process that has ended or hangs, or SUMO data that
-    does not fit the world.
+    Causes: a second simulation in one process, a SUMO process that has ended or hangs, or SUMO data
+    that does not fit the world.
     """
 
 

@@ -52,7 +52,7 @@ class Registry(Generic[T]):
                 f"{self._kind} {name!r}: must have letters, digits and _ only, and no digit first"
             )
         if name in taken:
-            raise ConfigError(f"{self._kind} '{name}': is cavmarl's own; use another name")
+            raise ConfigError(f"{self._kind} '{name}': cavmarl has this name; use another name")
         if self.modules.get(name, module) != module:
             raise ConfigError(
                 f"{self._kind} '{name}': already registered by {self.modules[name]}; use another "
@@ -65,7 +65,7 @@ class Registry(Generic[T]):
         del self._entries[name], self.modules[name]
 
     def advice(self) -> str:
-        """Return what to do about a name that is not registered."""
+        """Return advice for a name that is not registered."""
         known = ", ".join(self._entries) or "none"
         return f"not registered (registered: {known}); see cavmarl.register_{self._kind}"
 

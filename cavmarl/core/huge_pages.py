@@ -1,7 +1,7 @@
-"""Arrays in huge pages, which save address translations: a tick reads many places in memory.
+"""Arrays in huge pages, which save address translations when a tick reads scattered memory.
 
 In a virtual machine, a page that is not in the processor's translation buffer costs two walks
-through page tables. Linux provides pages of 2 MiB on request, unless they are switched off
+through page tables. Linux provides pages of 2 MiB on request, unless these pages are switched off
 (`/sys/kernel/mm/transparent_hugepage/enabled`). On other systems, arrays are NumPy's own.
 """
 
@@ -59,7 +59,7 @@ def huge_copy(array: NDArray[Any], also_mapped: bool = False) -> NDArray[Any]:
     """Return the array in huge pages, with the same writeability.
 
     Arrays that are small, in huge pages already, or (unless `also_mapped`) in a mapped file are
-    returned as they are.
+    returned unchanged.
     """
     if array.nbytes < LEAST or (_is_mapped(array) and not also_mapped):
         return array

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.cache_folder import cache_dir, report_unwritable
 from cavmarl.core.compiled import IS_PLAIN, sources_digest
 from cavmarl.core.compiled.kernel_files import machine_digest, numba_version
 from cavmarl.core.compiled.machine_code import CompileListener, kernel_source, listeners
@@ -85,7 +85,7 @@ def _can_cache() -> bool:
     try:
         _marker("plain").parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        tell_unwritable(error)
+        report_unwritable(error)
         return False
     return True
 

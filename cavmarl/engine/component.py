@@ -62,7 +62,7 @@ class Component(Protocol):
         ...
 
     def arrays(self) -> Iterator[NDArray[Any]]:
-        """Return all arrays (W, …) that outlive a tick, the same ones in each call.
+        """Return all arrays (W, …) that outlive a tick. Each call returns the same arrays.
 
         The hash of the state covers them. They must not depend on the division of a world or on
         the places of its rows. Records must have no padding, because padding is not saved.

@@ -118,7 +118,7 @@ class SumoPhases:
     def let_in(self, tick: Tick) -> None:
         """Add vehicles that have entered in SUMO: as rows if it drives, else to the queue."""
         sumo, departures, worlds = self._sumo, tick.departures, tick.worlds
-        tick.meet()
+        tick.finish_phase()
         if not sumo.drives:
             sumo.order(departures, worlds)
         elif sumo.let_in(departures, worlds, tick.peers.running()):

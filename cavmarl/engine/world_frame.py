@@ -69,7 +69,7 @@ class WorldFrame(NamedTuple):
     tick: int  # since the reset
     time_s: float
     vehicles: NDArray[np.void]  # SEEN (n,), by id
-    signals: NDArray[np.int32]  # (num_signals,) PHASE rows that are on
+    signals: NDArray[np.int32]  # (num_signals,) active PHASE rows
     transfers: tuple[TransferInFlight, ...] = ()
     ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids of its ghosts
     ended: NDArray[np.void] = NONE_ENDED  # ENDED (m,): agents that are not among `vehicles`

@@ -96,7 +96,7 @@ def load_world(
 
 
 def make_world(config: EnvConfig, base_dir: Path) -> World:
-    """Load the world of a configuration, and derive its horizon from the map if it asks for that.
+    """Load the world of a configuration, whose horizon may be derived from the map.
 
     Raises the errors of `load_world`.
     """
@@ -128,7 +128,7 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     """
     network = _joined(resolve_maps(config, base_dir), config.population.agents > 0)
     if len(network.maps) > 1:
-        _refuse_of_one_map(config)
+        _refuse_single_map_keys(config)
     buildings = resolve_buildings(config, base_dir)
     if buildings is not None:
         network = with_buildings(network, buildings)
@@ -136,7 +136,7 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
 
 
 def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
-    """Return the network of map files. Worlds of one process share the network of the same files.
+    """Return the network of map files. Worlds of one process share a network of the same files.
 
     With agents, the network includes the swept areas of steered vehicles.
 
@@ -168,7 +168,7 @@ def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
     return _LOADED.setdefault((has_agents, *contents), join(networks))
 
 
-def _refuse_of_one_map(config: EnvConfig) -> None:
+def _refuse_single_map_keys(config: EnvConfig) -> None:
     """Refuse keys that name elements of one map if there are several maps."""
     named = {
         "map.programs": config.map.programs,

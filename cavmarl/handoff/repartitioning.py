@@ -1,6 +1,6 @@
 """`Repartitioner`: new zones for running worlds whose vehicles are unevenly distributed.
 
-This is an extension, off by default: the paper's zones are fixed. The zones change between two
+This is off by default. The zones change between two
 ticks. In the next tick, each vehicle outside of its owner's new zone is handed over as at any
 border. So no result depends on repartitioning.
 """

@@ -59,7 +59,7 @@ def divide(
     fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
     wide_m = halo_m(config, reach_m, partition.count, fastest_mps, late_ticks)
     touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps, late_ticks)
-    # Only agents sense.
+    # Background vehicles have no sensors.
     has_agents = config.population.agents > 0
     sensed_m = _needed_m(config, sensing_m, fastest_mps, late_ticks) if has_agents else 0.0
     near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))

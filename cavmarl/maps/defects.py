@@ -1,4 +1,4 @@
-"""Places of a map that look wrong, each with its kind and position."""
+"""Defects of a map: places that look wrong, each with its kind and position."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 CAR_WIDTH_M = 1.8
 LEVEL_M = 3.0  # lanes with a larger difference in height are a bridge and the road below it
-STEP_M = 0.1  # in height, between lanes that lead into each other
+STEP_M = 0.1  # minimum difference in height of lanes that lead into each other
 SEARCHES = ("crossings", "signals", "lanes", "steps", "parts", "stop lines", "buildings")
 _DEEP_M = 1.0  # maximum distance of a stop line inside its junction
 
@@ -45,11 +45,11 @@ def find_defects(
     buildings: Path | None = None,
     told: Callable[[str], None] = lambda stage: None,
 ) -> list[Defect]:
-    """Return everything that looks wrong, kind by kind.
+    """Return all defects of a map, sorted by kind.
 
     Args:
         network: the map.
-        path: the map's file, which has rules and shapes of junctions.
+        path: the map's file, for the rules and shapes of junctions.
         buildings: OSM or SUMO polygons; None: buildings are not checked.
         told: called with each of `SEARCHES` as it begins.
 
@@ -76,7 +76,7 @@ def find_defects(
 
 
 def cut_off_edges(network: RoadNetwork) -> list[int]:
-    """Return EDGE rows for cars that are connected to the largest part in neither direction."""
+    """Return edges for cars (EDGE rows) that neither reach the largest part nor are reached."""
     from cavmarl.maps.components import strong_components
 
     open_lanes = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
@@ -115,7 +115,7 @@ def _middle(network: RoadNetwork, edge: int) -> tuple[float, float]:
 def _unruled_crossings(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
     """Find paths that cross in a junction without a rule or a signal.
 
-    The rules are taken from the file, because the reader adds missing rules.
+    The rules are read from the file, because the network has added rules where the file has none.
     """
     links = network.links
     rules = {
@@ -166,7 +166,7 @@ def _path(network: RoadNetwork, link: int) -> Points:
 
 
 def crossing_of(one: Points, other: Points) -> tuple[float, float] | None:
-    """Return where two polylines (n, 3) cross on one level, in the plane, or None."""
+    """Return the position in the plane where two polylines (n, 3) cross on one level, or None."""
     if len(one) < 2 or len(other) < 2:
         return None
     a, b = one[:-1, None], one[1:, None]
@@ -247,7 +247,7 @@ def _to_rim(place: Points, rim: Points) -> float:
 
 
 def _buildings_on_roads(network: RoadNetwork) -> Iterator[Defect]:
-    """Find lanes with points under a roof: the building covers the road, or has a passage."""
+    """Find lanes with points under a roof; the building may have a passage for the road."""
     lane_of = np.repeat(np.arange(len(network.lanes)), network.lanes["num_points"])
     places = np.stack([network.points["x"], network.points["y"]], axis=1)
     seen: set[int] = set()

@@ -2,7 +2,7 @@
 
 The same source and options give the same bytes: netconvert's comment with the date is removed.
 
-Each network file names its source (`maps.provenance`). Heights are added here.
+Each network file names its source (`maps.provenance`). This module also adds heights.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ OSM_OPTIONS = (
     "--keep-edges.by-vclass=passenger",
     "--remove-edges.isolated",
     *LANE_OPTIONS,
-    "--output.original-names",  # of the ways of each lane: for bridges, names, defaults
+    "--output.original-names",  # ids of the ways of each lane, for bridges, names, defaults
 )
 OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
 
@@ -78,7 +78,7 @@ _LEFT_HAND = "--lefthand"
 _CONVERSION = "conversion 2"
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
-_FAR_M = 100_000.0  # from the origin; farther away, the projection distorts lengths
+_FAR_M = 100_000.0  # farther from the origin, the projection distorts lengths
 
 Origin = tuple[float, float]  # latitude and longitude, degrees
 Told = Callable[[str], None]
@@ -95,20 +95,20 @@ class BuildResult:
     """The result of a build."""
 
     path: Path  # the SUMO network
-    source: Path  # the file it was made from
-    kind: MapKind  # of the source
+    source: Path  # the file from which it was built
+    kind: MapKind  # kind of the source
     options: tuple[str, ...]  # netconvert's options; empty if a SUMO network was copied
     # netconvert's warnings, counted by their text without names and numbers
     warnings: dict[str, int]
     # changes that netconvert reports: joined junctions, guessed roundabouts …
     corrections: tuple[str, ...]
-    # with `tolerant`, ignored errors of netconvert; the objects that they name were left out
+    # with `tolerant`, ignored errors of netconvert; the objects named there were left out
     dropped: tuple[str, ...]
     provenance: dict[str, str]  # origin of the map, as written in its file
     defaults: tuple[RoadDefaults, ...] = ()  # missing values, from the type map
     notes: tuple[str, ...] = ()  # what the source contains and the network does not, with counts
     heights: HeightReport | None = None
-    levels: int = 0  # lanes that cross on a bridge or in a tunnel, without `heights`
+    levels: int = 0  # number of lanes that cross on a bridge or in a tunnel; 0 with `heights`
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self) | {"path": str(self.path), "source": str(self.source)}
@@ -133,8 +133,8 @@ def build_network(
     Args:
         source: OpenStreetMap or OpenDRIVE, which netconvert converts to a network, or a SUMO
             network, which is copied. May be gzipped.
-        target: destination of the network, gzipped if it ends in `.gz`. Default: the cache, or
-            the source itself if nothing has to be done.
+        target: path of the network, gzipped if it ends in `.gz`. Default: in the cache, or the
+            source itself if it needs no changes.
         options: additional options for netconvert.
         bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
             OSM, otherwise metres in the source's own frame.
@@ -142,16 +142,16 @@ def build_network(
             the `rule` of the roads. A SUMO network has its own.
         origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
             the roads, in UTM.
-        heights: terrain models for the roads; nothing moves in the plane. Without them, the ground
-            is flat, and bridges and tunnels of OSM leave it where they cross roads.
-        licences: licences of the source and of the terrain models, if not the default ones.
-        tolerant: let netconvert leave out what it cannot use instead of failing.
+        heights: terrain models for the roads; positions in the plane do not change. Without models,
+            the ground is flat, and bridges and tunnels of OSM have heights where they cross roads.
+        licences: licences of the source and of the terrain models; empty: the default.
+        tolerant: let netconvert leave out objects that it cannot use instead of failing.
         timeout_s: time limit of netconvert; None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
         told: called with each of `STAGES` as it begins.
 
     Raises:
-        ConfigError: `bbox` is empty, the origin is not on the earth or far from the map, or the
-            source is a SUMO network and `side` is given.
+        ConfigError: `bbox` is empty, or the origin is not on the earth, or too far from the map; or
+            the source is a SUMO network and `side` is given.
         MapError: the source is broken, malicious or not a map; netconvert fails (its output is in
             the message); the result has no drivable lane; the heights cannot be used; the roads
             have no common traffic side; or the target cannot be written.
@@ -224,7 +224,7 @@ def _cache_entry(
     require("sumo", "sumo")
     words = [source_hash(source), version("eclipse-sumo"), _CONVERSION, *options]
     if heights is None:
-        words.append("levels 4")  # of bridges and tunnels; the number is the algorithm's version
+        words.append("levels 4")  # version of the algorithm for bridges and tunnels
     else:
         words += [*map(source_hash, heights.models), repr(heights)]
     digest = hashlib.sha256("\0".join(words).encode())
@@ -246,12 +246,12 @@ def _centred(source: Path, kind: MapKind, origin: Origin | None) -> tuple[str, .
     latitude, longitude = origin
     if kind != "osm":
         raise ConfigError(
-            f"--origin: {source} has its own frame: an origin is only for OpenStreetMap"
+            f"--origin: {source} has its own frame: leave it out; only OpenStreetMap needs it"
         )
     if not (abs(latitude) < 90.0 and abs(longitude) <= 180.0):
         raise ConfigError(
-            f"--origin {latitude:g},{longitude:g}: not a latitude and longitude: give LAT,LON in "
-            "degrees"
+            f"--origin {latitude:g},{longitude:g}: not a latitude and a longitude: give LAT,LON "
+            "in degrees"
         )
     projection = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +x_0=0 +y_0=0"
     projection += " +datum=WGS84 +units=m +no_defs"
@@ -280,12 +280,12 @@ class _Build:
     levels: int = 0
 
     def run(self) -> None:
-        """Make the network beside its destination, and move it there when it is complete."""
+        """Write the network to a folder beside the target, and move it when it is complete."""
         place = self.place
         if place.exists() and place.samefile(self.source):
             raise MapError(f"{place}: the target is the source: give another target")
         place.parent.mkdir(parents=True, exist_ok=True)
-        cache = cache_dir() / "maps"  # shared by all builds, so that one cleans up after another
+        cache = cache_dir() / "maps"  # one folder for all builds, so a build removes old drafts
         with draft_folder(cache if place.is_relative_to(cache) else place.parent) as folder:
             draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
@@ -368,7 +368,7 @@ class _Build:
         return run_netconvert(arguments, self.source, self.timeout_s, cures)
 
     def _finished(self, draft: Path) -> bytes:
-        """Return the network with additions to netconvert's output: heights and origin."""
+        """Return the network with the map's origin and heights added to netconvert's output."""
         if not self.options and self.heights is None:
             return draft.read_bytes()
         self.told(STAGES[1])
@@ -389,7 +389,7 @@ class _Build:
         return content.replace(b"<net ", facts + b"<net ", 1)
 
     def _facts(self, document: NetDocument) -> dict[str, str]:
-        """Return the map's origin, for its file."""
+        """Return the origin of the map, to be written into its file."""
         facts = read_provenance(self.source) if self.kind == "sumo" else {}
         if not facts:
             facts = {"source": self.source.name, "source sha256": source_hash(self.source)}

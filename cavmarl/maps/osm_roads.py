@@ -1,4 +1,4 @@
-"""Information of OpenStreetMap that netconvert does not use: levels, names, missing tags."""
+"""Data of OpenStreetMap that netconvert does not use: levels, names, missing tags."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class RoadWay:
 
     @property
     def level(self) -> int:
-        """Level above (bridges) or below (tunnels) the ground; 0: on it."""
+        """Level above (bridges) or below (tunnels) the ground; 0: on the ground."""
         for key, sign in (("bridge", 1), ("tunnel", -1)):
             if self.tags.get(key, "no") not in _ON_THE_GROUND:
                 try:

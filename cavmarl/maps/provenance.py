@@ -35,8 +35,8 @@ class RoadDefaults:
     kind: str  # OSM's `highway`, as named by netconvert; the type of a road of OpenDRIVE
     edges: int  # of OSM; roads of OpenDRIVE
     guessed: str  # lanes, maxspeed or width
-    value: str  # the most frequent one; speeds in m/s, widths in m
-    used_for: int  # edges or roads
+    value: str  # the most frequent value; speeds in m/s, widths in m
+    used_for: int  # number of edges or roads without the tag
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -50,7 +50,7 @@ def head_of(facts: Mapping[str, str]) -> bytes:
 
 
 def read_provenance(path: Path) -> dict[str, str]:
-    """Return the origin of a map from its file; empty if it has none."""
+    """Return the origin of a map from its file; empty if the file does not give it."""
     try:
         with path.open("rb") as raw:
             head = raw.read(_HEAD_BYTES)

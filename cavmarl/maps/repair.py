@@ -1,4 +1,4 @@
-"""Repairs a network without its source: netconvert writes it again."""
+"""Repairs a network without its source, by writing it again with netconvert."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TIMEOUT_S = 600.0
 
 
 def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str], list[Defect]]:
-    """Write a network without unconnected parts, and with new right of way and signals.
+    """Write a network again, without unconnected parts and with new right of way and signals.
 
     Args:
         source: a SUMO network.
@@ -43,7 +43,7 @@ def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str
         draft.write_bytes(NetDocument(draft).content(head_of(facts)))
         after = find_defects(read_network(draft), draft)
         os.replace(draft, target)
-    done = [f"removed edge {name}: cut off from the rest" for name in cut]
+    done = [f"edge {name}: removed, because it is not connected to the rest" for name in cut]
     left = {(defect.kind, defect.name) for defect in after}
     done += [
         f"{defect.kind} {defect.name}: repaired"

@@ -122,7 +122,7 @@ class Table:
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
         # With more moves than vehicles, `tallies` counts anew and ignores the moves. One surplus
-        # move is enough to tell, because every new vehicle adds a move.
+        # move is kept, so that `tallies` notices this: every new vehicle adds a move.
         del moves[len(owners) + 1 :]
         self.tick = tick
 
@@ -161,7 +161,7 @@ class Table:
             JournalError: a correct coordinator does not write this record here.
             ProtocolError: the record is wrong for one vehicle or zone.
         """
-        match record:  # the frequent ones first
+        match record:  # frequent records first
             case Begin():
                 self._begin(record)
             case Commit():

@@ -38,13 +38,13 @@ class Transfer(NamedTuple):
     target: int  # the new owner
     epoch: int  # of the new ownership
     forced: bool  # whether the state was attached, because the target was not ready in time
-    removed: bool  # whether the vehicle left the world in that tick
+    removed: bool  # whether the vehicle left the world in tick `tick`
     approached: int  # tick of the first state that arrived at the target, or -1
     waited: int  # ticks for which the source kept the vehicle after the crossing
     offers: int  # number of states that arrived at the target, including repeats
-    state_bytes: int  # size of the last of them; 0 if both zones are in one process
-    # distance outside of the owner's zone when the first state arrived; negative inside; None:
-    # unknown
+    state_bytes: int  # size of the last state; 0 if both zones are in one process
+    # distance outside of the owner's zone when the first state arrived; negative inside;
+    # None: unknown
     prepare_depth_m: float | None = None
     switch_depth_m: float | None = None  # the same when the switch was decided
     # distance outside of the old zone when the switch was committed; None: unknown, or the vehicle
@@ -74,7 +74,7 @@ class TransferLog:
     """A log of transfers, made from records and delivered messages.
 
     Attributes:
-        ask: called before each access, so that its caller can add outstanding entries.
+        ask: called before each access, so that the coordinator can add outstanding entries.
     """
 
     def __init__(

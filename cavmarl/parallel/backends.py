@@ -62,7 +62,7 @@ def register_backend(name: str, make: MakeWorlds) -> None:
 def find_backend(
     backend: str | None = None, workers: int | None = None, nodes: int | None = None
 ) -> BackendName:
-    """Read where worlds run; arguments and errors as of `read_backend`."""
+    """Read where worlds run. Arguments and errors are as in `read_backend`."""
     return read_backend(backend, workers, nodes, _REGISTERED)
 
 

@@ -106,7 +106,7 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
         lines = (f"{key} is {there} for it, {ours} here" for key, (there, ours) in unlike.items())
         cure = {key: there for key, (there, _) in unlike.items()}
         raise PolicyError(
-            f"The policy {name} expects different {_parts(unlike)} from those that this "
+            f"The policy {name} expects different {_parts(unlike)} than this "
             f"environment provides ({'; '.join(lines)}). It observes {config.sensed} numbers, and "
             f"this environment gives {size}. Add --sensors-of {name} to the command, or "
             f"sensors_of={name!r} in Python, or pass these overrides: {cure}"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.core.atomic_file import write_whole
-from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.cache_folder import cache_dir, report_unwritable
 from cavmarl.core.mapped_file import mapped
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import (
@@ -33,7 +33,7 @@ from cavmarl.roads.network import (
 )
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
-# Increase this if the reader returns other rows for the same file; record types are hashed, too.
+# Increase this if the reader returns other rows for a file. Record types are hashed, too.
 FORMAT = 50
 
 _DIGEST_BYTES = 32  # each entry begins with the SHA-256 of the rest; damaged entries are not read
@@ -89,12 +89,12 @@ def _cached(path: Path, what: str, make: Callable[[Path], RoadNetwork]) -> RoadN
         try:
             _store(entry, network)
         except OSError as error:
-            tell_unwritable(error)
+            report_unwritable(error)
     return network
 
 
 def network_layout() -> str:
-    """Return a short hash of the record types of a packed network; other layouts cannot be read."""
+    """Return a short hash of the layout of packed networks, for names of cache entries."""
     columns = [dtype.descr for dtype in _DTYPES.values()]
     return hashlib.sha256(repr((FORMAT, columns)).encode()).hexdigest()[:12]
 
@@ -119,7 +119,7 @@ def pack_network(network: RoadNetwork) -> bytes:
 
 
 def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadNetwork | None:
-    """Return a network that `pack_network` packed with the same layout, or None if damaged.
+    """Return a network that `pack_network` packed in the same layout, or None if it is damaged.
 
     Its arrays are views of the packed bytes.
 

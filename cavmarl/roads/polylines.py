@@ -13,7 +13,7 @@ from cavmarl.roads.network import POINT
 
 Shape = NDArray[np.float64]
 
-# SUMO writes centimetres: two points closer than a tenth of that are the same.
+# SUMO rounds to centimetres, so points at a tenth of that distance are the same.
 SAME_POINT_M = 1e-3
 # Length of an internal lane whose ends coincide (SUMO joins lanes that meet).
 STUB_M = 0.01
@@ -21,7 +21,7 @@ UNLIKE_M = 3.0  # a neighbour's end this far from the ends of a lane adds a poin
 
 
 def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
-    """Drop points that repeat the previous point in the plane; (n, 3) metres, n ≥ 1.
+    """Drop points that repeat the previous point in the plane; return (n, 3) metres, n ≥ 1.
 
     Raises MapError: the shape has no points.
     """
@@ -34,7 +34,7 @@ def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
 
 
 def refuse_points(shapes: Sequence[Shape], names: Sequence[str]) -> None:
-    """Check that normal lanes have a length; their ids are for the message.
+    """Check that lanes outside junctions have a length; `names` are their ids, for the message.
 
     Raises MapError: a lane has no length.
     """
@@ -62,9 +62,9 @@ def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
 
 
 def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
-    """Add a point where an adjacent lane begins or ends, if it is far from the lane's own ends.
+    """Add a point where an adjacent lane begins or ends, if that is far from the lane's own ends.
 
-    So positions between two points correspond linearly to positions on the neighbour.
+    Then positions between two points correspond linearly to positions on the neighbour.
 
     Args:
         shapes: one (n, 3) array per lane row; changed in place.

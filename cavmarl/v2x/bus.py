@@ -336,7 +336,7 @@ def _make_scratch(
         spare=np.zeros(capacity, STATION),
         receivers=np.zeros(num_receivers, RECEIVER),
         bodies=make_grid(network.room_m, BODY_CELL_M, capacity, len(network.maps) > 1),
-        everybody=np.zeros(capacity, zoned.rows.dtype),
+        vehicles=np.zeros(capacity, zoned.rows.dtype),
         next_cams=np.zeros(mail.last_cams.shape[1], mail.last_cams.dtype),
         near=np.zeros(MAX_NEAR, np.int32),
         near_squared=np.zeros(MAX_NEAR),

@@ -72,7 +72,7 @@ class Wishes:
 
     watchers: int = 0
     vehicles: frozenset[int] = frozenset()
-    sensed: frozenset[int] = frozenset()  # vehicles of which sensors are included
+    sensed: frozenset[int] = frozenset()  # vehicles whose sensors are included
     ghosts_of: tuple[int, ...] = ()
 
 

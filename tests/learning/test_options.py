@@ -61,7 +61,7 @@ def test_a_run_lies_where_its_name_says() -> None:
     assert run_folder("runs", "", "maps/town.net.xml", "ippo", 3) == Path("runs/town_ippo_3")
 
 
-def test_wrong_use_is_said_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_use_is_reported_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     def train() -> Path:
         raise ConfigError("no such world")
 

@@ -67,7 +67,7 @@ def test_progress_is_the_way_towards_the_goal() -> None:
         (math.inf, math.inf, 10.0, 0.0),
     ],
 )
-def test_another_plan_is_no_jump(
+def test_progress_does_not_jump_when_the_plan_changes(
     before: float, after: float, speed: float, progress: float
 ) -> None:
     found = terms(one(speed=speed, step_to_go=before, to_go=after))["progress"]
@@ -97,7 +97,7 @@ def test_comfort_is_the_mean_jerk() -> None:
         (EVENT_ARRIVED, "arrival"),
     ],
 )
-def test_events_are_ones(bit: int, name: str) -> None:
+def test_event_terms_are_one_in_their_step(bit: int, name: str) -> None:
     flags = ("collision", "off_road", "wrong_way", "red_light", "arrival")
     found = terms(one(events=bit))
     assert [flag for flag in flags if found[flag] == 1.0] == [name]

@@ -88,7 +88,7 @@ def test_a_reset_with_the_seed_repeats_the_episode_and_without_it_goes_on(make: 
     assert second[-1] != first[-1]
 
 
-def test_nobody_is_lost(make: Make) -> None:
+def test_no_vehicle_is_lost_or_duplicated(make: Make) -> None:
     simulation = make()
     start(simulation, seed=3)
     departures = simulation.departures
@@ -141,7 +141,7 @@ def test_two_processes_agree(tmp_path: Path) -> None:
     assert int(said[0][2]) > 5
 
 
-def test_the_hash_covers_who_waits_and_how_many_orders_were_called(tmp_path: Path) -> None:
+def test_the_hash_covers_waiting_vehicles_and_called_orders(tmp_path: Path) -> None:
     simulation = tiny("merge", tmp_path)
     start(simulation, seed=1)
     departures = simulation.departures

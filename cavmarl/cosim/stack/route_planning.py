@@ -86,7 +86,7 @@ class LaneRoute:
         return Trajectory(points, max(hardest.accel, -_HARDEST), hardest.reason, lanes)
 
     def _here(self, pose: EgoPose, plan: NDArray[np.void]) -> OnLane | None:
-        """Return the vehicle's lane, among those that lead to the goal."""
+        """Return the nearby lane that fits the vehicle best and leads to the goal, or None."""
         best, least = None, math.inf
         for place in self._map.near(pose.x_m, pose.y_m, _MATCH_M):
             apart = abs(wrap(pose.heading_rad - place.heading_rad))

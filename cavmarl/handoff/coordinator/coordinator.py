@@ -37,7 +37,7 @@ class Watcher(Protocol):
 
 
 class Coordinator(ABC):
-    """Decides ownership, tick by tick: `begin`, then the zones compute, then `end`."""
+    """Decides ownership, tick by tick: `begin`, then the zones advance, then `end`."""
 
     def __init__(self, directory: Directory, journal: Journal | None) -> None:
         self._directory = directory
@@ -88,7 +88,7 @@ class Coordinator(ABC):
     @abstractmethod
     def begin(
         self,
-        everybody: bool,  # check all rows, because rows have changed since ghosts were renewed
+        check_all: bool,  # check all rows, because rows have changed since ghosts were renewed
         inputs: bytes = b"",  # digest of the actions
     ) -> None:
         """Decide the owners for the next tick, and move rows between owners.

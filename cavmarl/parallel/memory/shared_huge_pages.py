@@ -1,4 +1,4 @@
-"""Memory that a process shares with those that it forks, in huge pages if the system has them.
+"""Memory that a process shares with its forks, in huge pages if the system has them.
 
 The vehicles of a city take thousands of small pages. In a virtual machine, their look-up takes some
 hundredths of a tick. By default, most systems give no huge pages to shared memory

@@ -32,9 +32,9 @@ class Node:
 def join() -> bool:  # whether `leave` has to be called
     """Join the cluster of this program, or start one on this machine.
 
-    A program that has called `ray.init` is a member already. Otherwise the cluster is that of
-    `RAY_ADDRESS`, or the one that `ray start` has started here, or a new one that ends with its
-    last user.
+    A program that has called `ray.init` is a member already. Otherwise this is the
+    cluster at `RAY_ADDRESS`, a cluster that `ray start` has started here, or a new cluster that
+    ends with its last user.
 
     Raises:
         ConfigError: the program is a Ray client outside of the cluster.

@@ -87,7 +87,7 @@ class TransportPoll(Protocol):
     def unregister(self, one: Any) -> None: ...
 
     def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
-        """Return the numbers of those that can receive or send, within that time."""
+        """Return the numbers of sockets that can receive or send, within that time."""
         ...
 
 

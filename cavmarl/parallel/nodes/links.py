@@ -130,7 +130,7 @@ class Links:
         return found
 
     def receive_next(self, number: int) -> NodeFrame:
-        """Receive the next frame of a sender, without a limit; errors as of `receive`."""
+        """Receive a sender's next frame, without a limit. Raises the errors of `receive`."""
         try:
             frames = self._links[number].frames
         except KeyError:

@@ -33,7 +33,7 @@ class CrossingDigests:
         return self.digests[vehicle]
 
     def state(self, vehicle: int) -> bytes:
-        """Raise ProtocolError: a node that needs a state has lost one that it acknowledged."""
+        """Raise ProtocolError: a node needs a state again that it has acknowledged."""
         raise ProtocolError(
             f"vehicle {vehicle}: its new zone does not have the state that it acknowledged"
         )
@@ -126,17 +126,17 @@ class NodeCoordinator:
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Start; return the hostings of all zones, by worlds."""
-        self.know(neighbours)
+        self.set_neighbours(neighbours)
         for world in self.worlds:
             world.write(world.directory.reset())
             for zone, node in enumerate(self._node_of):
                 world.write(world.directory.host(zone, worker=node))
         return self._hostings()
 
-    def know(self, neighbours: Neighbours) -> None:
+    def set_neighbours(self, neighbours: Neighbours) -> None:
         """Let vehicles change between these zones only, from now on."""
         for world in self.worlds:
-            world.directory.know(neighbours)
+            world.directory.set_neighbours(neighbours)
 
     def recover(self, node_of: Sequence[int], switched: int) -> list[list[Hosting]]:
         """Go back to a kept state, with zones on other nodes; open transfers are void.

@@ -96,7 +96,7 @@ class NodePeers:
         """Note that the next outputs are those of a step."""
         self._is_stepping = True
 
-    def keep_own(self, chosen: NDArray[np.bool_]) -> None:
+    def drop_foreign_rows(self, chosen: NDArray[np.bool_]) -> None:
         zoned = self._zoned
         for zone in self._foreign.tolist():
             for numbers in (zoned.num_owned, zoned.num_rows, zoned.num_near, zoned.num_through):
@@ -110,7 +110,7 @@ class NodePeers:
                     forget(array[num:])
         self._rerouted[chosen] = 0
 
-    def take_up(self, departures: DepartureQueue, side: int) -> None:
+    def resume_from(self, departures: DepartureQueue, side: int) -> None:
         self._rerouted[:] = departures.counts[:, COUNT_REROUTED]
         self._seen_s[...] = self._detected_s
         self.own[...] = False
@@ -233,7 +233,7 @@ class NodePeers:
                 self._agents.read(data, number, self.owner)
 
     @contextmanager
-    def everybody(self, departures: DepartureQueue, side: int) -> Iterator[None]:
+    def all_zones(self, departures: DepartureQueue, side: int) -> Iterator[None]:
         """Have the vehicles of each other node in its first zone, for a while."""
         before = departures.counts[:, COUNT_REROUTED].copy()
         with self._rows_of_all(side):

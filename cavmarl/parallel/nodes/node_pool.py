@@ -130,7 +130,7 @@ class NodePool:
         self._living = living_of(self.zones)
         self.reporter = 0
         self._cut = ZoneCut(self._partition, Neighbours(()))
-        # The state to which all nodes can go back, and the one that they keep next.
+        # The state to which all nodes can go back, and the state that they keep next.
         self._state = PoolState(self._next_state, self.zones, 0, self._cut)
         self._opened: PoolState | None = None
         self._next_state += 1
@@ -282,7 +282,7 @@ class NodePool:
         self._log.pop()
 
     def move(self, zones: Zones) -> None:
-        """Move zones to other nodes; errors as of `run`."""
+        """Move zones to other nodes. Raises the errors of `run`."""
         before, self._homes = self._homes, zones
         self._is_torn, self._opened = True, None
         try:
@@ -355,7 +355,7 @@ class NodePool:
             with reading(self.reporter):
                 near = read_neighbours(read_json(results[self.reporter], list), self._num_zones)
             self._cut = ZoneCut(command.cut, near)
-            self.coordinator.know(near)
+            self.coordinator.set_neighbours(near)
         return results
 
     def _begin_lease(self) -> dict[int, bytes]:
@@ -477,7 +477,7 @@ class NodePool:
         self.owner[~np.isin(self.owner, self._living)] = UNOWNED  # the owner may be any node
         self.generation += 1
         self._cut = state.cut
-        self.coordinator.know(state.cut.neighbours)
+        self.coordinator.set_neighbours(state.cut.neighbours)
         hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)
         self.send_zones(hostings, moves, begins=False, kept=kept)
         self.commit()
@@ -565,7 +565,7 @@ class NodePool:
         return results
 
     def close(self) -> None:
-        """End the nodes, unless this process is a fork of the one that started them."""
+        """End the nodes, unless this process is a fork of the process that started them."""
         if is_fork(self._pid):
             return
         self._links.end(END_S)

@@ -291,7 +291,7 @@ class NodeProgram:
         self._host(zones, order["runs"], order["hostings"], frame.number)
         state, mine = order["state"], zones[self._number]
         if order["begins"]:  # the SYNC after it confirms its arrival
-            self._peers.keep_own(self._worlds.simulation.everywhere)
+            self._peers.drop_foreign_rows(self._worlds.simulation.everywhere)
             self._replicas.keep(state, self._living)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)

@@ -119,7 +119,7 @@ class NodeWatch:
                 raise SilentNodeError(number, MessageError("others wait for it"))
 
     def most_missed(self, lost: LinkLostError) -> LinkLostError:
-        """Return the node that has ended, or else the one that most others cannot reach."""
+        """Return the node that has ended, or else the node that most nodes cannot reach."""
         links = self._links
         if not self._missed:  # the node has sent a bad frame
             return lost

@@ -172,7 +172,7 @@ class NodeWorlds(CommandedWorlds):
         self._network = network
 
     def _answer(self, data: memoryview) -> bytes:
-        """Return the answer of the network simulator; errors as of `answer_of`."""
+        """Return the answer of the network simulator. Raises the errors of `answer_of`."""
         latency = self.world.config.v2x.channel.latency_ticks
         return answer_of(self._network, read_request(data, len(self.arrays.mask), latency))
 
@@ -219,7 +219,7 @@ class NodeWorlds(CommandedWorlds):
     def set_worlds(
         self, arrays: StepArrays, runs: Sequence[WorldRun], saved: Sequence[bytes]
     ) -> None:
-        """Replace the worlds by saved ones; errors as of `NodePool.begin_anew`."""
+        """Replace the worlds by saved ones. Raises the errors of `NodePool.begin_anew`."""
         self._set_arrays(arrays)
         self.pool.begin_anew(runs)
         self.perform(Task.LOAD, saved)

@@ -54,7 +54,7 @@ class Process:
     mail: list[bytes] = field(default_factory=list)  # received messages that are not read yet
 
     def collect(self) -> None:
-        """Receive all messages that have come, and drop those that only wake."""
+        """Receive all messages that have come, and drop messages that only wake."""
         with suppress(BlockingIOError, ConnectionResetError):
             while self.receive():
                 pass

@@ -204,7 +204,7 @@ _has, _set, look, _pass, present_core = (
 
 
 def load_kernels() -> None:
-    """Load the compiled loops, for this process and those that it forks."""
+    """Load the compiled loops, for this process and the processes that it forks."""
     words = np.zeros(WORDS, dtype=np.int64)
     _set(words, NUMBER, 1, words)
     _has(words, 1)

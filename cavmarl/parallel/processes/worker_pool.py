@@ -1,10 +1,10 @@
 """`Pool`: worker processes that carry out commands together, and survive deaths of workers.
 
 Each worker has its state in its own memory, and writes an image of it after each command that
-changes it. A worker has two images: the committed one, and the one that it writes. When all workers
-have carried out a command, the pool commits it. If a worker dies before that, its successor resumes
-from the committed image and repeats the command. Commands are deterministic, so the result is the
-same.
+changes it. A worker has two images: the committed image, and the image that it writes. When all
+workers have carried out a command, the pool commits it. If a worker dies before that, its successor
+resumes from the committed image and repeats the command. Commands are deterministic, so the result
+is the same.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Pool:
         return self._command(self._all, task, payload, commits)
 
     def ask(self, worker: int, task: int, payload: Any = None) -> Any:
-        """Let one worker do a task that changes nothing; errors as of `run`."""
+        """Let one worker do a task that changes nothing. Raises the errors of `run`."""
         return self._command((worker,), task, payload, False)[0]
 
     def ping(self) -> None:

@@ -383,7 +383,7 @@ class _OwnedResources:
         return segment
 
     def release(self) -> None:
-        """End the processes, unless this process is a fork of the one that started them."""
+        """End the processes, unless this process is a fork of the process that started them."""
         if os.getpid() != self._pid:
             return
         for process in self.processes.values():

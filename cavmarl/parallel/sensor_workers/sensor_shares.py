@@ -1,7 +1,7 @@
 """Distribution of sensing over sensor workers: round robin, or by cost.
 
-A unit is one sensor of some agents. Agents of one sensor cost about the same, so many agents form a
-unit. By cost, frames are divided as well if whole frames overload a worker: then several workers
+A unit is one sensor of some agents. Agents of one sensor cost about the same, so a unit has many
+agents. By cost, frames are divided as well if whole frames overload a worker: then several workers
 write lines of the same frames.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.assignment import workers_of
-from cavmarl.balance.initial_placement import spread
+from cavmarl.balance.initial_placement import assign_longest_first
 from cavmarl.balance.load_snapshot import idle_snapshot
 from cavmarl.balance.local_search import refine
 from cavmarl.balance.problem import Problem, ShardCost
@@ -107,7 +107,7 @@ def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int)
     problem = Problem(shards, alone, idle_snapshot(min(workers, len(units))))
     hosts, _ = workers_of(problem)
     nowhere = Placement(problem, hosts, [-1] * len(units))
-    placed = refine(spread(nowhere, [[number] for number in range(len(units))]))
+    placed = refine(assign_longest_first(nowhere, [[number] for number in range(len(units))]))
     return Shares(tuple(units), tuple(placed.homes), tuple(costs_s), workers)
 
 

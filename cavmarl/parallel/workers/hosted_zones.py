@@ -37,14 +37,14 @@ class HostedZones:
         self._together = [ShardGroup(self._shards)] if self._shards else []
         self._alone: list[ShardGroup] = []
         self._untimed = -1  # tick whose run prepares the timed groups
-        self._sides: tuple[int, int] | None = None  # that the shards face, if known
+        self._sides: tuple[int, int] | None = None  # of the shards, if known
 
-    def face(self, side: int, next_side: int) -> None:
+    def set_sides(self, side: int, next_side: int) -> None:
         """Set the sides of the present and the next rows, as another process announced them."""
         if self._sides != (side, next_side):
             self._sides = side, next_side
             for shard in self._shards:
-                shard.face(side, next_side)
+                shard.set_sides(side, next_side)
 
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
         """Run a phase on the zones of this worker."""

@@ -1,10 +1,10 @@
 """`MovableWorlds`: worlds of a worker that may move to other workers.
 
 Worlds move between two commands. A worker that gives worlds away writes them to its outbox, which
-all workers can read (PACK). Then each worker restarts with the worlds that it has kept and with
-those that it finds in the outboxes of others (UNPACK). Both tasks give the same result if they are
-repeated, so a worker that dies meanwhile is replaced as usual. The bounds that say where the worlds
-are belong to the committed state.
+all workers can read (PACK). Then each worker restarts with the worlds that it has kept and with its
+new worlds, which it finds in the outboxes of other workers (UNPACK). Both tasks give the same
+result if they are repeated, so a worker that dies meanwhile is replaced as usual. The bounds that
+say where the worlds are belong to the committed state.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ class TeamLeader(PhaseExecutor):
         rule = phase.value
         which = self._which(phase, arguments)
         if (which < 0 and not rule.is_early) or rule.is_late:
-            self.meet()
+            self.finish_phase()
         if which < 0:
             phase.run(self._all_zones, arguments)
             return
@@ -138,11 +138,11 @@ class TeamLeader(PhaseExecutor):
         self._own.run(phase, arguments)
         if rule.is_late:
             return
-        self.meet()
+        self.finish_phase()
         if phase is self._last:
             self._dismiss()
 
-    def meet(self) -> None:
+    def finish_phase(self) -> None:
         """Wait until the members have run the phase that was announced last, if any."""
         if not self._is_ahead:
             return
@@ -153,7 +153,7 @@ class TeamLeader(PhaseExecutor):
                 raise TeamFailedError
 
     def _which(self, phase: Phase, arguments: tuple[Any, ...]) -> int:
-        """Return the index of the arguments among those that members know.
+        """Return the index of the arguments in the list that members know.
 
         -1: the members do not know the arguments, or wait for no phase.
         """
@@ -228,5 +228,5 @@ class TeamMember:
 
     def _run(self, phase: Phase, call: int) -> None:
         self._leave_shared_core()
-        self._own.face(call >> 1 & 1, call & 1)
+        self._own.set_sides(call >> 1 & 1, call & 1)
         self._own.run(phase, self._known[phase][call >> 16])

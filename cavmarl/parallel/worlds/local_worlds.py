@@ -239,7 +239,7 @@ class LocalWorlds:
         return [self._steps, self._waiting, *self.simulation.save()]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Resume from what `save` returned; errors as of `Simulation.load`."""
+        """Resume from the result of `save`. Raises the errors of `Simulation.load`."""
         self._check_own(saved)
         self.simulation.load(saved[2:])
         self._steps[:], self._waiting[:] = saved[:2]
@@ -296,7 +296,7 @@ class LocalWorlds:
         )
 
     def connect_network(self, network: NetworkSimulator) -> None:
-        """Let a network simulator decide receptions; errors as of `Bus.connect`."""
+        """Let a network simulator decide receptions. Raises the errors of `Bus.connect`."""
         self.simulation.messages.connect(network)
 
     def keep_logs(self) -> tuple[ToldLog, ...]:

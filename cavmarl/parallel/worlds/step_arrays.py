@@ -114,7 +114,7 @@ class SteppedWorlds(Protocol):
 
     world: World
     arrays: StepArrays  # inputs and outputs of a step
-    in_next_step: bool  # a new episode starts in the step after the one that ended the last one
+    in_next_step: bool  # a new episode starts one step after the last episode has ended
 
     @property
     def simulation(self) -> Simulation:

@@ -17,8 +17,8 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
 
-LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a long lane, in travel time, s;
-LANE_CHANGE_M = 250.0  # it doubles on a lane of this length, which is hardly enough for a change
+LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a very long lane, as travel time in s
+LANE_CHANGE_M = 250.0  # the cost doubles on a lane of this length: drivers can barely change there
 TURNAROUND = ord("t")
 
 
@@ -153,7 +153,7 @@ class _Search(NamedTuple):
 
     cost: NDArray[np.float64]  # (L,) cost of the cheapest known way, s
     heap: NDArray[np.int32]  # (L,) lanes that are reached and not settled
-    place: NDArray[np.int32]  # (L,) index of a lane in the heap; `_UNSEEN`, or `_SETTLED`
+    place: NDArray[np.int32]  # (L,) index of a lane in the heap, `_UNSEEN`, or `_SETTLED`
 
 
 _UNSEEN, _SETTLED = -1, -2
@@ -182,7 +182,7 @@ def _put_up(search: _Search, lane: int, at: int) -> None:
 
 @kernel
 def _put_down(search: _Search, lane: int, size: int) -> None:
-    """Move a lane down in a heap of some size whose first place is empty."""
+    """Insert a lane at the empty root of a heap, and move it down; `size` includes the lane."""
     at = 0
     while True:
         below = 2 * at + 1
@@ -215,7 +215,7 @@ def _offer(search: _Search, lane: int, cost: float, size: int) -> int:
 
 @kernel
 def _take_first(search: _Search, size: int) -> int:
-    """Remove the cheapest lane from a heap of some size, and settle it."""
+    """Remove the cheapest lane from a heap of `size` lanes, and mark it as settled."""
     first = search.heap[0]
     if size > 1:
         _put_down(search, search.heap[size - 1], size - 1)
@@ -278,8 +278,8 @@ def plan_goal(
     Args:
         roads: the road arrays.
         goal_edge: EDGE row to reach.
-        change_weight: multiple of the usual cost of lane changes. If it is large, plans change
-            lanes only if there is no other way.
+        change_weight: factor on the cost of lane changes. If it is large, plans change lanes only
+            where the goal cannot be reached otherwise.
         permission: bit of LANE["permissions"] that a lane needs.
         plan: PLAN records (L,), overwritten. Lanes from which the goal cannot be reached get
             to_go = inf and next = -1.

@@ -2,7 +2,7 @@
 
 netconvert joins the end of one lane to the start of another with a line. If roads overlap, the
 start may lie behind the end, or beside it. The line then runs against both roads, or folds back.
-Here, both lanes are shortened until a smooth curve joins them. The removed part of a lane is added
+This module shortens both lanes until a smooth curve joins them. The removed part of a lane is added
 to the other paths that begin or end there, so only the repaired paths change.
 """
 
@@ -19,16 +19,18 @@ from numpy.typing import NDArray
 from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
 from cavmarl.roads.polylines import SAME_POINT_M, Shape
 
-KINK_RAD = np.radians(60.0)  # a path cannot be driven if it has a corner sharper than this,
-ASTRAY_RAD = np.radians(90.0)  # and turns this much more than its roads do;
-BACK_RAD = np.radians(100.0)  # or if it has such a corner, and its roads
-U_TURN_RAD = np.radians(150.0)  # do not turn round themselves
-SMOOTH_RAD = np.radians(60.0)  # accepted excess turning of a new path; if no path meets it,
-WORTH_RAD = np.radians(3.0)  # a longer cut must save at least this much
-STEP_M = 0.5  # minimum cut of a lane, and its step,
-MOST_M = 12.0  # and its maximum,
-MOST_SHARE = 0.4  # or this share of the lane, as its other end may be cut, too
-CURVE_M = 1.0  # between the points of a new path
+# A car cannot follow a path with a corner above KINK_RAD that turns ASTRAY_RAD more than its roads
+# do, or with a corner above BACK_RAD between roads that do not make a U-turn of U_TURN_RAD.
+KINK_RAD = np.radians(60.0)
+ASTRAY_RAD = np.radians(90.0)
+BACK_RAD = np.radians(100.0)
+U_TURN_RAD = np.radians(150.0)
+SMOOTH_RAD = np.radians(60.0)  # accepted excess turning of a new path
+WORTH_RAD = np.radians(3.0)  # while no path is accepted, a longer cut must save this much turning
+STEP_M = 0.5  # minimum cut of a lane, and step between two cuts
+MOST_M = 12.0  # maximum cut of a lane
+MOST_SHARE = 0.4  # maximum cut as a share of the lane, because its other end may be cut, too
+CURVE_M = 1.0  # distance between the points of a new path
 MOST_POINTS = 24
 
 
@@ -41,9 +43,9 @@ class Way(NamedTuple):
 
 
 def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
-    """Redraw paths that no car can follow; `shapes` (n, 3) of all lanes in m, changed in place.
+    """Redraw paths that no car can follow; `shapes`: (n, 3) of each lane in m, changed in place.
 
-    A lane keeps its shape if a movement without internal lanes begins or ends there.
+    An end of a lane is not cut if a movement without internal lanes begins or ends there.
     """
     fixed_ends = {way.before for way in ways if not way.inside}
     fixed_starts = {way.after for way in ways if not way.inside}
@@ -103,7 +105,7 @@ def _astray(corners: NDArray[np.float64]) -> float:
 def _needed_cut(
     shapes: Sequence[Shape], way: Way, fixed_end: bool, fixed_start: bool
 ) -> tuple[float, float]:
-    """Return the smallest cuts in m of both lanes with a smooth curve, or the best ones."""
+    """Return the smallest cuts of both lanes in m for a smooth curve, or else the best cuts."""
     rooms = [
         0.0 if fixed else min(MOST_SHARE * _length(shapes[lane]), MOST_M)
         for lane, fixed in ((way.before, fixed_end), (way.after, fixed_start))

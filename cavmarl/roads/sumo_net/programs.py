@@ -1,6 +1,6 @@
 """Signal programs in SUMO's XML: <tlLogic> with its phases, and <WAUT> timetables.
 
-Networks and additional files have the same elements; one reader serves both.
+Networks and additional files have the same elements, so one reader reads both.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-# The program that every signal has: the signal is off, and right of way applies.
+# Every signal has this program: the signal is off, and the rules of right of way apply.
 OFF = "off"
 
 _REQUIRED = {
@@ -56,7 +56,7 @@ class SignalProgram:
 class Timetable:
     """One <WAUT>: the times at which signals switch between programs."""
 
-    start: str  # the program at the beginning
+    start: str  # program at the beginning
     place: str  # file and line, for error messages
     # (seconds since the beginning, program), in the file's order
     switches: list[tuple[float, str]] = field(default_factory=list)
@@ -141,7 +141,7 @@ class _AdditionalHandler(ContentHandler):
 
 def _phase(attrs: Mapping[str, str], place: str) -> ProgramPhase:
     duration = _seconds(attrs, "duration", place)
-    # As in SUMO: if only the minimum duration is given, there is no maximum.
+    # As in SUMO, there is no maximum duration if only the minimum is given.
     longest = math.inf if "minDur" in attrs else duration
     try:
         following = tuple(int(number) for number in attrs.get("next", "").split())

@@ -56,15 +56,15 @@ from cavmarl.roads.sumo_net.xml_source import limit
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
-APPROACH_M = 12.0  # before a junction, where bodies are still oblique to waiting vehicles
-FORK_WATCHED_M = 5.0  # after a junction, where vehicles that turn off beside a rear watch it
-MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the square
-MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable for another limit
+APPROACH_M = 12.0  # before a junction, bodies are oblique to waiting vehicles up to this distance
+FORK_WATCHED_M = 5.0  # after a junction, drivers that turn off watch rears up to this distance
+MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the squared length
+MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that changes this limit
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
 
 
 def map_name(path: Path) -> str:
-    """Return the file's name without the suffixes of map files."""
+    """Return a map file's name without its suffixes."""
     name = path.name
     for ending in _ENDINGS:
         name = name.removesuffix(ending)
@@ -90,7 +90,7 @@ def read_network(path: str | Path) -> RoadNetwork:
 
     Raises MapError: the file is broken, malicious or inconsistent, or has no drivable lane.
     """
-    # Load sumolib only if the cache does not have the network.
+    # Import sumolib only here: it is not needed for networks in the cache.
     from cavmarl.roads.sumo_net.sumo_xml import parse_net
 
     path = Path(path)
@@ -344,9 +344,9 @@ def _link_rows(
             raise MapError(
                 f"from lane '{connection.getFromLane().getID()}' to lane "
                 f"'{connection.getToLane().getID()}' are {link['length_m']:.6g} m over the "
-                f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both"
+                f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both lanes"
             )
-        # netconvert splits a path where drivers wait inside the junction.
+        # netconvert splits the path of a link where drivers wait inside the junction.
         link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf
         link["junction"] = node_row[id(movement.node)]
         link["index"] = movement.index
@@ -358,7 +358,7 @@ def _link_rows(
 
 
 def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
-    """Return the SWEEP rows, and fill the fields of links about them."""
+    """Return the SWEEP rows, and fill the fields of links that refer to them."""
     sweeps, first = sweep_rows(movements)
     links = movements.links
     links["first_sweep"], links["num_sweeps"] = first[:-1], np.diff(first)
@@ -404,7 +404,7 @@ def _connect(
     movements: Sequence[Movement],
     lane_row: dict[int, int],
 ) -> NDArray[np.int32]:
-    """Fill the connections of lanes: links from them, successors of internal ones, lanes before."""
+    """Fill the connections of lanes: links, successors of internal lanes, and preceding lanes."""
     rows = np.arange(len(lanes))
     lanes["first_link"] = np.searchsorted(links["from_lane"], rows, side="left")
     lanes["num_links"] = np.searchsorted(links["from_lane"], rows, side="right")
@@ -441,8 +441,8 @@ def _path(
 ) -> LinkPath | None:
     """Return the sampled path of a link along its chain of internal lanes.
 
-    It may begin `approach_m` before the junction, with negative positions, and end `beyond_m` after
-    it.
+    The path begins `approach_m` before the junction, at a negative position, and ends `beyond_m`
+    after it.
     """
     if not movement.chain:
         return None

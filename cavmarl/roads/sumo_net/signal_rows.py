@@ -15,12 +15,12 @@ from cavmarl.core.errors import MapError
 from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
 from cavmarl.roads.sumo_net.programs import ProgramPhase, SignalProgram
 
-# Trains switch these signals. No trains run here, so their links count as links without a signal.
+# Trains switch these signals. There are no trains, so their links count as links without a signal.
 RAIL_KINDS = ("rail_signal", "rail_crossing")
 
 MAX_MS = 10**12  # SUMO's largest time: 30 years
 
-# SUMO's default distance from detector to stop line, in seconds at the limit.
+# SUMO's default distance from detector to stop line, in seconds at the speed limit.
 DETECTOR_GAP_S = 2.0
 
 # Parameters of actuated programs that are not implemented; `map check` lists such programs.
@@ -82,9 +82,8 @@ class SignalRows:
     def add(self, program: SignalProgram) -> None:
         """Append a program; the last program of a signal runs, as in SUMO.
 
-        Raises MapError: the program has no phases, phases of different lengths, an unknown letter,
-            a
-        cycle of zero length, or the name of another program.
+        Raises MapError: the program has no phases, states of different lengths, an unknown letter,
+        a cycle of zero length, or the name of another program.
         """
         signal_id = program.signal_id
         cycle = sum(phase.duration_s for phase in program.phases)

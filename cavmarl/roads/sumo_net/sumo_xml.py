@@ -1,7 +1,7 @@
 """Reads SUMO's network files with sumolib, and adds checks that sumolib lacks.
 
 sumolib merges edges of the same name, accepts NaN as a speed, and raises a bare KeyError for
-missing attributes. Here, every element is checked first. Error messages have a place and a remedy.
+missing attributes. This module checks every element first. Messages have a place and a remedy.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cavmarl.roads.sumo_net.programs import ProgramReader, SignalProgram
 from cavmarl.roads.sumo_net.xml_source import limit, read_xml
 
 MAX_LANE_POINTS = 100_000
-MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # environment variable for another limit
+MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # environment variable that changes this limit
 _MAX_COORDINATE_M = 1e8  # more than twice around the Earth
 
 _REQUIRED = {

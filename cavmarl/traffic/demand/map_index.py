@@ -80,8 +80,8 @@ class MapIndex:
         if len(unknown) * 2 > len(names) > 1:
             some = ", ".join(list(self.edge_row)[:5])
             raise element.error(
-                f"names {len(names)} edges, of which the map '{self.network.name}' has only "
-                f"{len(names) - len(unknown)}",
+                f"names {len(names)} edges, but the map '{self.network.name}' has only "
+                f"{len(names) - len(unknown)} of them",
                 f"use files that were made for this map; its edges are named {some} …",
             )
         return tuple(self.edge(name, element) for name in names)

@@ -138,7 +138,7 @@ class SumoSimulation:
     def _on_road(
         self,
     ) -> tuple[Sequence[str], NDArray[np.int32], NDArray[np.int32], list[list[Any]]]:
-        """Find the vehicles on the map's lanes, and register those that have just entered.
+        """Find the vehicles on the map's lanes, and register newly entered vehicles.
 
         Returns names, numbers and LANE rows, and the reports of newly entered vehicles.
         """
@@ -212,7 +212,7 @@ class SumoSimulation:
         return rows
 
     def _place(self, moved: NDArray[np.void]) -> None:
-        """Place the puppets; add new ones and remove those that are no longer listed."""
+        """Place the puppets. Add new puppets, and remove puppets that are not listed."""
         vehicle = self._vehicle
         present = set(vehicle.getIDList()) if len(moved) or self._puppets else set()
         wanted = {int(row["id"]) for row in moved}

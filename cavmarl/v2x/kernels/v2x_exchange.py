@@ -349,8 +349,8 @@ def exchange_messages(
         if sending.cpm_period > 0 or sending.unit_cpm_period > 0:
             for k in range(num):
                 station = scratch.stations[k]
-                scratch.everybody[k] = zoned.rows[side, station["zone"], w, station["row"]]
-            fill_grid(scratch.everybody, num, scratch.bodies)
+                scratch.vehicles[k] = zoned.rows[side, station["zone"], w, station["row"]]
+            fill_grid(scratch.vehicles, num, scratch.bodies)
         slots = sending.latency + 1
         slot = tick % slots
         mail.num_packets[w, slot] = 0

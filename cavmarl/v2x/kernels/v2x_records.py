@@ -180,11 +180,11 @@ class V2xScratch(NamedTuple):
     spare: NDArray[np.void]  # STATION (C,)
     receivers: NDArray[np.void]  # RECEIVER (R,)
     bodies: Grid  # grid of vehicles in id order
-    everybody: NDArray[np.void]  # VEHICLE (C,) in id order
+    vehicles: NDArray[np.void]  # VEHICLE (C,) in id order
     next_cams: NDArray[np.void]  # LAST_CAM (C,)
     near: NDArray[np.int32]  # (MAX_NEAR,) bodies around a station, nearest first
     near_squared: NDArray[np.float64]
-    seen: NDArray[np.int32]  # (MAX_NEAR,) those that the station sees, as rows of `everybody`
+    seen: NDArray[np.int32]  # (MAX_NEAR,) vehicles that the station sees, as rows of `vehicles`
     cams: Air  # CAMs
     others: Air  # all other packets
     kinds: NDArray[np.int64]  # (NUM_KINDS,) number of packets received now

@@ -235,7 +235,7 @@ def _send_seen(
     if first < 0:
         return
     for k in range(num):
-        row = scratch.everybody[scratch.seen[k]]
+        row = scratch.vehicles[scratch.seen[k]]
         report = mail.reports[w, slot, first + k]
         vclass = types[row["vtype"]]["vclass"]
         _write_vehicle(report, row, sender, KIND_CPM, vclass, tick, tick + sending.memory_ticks)

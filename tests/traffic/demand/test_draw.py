@@ -196,7 +196,7 @@ def test_departures_that_name_no_lane_and_speed_have_sumos_or_the_configurations
     assert (element["depart_speed_code"], element["depart_speed"]) == speed
 
 
-def test_a_speed_of_departures_that_is_none_is_an_error_of_the_configuration(
+def test_an_invalid_departure_speed_is_an_error_of_the_configuration(
     town: RoadNetwork, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.sumocfg"

@@ -169,7 +169,7 @@ def imposed_on_followers(
     """Return the lowest acceleration in m/s² that a change to `s` on `target` imposes on others.
 
     The result is -inf if a follower is beside that place. A fast follower far behind may have to
-    brake harder than a near one that stands, so every lane that leads to `target` is searched.
+    brake harder than a stopped follower nearby, so every lane that leads to `target` is searched.
     """
     kind = travel.types[row["vtype"]]
     half = 0.5 * row["length"]
