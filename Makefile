@@ -7,6 +7,9 @@ OLDEST := .venv-oldest
 LIBRARIES := .venv-libraries
 TOOLS := .venv-tools
 SITE := .venv-docs
+DEMO := .venv-demo
+# A CPU build of torch for the demo (0.7 GB instead of several GB), unless pip is told of another place.
+TORCH_INDEX ?= $(if $(PIP_EXTRA_INDEX_URL)$(PIP_FIND_LINKS),,--extra-index-url https://download.pytorch.org/whl/cpu)
 # What old versions of others will no longer do is no news; the rest stays an error.
 OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
 OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/rewards tests/roads tests/sensors \
@@ -34,8 +37,8 @@ export PYTHONDONTWRITEBYTECODE :=
 help: ## say what there is
 	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "make %-9s  %s\n", $$1, $$2 }' Makefile
 
-demo: $(READY) ## adapt a driver to merge, evaluate, drive through town, leave a page and videos (some minutes)
-	$(BIN)/cavmarl demo
+demo: $(DEMO)/.ready ## adapt a driver to merge, compare it, write a page with moving pictures (1.2 GB, some minutes)
+	$(DEMO)/bin/cavmarl demo
 
 test: $(READY) ## the tests but the slow ones; those of kernels that have a twin also without the compiler
 	$(BIN)/python $(KERNELS)
@@ -132,19 +135,33 @@ docs: $(SITE)/.ready ## build the site of all pages into dist/site
 	NO_MKDOCS_2_WARNING=1 $(SITE)/bin/mkdocs build --clean
 
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) $(SITE) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) $(SITE) $(DEMO) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
-# torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
-# PIP_FIND_LINKS) is taken instead of several GB of CUDA libraries.
-$(READY): pyproject.toml constraints/exact.txt
+define CHECK_PYTHON
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "cavmarl needs Python 3.11 or newer: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 	    echo "Python's venv is missing; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
+endef
+
+# torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
+# PIP_FIND_LINKS) is taken instead of several GB of CUDA libraries.
+$(READY): pyproject.toml constraints/exact.txt
+	$(CHECK_PYTHON)
 	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear .venv
 	$(BIN)/python -m pip install $$(grep '^torch==' constraints/exact.txt) --constraint constraints/exact.txt
 	$(BIN)/python -m pip install --editable '.[dev]' --constraint constraints/exact.txt
+	@touch $@
+
+$(DEMO)/.ready: pyproject.toml constraints/exact.txt
+	$(CHECK_PYTHON)
+	@echo "$(DEMO): installing 1.2 GB, once; then the demo compiles its kernels: three minutes on two cores"
+	test -x $(DEMO)/bin/pip || "$(PYTHON)" -m venv --clear $(DEMO)
+	$(DEMO)/bin/python -m pip install --quiet --no-compile $(TORCH_INDEX) \
+	    $$(grep '^torch==' constraints/exact.txt) --constraint constraints/exact.txt
+	$(DEMO)/bin/python -m pip install --quiet --no-compile --editable '.[demo]' \
+	    --constraint constraints/exact.txt
 	@touch $@
 
 $(TOOLS)/.ready:

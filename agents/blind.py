@@ -1,7 +1,7 @@
 """A driver that sees no other vehicle and no signal: an opponent that teaches caution.
 
-It steers like the built-in driver and keeps its own target speed: a share of the limit that is
-drawn per seat. It needs `sensors.ego` and continuous actions.
+It steers like the built-in driver and keeps its own target speed: a share of the speed limit, drawn
+per seat. It needs `sensors.ego` and continuous actions.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SPEED_SCALE = 40.0
 
 
 class BlindPolicy(Policy):
-    """Follows its lane at a share of the limit that is drawn by the seed of `reset`."""
+    """Follows its lane at a share of the speed limit, drawn from the seed of `reset`."""
 
     def __init__(self, env: Environment) -> None:
         super().__init__(env)

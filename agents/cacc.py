@@ -1,11 +1,11 @@
 """Cooperative adaptive cruise control: car following by messages of the vehicle ahead.
 
-The driver steers, stops and yields like the built-in driver, and near junctions it is as careful.
+The driver steers, stops and yields like the built-in driver, and is as careful near junctions.
 Behind a vehicle whose messages it receives, it uses the acceleration of van Arem, van Driel,
 Visser: "The impact of cooperative adaptive cruise control on traffic-flow characteristics", IEEE
-Trans. ITS 7 (4), 2006. A radar measures gap and relative speed (the sensor `lanes`); the
-acceleration of the vehicle ahead, which a radar cannot measure in time, comes by message (the
-sensor `messages`).
+Trans. ITS 7 (4), 2006. A radar measures gap and relative speed (the sensor `lanes`). A radar cannot
+measure the acceleration of the vehicle ahead in time, so messages transmit it (the sensor
+`messages`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ NEEDED = {
 
 
 class CaccPolicy(Policy):
-    """Follows by messages where it has any, and drives like the built-in driver elsewhere.
+    """Follows senders of messages by CACC, and otherwise drives like the built-in driver.
 
     Args:
         env: the environment.
@@ -77,12 +77,12 @@ class CaccPolicy(Policy):
         self._accel_mps2 = config.action.acceleration_mps2
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Return (W, A, 2): the built-in driver's steering, and its or the following throttle."""
+        """Return (W, A, 2): the built-in driver's steering, and the throttle of either driver."""
         newest = observations[..., -self._frame :].astype(np.float64)
         actions: NDArray[Any] = self._suggested(mask.shape).copy()
         follows, accel = self._follow(newest)
         followed = np.clip(accel / self._accel_mps2, -1.0, 1.0)
-        # Other vehicles matter there too, so the more careful throttle wins.
+        # Other vehicles matter near junctions, too, so use the more careful throttle.
         careful = np.minimum(followed, actions[..., 0])
         throttle = np.where(self._near_others(newest), careful, followed)
         actions[..., 0] = np.where(follows, throttle, actions[..., 0])

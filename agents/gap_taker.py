@@ -1,11 +1,12 @@
-"""Crosses a road in a known gap: by messages before its line, or else by sight from the edge.
+"""A driver that crosses a road in a gap, known from messages before its line or seen from the edge.
 
-The driver steers like the built-in driver. At a line where it must yield, it assumes that vehicles
-that it sees or receives messages of (`sensors.conflicts.heard`) keep their speed; it crosses if
-none of them comes within `GAP_S` of the time that it needs. If it has received any message in the
-last seconds, it decides before the line. Otherwise, it first stops at the edge of the other road
-and relies on what it sees from there. It is made for straight paths over one road, and needs the
-sensors `ego`, `signal` and `conflicts` with `heard`.
+The driver steers like the built-in driver. At a line where it must yield, it assumes that known
+vehicles keep their speed: vehicles that it sees, or receives messages of
+(`sensors.conflicts.heard`). It crosses if no known vehicle comes within `GAP_S` of the time that it
+needs. If it has received any message in the last seconds, it decides before the line. Otherwise, it
+first stops at the edge of the other road and decides by the vehicles that it sees from there. It is
+made for straight paths over one road, and needs the sensors `ego`, `signal` and `conflicts` with
+`heard`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from cavmarl.core.errors import PolicyError
 from cavmarl.engine.spaces import observation_parts
 from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
-GAP_S = 0.8  # between the times of the ego vehicle and of another one in the conflict area
+GAP_S = 0.8  # minimum time between the ego vehicle and another vehicle in the conflict area
 BRISK_MPS2 = 2.5
 STOP_MPS2 = 2.0
 LEAST_MPS = 3.0  # assumed lower bound of the speed of a moving vehicle nearer than `NEAR_M`
@@ -48,13 +49,13 @@ Floats = NDArray[np.float64]
 
 
 def straight(ratio: Floats) -> Floats:
-    """Invert value / (RATIO + abs(value)), to m or m/s."""
+    """Invert the scaling value / (RATIO + abs(value)); return m or m/s."""
     found: Floats = ratio * RATIO / np.maximum(1.0 - np.abs(ratio), 1e-6)
     return found
 
 
 def time_for(way_m: Floats, speed: Floats, limit: Floats) -> Floats:
-    """Return the time in s for a distance, accelerating up to a limit; 0 for none."""
+    """Return the time in s for a distance, accelerating up to a limit; 0 if the distance is 0."""
     speed, way_m = np.minimum(speed, limit), np.maximum(way_m, 0.0)
     ramp_m = (limit**2 - speed**2) / (2.0 * BRISK_MPS2)
     within = (np.sqrt(speed**2 + 2.0 * BRISK_MPS2 * way_m) - speed) / BRISK_MPS2
@@ -93,7 +94,7 @@ class GapTaker(Policy):
         self._goes = np.zeros((0, 0), dtype=np.bool_)
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Return (W, A, 2): the built-in driver's steering, and an own throttle."""
+        """Return (W, A, 2): the built-in driver's steering, and this driver's throttle."""
         if self._goes.shape != mask.shape:
             self._beyond_m, self._silent_s = np.zeros(mask.shape), np.full(mask.shape, np.inf)
             self._goes = np.zeros(mask.shape, dtype=np.bool_)
@@ -163,7 +164,7 @@ class GapTaker(Policy):
         gone_s = np.maximum(gone_m, 0.0) / np.maximum(np.abs(across), STANDING_MPS)
         meets = (enters_s - GAP_S < gone_s) & (arrives_s - GAP_S < leaves_s)
         counts = crosses & (ahead_m + HALF_M + ASIDE_M > 0.0) & (gone_m > 0.0)
-        counts &= np.where(moves, True, away_m < there_m)  # a standing vehicle lets it go first
+        counts &= np.where(moves, True, away_m < there_m)  # a stopped vehicle yields to it
         found: NDArray[np.bool_] = np.logical_or.reduce(counts & meets, axis=-1)
         return found
 

@@ -1,11 +1,11 @@
 """A driver for dense single-lane traffic that accelerates so gently that no wave can grow.
 
-Its target speed is slightly below that of uniform flow and rises by 0.03 m/s per second; after a
-stop it rises hardly faster, and it never exceeds the speed from which it can brake behind the
-vehicle ahead. The vehicles behind follow without stopping. In `ring22` this dissolves the
-stop-and-go waves of 21 human drivers; elsewhere it is of no use. It reads the world's clock, which
-is not in the sensors, and steers towards a point ahead on its path (pure pursuit: Coulter 1992). It
-needs `sensors.ego`, `sensors.route`, `sensors.lanes` and continuous actions.
+Its target speed is slightly below the speed of uniform flow and rises by 0.03 m/s per second; after
+a stop it rises hardly faster, and it never exceeds the speed from which it can brake behind the
+vehicle ahead. The vehicles behind follow without stopping. In `ring22`, this dissolves the
+stop-and-go waves of 21 human drivers; in other environments, it is of no use. It reads the world's
+clock, which is not in the sensors, and steers towards a point ahead on its path (pure pursuit:
+Coulter 1992). It needs `sensors.ego`, `sensors.route`, `sensors.lanes` and continuous actions.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ GAIN_MPS2 = 0.03
 CATCH_UP_MPS2 = 0.035
 BRAKE_MPS2 = 1.5
 REACT_S = 0.6
-STAND_M = 1.5  # between the bumpers
+STAND_M = 1.5  # distance between the bumpers of stopped vehicles
 WHEELBASE_M = 3.0
 
 # Scales of the features, see the table of any environment's card.
@@ -55,7 +55,7 @@ class GentlePolicy(Policy):
                 "'sensors.route.points': 3, 'action.kind': 'continuous'}"
             )
         self._ego, self._lanes = parts["ego"].place, parts["lanes"].place
-        # The second point, or the only one.
+        # Use the second point of the route, or its only point.
         at = parts["route"].place.start + 2 * min(1, config.sensors.route.points - 1)
         self._aim = slice(at, at + 2)
         self._aim_scale_m = config.sensors.route.points * config.sensors.route.spacing_m

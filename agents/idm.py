@@ -1,7 +1,7 @@
 """The built-in driver: IDM, MOBIL with route-dependent lane changes, and a lane controller.
 
-It drives like background vehicles, from the world's state instead of observations. As an agent it
-is the baseline for policies that have only their sensors.
+It drives like background vehicles, from the world's state instead of observations. As an agent, it
+is the baseline for policies that use only sensors.
 """
 
 from __future__ import annotations

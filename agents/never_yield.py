@@ -1,4 +1,4 @@
-"""Keeps its lane and its speed under all circumstances: a driver that scenarios must catch."""
+"""A driver that always keeps its lane and its speed: scenarios must detect its mistakes."""
 
 from __future__ import annotations
 

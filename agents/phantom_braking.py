@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
-BETWEEN_S = (5.0, 30.0)  # mean range
+BETWEEN_S = (5.0, 30.0)  # range of the mean time between two brakings
 LONG_S = (0.5, 3.0)
 BRAKE_MPS2 = (2.0, 6.0)
 
 
 class PhantomBrakingPolicy(Policy):
-    """Draws by the seed of `reset` and the number of decisions since then."""
+    """Draws its brakings from the seed of `reset` and the number of decisions since then."""
 
     def __init__(self, env: Environment) -> None:
         super().__init__(env)

@@ -13,7 +13,7 @@ from cavmarl.policies.policy import Policy
 
 
 class RandomPolicy(Policy):
-    """Draws every action by the seed of `reset` and the number of the step."""
+    """Draws every action from the seed of `reset` and the number of the step."""
 
     def __init__(self, env: CavEnv | CavVectorEnv) -> None:
         super().__init__(env)

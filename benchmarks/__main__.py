@@ -17,7 +17,7 @@ KEPT = {
 
 
 def programs() -> dict[str, str]:
-    """Return the description of each program by name; modules that are no programs are left out."""
+    """Return the description of each program by name, without modules that are not programs."""
     found = {}
     for path in sorted(Path(__file__).parent.glob("*.py")):
         text = path.read_text(encoding="utf-8")
@@ -27,7 +27,7 @@ def programs() -> dict[str, str]:
 
 
 def main(words: list[str]) -> None:
-    """List the benchmarks, or run the one that the first word names with the remaining options."""
+    """List the benchmarks, or run the benchmark named by the first word with the other words."""
     name, *options = words or [""]
     if name in KEPT:
         cavmarl(["bench", name, *options])

@@ -1,9 +1,9 @@
 """Replay of load traces through each placement strategy, compared with static placement.
 
 The replay uses a model of the true cost: a worker gets the share of its processor that other
-programs leave, so its shards take their cost over 1 - CPU; memory and GPU in use slow no worker
-down. All workers wait for the slowest. Moving a shard costs the rule's `move_s` once, and a vehicle
-that changes its zone because the map is cut again costs `HANDOFF_S`.
+programs leave, so the time of its shards is their cost over 1 - CPU. Memory and GPU in use do not
+slow a worker down. All workers wait for the slowest. Moving a shard costs the rule's `move_s` once,
+and a vehicle that changes its zone because the map is cut again costs `HANDOFF_S`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class BalanceReplay:
     traces: int  # number of traces
     rounds: int  # rounds per trace, including those before times count
     ticks: int  # ticks per round
-    rule: BalanceRule  # when shards move, and the cost of a move
+    rule: BalanceRule  # conditions for moving shards, and the cost of a move
     rows: tuple[StrategyResult, ...]  # results by strategy
 
 

@@ -1,4 +1,4 @@
-"""Strategies that place shards, round by round, on one load trace."""
+"""Strategies that place shards in each round of a load trace."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ class StaticPlacement:
 
 
 class LoadStrategy(StaticPlacement):
-    """Moves a few shards per round by measured costs; each extension is a switch.
+    """Moves a few shards per round by measured costs; each extension can be switched on.
 
     Args:
         trace: the loads.
-        rule: when shards move.
+        rule: conditions for moving shards.
         warm: rounds before learnt values are used.
         calibrated: whether to fit the score's weights to the workers' times.
         predicted: whether to predict costs from the present contents of zones.

@@ -61,7 +61,7 @@ def _verdict(found: ClockDrift) -> str:
         return f"the follower did not tick on its own; the clocks are {equal}"
     event = f"the follower ticked on its own {found.own_ticks} times ({found.answer})"
     if found.noticed_ticks is None:
-        return f"{event}; the master counted {found.counted}, and the world went on only with it"
+        return f"{event}; the master counted {found.counted}, and only the master ticked the world"
     return (
         f"{event}; the master noticed {found.drift_events} times that the world advanced without "
         f"it, first {found.noticed_ticks} of its ticks after the first time"

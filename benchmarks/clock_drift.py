@@ -41,8 +41,8 @@ class DriftRow:
     normalised_s: float  # the same since the follower joined
     delta_s: float  # follower's lead over the master
     ratio: float  # follower's time over the master's
-    # lead of the follower's process clock, which it does not use, over the master's; None: steps
-    # are not paced
+    # lead of the follower's (unused) process clock over the master's clock; None: steps are not
+    # paced
     own_delta_s: float | None
 
 
@@ -59,7 +59,7 @@ class ClockDrift:
     own_ticks: int  # number of its own ticks counted by the follower
     counted: int  # the same, counted by the master
     drift_events: int  # number of times that the master noticed the world had advanced without it
-    noticed_ticks: int | None  # ticks of the master until it first noticed; None: it did not
+    noticed_ticks: int | None  # ticks of the master until it first noticed; None: never
 
     @property
     def holds(self) -> bool:

@@ -1,9 +1,9 @@
 """Cost models that the balance benchmark compares with measured costs; cavmarl does not use them.
 
-Calibrated: the LoadScore is the share of a worker that its shards do not get. A worker that took
-`tick_s` for shards that cost `load_s` has lost the share 1 - load_s / tick_s; the weights are those
-that best explain the lost shares. Predicted: a shard's future cost is linear in its present
-vehicles, sensor readings and migrations. No coefficient is negative.
+Calibrated: the LoadScore is the share of a worker that its shards do not get. If a worker takes
+`tick_s` for shards that cost `load_s`, it has lost the share 1 - load_s / tick_s; the weights are
+fitted to the lost shares. Predicted: a shard's future cost is linear in its present vehicles,
+sensor readings and migrations. No coefficient is negative.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class CostModel(NamedTuple):
 def calibrate(
     log: Sequence[LoggedTick], given: tuple[float, float, float] = WEIGHTS
 ) -> tuple[float, float, float]:
-    """Return weights of CPU, RAM and GPU that sum to 1; `given` if nothing can be learnt."""
+    """Return weights of CPU, RAM and GPU that sum to 1; `given` if they cannot be fitted."""
     rows = [row for row in log if row.load_s > 0.0]
     if not rows:
         return given
@@ -70,7 +70,7 @@ def calibrate(
 
 
 def fit_costs(contents: Sequence[ShardContent], costs_s: Sequence[float]) -> CostModel:
-    """Return the model that fits logged rows best."""
+    """Return the cost model with the best fit to logged rows."""
     rows = np.column_stack([np.ones(len(contents)), np.array(contents)])
     scale = np.abs(rows).max(axis=0)
     scale[scale == 0.0] = 1.0  # columns without data

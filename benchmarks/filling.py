@@ -20,7 +20,7 @@ def write_filling_demand(
     ins, outs = _ends(network, "num_into"), _ends(network, "num_links")
     if not (ins and outs):
         raise ConfigError(
-            f"map '{network.name}': it needs roads that lead in and out; choose another"
+            f"map '{network.name}': needs roads that lead in and out; choose another map"
         )
     flows = "\n".join(
         f'  <flow id="{a}-{b}" from="{a}" to="{b}" begin="{period_s * n:g}" end="{seconds:g}" '

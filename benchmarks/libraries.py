@@ -1,7 +1,7 @@
 """The time that each library's adapter adds to a step of the same world.
 
-Each adapter has its own world; all agents coast, and agents that end get new vehicles. Times are
-processor times on one core; each step is measured right after a step of the plain arrays.
+Each adapter has its own world. All agents coast, and agents whose trip ends get new vehicles. Times
+are processor times on one core; each step is measured right after a step of the plain arrays.
 """
 
 from __future__ import annotations

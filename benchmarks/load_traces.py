@@ -1,8 +1,8 @@
 """Load traces: positions and costs of vehicles, and other load on workers.
 
 A trace is generated or recorded; `balance_replay` replays both kinds through the same balancer. The
-other load is always generated, because a test that loads the machine on purpose would measure its
-own program.
+other load is always generated, because a program that loads the machine on purpose would affect the
+measurement.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class LoadTrace:
     rounds: tuple[LoadRound, ...]  # in temporal order
 
     def arrivals(self, number: int, partition: ZonePartition) -> NDArray[np.int64]:
-        """Return how many vehicles of each zone (k,) were in another one in the round before."""
+        """Return the number of vehicles of each zone (k,) that have entered it in this round."""
         now = self.rounds[number]
         if number == 0:
             return np.zeros(partition.count, dtype=np.int64)
@@ -92,9 +92,9 @@ class Crowd:
     agent_s: float = 4e-6  # additional cost of an agent's sensors, s per tick
     migration_s: float = 2e-5  # cost of a change of zone, once
     ticks: int = 200  # per round
-    pull: float = 15.0  # density at the hot spot over that elsewhere
-    width: float = 0.2  # of the hot spot, as a share of the map's shorter side
-    stride: float = 0.04  # movement of the hot spot per round, as the same share
+    pull: float = 15.0  # density at the hot spot over the density elsewhere
+    width: float = 0.2  # width of the hot spot, as a share of the map's shorter side
+    stride: float = 0.04  # movement of the hot spot per round, as a share of the same side
     turnover: float = 0.2  # share of vehicles that get a new position each round
     noise: float = 0.1  # standard deviation of the logarithm of measured costs
 

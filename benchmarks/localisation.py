@@ -33,7 +33,7 @@ from cavmarl.maps.fidelity.map_surface import map_surface
 AGENT = "car_0"
 STEP_S = 0.05
 STAGES = {"gnss_imu": "filter", "scan_matching": "scans"}  # names in the table
-CLOUD_SPACING_M, CLOUD_NOISE_M = 0.4, 0.03  # of the map's own surface
+CLOUD_SPACING_M, CLOUD_NOISE_M = 0.4, 0.03  # for points on the map's own surface
 
 
 def measure(

@@ -1,4 +1,4 @@
-"""Names of properties of a map by which worlds are grouped."""
+"""Properties of a map by which worlds are grouped."""
 
 from __future__ import annotations
 

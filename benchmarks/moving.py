@@ -1,4 +1,4 @@
-"""Speedup of worlds of unequal cost if they may move between workers."""
+"""Speedup of moving worlds of unequal cost between workers."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def measure(
 
     The worlds fill with vehicles, and half of them restart. Both sides are then stepped in turn.
     Initially, each worker gets the same number of worlds, so the first half of the workers has the
-    full ones.
+    full worlds.
     """
     check_positive("--at-least", at_least)
     if not 2 <= workers <= worlds or min(lead, every, steps, repeats) < 1 or not period > 0.0:
         raise ConfigError(
             f"{worlds} worlds over {workers} workers, {lead} steps before, a round every {every}, "
-            f"{repeats} turns of {steps} steps, {period:g} s: at least 2 workers, no more than "
-            "worlds, and all other numbers above 0"
+            f"{repeats} turns of {steps} steps, {period:g} s: must be at least 2 workers, at most "
+            "one per world, and all other numbers above 0"
         )
     overrides = parse_settings(settings)
     measured: dict[str, _Measured] = {}
@@ -149,7 +149,7 @@ class _Measured:
         self._busy_s = np.zeros(len(vec.worlds.pool.pids))
 
     def lead(self, seed: int, steps: int, settle: int) -> None:
-        """Fill the worlds, restart the second half, and let the movable ones move."""
+        """Fill the worlds, restart the second half, and let movable worlds move."""
         vec = self.vec
         vec.reset(seed=seed)
         self._drive(steps)

@@ -64,12 +64,12 @@ class NodeCosts:
     memory_s: float  # additional time per row beyond all caches
     caches: Caches
     caller_s: float  # processor time of the caller per tick
-    caller_node_s: float  # the same per node
-    wake_s: float  # from one process to another, without latency
+    caller_node_s: float  # additional processor time of the caller per node and tick
+    wake_s: float  # time from one process to another, without latency
     uneven: float  # additional time of the last node in a tick, as a share
-    base_bytes: float  # of a node, constant part
-    city_bytes: float  # per vehicle that the city has room for: map and tables, at every node
-    own_bytes: float  # per owned vehicle and ghost
+    base_bytes: float  # memory of a node, constant part
+    city_bytes: float  # map and tables at every node, per vehicle that the city has room for
+    own_bytes: float  # additional memory per owned vehicle and ghost
     ghost_factor: float  # ghosts over the square root of a node's vehicles, per border
     crossing_share: float  # share of a node's ghosts that change their node in a step
     ticks_per_step: float
@@ -81,9 +81,9 @@ class NodeCosts:
     def hops(self, vehicles: float, nodes: int) -> float:
         """Return the mean number of sequential messages of a tick.
 
-        Per step there are the command and the report and, with several nodes, their messages to
-        each other for each tick and for the agents. If a vehicle has crossed a border, an offer and
-        its answer replace the report.
+        Each step has a command and a report. Several nodes also exchange messages for each tick and
+        for the agents. If a vehicle has crossed a border, an offer and its answer replace the
+        report.
         """
         if nodes < 2:
             return 2.0 / self.ticks_per_step
@@ -94,8 +94,8 @@ class NodeCosts:
     def work(self, vehicles: float, ghosts: float, busy: int) -> float:
         """Return the processor time per tick for stepping vehicles, without the cost of ghosts.
 
-        Rows that fit a cache are read from it, the others from memory. `busy`: number of working
-        cores.
+        Rows that fit a cache are read from the cache, the other rows from memory. `busy`: number of
+        working cores.
         """
         far, farthest = self.caches.beyond(vehicles + ghosts, busy)
         return self.vehicle_s * vehicles + self.far_s * far + self.memory_s * farthest
@@ -178,7 +178,7 @@ def fitted(samples: Sequence[NodeSample], caches: Caches) -> NodeCosts:
         crossing_share=_mean([s.crossings / (s.ghosts * s.nodes) for s in divided if s.ghosts]),
         ticks_per_step=samples[0].ticks_per_step,
     )
-    # The rest of the wall time is waking a process and waiting for the last node.
+    # The rest of the wall time passes while a process wakes or waits for the last node.
     waits = [s.tick_s - s.node_s - s.caller_s for s in calm]
     hops = [costs.hops(s.vehicles, s.nodes) for s in calm]
     rows = [[n, s.node_s if s.nodes > 1 else 0.0] for n, s in zip(hops, calm, strict=True)]

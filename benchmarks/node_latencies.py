@@ -51,7 +51,7 @@ def measure(
     check_positive("--turns", turns)
     check_positive("--kills", kills)
     if nodes < 2:
-        raise ConfigError(f"--nodes {nodes}: must be at least 2, so that one can take over")
+        raise ConfigError(f"--nodes {nodes}: must be at least 2, so that a node can take over")
     say("empty ticks")
     rows = _empty_ticks(env, nodes, turns)
     rows.append(_kills(env, nodes, kills, background, random.Random(seed), say))

@@ -1,7 +1,7 @@
 """Upper bound of the speedup of two nodes: two independent worlds of half the size.
 
 Both nodes of a divided world do at least this work, and also exchange ghosts and leases. If the
-halves are slow, the machine is the limit: cores that share a cache, memory, or a core's units.
+halves are slow, the machine is the limit: programs share a cache, memory, or the units of a core.
 """
 
 from __future__ import annotations

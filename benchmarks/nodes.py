@@ -45,7 +45,7 @@ def measure(
     """Measure worlds in turn, fit a model to the runs with 0 to 2 nodes, and compare the others.
 
     Each world has its own processes, with its heap in huge pages. The worlds take turns in one
-    order, then in reverse. A turn begins with unmeasured steps, because the others have used the
+    order, then in reverse. A turn begins with unmeasured steps, because other worlds have used the
     cache.
     """
     if steps < 1 or repeats < 1:
@@ -54,8 +54,8 @@ def measure(
     added = [float(text) * 1e-3 for text in latencies.split(",") if text]
     if len(set(sizes)) < 2 or min(sizes) < PER_JUNCTION * 16 or not {1, 2} <= set(counts):
         raise ConfigError(
-            f"--vehicles {vehicles} --nodes {nodes}: give two sizes from {PER_JUNCTION * 16} on, "
-            "and the nodes 1 and 2, to which the model is fitted"
+            f"--vehicles {vehicles} --nodes {nodes}: give two sizes of at least "
+            f"{PER_JUNCTION * 16}, and the nodes 1 and 2, to which the model is fitted"
         )
     sides = [_Side(size, n, s) for size in sizes for s in (0.0, *added) for n in counts]
     sides += [_Side(size, 0, 0.0) for size in sizes]  # last, when maps are in the cache

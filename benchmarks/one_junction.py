@@ -1,7 +1,7 @@
 """One junction of each kind with turning traffic, compared with SUMO.
 
-A random net mixes kinds of junctions and turns. Here each kind stands alone, with four single-lane
-arms and the same trips for both sides, so that a deviation has one cause.
+A random net mixes kinds of junctions and turns. Here, each net has a single junction with four
+single-lane arms, and both sides have the same trips, so that a deviation has one cause.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FLOWS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "allway_stop": ((250, 100, 100), (150, 60, 60)),
 }
 ARM_M = 400
-ARMS = ("top", "right", "bottom", "left")  # clockwise, so that the opposite arm is two further on
+ARMS = ("top", "right", "bottom", "left")  # clockwise, so that the opposite arm has the index + 2
 TURNS = (2, 1, 3)  # number of arms further on for straight on, left and right
 
 

@@ -31,9 +31,8 @@ def measure(
 ) -> BenchmarkReport:
     """Measure processor nanoseconds per vehicle and step, by phase.
 
-    A world with stopwatches and one without run the same episodes in turn. The time of the
-    stopwatches is measured beforehand and subtracted, and so is that of the built-in driver in the
-    agents' seats.
+    A world with stopwatches and a world without run the same episodes in turn. The times of the
+    stopwatches and of the built-in driver in the agents' seats are measured and subtracted.
     """
     check_range(steps=(steps, 1, 1_000_000), repeats=(repeats, 1, 1_000_000))
     overrides = parse_settings(settings)

@@ -1,7 +1,7 @@
 """Create a rig for the benchmark `sensors` that takes a given time per tick.
 
-Resolutions and rates are raised until all sensors together, each due in every tick, take this time.
-Each sensor takes about the same share, as far as its resolution can be changed.
+Every sensor is due in every tick. Resolutions are raised until all sensors together take this time,
+each about the same share, as far as its resolution can be changed.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     """Return the job with resolutions at which the sensors take a given time per tick.
 
     Sensors with variable resolution take about equal times. Times are not proportional to
-    resolutions, so once one rig is too light and another too heavy, the next one is interpolated.
+    resolutions, so the next rig is interpolated between a too light and a too heavy rig.
     """
     even, found_ms = _evened(job, load_ms, say), 0.0
     scale, light, heavy = 1.0, 0.0, math.inf
@@ -130,7 +130,7 @@ def _scaled_by(job: SensorJob, factors: Mapping[str, float]) -> SensorJob:
 
 
 def _tried(job: SensorJob, load_ms: float, say: Say) -> tuple[float, Sequence[float]]:
-    """Return the time of all sensors per tick in ms, and that of each."""
+    """Return the time of all sensors per tick in ms, and the time of each sensor."""
     tried = run_job(replace(job, warmup=TRIED_STEPS, steps=TRIED_STEPS))
     found_ms = statistics.median(tried.parts_ms["sensor compute"])
     say(f"searching a load of {load_ms:g} ms: found {found_ms:.3g} ms")

@@ -1,7 +1,7 @@
 """Effect of one driver among 21 human drivers: the mean speed on `ring22`.
 
 This is Flow's measure of a driver that stabilises a ring (Wu et al. 2017): the mean speed of all 22
-cars after stop-and-go waves have formed, compared with that of 22 human drivers.
+cars after stop-and-go waves have formed, compared with the mean speed of 22 human drivers.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cavmarl.evaluate.built_in_runs import DrivenWorld
 from cavmarl.policies.loading import driver_keys, load_policy, policy_files
 
 ENV = "ring22"
-HUMAN = "human"  # a further human driver in the agent's seat
+HUMAN = "human"  # one more human driver in the agent's seat
 ALL_HUMAN = {"traffic.demand": ["map/all_human.rou.xml"]}
 
 

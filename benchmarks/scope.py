@@ -1,7 +1,7 @@
 """The scope of the paper on distributed CARLA (A), compared with the results of a short run.
 
 A is cited by its sections and Table 1 (`docs/explanation/papers.md`). Each row is checked for
-cavmarl; if one fails, the exit code is 1.
+cavmarl; if a check fails, the exit code is 1.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class SensorBench:
     seed: int  # of every run, and of their order
     placement: str  # placement of sensors: by `cost` or `in_turn`
     turns: tuple[Turn, ...]  # all runs, in order
-    # for as many independent programs as the largest number of workers with a core each; None: one
+    # for one independent program per worker, at most one per core; None: that is a single program
     ceiling: CoreCeiling | None
 
     def of(self, workers: int) -> list[SensorRun]:
@@ -149,8 +149,8 @@ def measure_sensor_workers(
 ) -> SensorBench:
     """Run the same world with each number of sensor workers, in random order.
 
-    Each run has its own processes, which share only files with those of other runs. By default, one
-    agent has the rig, and there are no other vehicles.
+    Each run has its own processes, which share only files with other runs. By default, one agent
+    has the rig, and there are no other vehicles.
     """
     if not workers or len(set(workers)) < len(workers) or not 1 <= min(workers) <= max(workers):
         raise ConfigError(f"workers {list(workers)}: must be distinct numbers of at least 1")

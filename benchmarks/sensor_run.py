@@ -1,6 +1,6 @@
 """One run of a world with sensor workers, step by step, and its measurements.
 
-Time outside all parts is not measured: the parts need not sum up to the step.
+Time outside all parts is not measured, so the parts may sum up to less than the step.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class _Timed:
             self._parts_ms[name].append(1e3 * part_s)
 
     def digest(self) -> None:
-        """Record the state's hash; not called between measured steps, as it reads all frames."""
+        """Record the state's hash; not between measured steps, because it reads all frames."""
         self._digests.append(self._vec.state_hash())
 
     def run(self, windows: tuple[Window, ...]) -> SensorRun:

@@ -1,8 +1,9 @@
 """Derived figures and the plot of step times over numbers of sensor workers.
 
-All figures of such a table are computed here from raw series. A standard deviation within a run is
-that of its steps (n - 1); it says nothing about other runs. The interval between runs does, and
-needs at least five runs. There are no predictions for numbers of workers that were not measured.
+All figures of the table are computed here from raw series. The standard deviation within a run is
+computed from its steps (n - 1), and does not describe differences between runs. The interval
+between runs does; it needs at least five runs. Numbers of workers that were not measured are not
+predicted.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from cavmarl.evaluate.traffic.traffic_plot import save_figure
 
 MIN_RUNS = 5  # smallest number of runs for an interval between runs
 FPS, STEP = "#2f6db5", "#d1793b"
-HEADROOM = 1.1  # of the axis over the largest value
+HEADROOM = 1.1  # end of the axis over the largest value
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class ScalingRow:
     wait_share_pct: float  # waiting time / T
     rest_ms: float  # T minus waiting time
     fps_gain_pct: float  # relative to the FPS of the fewest workers
-    step_gain_pct: float  # T relative to that of the fewest workers; negative if shorter
+    step_gain_pct: float  # relative to T of the fewest workers; negative if shorter
     is_best: bool  # whether T is the shortest of those measured
 
 

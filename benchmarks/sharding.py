@@ -3,7 +3,7 @@
 All zones run in this process on one core, so the whole work is visible. For each number of zones
 there are two worlds, one of them with a stopwatch on every phase. All worlds advance in turn, each
 by a part of its turn, in a random order per part; ratios are taken within a turn. So other load on
-the machine, and data evicted from caches, affect all of them.
+the machine, and data evicted from caches, affect all worlds.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Turns of one world in zones, without a stopwatch and with one on every phase.
 
-A turn is run in parts, interleaved with those of other worlds, so that other load on the machine
-affects all of them.
+A turn is run in parts, interleaved with parts of other worlds, so that other load on the machine
+affects all worlds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cavmarl.zones.partition.zone_statistics import imbalance
 __all__ = ["PHASES", "Pair", "Turn", "TwinWorlds"]
 
 PHASES = ("traffic", "advance", "exchange", "resolve", "migrate", "sense", "other")
-# Calls of the runtime by phase, for calls with another name than their phase; the rest is `other`.
+# Phases by the runtime's calls that have other names than their phase; other calls are `other`.
 _MEMBERS = {
     "traffic": (
         "choose_goals", "leave", "settle",

@@ -1,4 +1,4 @@
-"""Parts of a map on which vehicles touch whatever drivers do, grouped by property."""
+"""Parts of a map on which vehicles touch although drivers obey all rules, grouped by property."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ STEP_M = 1.0
 def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
     """Return pairs of LANE rows that are closer than a car's width without any right of way.
 
-    These are lanes of two roads of which neither leads to the other; movements over two junctions
-    of which neither leads to the road that the other leaves; or lanes of a road and of a junction
-    elsewhere.
+    These are lanes of two roads that do not lead to each other; movements over two junctions that
+    do not lead to the roads before each other; or lanes of a road and of a junction elsewhere.
     """
     grid = lane_grid(network)
     links = network.links[network.links["direction"] != ord("t")]
@@ -71,7 +70,7 @@ def _owners(network: RoadNetwork) -> _Owners:
 
 
 def _are_apart(owners: _Owners, one: int, other: int) -> bool:
-    """Return whether two lanes belong to roads or junctions of which neither leads to the other."""
+    """Return whether two lanes belong to roads or junctions that do not lead to each other."""
     inside, ground, before, beyond = owners
     if inside[one] != inside[other]:
         road, junction = (other, one) if inside[one] else (one, other)

@@ -54,7 +54,9 @@ def measure(
             config, _ = load_config(env, **spec.keywords)
             others = number - config.population.agents
             if others < 0:
-                raise ConfigError(f"{number} vehicles: agents alone are {config.population.agents}")
+                raise ConfigError(
+                    f"{number} vehicles: must be at least the {config.population.agents} agents"
+                )
         wanted = replace(spec, background=others)
         rows.append(_measured(wanted, zones or workers, workers, steps, repeats))
     line = split_line([(row["vehicles"], row["ratio"]) for row in rows])

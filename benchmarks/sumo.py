@@ -50,7 +50,7 @@ def measure(
     repeats: Annotated[int, about("Turns per side, of 10 simulated seconds.")] = 5,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure the time that coupling a world to SUMO adds to that of libsumo alone."""
+    """Measure the time that coupling a world to SUMO adds to the time of libsumo alone."""
     check_range(after=(after, 1, 3600), repeats=(repeats, 1, 100))
     path = find_map(map_name)
     job = SumoJob(path, read_input(demand), after, dt, seed)

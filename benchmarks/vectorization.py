@@ -1,9 +1,9 @@
 """Overhead of stepping worlds over worker processes, measured with worlds that do nothing.
 
-The agents are divided evenly among the workers, one world each. In every library they see the same
-numbers, all rewards are 0, and no agent leaves, so the time of a step is that of vectorization.
-`ORDER` is the part of cavmarl's workers: actions into shared memory, the command, and waiting until
-results are committed, without checking actions and copying results.
+The agents are divided evenly among the workers, one world each. In every library, they observe the
+same numbers, all rewards are 0, and no agent leaves, so a step takes only the time of
+vectorization. `ORDER` is the time of cavmarl's workers alone: actions are written to shared memory,
+the command is sent, and results are committed, without checking actions and copying results.
 """
 
 from __future__ import annotations

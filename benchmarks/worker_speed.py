@@ -1,8 +1,8 @@
 """Speedup by workers, the cost of workers, and the limit of the machine.
 
-The limit of the machine is the speedup of independent programs that run side by side. No number of
-workers can exceed it. It is less than the number of cores if cores share memory, caches or clocks,
-or if other programs run.
+The limit of the machine is the speedup of independent programs that run at the same time. Workers
+cannot exceed it. It is less than the number of cores if cores share memory, caches or clocks, or if
+other programs run.
 """
 
 from __future__ import annotations
@@ -65,13 +65,13 @@ class WorkerSpeed:
 
     @property
     def processor_ratio(self) -> float:
-        """The same by processor time of the busiest worker: the speedup with enough free cores."""
+        """Speedup by processor time of the busiest worker: the speedup with enough free cores."""
         one, many = self.rows[1].busiest_ms, self.rows[2].busiest_ms
         return math.nan if one is None or many is None else one / many
 
     @property
     def cost_of_one(self) -> float:
-        """Time of a step with one worker over that without; median of the turns."""
+        """Time of a step with one worker over the time without workers; median of the turns."""
         return paired_ratio(self.rows[1].step_ms, self.rows[0].step_ms)
 
     @property
@@ -193,7 +193,7 @@ def measure_ceiling(
     alike: bool = False,
     **keys: Unpack[WorldKeys],
 ) -> CoreCeiling:
-    """Let programs step as many worlds as workers would, without any command."""
+    """Let independent programs step as many worlds as workers would, without communication."""
     if not 1 <= programs <= worlds:
         raise ConfigError(f"{programs} programs, {worlds} worlds: must be at least one world each")
     spec = WorldSpec.of(env, **keys)

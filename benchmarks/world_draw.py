@@ -98,7 +98,7 @@ def draw_world(seed: int, without: Collection[str] = ()) -> WorldDraw:
         without: features to exclude.
 
     Raises:
-        ConfigError: there is no such feature, or no choice is left.
+        ConfigError: a feature is unknown, or no choice is left.
     """
     check_features(without)
     chance = _Chance(seed, without)
@@ -138,7 +138,7 @@ class _Chance:
         self.features: list[str] = []
 
     def one_of(self, shares: dict[str, float]) -> str:
-        """Draw a feature by its share among those that are not excluded."""
+        """Draw a feature by its share among the features that are not excluded."""
         left = {name: share for name, share in shares.items() if name not in self._without}
         if not left:
             raise ConfigError(f"--without: excludes all of {', '.join(shares)}; exclude fewer")

@@ -23,15 +23,15 @@ from cavmarl.roads.network import RoadNetwork
 NET_FILE, ROUTES_FILE = "world.net.xml", "world.rou.xml"
 # Maps of real cities in the wheel's `tools/game` from which cuts are taken; levels by height.
 GAME_MAPS = ("kuehne/kuehne", "bs3d/bs", "fokr_bs_demo/fokr_bs", "DRT/osm", "fkk_in/ingolstadt")
-_DRAWN_TRIPS = 1500  # from which departures are taken
-_LEAST_EDGES = 12  # of a cut; smaller cuts are drawn again
+_DRAWN_TRIPS = 1500  # number of trips from which departures are taken
+_LEAST_EDGES = 12  # smaller cuts are drawn again
 _CUTS = 20
 _END_PER_H = 600.0  # upper bound per road into the net, so that vehicles can enter
 _TOOL_S = 300.0
 
 
 def cut_maps(folder: Path | None) -> tuple[Path, ...]:
-    """Return the maps for cuts: all below a folder, or those in the wheel.
+    """Return the maps for cuts: all maps below a folder, or the maps in the wheel.
 
     Raises ConfigError: the folder has no map.
     """

@@ -30,7 +30,7 @@ from cavmarl.verify.faulty_network import FaultyNetwork
 PER_JUNCTION = 25  # vehicles
 EDGE_M = 200
 FIRST_STEPS = 3  # after creation
-WARM_STEPS = 2  # unmeasured, per turn, because other worlds have used the cache
+WARM_STEPS = 2  # unmeasured steps per turn, because other worlds have used the cache
 PINGS = 40
 PING = bytes(1 << 14)  # about the size of the nodes' messages in a tick
 LOCAL = "127.0.0.1"

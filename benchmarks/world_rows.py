@@ -105,7 +105,7 @@ def worst(rows: Sequence[Row], count: int) -> list[Row]:
 
 
 def summary(rows: Sequence[Row]) -> Row:
-    """Return the distribution over the worlds that could be compared."""
+    """Return the distribution of figures over the worlds that could be compared."""
     good = [row for row in rows if "error" not in row]
     found: Row = {"worlds": len(rows), "failed": len(rows) - len(good)}
     if not good:
@@ -146,7 +146,7 @@ def by_feature(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 def comparable(rows: Sequence[Row]) -> list[Row]:
-    """Return the worlds that should match SUMO: those with none of `MAP_FEATURES`."""
+    """Return the worlds that should match SUMO: worlds without any of `MAP_FEATURES`."""
     return [row for row in rows if MAP_FEATURES.isdisjoint(row["features"])]
 
 

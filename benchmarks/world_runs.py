@@ -94,7 +94,7 @@ def run_worlds(
 def read_rows(path: Path) -> Iterator[Row]:
     """Yield the rows of a file, none if it does not exist.
 
-    Raises ConfigError: a line is no row.
+    Raises ConfigError: a line is not a row.
     """
     if not path.exists():
         return
@@ -176,7 +176,7 @@ def _draw_end(world: Simulation, path: Path) -> None:
 
 
 def _drop_files(out: Path, rows: Sequence[Row]) -> None:
-    """Delete all files except those of the worst worlds."""
+    """Delete all files except the files of the worst worlds."""
     kept: Collection[int] = {row["seed"] for row in worst(rows, KEPT)}
     for row in rows:
         if row["seed"] not in kept:

@@ -1,10 +1,10 @@
 """The built-in driver in agents' seats, alone and in traffic, on any maps.
 
-Every trip counts, including those that the end of the run cuts off. A vehicle stands without a
+Every trip counts, including trips that the end of the run cuts off. A vehicle stands without a
 cause if it has stood for `STANDS_S`; its signal is not red; no other vehicle is close ahead or just
-behind the junction; no vehicle, or its rear, is on a path that crosses its own; and none approaches
-a line at which it must yield, within the distance of an announcement. Contacts on ground that the
-map gives to two roads are counted separately (`shared_ground`).
+behind the junction; no vehicle, or its rear, is on a path that crosses its own; and no vehicle with
+priority approaches within the distance of an announcement. Contacts on ground that the map gives to
+two roads are counted separately (`shared_ground`).
 """
 
 from __future__ import annotations
@@ -232,9 +232,9 @@ class SharedGround:
     def holds(self, row: np.void, rows: NDArray[np.void], dt: float) -> bool:
         """Return whether the vehicle about to be touched is on a lane that shares the ground.
 
-        The other vehicle is the one with the nearest axis. `dt`: upper bound of the time until they
-        touch, s. If no vehicle is near, the other one has just entered, on the other lane, since a
-        vehicle does not enter too close on the same lane. Inside a junction, a vehicle counts as on
+        The other vehicle has the nearest axis. `dt`: upper bound of the time until they touch, s.
+        If no vehicle is near, the other vehicle has just departed on the other lane, because
+        vehicles do not depart too close on the same lane. Inside a junction, a vehicle counts as on
         the lanes before and after it.
         """
         others = rows[rows["id"] != row["id"]]

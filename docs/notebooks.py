@@ -1,14 +1,20 @@
 """The notebooks of `examples/`, made of the scripts beside them.
 
-    python -m docs.notebooks
+    python -m docs.notebooks [NAME ...]
 
-A line `# %%` begins a cell of code, `# %% [markdown]` one of text.
+A line `# %%` begins a cell of code, `# %% [markdown]` one of text. Each script is run, and its
+output is stored in the notebook; a training takes some minutes.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -31,13 +37,30 @@ def cells(script: str) -> list[tuple[str, str]]:
     return [(kind, "\n".join(lines).strip("\n")) for kind, lines in found]
 
 
-def notebook(script: str) -> str:
-    """A script as a Jupyter notebook without outputs."""
+def outputs(script: str) -> list[str]:
+    """Run the cells of code in a new folder, and return what each of them prints."""
+    names: dict[str, Any] = {"__name__": "__main__"}
+    printed = []
+    with TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for kind, text in cells(script):
+            if kind == "code":
+                with contextlib.redirect_stdout(io.StringIO()) as output:
+                    exec(compile(text, "cell", "exec"), names)
+                printed.append(output.getvalue())
+    return printed
+
+
+def notebook(script: str, printed: Sequence[str]) -> str:
+    """Return a script as a Jupyter notebook; `printed`: output of each cell of code."""
     made: list[dict[str, Any]] = []
+    left = iter(enumerate(printed, start=1))
     for number, (kind, text) in enumerate(cells(script)):
         cell: dict[str, Any] = {"cell_type": kind, "id": f"cell-{number}", "metadata": {}}
         if kind == "code":
-            cell |= {"execution_count": None, "outputs": []}
+            count, output = next(left)
+            lines = output.splitlines(keepends=True)
+            stream = {"name": "stdout", "output_type": "stream", "text": lines}
+            cell |= {"execution_count": count, "outputs": [stream] if lines else []}
         made.append(cell | {"source": text.splitlines(keepends=True)})
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     whole = {"cells": made, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
@@ -46,4 +69,6 @@ def notebook(script: str) -> str:
 
 if __name__ == "__main__":
     for path in scripts():
-        path.with_suffix(".ipynb").write_text(notebook(path.read_text("utf-8")), "utf-8")
+        if path.stem in sys.argv[1:] or not sys.argv[1:]:
+            source = path.read_text("utf-8")
+            path.with_suffix(".ipynb").write_text(notebook(source, outputs(source)), "utf-8")

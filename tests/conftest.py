@@ -12,13 +12,15 @@ import pytest
 from hypothesis import settings
 
 from tests.support.cpu_time import CpuTimes, argued, costs_of_files, known_costs, rare_tests
-from tests.support.tiers import ProcessWatch, is_needed, mark, skip_if_late
+from tests.support.tiers import ProcessWatch, TimeLimit, is_needed, mark
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Count what the tests cost, and see that their tiers hold."""
     config.pluginmanager.register(CpuTimes(), "cpu_times")
     config.pluginmanager.register(ProcessWatch(), "process_watch")
+    if limit_s := os.environ.get("CAVMARL_QUICK_S"):
+        config.pluginmanager.register(TimeLimit(float(limit_s)), "time_limit")
     # Deadlines fail on a busy machine; without the compiler a few examples are enough.
     settings.register_profile("compiled", deadline=None)
     settings.register_profile("python", deadline=None, max_examples=25)
@@ -43,7 +45,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         mark(item)
         if item.nodeid in rare:
             item.add_marker(pytest.mark.slow)
-    if hasattr(config, "workerinput"):
+    if hasattr(config, "workerinput") and not config.pluginmanager.has_plugin("time_limit"):
         often = (item.nodeid for item in items if not any(item.iter_markers("slow")))
         costs = costs_of_files(often, known_costs())
         items.sort(key=lambda item: -costs[item.nodeid.partition("::")[0]])
@@ -76,11 +78,6 @@ def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     from cavmarl.core.processes import start_python
 
     _let_start(monkeypatch, start_python, get_context("spawn"))
-
-
-def pytest_runtest_setup() -> None:
-    """Heed the time that `make quick` has."""
-    skip_if_late()
 
 
 @pytest.fixture(scope="session")

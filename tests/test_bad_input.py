@@ -126,7 +126,7 @@ def test_missing_actions_are_named_all() -> None:
 
 
 @pytest.mark.parametrize("stranger", ["car_3", "Car_0", "", 0, None, ("car_0",)])
-def test_actions_for_nobody_are_refused(stranger: Any) -> None:
+def test_actions_for_unknown_agents_are_refused(stranger: Any) -> None:
     actions = {**dict.fromkeys(["car_0", "car_1", "car_2"], FINE), stranger: FINE}
     refused(make(), actions, ActionError, repr(stranger), "car_0", "car_2")
 
@@ -307,7 +307,7 @@ def test_the_world_with_the_wrong_value_is_named() -> None:
 
 
 @pytest.mark.parametrize("num_envs", [0, -1, 65_537, 1.5, "2", None, True])
-def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
+def test_an_invalid_number_of_worlds_is_refused(num_envs: Any) -> None:
     with pytest.raises(ConfigError, match="num_envs"):
         make_vec("ring", num_envs=num_envs)
 
@@ -365,9 +365,7 @@ def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
     ],
     ids=repr,
 )
-def test_a_world_that_cannot_be_is_refused(
-    arguments: dict[str, Any], words: tuple[str, ...]
-) -> None:
+def test_an_invalid_world_is_refused(arguments: dict[str, Any], words: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError) as caught:
         parallel_env("ring", **arguments)
     for word in words:
@@ -392,7 +390,7 @@ def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "", "\ud800"])
-def test_names_that_no_file_can_have_are_refused(name: str) -> None:
+def test_names_that_are_invalid_as_files_are_refused(name: str) -> None:
     with pytest.raises(UnknownEnvironmentError):
         parallel_env(name)
     with pytest.raises(PolicyError):  # "" is the folder that one works in

@@ -77,7 +77,7 @@ def test_a_broken_map_is_refused(write: Write, text: str) -> None:
         parallel_env(path)
 
 
-def test_a_map_in_two_parts_is_driven_and_nobody_goes_across(write: Write) -> None:
+def test_a_map_in_two_parts_is_driven_within_each_part(write: Write) -> None:
     env = parallel_env(write(NET), agents=2, background=4, seed=0)
     env.reset()
     network = env.network
@@ -147,7 +147,7 @@ def demanding(write: Write, body: str, **more: str) -> CavEnv:
     ],
     ids=["edge", "map", "route", "trip", "type", "times", "many"],
 )
-def test_demand_that_cannot_be_is_refused_with_its_line(
+def test_invalid_demand_is_refused_with_its_line(
     write: Write, body: str, error: type[Exception], words: tuple[str, ...]
 ) -> None:
     with pytest.raises(error) as caught:

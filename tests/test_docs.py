@@ -90,7 +90,9 @@ def test_installing_is_from_a_checkout_as_long_as_no_index_has_cavmarl() -> None
     by_name = re.compile(r"pip install[^`\n]*\bcavmarl\[")
     texts = [*PAGES, *ROOT.glob("cavmarl/**/*.py"), *ROOT.glob("train/*.py")]
     assert [path.name for path in texts if by_name.search(path.read_text(encoding="utf-8"))] == []
-    assert "checkout" in str(missing("torch", "train"))
+    assert f"pip install -e '{ROOT}[train]'" in str(missing("torch", "train")).replace(
+        "'.", f"'{ROOT}"
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -42,7 +42,7 @@ def test_the_map_can_be_driven_and_has_the_edges_that_are_named(folder: Path) ->
 
 
 @each_folder
-def test_the_card_says_what_the_configuration_says(folder: Path) -> None:
+def test_the_card_agrees_with_the_configuration(folder: Path) -> None:
     config, base_dir = load_config(folder.name)
     card = folder / "README.md"
     check_block(card, "facts", facts(config, maps_or_skip(config, base_dir)))

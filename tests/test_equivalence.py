@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -279,7 +280,7 @@ BEHIND_THE_LAST = """<routes>
 </routes>"""
 
 
-def test_who_enters_behind_the_last_enters_once_however_far_the_last_is(tmp_path: Path) -> None:
+def test_a_departure_behind_a_far_last_vehicle_enters_once(tmp_path: Path) -> None:
     # The zone at the end of the road says where, another one sees the last that is far from there.
     on_a_long_road(tmp_path, BEHIND_THE_LAST)
 
@@ -351,6 +352,13 @@ SLOW_AT_THE_START = """<routes>
 def test_the_mean_speed_behind_the_last_is_that_at_the_end_of_the_lane(tmp_path: Path) -> None:
     # The zone there does not know the slow ones that enter at the start.
     assert on_a_long_road(tmp_path, SLOW_AT_THE_START).traffic_stats().departed > 5
+
+
+def test_solid_lines_hold_in_every_zone(tmp_path: Path) -> None:
+    path = netgenerate(tmp_path / "grid.net.xml", "--grid", "--grid.number", "3", "-L", "2")
+    barred = re.sub(r'(id="[AC][0-2][A-C][0-2]_0")', r'\1 changeLeft="bus"', path.read_text())
+    path.write_text(re.sub(r'(id="B[0-2][A-C][0-2]_1")', r'\1 changeRight="bus"', barred))
+    equal(path, zones=(2, 4), steps=60, crossings=20, overrides={"population.background": 60})
 
 
 @pytest.mark.parametrize("halo_m", [0.0, 12.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -25,17 +26,31 @@ for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
 """
 
 
-def test_there_are_three() -> None:
+def test_there_are_three_notebooks() -> None:
     assert len(SCRIPTS) == 3
 
 
 @each
 def test_a_notebook_is_what_its_script_makes(script: Path) -> None:
     made = script.with_suffix(".ipynb").read_text(encoding="utf-8")
-    assert made == notebook(script.read_text(encoding="utf-8")), "run python -m docs.notebooks"
-    kinds = [cell["cell_type"] for cell in json.loads(made)["cells"]]
-    assert kinds[0] == "markdown"
-    assert kinds.count("code") >= 2
+    found = json.loads(made)["cells"]
+    code = [cell for cell in found if cell["cell_type"] == "code"]
+    printed = [
+        "".join(line for output in cell["outputs"] for line in output["text"]) for cell in code
+    ]
+    source = script.read_text(encoding="utf-8")
+    assert made == notebook(source, printed), f"run python -m docs.notebooks {script.stem}"
+    assert found[0]["cell_type"] == "markdown"
+    assert len(code) >= 2
+
+
+@each
+def test_a_notebook_shows_the_output_of_each_cell_that_prints(script: Path) -> None:
+    made = json.loads(script.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    for cell in made["cells"]:
+        if cell["cell_type"] == "code":
+            prints = re.search(r"^ *print\(", "".join(cell["source"]), re.MULTILINE)
+            assert bool(cell["outputs"]) == bool(prints)
 
 
 @each

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from cavmarl.core.errors import MissingExtraError, missing, require_all
+
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
@@ -29,7 +31,7 @@ def named_extras() -> Iterator[tuple[str, str]]:
                 if node.func.id in ("require", "missing") and len(node.args) == 2:
                     extra = node.args[1]
                     if isinstance(extra, ast.Constant):
-                        yield extra.value, path.relative_to(ROOT).as_posix()
+                        yield str(extra.value), path.relative_to(ROOT).as_posix()
 
 
 def reached(extra: str) -> set[str]:
@@ -42,7 +44,7 @@ def reached(extra: str) -> set[str]:
     return found
 
 
-def test_errors_name_extras_that_there_are() -> None:
+def test_errors_name_existing_extras() -> None:
     named = list(named_extras())
     assert len(named) > 50
     assert not [(extra, file) for extra, file in named if extra not in EXTRAS]
@@ -59,7 +61,7 @@ def extras_of_pages() -> Iterator[tuple[str, str]]:
                 yield extra, path.relative_to(ROOT).as_posix()
 
 
-def test_pages_name_extras_that_there_are() -> None:
+def test_pages_name_existing_extras() -> None:
     named = list(extras_of_pages())
     assert ("train", "README.md") in named
     assert not [(extra, file) for extra, file in named if extra not in EXTRAS]
@@ -72,3 +74,21 @@ def test_all_has_each_task_whose_packages_fit_together() -> None:
 @pytest.mark.parametrize("extra", ["all", "bench"])
 def test_a_developer_has_all_and_what_is_compared_with(extra: str) -> None:
     assert extra in reached("dev")
+
+
+def test_all_missing_modules_are_named_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    needed = {"no_torch": "train", "numpy": "report", "no_sumo": "sumo"}
+    command = re.escape(f"pip install -e '{ROOT}[sumo,train]'")
+    with pytest.raises(MissingExtraError, match=f"'no_torch' and 'no_sumo' are .*: {command}"):
+        require_all(needed)
+    monkeypatch.chdir(ROOT)
+    with pytest.raises(MissingExtraError, match=r"pip install -e '\.\[train\]'"):
+        require_all({"no_torch": "train"})
+
+
+def test_a_wheel_is_extended_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cavmarl.core.errors.__file__", "/site-packages/cavmarl/core/errors.py")
+    assert "pip install 'cavmarl[train]'" in str(missing("torch", "train"))

@@ -13,7 +13,7 @@ from tests.support.generated import check_block
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_the_page_tells_the_licence_of_each_package() -> None:
+def test_the_page_has_the_licence_of_each_package() -> None:
     rows = list(licences())
     if not {"ray", "torchrl", "stable-baselines3"} <= {name for name, *_ in rows}:
         pytest.skip("an installation of less than cavmarl[dev]: `make test` has all of it")

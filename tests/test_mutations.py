@@ -7,7 +7,7 @@ import pytest
 from tests.mutations import ROOT, TABLE, Mutation, mutated, read_table
 
 
-def test_no_row_is_passed_over() -> None:
+def test_every_row_of_the_page_is_read() -> None:
     numbers = [mutation.number for mutation in read_table()]
     assert numbers == list(range(1, len(numbers) + 1))
     assert TABLE.read_text().count("\n| ") == len(numbers) + 1, "each row can be read"

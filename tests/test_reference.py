@@ -30,7 +30,7 @@ from tests.naive.kinematics import clip_control
 IDM_DEFAULTS = (idm.ACCEL_MAX, idm.DECEL_COMFORT, idm.JAM_DISTANCE_M, idm.TIME_HEADWAY_S)
 
 
-def test_defaults_are_theirs() -> None:
+def test_defaults_equal_highway_env() -> None:
     assert IDMVehicle.COMFORT_ACC_MAX == idm.ACCEL_MAX
     assert -IDMVehicle.COMFORT_ACC_MIN == idm.DECEL_COMFORT
     assert IDMVehicle.DISTANCE_WANTED == idm.JAM_DISTANCE_M
@@ -117,7 +117,7 @@ def our_acceleration(car: IDMVehicle | None, front: IDMVehicle | None) -> float:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_acceleration_is_theirs(seed: int) -> None:
+def test_acceleration_equals_highway_env(seed: int) -> None:
     cars = random_road(seed).vehicles
     for car in cars:
         for front in (None, *cars):
@@ -141,7 +141,7 @@ def our_mobil(car: IDMVehicle, lane: tuple[str, str, int], mandatory: bool) -> b
     )
 
 
-def test_lane_changes_are_theirs() -> None:
+def test_lane_changes_equal_highway_env() -> None:
     decisions = []
     for seed in range(60):
         road = random_road(seed)
@@ -152,7 +152,7 @@ def test_lane_changes_are_theirs() -> None:
     assert 0.05 < np.mean(decisions) < 0.95
 
 
-def test_lane_changes_for_a_route_are_theirs() -> None:
+def test_lane_changes_for_a_route_equal_highway_env() -> None:
     decisions = []
     for seed in range(60):
         road = random_road(seed)
@@ -172,7 +172,7 @@ LANES = {
 
 
 @pytest.mark.parametrize("name", LANES)
-def test_controllers_are_theirs(name: str) -> None:
+def test_controllers_equal_highway_env(name: str) -> None:
     rng = np.random.default_rng(3)
     lane = LANES[name]
     network = RoadNetwork()

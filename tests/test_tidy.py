@@ -62,7 +62,7 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 112_700
+PACKAGE_LINES = 115_500
 REACHABLE_LINES = 74_500  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
@@ -83,7 +83,7 @@ PERSONS_AT_MOST = {"cavmarl": 2, "docs": 2}
 PHRASES = re.compile(
     r"\b(likewise|one that|those that|so many|everybody|of which)\b|\bas of `", re.IGNORECASE
 )
-PHRASES_AT_MOST = 350
+PHRASES_AT_MOST = 40
 
 WORDS_OF_A_PAGE = 2500  # outside of tables, generated blocks and code
 LONG_PAGES: set[str] = set()
@@ -218,7 +218,7 @@ def words_of(page: str) -> int:
     return sum(len(line.split()) for line in prose.splitlines() if not line.startswith("|"))
 
 
-def test_dear_tests_are_slow_but_for_those_that_are_argued_for() -> None:
+def test_expensive_tests_are_slow_unless_they_are_argued_for() -> None:
     costs = {"a[1]": 1.2, "a[2]": 0.2, "a[3]": 0.2, "b[1]": 1.9, "b[2]": 0.0, "c": 9.0}
     assert rare_tests(costs, costs) == {"a[3]", "c"}
     assert rare_tests(costs, costs, frozenset({"c"})) == {"a[3]"}
@@ -237,12 +237,12 @@ def test_long_files_come_first_and_small_tiers_read_only_their_own() -> None:
         assert all(is_needed(path, ROOT, expression) for path in files)
 
 
-def test_tests_that_are_argued_for_are_dear() -> None:
+def test_argued_tests_are_expensive() -> None:
     alone = [name for name in argued() if not name.endswith("[*]")]
     assert [name for name in alone if known_costs().get(name, 0.0) <= ARGUED_S] == []
 
 
-def test_the_files_of_costs_and_of_argued_ones_name_tests_that_are_there() -> None:
+def test_the_lists_of_costs_and_argued_tests_name_existing_tests() -> None:
     for name in (*known_costs(), *argued()):
         path, test, *_ = name.split("::")
         function = test.split("[", 1)[0]

@@ -66,7 +66,9 @@ def test_a_tutorial_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.slow  # it trains
 @pytest.mark.parametrize("name", sorted(DEAR))
-def test_a_dear_tutorial_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_expensive_tutorial_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     run_page(name)
 

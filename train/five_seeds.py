@@ -3,16 +3,15 @@
     python train/five_seeds.py --config configs/train/merge.yaml
     python train/five_seeds.py --config configs/train/tasks.yaml --env intersection exit --seeds 0 1
 
-The program trains with each seed (`ppo.py`, one core each) and evaluates all drivers and the
-scripted ones on the same held-out episodes. It writes into the folder: `table.md`, `result.json`,
-`curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with its own
-manifest. Finished seeds are not trained again; interrupted ones resume from their checkpoints.
-Trainings end with this program, however it ends.
+The program trains with each seed (`ppo.py`, one core each) and evaluates the trained and the
+scripted drivers on the same held-out episodes. It writes into the folder: `table.md`,
+`result.json`, `curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with
+its own manifest. Finished seeds are not trained again; interrupted seeds resume from their
+checkpoints. Trainings end with this program, however it ends.
 
-The interval of the trained drivers is that of the mean over training seeds; the interval of a
-scripted driver is that of the mean over evaluation runs. Both are 95 % by Student's t, clipped to 0
-and 100 % for shares. `alone` is `idm` without any other vehicle: an upper bound, as long as other
-causes of failure are not the driver's fault.
+Trained drivers have the interval of the mean over training seeds, scripted drivers the interval of
+the mean over evaluation runs. Both are 95 % by Student's t, clipped to 0 and 100 % for shares.
+`alone` is `idm` without any other vehicle: an upper bound, unless `idm` itself causes failures.
 """
 
 from __future__ import annotations

@@ -137,7 +137,7 @@ def rows_of(batch: TensorDict) -> TensorDict:
 
 
 class Learner:
-    """Improves the network by batches of steps.
+    """Trains the network with batches of steps.
 
     Args:
         network: network shared by all agents.
@@ -281,7 +281,7 @@ def train(args: Args) -> Path:
 
 
 def learn(args: Args, folder: RunFolder, worlds: CavTorchRLEnv, network: ActorCritic) -> int:
-    """Improve the network by steps of the worlds; return the run's number of decisions."""
+    """Train the network with steps of the worlds; return the run's number of decisions."""
     learner, curve = Learner(network, args), Curve(folder)
     decisions = folder.began.agent_steps
     if folder.began.parts:  # the collector's worlds cannot be restored: they begin new episodes

@@ -1,12 +1,12 @@
-"""The value of messages: drivers that learnt with and without them, on the blind junction.
+"""The value of messages: drivers trained with and without messages on the blind junction.
 
     python train/messages.py
 
 The program trains two arms with each seed, as `five_seeds.py` does: `on` with all messages and
-`off` with none (`v2x.channel.loss=1`, so that observations keep their shape). Both drive the same
-episodes, `on` also with increasing loss. The folder gets `table.md`, `result.json`, `loss.svg` and
-the runs. All intervals are 95 % by Student's t over the training seeds, clipped to 0 and 100 % for
-shares; the arms are paired by seed.
+`off` without messages (`v2x.channel.loss=1`, so that observations keep their shape). Both arms
+drive the same episodes, `on` also with increasing loss. The folder gets `table.md`, `result.json`,
+`loss.svg` and the runs. All intervals are 95 % by Student's t over the training seeds, clipped to 0
+and 100 % for shares; the arms are paired by seed.
 """
 
 from __future__ import annotations

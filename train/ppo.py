@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from cavmarl.cli.output import parse_settings
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.extensions import import_plugins
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning import options
 from cavmarl.learning.actor_critic import ActorCritic
@@ -56,6 +57,7 @@ class Args:
     background: Annotated[int, "background vehicles per world; -1: the environment's"] = -1
     num_envs: Annotated[int, "number of parallel worlds"] = 16
     settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
+    plugins: Annotated[str, "modules with terms, sensors, … of your own, comma-separated"] = ""
     zones: Annotated[int, "zones per world; 0: the environment's"] = 0
     backend: Annotated[str, "place of the worlds: local, processes:N, nodes:N, ray:N, …"] = ""
     workers: Annotated[int, "short form: N for --backend processes:N; 0: see --backend"] = 0
@@ -105,9 +107,9 @@ class Args:
         options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
         options.check_device(self.device)
         if self.residual and self.imitation_weight:
-            raise ConfigError("--residual: not with --imitation-weight; it starts as that driver")
+            raise ConfigError("--residual: leave out --imitation-weight; it starts as that driver")
         if self.shared and self.mappo:
-            raise ConfigError("--shared: not with --mappo, whose critic has other inputs")
+            raise ConfigError("--shared: leave out --mappo, whose critic has other inputs")
 
     @property
     def folder(self) -> Path:
@@ -146,13 +148,13 @@ class Batch:
 
 
 class Collector:
-    """Drives the worlds with a network and stores the data, with the times.
+    """Drives the worlds with a network, stores the data, and measures times.
 
     If the critic sees states, worlds restart in the next step: otherwise, the last state of an
     episode would be overwritten.
 
     Attributes:
-        opponents: drive some of the vehicles; nothing is learnt from these.
+        opponents: drivers of some vehicles, whose data are not used for training.
     """
 
     def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
@@ -368,7 +370,7 @@ class Run:
             self.learner.scales.start(self.config, policy_files(args.start)[0].parent)
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
         if not folder.began.parts:
-            self.save()  # a run that is killed early restarts from here
+            self.save()  # a run that is killed before its first checkpoint restarts from here
         if parts := folder.resume():
             self.learner.load(parts["learner"])
             self.collector.load(parts["collector"])
@@ -411,8 +413,11 @@ class Run:
 @contextmanager
 def opened(args: Args) -> Iterator[Run]:
     """Open a run with its worlds and its folder, and close them at the end."""
+    plugins = [word for word in args.plugins.split(",") if word]
+    import_plugins(plugins)
     args = options.with_form_of(args, args.start)
     own = driver_keys(args.start) if args.start else {}
+    given = parse_settings([word for word in args.settings.split(",") if word], plugins)
     vec = make_vec(
         args.env,
         num_envs=args.num_envs,
@@ -421,7 +426,7 @@ def opened(args: Args) -> Iterator[Run]:
         workers=args.workers or None,
         agents=args.agents or None,
         background=None if args.background < 0 else args.background,
-        overrides=own | parse_settings([word for word in args.settings.split(",") if word]),
+        overrides=own | given,
         autoreset_mode=AutoresetMode.NEXT_STEP if args.mappo else AutoresetMode.SAME_STEP,
         copy=False,
     )

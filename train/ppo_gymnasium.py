@@ -88,7 +88,7 @@ def make_rows(args: Args) -> Any:
 
 
 class Learner:
-    """Collects steps of all rows and improves the network by them.
+    """Collects steps of all rows and trains the network with them.
 
     Args:
         rows: rows from `make_rows`.
@@ -172,7 +172,7 @@ class Learner:
                     "log_probs": log_probs,
                     "active": self._active,
                     "values": self._network.value(before),
-                    # final observations are included, so that the value of a cut trip is known
+                    # Include final observations, so that the value of a cut trip is known.
                     "next_values": self._network.value(self._observations),
                     "rewards": torch.from_numpy(rewards.copy()),
                     "ended": torch.from_numpy(ended.copy()),

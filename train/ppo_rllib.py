@@ -143,7 +143,7 @@ def make_algorithm(args: Args, network: NetworkConfig) -> PPO:
             grad_clip=0.5,
             grad_clip_by="global_norm",
             train_batch_size_per_learner=world_steps,
-            # In decisions, although the batch is counted in world steps, which are the upper limit.
+            # Minibatches are counted in decisions, and limited by the batch in world steps.
             minibatch_size=min(max(decisions // args.minibatches, 2), world_steps),
             num_epochs=args.epochs,
         )

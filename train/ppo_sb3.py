@@ -2,8 +2,8 @@
 
     python train/ppo_sb3.py --env merge --minutes 8
 
-The program uses the library's own PPO, learning rate, batches and network; only the adapter
-(`cavmarl.adapters.sb3_vec_env`) is cavmarl's. The run's folder has stable-baselines3's `model.zip`,
+The program uses the library's own PPO, learning rate, batches and network; only the adapter is part
+of cavmarl (`cavmarl.adapters.sb3_vec_env`). The run's folder has stable-baselines3's `model.zip`,
 `progress.csv` with the columns of `ppo.py`, the same network as `model.safetensors` and
 `config.json`, which `cavmarl evaluate --policy FOLDER` reads, and `manifest.json` with the
 conditions of the training. `--resume FOLDER` continues bit for bit from `checkpoint.pt`.
@@ -72,7 +72,7 @@ class Args:
 
 
 class Curve(BaseCallback):
-    """Writes a line per update and checkpoints; stops the run after its time.
+    """Writes progress and checkpoints, and stops the run at its time limit.
 
     Trips cut by the horizon do not count, as in `ppo.py`.
     """
@@ -112,7 +112,7 @@ class Curve(BaseCallback):
                 self._ended.append((info["episode"]["r"], info["is_success"]))
                 self._trips += 1
         in_time = self._folder.has_time(self._minutes)
-        if not in_time:  # the library returns here, before it stores the present observation
+        if not in_time:  # the library stops before it stores the present observation
             self.model._last_obs = self.locals["new_obs"]
             self.model._last_episode_starts = self.locals["dones"]
         return in_time

@@ -1,4 +1,4 @@
-"""BenchMARL's tasks: every entry of `envs/`, via `cavmarl.adapters.torchrl_env`.
+"""The entries of `envs/` as tasks of BenchMARL, via `cavmarl.adapters.torchrl_env`.
 
 Importing this module loads BenchMARL and torch; `import cavmarl` does not import it.
 """
@@ -23,17 +23,15 @@ DECIDED = ("num_envs", "device", "action.kind")
 
 
 class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separate environment
-    """One environment; BenchMARL chooses the number of worlds, the device and the kind of action.
+    """An environment; BenchMARL chooses the number of worlds, the device and the kind of action.
 
-    In `respawn` worlds, the default, an agent whose vehicle ended gets a new one. BenchMARL's
-    losses have no mask: they also count steps in which an agent has no vehicle, with an observation
-        and a
-    reward of 0. Such steps are rare in `respawn` worlds, and frequent in `closed` and `open`
-    worlds.
+    In `respawn` worlds, the default, an agent gets a new vehicle when its vehicle has ended.
+    BenchMARL's losses have no mask: steps without a vehicle count, too, with an observation and a
+    reward of 0. They are rare in `respawn` worlds, and frequent in `closed` and `open` worlds.
 
     Args:
-        name: name of the task; in lower case, the name of the environment, unless `config` has
-            `env`.
+        name: name of the task. Unless `config` has `env`, its lower-case form is the name of the
+            environment.
         config: keyword arguments of `CavTorchRLEnv`.
 
     Raises:
@@ -73,7 +71,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         return True
 
     def supports_discrete_actions(self) -> bool:
-        """Return True: meta-actions, or the grid of an environment that has one."""
+        """Return True: meta-actions, or the grid of an environment with a grid of actions."""
         return True
 
     def max_steps(self, env: CavTorchRLEnv) -> int:
@@ -113,7 +111,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
 
     @staticmethod
     def _of_agents(env: CavTorchRLEnv, part: str) -> Composite:
-        """Return the spec of one world with only this part of the agents' entries."""
+        """Return the spec of one world with only the entry `part` of the agents."""
         spec = env.full_observation_spec_unbatched.clone()
         for other in set(spec[GROUP].keys()) - {part}:
             del spec[GROUP, other]
@@ -131,11 +129,11 @@ class CavTask(Task):  # type: ignore[misc] # only installed in a separate enviro
 
     @staticmethod
     def associated_class() -> type[CavTaskClass]:
-        """Return the class of `get_task`'s results."""
+        """Return the class of the results of `get_task`."""
         return CavTaskClass
 
     def get_from_yaml(self, path: str | None = None) -> CavTaskClass:
-        """Return the task of the entry, or with the keyword arguments in a YAML file."""
+        """Return the task with the defaults of its entry, or with the arguments in a YAML file."""
         if path is None:
             return CavTaskClass(self.name)
         found: CavTaskClass = super().get_from_yaml(path)

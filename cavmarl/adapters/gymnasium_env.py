@@ -1,4 +1,4 @@
-"""Gymnasium's single-agent form: one vehicle of a world."""
+"""One vehicle of a world as a single-agent environment of Gymnasium."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
 
     The entry's other agents become background vehicles, so that the traffic has the same density.
     Infos also have highway-env's `speed` in m/s and `crashed`, and `is_success` (the vehicle has
-    arrived). For a vehicle that has left, `speed` is its last speed.
+    arrived). After the vehicle has left, `speed` is its last speed.
 
     An episode is the trip of one vehicle. In `closed` worlds, the default, the other vehicles leave
-    one by one; in `open` and `respawn` worlds, new ones replace them.
+    one by one; in `open` and `respawn` worlds, new vehicles replace them.
 
     Args:
         env: see `parallel_env`.
         render_mode: `human`, `rgb_array` or None.
-        background: number of other vehicles; None: all of the entry but one.
+        background: number of other vehicles; None: one vehicle less than the entry has.
         overrides: see `parallel_env`.
-        config: the same, nested as in an env.yaml: `{"sensors": {"lidar": {"rays": 8}}}`.
+        config: more overrides, nested as in an env.yaml: `{"sensors": {"lidar": {"rays": 8}}}`.
         action_kind: sets action.kind: `continuous`, `discrete` or `grid`.
         arguments: other keyword arguments of `parallel_env`.
 
@@ -92,7 +92,7 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
         return observations[EGO], self._info(infos[EGO])
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Let the vehicle act."""
+        """Run one step with the vehicle's action."""
         observations, rewards, _, truncations, infos = self._env.step({EGO: action})
         ended = bool(infos[EGO]["vehicle_done"])  # a seat itself does not end
         cut = truncations[EGO] and not ended

@@ -1,4 +1,4 @@
-"""Gymnasium's vector form: all agents as the rows of a `VectorEnv`."""
+"""All agents as the rows of a `VectorEnv` of Gymnasium."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ DECIDED = ("agents", "population.budget")
 
 
 class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
-    """The agents of one or more worlds as rows, for programs written for single-agent vectors.
+    """The agents of one or more worlds as rows, for programs for vectors of single-agent worlds.
 
     A row is an agent of a world; row `w · A + a` is agent a of world w. In `respawn` worlds, the
-    default, a row whose vehicle ended gets a new one as soon as there is room. In `closed` worlds
-    it waits until the world resets. In `open` worlds each row is used once per episode, from the
-    time when its agent enters.
+    default, a row gets a new vehicle as soon as there is room. In `closed` worlds, it waits until
+    the world resets. In `open` worlds, each row is used once per episode, from the time when its
+    agent enters.
 
-    Rows end individually (terminations), or at the horizon together (truncations).
+    Rows end individually (terminations), or all at the horizon (truncations).
     `infos["active"]` marks the rows that act next. Observations of the other rows are 0, and their
     actions are not read. With `NEXT_STEP` or `DISABLED`, a row that has just ended shows its last
     observation. With `SAME_STEP`, that observation is in `infos["final_obs"]`, and its last infos
     in `infos["final_info"]`. Infos also have every term by its name.
 
     With `DISABLED`, `reset(options={"reset_mask": …})` takes a mask of rows (num_envs,). A world
-    that is over resets if any of its rows is chosen, another world if all of them are. A row that
-    ended in a world that continues waits as usual, with observations of 0 until it has a vehicle.
-    The horizon truncates every row of a world, including those without a vehicle.
+    that is over resets if any of its rows is chosen. A world that continues resets if all of its
+    rows are chosen; otherwise its chosen rows must have ended, and wait as usual, with observations
+    of 0 until they have a vehicle. The horizon truncates all rows of a world.
 
     The frame of a row is that of its world.
 
@@ -45,7 +45,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         env: see `make_vec`.
         num_envs: number of rows in all worlds.
         num_worlds: number of worlds.
-        autoreset_mode: when rows and worlds that ended begin again.
+        autoreset_mode: when rows and worlds restart after their end.
         max_episode_steps: Gymnasium's name of `max_cycles`.
         render_mode: `rgb_array` or None.
         action_kind: sets action.kind: `continuous`, `discrete` or `grid`.
@@ -70,7 +70,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        self.closed = True  # Gymnasium closes it when it is freed, even if it was not completed
+        self.closed = True  # Gymnasium calls close() on garbage collection, even if __init__ failed
         refuse_decided(DECIDED, overrides, arguments)
         wanted = {"population.mode": "respawn", **(overrides or {})}
         if action_kind is not None:
@@ -131,7 +131,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
     ) -> tuple[
         Observations, NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:
-        """Let every row act."""
+        """Run one step with the actions of all rows."""
         actions = np.asarray(actions)
         observations, rewards, ended, cut, infos = self._vec.step(
             actions.reshape(*self._shape, *actions.shape[1:])
@@ -141,7 +141,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
             {"active": infos["mask"], "vehicle_done": infos["vehicle_done"], **terms}
         )
         if self.autoreset_mode is AutoresetMode.DISABLED:
-            # Rows without a vehicle are truncated, too: a world may end when none has one.
+            # Truncate rows without a vehicle, too: a world may end when no row has a vehicle.
             cut = cut | (infos["episode_over"][:, None] & ~ended)
         over = self._rows(ended | cut)
         self._over = np.stack([over, infos["episode_over"].repeat(self._shape[1])])
@@ -161,7 +161,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         )
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a frame (height, width, 3) for each row, that of its world."""
+        """Return the frame (height, width, 3) of its world for each row."""
         frames = self._vec.render()
         if frames is None:
             return None
@@ -175,7 +175,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         """Return the worlds (W,) that reset for these rows.
 
         Raises:
-            ConfigError: `rows` is not a mask, or has only a part of a world that continues.
+            ConfigError: `rows` is not a mask, or selects only some active rows of a world.
         """
         if rows.shape != (self.num_envs,) or rows.dtype != np.bool_:
             raise ConfigError(
@@ -188,8 +188,8 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         parts = chosen & ~ended & ~worlds[:, None]
         if parts.any():
             raise ConfigError(
-                f"reset_mask has row {int(parts.argmax())}, which has not ended: its world "
-                f"continues for the other rows; choose all {self._shape[1]} rows of the world"
+                f"reset_mask selects row {int(parts.argmax())}, which has not ended, but not all "
+                f"rows of its world: select all {self._shape[1]} rows of the world"
             )
         return worlds
 
@@ -214,15 +214,15 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
 def _rows_per_world(
     env: str | Path, overrides: Mapping[str, Any], num_envs: int, num_worlds: int
 ) -> dict[str, int]:
-    """Return the keys that give each world its share of the rows.
+    """Return the keys of the configuration that distribute the rows over the worlds.
 
     Raises:
         ConfigError: the rows cannot be divided evenly.
     """
     if min(num_envs, num_worlds) < 1 or num_envs % num_worlds:
         raise ConfigError(
-            f"num_envs = {num_envs}: must be a multiple of num_worlds = {num_worlds}, as every "
-            "world has the same number of rows"
+            f"num_envs = {num_envs}: must be a multiple of num_worlds = {num_worlds}, because "
+            "every world has the same number of rows"
         )
     rows = num_envs // num_worlds
     if overrides["population.mode"] == "open":

@@ -1,4 +1,4 @@
-"""highway-env's tasks under its own names, for scripts in which only the id changes.
+"""highway-env's tasks: scripts for highway-env only have to change the id of the environment.
 
 `gymnasium.make("cavmarl-highway/merge-v0", config={...})` accepts highway-env's `config` with its
 names and units, and returns its observations, actions, rewards and infos. Cars drive on maps of
@@ -21,7 +21,7 @@ from cavmarl.adapters.highway_tasks import COMMON, DRAWING_KEYS, REWARDS, TASKS,
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import DRIVER_AGENT
 
-# highway-env's type of observation → the sensor, and its settings that are on by default there.
+# highway-env's type of observation → the sensor, and highway-env's default settings for it.
 OBSERVATIONS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "Kinematics": ("kinematics", {"vehicles_count": 5}),
     "OccupancyGrid": (
@@ -52,13 +52,14 @@ _OFF: Mapping[str, Any] = {
 class HighwayEnv(CavEgoEnv):
     """A task of highway-env as a Gymnasium environment.
 
-    Rewards are highway-env's named rewards, weighted by its keys. In all tasks,
-    `reward_speed_range` scales the speed for `high_speed_reward`. `info["rewards"]` has each
-    reward. A vehicle that leaves the road ends the episode, independent of `offroad_terminal`.
+    The reward is the sum of highway-env's named rewards, weighted by its keys; `info["rewards"]`
+    has each named reward. In all tasks, `reward_speed_range` scales the speed for
+    `high_speed_reward`. If the vehicle leaves the road, the episode ends; `offroad_terminal` is
+    ignored.
 
     Args:
         task: a key of `TASKS`.
-        config: highway-env's keys, which replace those of the task.
+        config: highway-env's keys, which replace the defaults of the task.
         render_mode: see `CavEgoEnv`.
         arguments: other keyword arguments of `parallel_env`; `overrides` has keys of env.yaml.
 
@@ -67,8 +68,7 @@ class HighwayEnv(CavEgoEnv):
         action_type: has `actions_indexes`, the number of each named action.
 
     Raises:
-        ConfigError: the task does not have a key, or a type does not exist; the message lists
-            those that exist.
+        ConfigError: a key or a type is unknown; the message lists the known ones.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class HighwayEnv(CavEgoEnv):
         return observation[self._seen], info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Let the vehicle act; the reward is highway-env's."""
+        """Run one step with the vehicle's action; the reward is highway-env's."""
         taken = self._actions.translate(action)
         changes = self._actions.changes_lane(action)
         observation, _, ended, cut, info = super().step(taken)
@@ -150,7 +150,7 @@ class HighwayEnv(CavEgoEnv):
         return float((total - worst) / (best - worst)) if best > worst else float(total)
 
     def _lane_and_merging(self) -> tuple[float, float]:
-        """Return how far right the lane is, 0 to 1, and by how much merging cars are too slow."""
+        """Return how far right the lane is, 0 to 1, and the sum of merging cars' speed deficits."""
         network = self._env.network
         rows = self._env.worlds.simulation.vehicles(0)
         own = rows[rows["driver"] == DRIVER_AGENT]
@@ -179,7 +179,7 @@ class _Actions:
         space: the action space.
         numbers: named action → its number.
 
-    Raises ConfigError: a type or a setting does not exist.
+    Raises ConfigError: a type or a setting is unknown.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -197,7 +197,7 @@ class _Actions:
         self._pedals = bool(settings.get("longitudinal", True))
         self._wheel = bool(settings.get("lateral", True))
         if not (self._pedals or self._wheel):
-            raise ConfigError("action.longitudinal, action.lateral: one of them must be true")
+            raise ConfigError("action.longitudinal, action.lateral: at least one must be true")
         self.numbers: dict[str, int] = {}
         self._meta: list[int] = []
         self._choices: list[tuple[float, float]] = []
@@ -230,7 +230,7 @@ class _Actions:
         return np.array(pair, dtype=np.float32)
 
     def changes_lane(self, action: Any) -> bool:
-        """Return whether a meta-action asks for another lane."""
+        """Return whether a meta-action requests a lane change."""
         return bool(self._meta) and self._meta[int(action)] in (0, 2)
 
     def _make_meta(self, settings: Mapping[str, Any]) -> None:
@@ -258,7 +258,7 @@ class _Actions:
 def _whole_config(
     task: str, found: HighwayTask, config: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """Return all keys of a task, with those of the caller."""
+    """Return all keys of a task with their values, some of them replaced by the caller."""
     if config is not None and not isinstance(config, Mapping):
         raise ConfigError(f"config = {config!r}: must be a mapping of highway-env's keys")
     whole = {**COMMON, **found.config}
@@ -271,7 +271,7 @@ def _whole_config(
     if whole["controlled_vehicles"] != 1:
         raise ConfigError(
             f"controlled_vehicles = {whole['controlled_vehicles']!r}: must be 1 in this view; "
-            f"cavmarl.parallel_env({found.entry!r}) drives many"
+            f"use cavmarl.parallel_env({found.entry!r}) for several agents"
         )
     return whole
 
@@ -294,7 +294,7 @@ def _clock(config: Mapping[str, Any]) -> dict[str, Any]:
     if policy <= 0.0 or ticks < policy:
         raise ConfigError(
             f"policy_frequency = {policy:g}, simulation_frequency = {ticks:g}: must be above 0, "
-            "and the second must not be below the first"
+            "and simulation_frequency must not be below policy_frequency"
         )
     duration = float(config["duration"])
     if not 0.0 < duration < math.inf:
@@ -321,10 +321,10 @@ def _map(task: HighwayTask, config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _half(name: str, settings: Mapping[str, Any], usual: float) -> float:
-    """Return the value of ±1."""
+    """Return the upper limit of an action, which has the value 1."""
     low, high = settings.get(name, (-usual, usual))
     if low != -high or high <= 0.0:
-        raise ConfigError(f"action.{name} = [{low}, {high}]: must be symmetric, as [-5, 5]")
+        raise ConfigError(f"action.{name} = [{low}, {high}]: must be symmetric, like [-5, 5]")
     return float(high)
 
 
@@ -332,5 +332,5 @@ def _refuse_unknown(where: str, given: Mapping[str, Any], known: Iterable[str]) 
     for key in given:
         if key not in known:
             raise ConfigError(
-                f"{where}.{key}: no such key; must be one of {', '.join(sorted(set(known)))}"
+                f"{where}.{key}: unknown key; must be one of {', '.join(sorted(set(known)))}"
             )

@@ -1,7 +1,7 @@
 """highway-env's tasks: the entry of each task, and the default values of its `config`.
 
-The values are those of highway-env 1.10, except for observations that this package does not have:
-`two-way` and `u-turn` have times to collision there, and `Kinematics` here.
+The values are taken from highway-env 1.10, except for observations that this package does not have:
+`two-way` and `u-turn` have times to collision in highway-env, and `Kinematics` here.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-# Common to all tasks.
+# Keys of all tasks.
 COMMON: Mapping[str, Any] = {
     "observation": {"type": "Kinematics"},
     "action": {"type": "DiscreteMetaAction"},
@@ -22,7 +22,7 @@ COMMON: Mapping[str, Any] = {
     "collision_reward": -1,
 }
 
-# Settings of highway-env's rendering; they are accepted and ignored.
+# Settings for rendering in highway-env, which are accepted and ignored.
 DRAWING_KEYS = frozenset(
     (
         "screen_width", "screen_height", "centering_position", "scaling", "show_trajectories",
@@ -30,7 +30,7 @@ DRAWING_KEYS = frozenset(
     )
 )  # fmt: skip
 
-# Named rewards of a task; its config has their weights.
+# Named rewards of tasks; `config` has their weights.
 REWARDS = (
     "collision_reward",
     "right_lane_reward",
@@ -48,11 +48,11 @@ class HighwayTask:
     """A task of highway-env.
 
     Attributes:
-        entry: the environment in `envs/` of the task.
+        entry: the environment of the task in `envs/`.
         config: highway-env's keys, in addition to `COMMON`.
         keys: keys of `env.yaml` that change the entry for the task.
-        worst: rewards of the smallest sum, which `normalize_reward` maps to 0.
-        best: rewards of the largest sum, which it maps to 1.
+        worst: rewards with the smallest sum, which `normalize_reward` maps to 0.
+        best: rewards with the largest sum, which `normalize_reward` maps to 1.
         maps: number of lanes → map of the entry, if `lanes_count` selects one.
         merging: edge from which vehicles merge.
     """

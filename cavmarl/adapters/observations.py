@@ -1,4 +1,4 @@
-"""Common parts of the views: the form of observations, fixed keys, and specs with a horizon."""
+"""Parts shared by the views: the form of observations, fixed keys, and specs with a horizon."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def refuse_decided(keys: Iterable[str], *given: Mapping[str, Any] | None) -> Non
 
 
 class WithSpec:
-    """Base of a view whose Gymnasium spec has the horizon of this environment.
+    """Base of a view whose Gymnasium spec has the horizon of the environment.
 
-    The registered ids have no horizon, as Gymnasium would also cut longer episodes at it.
+    The registered ids have no horizon, because Gymnasium would truncate longer episodes there.
     """
 
     _spec: EnvSpec | None = None

@@ -22,7 +22,7 @@ Step = tuple[
 ]
 
 
-class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an environment of its own only
+class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only installed separately
     """One world; `config` has the keyword arguments of `parallel_env`.
 
         PPOConfig().environment(CavRllibEnv, env_config={"env": "town", "agents": 25})
@@ -30,8 +30,8 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an
     Agents enter and leave in every population. All ids of an episode are declared in advance, and
     an id that has ended does not return. The end of the episode (`__all__`) is a truncation if the
     horizon cut an agent. RLlib ends an episode as soon as all agents known to it have ended, even
-    if other agents enter in the same step. They are the agents of its next episode, in which the
-    same world continues.
+    if new agents enter in the same step. The next episode then continues the same world with the
+    new agents.
 
     In `respawn` worlds an id is a seat: its vehicle ends with `infos[agent]["vehicle_done"]`, but
     RLlib's value estimates continue across it. Learning is therefore more exact in `closed` and
@@ -59,7 +59,7 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode; without a seed, that of the agents that entered last, if any."""
+        """Begin an episode; without a seed, continue the world if agents have just entered."""
         if self._entered is None or seed is not None:
             self._entered = self._env.reset(seed=seed, options=options)
         (observations, infos), self._entered = self._entered, None
@@ -67,7 +67,7 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an
         return observations, infos
 
     def step(self, action_dict: Mapping[str, Any]) -> Step:
-        """Let every agent act."""
+        """Run one step with the actions of all agents."""
         known, step = set(self.agents), self._env.step(action_dict)
         self.agents = self._env.agents
         if self.agents and known.isdisjoint(self.agents):
@@ -92,5 +92,5 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an
 
 
 def _only(agents: Collection[str], part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of these agents."""
+    """Return the entries of some agents."""
     return {agent: value for agent, value in part.items() if agent in agents}

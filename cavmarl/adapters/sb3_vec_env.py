@@ -1,4 +1,4 @@
-"""stable-baselines3's `VecEnv`: every agent of every world is one of its environments.
+"""All agents of all worlds as the environments of a `VecEnv` of stable-baselines3.
 
 Importing this module loads stable-baselines3 and torch; `import cavmarl` does not import it.
 """
@@ -24,7 +24,7 @@ try:
 except ModuleNotFoundError as error:
     raise missing(error.name, "train") from error
 
-DECIDED = ("autoreset_mode", "copy")  # stable-baselines3 resets in the same step and keeps views
+DECIDED = ("autoreset_mode", "copy")  # stable-baselines3 resets in the same step; it keeps arrays
 ARRIVAL = TERMS.index("arrival")
 
 Indices = int | Iterable[int] | None
@@ -33,9 +33,9 @@ Indices = int | Iterable[int] | None
 class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
     """W worlds with A agents each as W · A environments that share one policy; row w · A + a.
 
-    In `respawn` worlds, the default, a row whose vehicle ended gets a new one as soon as there is
-    room. In `closed` worlds it waits until the world resets. In `open` worlds each row is used once
-    per episode, from the time when its agent enters.
+    In `respawn` worlds, the default, a row gets a new vehicle as soon as there is room. In `closed`
+    worlds, it waits until the world resets. In `open` worlds, each row is used once per episode,
+    from the time when its agent enters.
 
     A row that ended is `done`. Its info has its last observation as `terminal_observation`, whether
     the horizon cut it as `TimeLimit.truncated`, and whether it arrived as `is_success`. While a row
@@ -49,7 +49,7 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
         arguments: other keyword arguments of `make_vec`.
 
     Attributes:
-        spec: Gymnasium's spec of the entry's rows; None if there is no such id.
+        spec: Gymnasium's spec of the entry's rows; None if the entry has no id in Gymnasium.
 
     Raises:
         ConfigError: a key, a value or a combination is not possible.
@@ -81,7 +81,7 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
         self.spec = gymnasium.registry.get(f"cavmarl/{env}Agents-v{self._vec.config.version}")
 
     def reset(self) -> Observations:
-        """Begin an episode in every world; the first row's seed is the root of all seeds."""
+        """Begin an episode in every world; all seeds are derived from the seed of the first row."""
         observations, infos = self._vec.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
@@ -95,7 +95,7 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
     def step_wait(
         self,
     ) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Let every row act."""
+        """Run one step with the stored actions."""
         observations, rewards, ended, cut, infos = self._vec.step(self._actions)
         done = self._rows(ended | cut)
         shown: list[dict[str, Any]] = [
@@ -117,7 +117,7 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
         self._vec.close()
 
     def get_images(self) -> tuple[NDArray[np.uint8], ...]:
-        """Return a frame (height, width, 3) per world, from which `render` makes one picture."""
+        """Return a frame (height, width, 3) per world; `render` combines them in one picture."""
         return self._vec.render() or ()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
@@ -136,12 +136,12 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the worlds once; every row gets its result."""
+        """Call a method of the worlds once, and return its result for every row."""
         found = getattr(self._vec, method_name)(*method_args, **method_kwargs)
         return [found for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
-        """Return False for each row: no row is wrapped individually."""
+        """Return False for each row, because rows cannot be wrapped individually."""
         return [False for _ in self._get_indices(indices)]
 
     def _rows(self, batch: NDArray[Any]) -> NDArray[Any]:

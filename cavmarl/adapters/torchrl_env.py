@@ -1,6 +1,6 @@
-"""TorchRL's `EnvBase`: W worlds with A agents each as one batch of tensors.
+"""W worlds with A agents each as an `EnvBase` of TorchRL: one batch of tensors.
 
-No Python loop runs over agents in a step. Importing this module loads TorchRL and torch;
+Steps have no Python loop over agents. Importing this module loads TorchRL and torch;
 `import cavmarl` does not import it.
 """
 
@@ -40,15 +40,16 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     Entries of a tensordict; the agents' entries have one axis more than the batch:
 
     - `("car", "observation")`: (W, A, D), or one entry per sensor (`observation.kind: dict`);
-    - `("car", "mask")`: (W, A) agents that have a vehicle and act next. Actions of other agents are
-      not read. Their observations are 0, except for the last one of an agent that has just ended.
-      Use only entries where the mask is True for losses and means;
+    - `("car", "mask")`: (W, A) whether an agent has a vehicle and acts next. Actions of other
+      agents are not read. Their observations are 0, except for the last observation of an agent
+      that has just ended. Use only entries where the mask is True for losses and means;
     - `("car", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;
     - `("next", "car", "reward")`: (W, A, 1);
-    - `("next", "car", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) for each agent: its
+    - `("next", "car", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) whether the agent's
       vehicle ended, or the horizon cut its trip. Use these for value estimators;
-    - `("next", "terminated")`, `"truncated"`, `"done"`: (W, 1) of each world; TorchRL resets by it.
-      `("next", "car", "observation")` still has the last observations of the old episode;
+    - `("next", "terminated")`, `"truncated"`, `"done"`: (W, 1) for each world; TorchRL resets
+      worlds that are done. `("next", "car", "observation")` then still has the last observations
+      of the old episode;
     - `("next", "car", "info", term)`: (W, A, 1) each term by its name.
 
     Every population can be used; the mask changes when agents enter and leave. In `respawn` worlds,
@@ -75,7 +76,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         **arguments: Any,
     ) -> None:
         refuse_decided(DECIDED, arguments)
-        # Last observations are not replaced, and a world that TorchRL has reset is not reset again.
+        # Keep last observations, and do not reset a world again that TorchRL has reset.
         vec = make_vec(env, num_envs=num_envs, autoreset_mode=AutoresetMode.NEXT_STEP, **arguments)
         super().__init__(device=device, batch_size=[num_envs])
         self._vec = vec
@@ -164,7 +165,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
 
 
 def _ends(terminated: NDArray[np.bool_], truncated: NDArray[np.bool_]) -> dict[str, Tensor]:
-    """Return TorchRL's three entries, each with a last axis of 1."""
+    """Return TorchRL's entries `terminated`, `truncated` and `done`, each with a last axis of 1."""
     ended, cut = (torch.from_numpy(flags).unsqueeze(-1) for flags in (terminated, truncated))
     return {"done": ended | cut, "terminated": ended, "truncated": cut}
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 
-from cavmarl.balance.contiguous_split import divide_row, slide
-from cavmarl.balance.initial_placement import spread, string
+from cavmarl.balance.contiguous_split import divide_row, shift_ends
+from cavmarl.balance.initial_placement import assign_longest_first, divide_chain
 from cavmarl.balance.load_score import Candidate, Rejection, admissible, find_rejections
 from cavmarl.balance.local_search import refine
 from cavmarl.balance.problem import Problem
@@ -43,7 +43,7 @@ def assign(problem: Problem) -> tuple[Placement, str]:
         admissible(problem.snapshot.workers, rejections)
         if problem.in_row:
             return _place(problem, workers)
-        spread(placement, [[shard] for shard in lost])
+        assign_longest_first(placement, [[shard] for shard in lost])
     return _rebalance(placement, "those of lost workers" if lost else "as it was")
 
 
@@ -54,12 +54,12 @@ def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
     if problem.in_row:
         return divide_row(nowhere), "all in a row"
     worlds = [list(part) for _, part in groupby(shards, lambda n: problem.shards[n].world)]
-    longest = refine(spread(nowhere.copy(), [[shard] for shard in shards]))
+    longest = refine(assign_longest_first(nowhere.copy(), [[shard] for shard in shards]))
     if not longest.fair_s:
         return longest, "evenly by number: no shard costs anything"
     limit_s = longest.makespan_s * (1.0 + problem.rule.tolerance)
     slack_s = _slack_s(longest)
-    whole, row = spread(nowhere.copy(), worlds), string(nowhere.copy())
+    whole, row = assign_longest_first(nowhere.copy(), worlds), divide_chain(nowhere.copy())
     ways = [
         (whole, "worlds whole"),
         (row, "neighbours in a row"),
@@ -84,7 +84,7 @@ def _rebalance(placement: Placement, method: str) -> tuple[Placement, str]:
     slack_s = _slack_s(placement)
     until_s = placement.fair_s + slack_s
     if placement.problem.in_row:
-        moved = slide(placement.copy(), until_s=until_s, max_moves=rule.max_moves)
+        moved = shift_ends(placement.copy(), until_s=until_s, max_moves=rule.max_moves)
     else:
         moved = refine(placement.copy(), until_s=until_s, slack_s=slack_s, max_moves=rule.max_moves)
     gain_s = placement.excess_s() - moved.excess_s()

@@ -131,5 +131,5 @@ def make_plan(problem: Problem) -> Plan:
 
 
 def replan(plan: Plan, snapshot: LoadSnapshot) -> Plan:
-    """Return the plan for another snapshot, or for the same one again."""
+    """Return the plan for another snapshot, or again for the same snapshot."""
     return make_plan(replace(plan.problem, snapshot=snapshot))

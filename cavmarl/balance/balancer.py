@@ -41,7 +41,7 @@ class Balancer:
         rows = sorted(measured)
         names = [(shard.world, shard.zone) for shard in rows]
         if names != [(shard.world, shard.zone) for shard in self.plan.problem.shards]:
-            raise ConfigError(f"measured shards {names}: must be the shards of the plan, each once")
+            raise ConfigError(f"measured shards {names}: must be the shards of the plan, once each")
         self._costs = self._smooth.update(rows)
 
     def round(

@@ -38,7 +38,7 @@ def divide_row(
     return placement
 
 
-def slide(
+def shift_ends(
     placement: Placement,  # changed and returned
     *,
     until_s: float,  # a makespan that is good enough
@@ -47,8 +47,8 @@ def slide(
     """Shorten the piece of the slowest worker repeatedly.
 
     The slowest worker gives the shard at one of its ends to the adjacent worker. This worker may
-    pass one on to the next, and so on, until all are faster than the slowest was. The change with
-    the shortest makespan is made; on a tie, the one that moves fewer shards.
+    pass a shard on to the next worker, and so on, until all are faster than the slowest was. The
+    change with the shortest makespan is made; on a tie, the change that moves fewer shards.
     """
     left = max_moves
     while left > 0 and placement.makespan_s > until_s:
@@ -58,9 +58,9 @@ def slide(
         for step in (-1, 1):
             homes = list(placement.homes)
             for moves, giver in enumerate(_towards(source, step, len(ticks)), start=1):
-                if moves > left or not _give(placement, homes, giver, step):
+                if moves > left or not _pass_to_next(placement, homes, giver, step):
                     break
-                worst_s = _worst_s(placement, homes, source, giver + step)
+                worst_s = _slowest_s(placement, homes, source, giver + step)
                 found.append((worst_s, moves, step, list(homes)))
         if not found:
             break
@@ -73,11 +73,11 @@ def slide(
 
 
 def _towards(source: int, step: int, count: int) -> range:
-    """Return the workers that may give a shard on in a direction, from `source` on."""
+    """Return the workers that may pass a shard on in a direction, from `source` on."""
     return range(source, count - 1) if step > 0 else range(source, 0, -1)
 
 
-def _give(placement: Placement, homes: list[int], giver: int, step: int) -> bool:
+def _pass_to_next(placement: Placement, homes: list[int], giver: int, step: int) -> bool:
     """Give the shard at one end of a piece to the next worker; return whether this is allowed."""
     taker = giver + step
     if homes.count(giver) < 2 or not placement.workers.is_open[taker]:
@@ -87,7 +87,7 @@ def _give(placement: Placement, homes: list[int], giver: int, step: int) -> bool
     return True
 
 
-def _worst_s(placement: Placement, homes: list[int], first: int, last: int) -> float:
+def _slowest_s(placement: Placement, homes: list[int], first: int, last: int) -> float:
     shards, speeds = placement.problem.shards, placement.workers.speeds
     between = range(min(first, last), max(first, last) + 1)
     return max(

@@ -10,7 +10,7 @@ from cavmarl.balance.shard_placement import Placement
 HALVINGS = 60  # halvings of an interval, to beyond the precision of a float
 
 
-def spread(
+def assign_longest_first(
     placement: Placement,  # changed and returned
     groups: Iterable[Sequence[int]],  # groups of shards that stay together
 ) -> Placement:
@@ -40,7 +40,7 @@ def spread(
     return placement
 
 
-def string(
+def divide_chain(
     placement: Placement,  # changed and returned
 ) -> Placement:
     """Divide the row of all shards, by world and zone, into one piece per worker.

@@ -126,8 +126,8 @@ class Selection:
     worker: int
     preferred: int | None  # the requested worker, if any
     outcome: Outcome  # the reason for the choice
-    scores: tuple[tuple[int, float], ...]  # (worker, LoadScore), admissible ones by worker
-    # of the excluded workers, by worker; one for each resource above its threshold
+    scores: tuple[tuple[int, float], ...]  # (worker, LoadScore) of admissible workers, by worker
+    # reasons for excluded workers, by worker; one for each resource above its threshold
     rejections: tuple[Rejection, ...]
 
     @property
@@ -139,7 +139,7 @@ class Selection:
 def find_rejections(
     candidates: Iterable[Candidate], rule: LoadRule = DEFAULT_RULE
 ) -> tuple[Rejection, ...]:
-    """Return why workers are excluded, by worker; a value at its threshold is allowed."""
+    """Return the reasons why workers are excluded; a value at its threshold is allowed."""
     found: list[Rejection] = []
     for candidate in sorted(candidates, key=lambda one: one.worker):
         if not candidate.available:
@@ -179,11 +179,11 @@ def select(
 ) -> Selection:
     """Return the admissible worker with the lowest score, or the preferred one if about as good.
 
-    On equal scores, the worker that hosts fewer shards is chosen, then the one with the lower
+    On equal scores, the worker that hosts fewer shards is chosen, then the worker with the lower
     number. The order of `candidates` has no effect.
 
     Raises:
-        NoAdmissibleWorkerError: all are excluded; the error contains all reasons.
+        NoAdmissibleWorkerError: all workers are excluded; the error contains all reasons.
     """
     known = {candidate.worker for candidate in candidates}
     if preferred is not None and preferred not in known:
@@ -192,12 +192,12 @@ def select(
     left = admissible(candidates, rejections)
     scores = {candidate.worker: load_score(candidate.use, rule.weights) for candidate in left}
     best = min(left, key=lambda one: (scores[one.worker], one.hosted, one.worker)).worker
-    outcome = _judge(preferred, best, scores, rejections, rule)
+    outcome = _outcome_of(preferred, best, scores, rejections, rule)
     chosen = preferred if outcome == "preferred" and preferred is not None else best
     return Selection(chosen, preferred, outcome, tuple(scores.items()), rejections)
 
 
-def _judge(
+def _outcome_of(
     preferred: int | None,
     best: int,
     scores: dict[int, float],

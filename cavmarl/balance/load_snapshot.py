@@ -27,7 +27,7 @@ class LoadSnapshot:
     def __post_init__(self) -> None:
         numbers = [candidate.worker for candidate in self.workers]
         if not numbers:
-            raise ConfigError("a snapshot of no workers: there must be at least one")
+            raise ConfigError("the snapshot has no workers; there must be at least one")
         if len(set(numbers)) != len(numbers):
             raise ConfigError(f"workers {sorted(numbers)}: each must be named once")
         ordered = sorted(self.workers, key=lambda one: one.worker)

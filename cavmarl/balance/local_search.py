@@ -19,12 +19,12 @@ def refine(
     placement: Placement,  # changed and returned
     *,
     until_s: float = 0.0,  # a makespan that is good enough
-    # of all changes that help and are at most this worse than the best, the one that separates the
-    # fewest neighbours is made
+    # a change that separates fewer neighbours is preferred to the best change, if its makespan is
+    # longer by at most this
     slack_s: float = 0.0,
     max_moves: int | None = None,  # maximum number of shards; a swap counts as two. None: no limit
 ) -> Placement:
-    """Move a shard off the slowest worker, or swap it for one of another, while that helps.
+    """Move a shard off the slowest worker, or swap it with another worker's, while that helps.
 
     A change helps if both workers are then faster than the slowest was. No shard moves to an
     excluded worker, and no worker loses its last shard if the rule says so.
@@ -64,7 +64,8 @@ def _best_change(
     others = np.flatnonzero(homes != source)
     if not (may_swap and workers.is_open[source]):
         others = others[:0]
-    # What comes back: nothing, for each worker, or one of the other shards.
+    # Columns: a move to each worker, then a swap with each other shard. `back` is the cost that the
+    # slowest worker gets in return.
     targets = np.concatenate([np.arange(count), homes[others]])
     back = np.concatenate([np.zeros(count), costs[others]])
     change = costs[own][:, None] - back[None, :]
@@ -100,6 +101,6 @@ def _more_cut(
     first = len(targets) - len(others)
     homes = targets[first:]
     cut[:, first:] += (near[others, homes] - near[others, source])[None, :]
-    # Two neighbours that change places stay separated.
+    # Two neighbours that are swapped stay separated.
     cut[:, first:] += 2 * touching[np.ix_(own, others)]
     return np.asarray(cut)

@@ -23,7 +23,7 @@ LONGEST = 40  # maximum number of characters of a wrong value in a message
 def read_plan(path: Path) -> Plan:
     plans = read_plans(path)
     if len(plans) != 1:
-        raise ConfigError(f"{path}: has {len(plans)} plans; give a file with one plan")
+        raise ConfigError(f"{path}: has {len(plans)} plans; use a file with one plan")
     return plans[0]
 
 
@@ -119,38 +119,38 @@ def _rule(document: Mapping[str, Any]) -> BalanceRule:
 def _three(value: object, name: str) -> tuple[float, float, float]:
     values = [_real(one, name) for one in _list(value, name)]
     if len(values) != 3:
-        raise _none(name, value, "three numbers")
+        raise _invalid(name, value, "three numbers")
     cpu, ram, gpu = values
     return cpu, ram, gpu
 
 
 def _table(value: object, name: str) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise _none(name, value, "a table")
+        raise _invalid(name, value, "a table")
     return value
 
 
 def _list(value: object, name: str) -> Sequence[Any]:
     if not isinstance(value, list | tuple):
-        raise _none(name, value, "a list")
+        raise _invalid(name, value, "a list")
     return value
 
 
 def _text(value: object, name: str) -> str:
     if not isinstance(value, str):
-        raise _none(name, value, "text")
+        raise _invalid(name, value, "text")
     return value
 
 
 def _truth(value: object, name: str) -> bool:
     if not isinstance(value, bool):
-        raise _none(name, value, "true or false")
+        raise _invalid(name, value, "true or false")
     return value
 
 
 def _whole(value: object, name: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LARGEST:
-        raise _none(name, value, "a whole number of at least 0")
+        raise _invalid(name, value, "a whole number of at least 0")
     return value
 
 
@@ -164,7 +164,7 @@ def _real(value: object, name: str) -> float:
     return float(_whole(value, name))
 
 
-def _none(name: str, value: object, needed: str) -> ConfigError:
+def _invalid(name: str, value: object, needed: str) -> ConfigError:
     text = repr(value)
     shown = text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
     return ConfigError(f"not a plan: {name} is {shown}, must be {needed}")

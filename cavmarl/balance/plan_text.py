@@ -57,7 +57,7 @@ def _is_measured(plan: Plan) -> bool:
 
 
 def _cost(plan: Plan, cost_s: float) -> str:
-    """Format a measured cost in ms, another cost without a unit, as only its ratios count."""
+    """Format a measured cost in ms; other costs have no unit, because only ratios count."""
     return f"{1e3 * cost_s if _is_measured(plan) else cost_s:.3f}"
 
 

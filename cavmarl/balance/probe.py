@@ -22,7 +22,7 @@ GPU_QUERY = ("--query-gpu=utilization.gpu", "--format=csv,noheader,nounits")
 
 
 def take_snapshot(
-    # number → process id; None: not started yet, it will run on this process's cores
+    # number → process id; None: not started yet, and will run on this process's cores
     workers: Mapping[int, int | None],
     interval_s: float = INTERVAL_S,  # duration of the measurement and of this call
 ) -> LoadSnapshot:
@@ -51,7 +51,7 @@ class Watch:
         self._before = _busy_s()
 
     def snapshot(self) -> LoadSnapshot:
-        """Return the use by other programs since the start. Raises ConfigError: no worker."""
+        """Return the use by other programs since the start. Raises ConfigError without workers."""
         elapsed_s = max(time.perf_counter() - self._began_s, SHORTEST_S)
         foreign = [
             (after - before) / elapsed_s

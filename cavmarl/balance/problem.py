@@ -35,14 +35,14 @@ class BalanceRule:
     """When shards move, and how many at once."""
 
     load: LoadRule = field(default_factory=LoadRule)  # how workers are scored and excluded
-    # as a share of a perfect division's tick: no shard moves while the slowest worker exceeds it
-    # by no more; a round with a smaller gain is not made; and this much may be given up to keep
-    # neighbours together
+    # share of a perfect division's tick. Shards move only if the slowest worker exceeds a perfect
+    # division by more than this, and if the gain exceeds it. To keep neighbours together, a tick
+    # may be longer by this share.
     tolerance: float = 0.1
-    # maximum number of shards per round, without those of lost workers
+    # maximum number of shards that move in a round, without shards of lost workers
     max_moves: int = 4
     move_s: float = 0.01  # s, cost of one move
-    # a round is made only if all workers together save its cost within this many ticks
+    # shards move only if all workers together save the cost of the moves within this many ticks
     payback_ticks: int = 1000
     keeps_one: bool = False  # whether a worker's last shard may only be swapped
 
@@ -66,8 +66,8 @@ class Problem:
     rule: BalanceRule = field(default_factory=BalanceRule)  # rules for moving shards
     # present worker of each shard, in the order of `shards`; None: none is placed yet
     present: tuple[int, ...] | None = None
-    # whether each worker hosts at least one shard and consecutive ones, in the order of workers;
-    # for worlds whose results lie in one array
+    # whether each worker hosts one or more consecutive shards, in the order of workers, because the
+    # results of all worlds are in one array
     in_row: bool = False
     # source of the costs; unless it is `measured`, only their ratios count
     cost_source: str = MEASURED_COSTS
@@ -111,11 +111,11 @@ class Problem:
 
 def _check_shards(shards: Sequence[ShardCost], zones: int) -> None:
     if not shards:
-        raise ConfigError("no shards: there must be at least one")
+        raise ConfigError("there are no shards; define at least one")
     names = [(shard.world, shard.zone) for shard in shards]
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise ConfigError(f"world {twice[0]}, zone {twice[1]}: is named twice")
+        raise ConfigError(f"world {twice[0]}, zone {twice[1]}: is repeated; name each shard once")
     for shard in shards:
         if not 0 <= shard.zone < zones:
             raise ConfigError(

@@ -1,9 +1,9 @@
 """`Placement`: shards on workers, and the resulting duration of each worker's tick.
 
 A worker with LoadScore S, the share taken by other programs, has the speed 1 - S: shards that cost
-`load` seconds take it load / (1 - S). Before anything is placed, this is shortest where LoadScore
-is lowest: eq. (2). The slowest worker determines the pace of all. Its tick divided by that of a
-perfect division is the imbalance.
+`load` seconds take load / (1 - S) on it. Before shards are placed, the fastest worker is thus the
+worker with the lowest LoadScore, as in eq. (2). The slowest worker determines the pace of all. Its
+tick divided by that of a perfect division is the imbalance.
 """
 
 from __future__ import annotations

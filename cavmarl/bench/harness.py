@@ -31,7 +31,7 @@ Taken = TypeVar("Taken")
 
 
 def silent(text: str) -> None:
-    """Print nothing; a `say` for silent runs."""
+    """Print nothing; the argument `say` of silent runs."""
 
 
 @dataclass(frozen=True)

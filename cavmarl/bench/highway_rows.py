@@ -17,9 +17,10 @@ from cavmarl.core.errors import require
 
 
 class HighwayRows(VecEnvWrapper):
-    """Each controlled vehicle is a row; rows of one world end together and have equal rewards.
+    """A `VecEnv` with a row per controlled vehicle; rows of a world end together.
 
-    Each world runs in its own process, has no other vehicles, and restarts after `horizon_s`.
+    The rows of a world have equal rewards. Each world runs in its own process, has no other
+    vehicles, and restarts after `horizon_s`.
     `observation` has highway-env's settings.
     """
 

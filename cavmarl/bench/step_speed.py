@@ -34,7 +34,7 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 
 __all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed", "one_core"]
 
-OUR_STEPS = 100  # from a fresh reset; no vehicle reaches the end of the road
+OUR_STEPS = 100  # number of steps from a reset; no vehicle reaches the end of the road
 THEIR_STEPS = 10
 MORE = 10  # factor of agents and of road length in the larger world
 MAX_AGENTS = 1000
@@ -56,7 +56,7 @@ THEIRS = (
 
 @dataclass(frozen=True)
 class Row:
-    """One way to step one kind of world."""
+    """Measurements of one way to step one kind of world."""
 
     sensors: str  # `lidar` (with neighbours) or `kinematics`
     side: str  # `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`

@@ -9,7 +9,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import find_map
 from cavmarl.evaluate.traffic.native_side import idle_commands, make_world
 from cavmarl.evaluate.traffic.sumo_side import SumoJob, start_sumo, sumo_process
+from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_input import read_input
 
 TURN_S = 10
@@ -69,11 +70,14 @@ def measure_traffic_speed(
     """Measure both sides in turn on one core."""
     check_range(after=(after_s, 1, 3600), repeats=(repeats, 1, 100))
     path = find_map(map_name)
-    job = SumoJob(path, read_input(demand), after_s, dt_s, seed)
+    given = read_input(demand)
+    # cavmarl first, since its errors name file and line of unsupported demand.
+    simulation = make_world(path, demand, after_s + repeats * TURN_S, seed, dt_s)
+    if isinstance(simulation.demand, DemandFile):
+        given = replace(given, begin_s=simulation.demand.begin_ms / 1000.0)
+    job = SumoJob(path, given, after_s, dt_s, seed)
     warm, steps = round(after_s / dt_s), round(TURN_S / dt_s)
     with one_core(), tempfile.TemporaryDirectory() as folder, sumo_process(job) as sumo:
-        # cavmarl first, since its errors name file and line of unsupported demand.
-        simulation = make_world(path, demand, after_s + repeats * TURN_S, seed, dt_s)
         progress(f"SUMO's first {after_s} s")
         sumo.submit(load_sumo, job, folder).result()
         sumo.submit(turn_of_sumo, warm).result()

@@ -74,7 +74,7 @@ class TrainingRow:
 
     name: str  # `cavmarl`, `stable_baselines3`, or `cavmarl_recipe` with the recommended settings
     worlds: int  # worlds stepped together
-    decisions: int  # per update
+    decisions: int  # number of decisions per update
     rates: tuple[float, ...]  # agent-steps per second of each turn: one update, including learning
     # shares of time by phase; highway-env's `simulation` includes communication
     shares: dict[str, float]
@@ -84,8 +84,8 @@ class TrainingRow:
 class TrainingSpeed:
     """Results of two kinds of benchmark, whose numbers must not be mixed."""
 
-    agents: int  # per world
-    workers: int  # per side
+    agents: int  # number of agents per world
+    workers: int  # number of workers per side
     numbers: int  # size of an observation
     recipe_numbers: int  # size of an observation with the recommended settings
     end_to_end: tuple[TrainingRow, ...]  # PPO, including collection and learning

@@ -99,7 +99,8 @@ add_command(
     app,
     "demo",
     demo.demo,
-    "cavmarl demo --minutes 2",
+    "cavmarl demo",
+    "cavmarl demo --decisions 500000",
     panel=START,
 )
 add_command(

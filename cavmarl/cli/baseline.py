@@ -12,6 +12,7 @@ from rich.markup import escape
 from cavmarl.cli.evaluate import report_cell
 from cavmarl.cli.output import (
     OUTPUT,
+    PAGE_EXTRAS,
     Agents,
     Background,
     JsonPath,
@@ -22,7 +23,7 @@ from cavmarl.cli.output import (
     make_folder,
     write_json,
 )
-from cavmarl.core.errors import ConfigError, require
+from cavmarl.core.errors import ConfigError, require_all
 from cavmarl.core.progress import progress_bar
 
 
@@ -50,8 +51,7 @@ def baseline(
     The drivers are random actions, `idm`, a trained driver, and as the oracle `idm` alone on the
     road.
     """
-    require("matplotlib", "report")
-    require("jinja2", "report")
+    require_all(PAGE_EXTRAS)
     from cavmarl.evaluate.baseline import baseline_rows, figures, run_baseline, write_baseline
 
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")

@@ -18,6 +18,9 @@ from rich.table import Table
 from cavmarl.cli.output import (
     OUTPUT,
     PAGE,
+    PAGE_EXTRAS,
+    RECORD_EXTRAS,
+    WEB_EXTRAS,
     Episodes,
     JsonPath,
     Policies,
@@ -26,6 +29,7 @@ from cavmarl.cli.output import (
     Repeats,
     about,
     about_file,
+    check_extras,
     flag,
     grid,
     make_folder,
@@ -36,7 +40,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.cli.web import WebPort, say
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
-from cavmarl.core.errors import require
+from cavmarl.core.errors import require_all
 from cavmarl.core.progress import progress_bar
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
@@ -87,9 +91,13 @@ def evaluate(
 
     The report shows success, safety, comfort, delay, throughput and fairness.
     """
+    drivers = policy or ["idm"]
+    check_extras(
+        world, drivers, (html, PAGE_EXTRAS), (failures, {"jinja2": "report"}),
+        (page, WEB_EXTRAS), (record, RECORD_EXTRAS),
+    )  # fmt: skip
     _check_page(html)
     console = Console()
-    drivers = policy or ["idm"]
     world = with_sensors_of_drivers(
         world, drivers
     )  # prints to the terminal: before the progress bar
@@ -279,8 +287,7 @@ def _check_page(html: Path | None) -> None:
     """Raise an error before the evaluation starts if the page cannot be written."""
     if html is None:
         return
-    require("matplotlib", "report")
-    require("jinja2", "report")
+    require_all(PAGE_EXTRAS)
     make_folder(html.parent)
 
 

@@ -11,6 +11,7 @@ from rich.table import Table
 from cavmarl.cli.lead import DEFAULT_PLACE, SecretFile, address_of, read_secret
 from cavmarl.cli.output import (
     Environment,
+    Imports,
     JsonPath,
     Settings,
     about,
@@ -41,6 +42,7 @@ def follow(
         about("Point-cloud map for localisation=scan_matching.", metavar="FILE", exists=True),
     ] = None,
     settings: Settings = None,
+    imports: Imports = None,
     joins_s: Annotated[float, about("Seconds in which the world must answer.", metavar="S")] = 60.0,
     secret_file: SecretFile = None,
     json_path: JsonPath = None,
@@ -56,7 +58,7 @@ def follow(
     from cavmarl.engine.world_setup import load_roads
 
     config = StackConfig(**_stages(stage or [], tuple(STAGES)), cloud=cloud)
-    network = load_roads(*load_config(env, overrides=parse_settings(settings)))
+    network = load_roads(*load_config(env, overrides=parse_settings(settings, imports)))
     steps = 0
     secret = read_secret(secret_file)
     with Follower(address_of(at), vehicles.split(","), name, joins_s, secret) as follower:

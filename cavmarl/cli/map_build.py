@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -28,7 +28,9 @@ from cavmarl.roads.sumo_net.reader import map_name
 
 Source = Annotated[
     Path,
-    typer.Argument(help="Map file: a SUMO network, OSM or OpenDRIVE.", exists=True, dir_okay=False),
+    typer.Argument(
+        help="Map file: a SUMO network or .sumocfg, OSM or OpenDRIVE.", exists=True, dir_okay=False
+    ),
 ]
 
 _NETWORK_ENDINGS = (".net.xml", ".net.xml.gz")
@@ -56,6 +58,13 @@ def build(
             dir_okay=False,
         ),
     ] = None,
+    traffic_side: Annotated[
+        Literal["auto", "left", "right"],
+        about(
+            "Side of the road to drive on; auto: that of the country (OSM), or the rule of the "
+            "roads (OpenDRIVE).",
+        ),
+    ] = "auto",
     origin: Annotated[
         str | None,
         about(
@@ -113,6 +122,7 @@ def build(
             source,
             target,
             bbox=_box(bbox),
+            side=None if traffic_side == "auto" else traffic_side,
             origin=_origin(origin),
             heights=heights,
             licences=(licence, dem_licence),
@@ -162,7 +172,7 @@ def _print_build(console: Console, result: BuildResult) -> None:
         console.print(Text(f"corrected: {line}"))
     for line in result.dropped:
         console.print(Text(f"dropped: {line}", style="yellow"))
-    for key in ("licence", "attribution", "projection", "origin"):
+    for key in ("licence", "attribution", "projection", "origin", "traffic side"):
         if key in result.provenance:
             console.print(Text(f"{key}: {result.provenance[key]}"))
     if result.warnings:
@@ -178,7 +188,9 @@ def _print_build(console: Console, result: BuildResult) -> None:
             [row.kind, row.guessed, row.value, f"{row.used_for} of {row.edges}"]
             for row in result.defaults
         ]
-        console.print(grid(["kind of road", "missing", "default", "edges"], rows))
+        console.print(grid(["kind of road", "missing", "default", "used for"], rows))
+    for line in result.notes:
+        console.print(Text(f"note: {line}", style="yellow"))
     if result.heights is not None:
         _print_heights(console, result.heights)
 

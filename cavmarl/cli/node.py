@@ -15,6 +15,7 @@ from rich.console import Console
 
 from cavmarl.cli.output import (
     SERVICE,
+    Imports,
     about,
     flag,
 )
@@ -42,6 +43,7 @@ def node(
     mpi: Annotated[
         bool, flag("Join the MPI run as one of its ranks; rank 0 is the caller.", "--mpi")
     ] = False,
+    imports: Imports = None,
     wait_s: Annotated[
         float, about("With --join and --mpi: seconds in which the caller must answer.", metavar="S")
     ] = 300.0,

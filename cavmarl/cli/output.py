@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -18,8 +18,11 @@ from rich.text import Text
 from typer.core import TyperCommand
 
 from cavmarl.bench.harness import check_positive
+from cavmarl.config.driver_names import ONNX_FILE, SB3_FILE, TORCH_SCRIPT_FILES, drivers_in
+from cavmarl.config.registry import SUMO_PREFIX, is_converted, load_config
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, require_all
+from cavmarl.core.extensions import import_plugins
 from cavmarl.core.seeds import check_seed
 
 if TYPE_CHECKING:
@@ -58,6 +61,24 @@ def check_bound(value: float | None) -> float | None:
     check_positive("--at-least", value)
     return value
 
+
+def _import_all(modules: list[str] | None) -> list[str] | None:
+    """Import the modules before any other option uses what they register."""
+    import_plugins(modules or ())
+    return modules
+
+
+# Optional modules of outputs, with their extras.
+PAGE_EXTRAS = {"matplotlib": "report", "jinja2": "report"}
+WINDOW_EXTRAS = {"pygame": "render"}
+VIDEO_EXTRAS = WINDOW_EXTRAS | {"imageio_ffmpeg": "render"}
+WEB_EXTRAS = dict.fromkeys(("starlette", "uvicorn", "httptools", "websockets"), "viewer")
+RECORD_EXTRAS = {"pyarrow": "record"}
+DRIVER_EXTRAS: dict[str, dict[str, str]] = {  # by the suffix of a model file
+    SB3_FILE: {"stable_baselines3": "train", "torch": "train"},
+    **{suffix: {"torch": "train"} for suffix in TORCH_SCRIPT_FILES},
+    ONNX_FILE: {"onnxruntime": "onnx"},
+}
 
 # Groups of options in the help.
 WORLD, RUN, OUTPUT, PAGE, SERVICE = "World", "Where it runs", "Output", "Page", "Service"
@@ -114,18 +135,28 @@ Workers = Annotated[
     about("Short form of --backend processes:N; 0 means local.", metavar="N", panel=RUN),
 ]
 Environment = Annotated[
-    str, typer.Argument(metavar="ENV", help="Environment: its name, its folder, or a map file.")
+    str,
+    typer.Argument(
+        metavar="ENV", help="Environment: its name, its folder, a map file or a .sumocfg."
+    ),
 ]
 OptionalEnvironment = Annotated[
-    str, typer.Argument(metavar="[ENV]", help="Environment: its name, its folder, or a map file.")
+    str,
+    typer.Argument(
+        metavar="[ENV]", help="Environment: its name, its folder, a map file or a .sumocfg."
+    ),
 ]
 MapName = Annotated[
-    str, typer.Argument(metavar="MAP", help="Map file, or the name or folder of an environment.")
+    str,
+    typer.Argument(
+        metavar="MAP", help="Map file, .sumocfg, or the name or folder of an environment."
+    ),
 ]
 PolicyName = Annotated[
     str,
     about(
-        "Driver of the agents: a name from `cavmarl list`, a .py file or a folder.",
+        "Driver of the agents: a name from `cavmarl list`, a folder, a .py file, or a model file "
+        "(.zip of stable-baselines3, .pt of TorchScript, .onnx).",
         "--policy",
         "-p",
         metavar="POLICY",
@@ -134,8 +165,9 @@ PolicyName = Annotated[
 Policies = Annotated[
     list[str] | None,
     about(
-        "Driver to evaluate: a name from `cavmarl list`, a .py file or a folder. Repeat the option "
-        "to compare drivers with the first one [default: idm].",
+        "Driver to evaluate: a name from `cavmarl list`, a folder, a .py file, or a model file "
+        "(.zip of stable-baselines3, .pt of TorchScript, .onnx). Repeat the option to compare "
+        "drivers with the first one [default: idm].",
         "--policy",
         "-p",
         metavar="POLICY",
@@ -165,6 +197,17 @@ Zones = Annotated[
     about(
         "Number of zones of each world [default: as configured by the environment].",
         metavar="K",
+        panel=WORLD,
+    ),
+]
+Imports = Annotated[
+    list[str] | None,
+    about(
+        "Import this module first, for terms, sensors, driver models and backends of your own. "
+        "Repeat it for more modules.",
+        "--import",
+        metavar="MODULE",
+        callback=_import_all,
         panel=WORLD,
     ),
 ]
@@ -235,15 +278,39 @@ def recorded(path: Path | None, also: str) -> RecordOptions | None:
     return RecordOptions(path, include)
 
 
+def check_extras(
+    world: WorldSpec, policies: Iterable[str], *needed: tuple[object, Mapping[str, str]]
+) -> None:
+    """Raise one MissingExtraError for all modules that a command lacks, before it does any work.
+
+    Args:
+        world: the world to make, which may need SUMO.
+        policies: drivers, which may need the library of a model file.
+        needed: values of options, with the modules and extras that they need if they are set.
+    """
+    config, _ = load_config(world.env, **world.keywords)
+    modules: dict[str, str] = {}
+    if any(name.startswith(SUMO_PREFIX) or is_converted(name) for name in config.map.sources):
+        modules["sumo"] = "sumo"
+    if config.traffic.source != "native":
+        modules["libsumo"] = "sumo"
+    for policy in policies:
+        for driver in drivers_in(policy):
+            modules |= DRIVER_EXTRAS.get(Path(driver).suffix, {})
+    for value, extras in needed:
+        modules |= extras if value else {}
+    require_all(modules)
+
+
 def with_world(*names: str) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
     """Return a decorator for commands that take a `world: WorldSpec`.
 
-    The command line gets the options from which the WorldSpec is made instead: ENV and the options
-    called `names`, by default all of them. A parameter of the function with the name of such an
-    option replaces that option, and the function receives its value, too.
+    The command line gets the options from which the WorldSpec is made instead: ENV, --import and
+    the options called `names`, by default all of them. A parameter of the function with the name
+    of such an option replaces that option, and the function receives its value, too.
     """
     chosen = names or ("agents", "background", "seed", "settings", "sensors_of")
-    return partial(_with_world, ("env", *chosen))
+    return partial(_with_world, ("env", *chosen, "imports"))
 
 
 def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callable[..., Made]:
@@ -256,6 +323,7 @@ def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callabl
         "background": (Background, None),
         "settings": (Settings, None),
         "sensors_of": (SensorsOf, None),
+        "imports": (Imports, None),
     }
     wanted = {
         name: Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
@@ -268,9 +336,10 @@ def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callabl
 
     @wraps(command)
     def program(**options: Any) -> Made:
-        keys = {name: options[name] for name in names if name != "settings"}
+        keys = {name: options[name] for name in names if name not in ("settings", "imports")}
         env = keys.pop("env") or ""
-        spec = WorldSpec.of(env, overrides=parse_settings(options["settings"]), **keys)
+        overrides = parse_settings(options["settings"], options["imports"])
+        spec = WorldSpec.of(env, overrides=overrides, **keys)
         return command(spec, **{name: options[name] for name in own})
 
     program.__annotations__ = {name: one.annotation for name, one in wanted.items()}
@@ -278,8 +347,10 @@ def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callabl
     return program
 
 
-def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
-    """Return overrides from texts like `sensors.lidar.rays=32`.
+def parse_settings(
+    settings: Sequence[str] | None, imports: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """Return overrides from texts like `sensors.lidar.rays=32`, with the imports as `plugins`.
 
     A value that is not JSON is text. Raises ConfigError if a text is not KEY=VALUE, has no value,
     or names a key that another text has named.
@@ -299,6 +370,10 @@ def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
             overrides[key] = text
         if overrides[key] == "":
             raise ConfigError(f"--set {key}=: the value is missing; write KEY=VALUE")
+    if imports:
+        if "plugins" in overrides:
+            raise ConfigError("--set plugins with --import: name all modules with --import")
+        overrides["plugins"] = list(imports)
     return overrides
 
 

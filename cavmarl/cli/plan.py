@@ -38,7 +38,7 @@ def plan(
         str | None,
         typer.Argument(
             metavar="[ENV]",
-            help="Environment: its name, its folder, or a map file; not with --again.",
+            help="Environment: its name, its folder, a map file or a .sumocfg; not with --again.",
         ),
     ] = None,
     zones: Annotated[int, about("Number of zones of each world.", metavar="K", panel=WORLD)] = 9,

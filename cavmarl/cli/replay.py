@@ -13,6 +13,11 @@ from rich.console import Console
 from cavmarl.cli.output import (
     OUTPUT,
     PAGE,
+    RECORD_EXTRAS,
+    VIDEO_EXTRAS,
+    WEB_EXTRAS,
+    WINDOW_EXTRAS,
+    Imports,
     JsonPath,
     about,
     about_file,
@@ -54,10 +59,19 @@ def replay(
     token: WebToken = "",
     watch_token: WatchToken = "",
     watch_only: Annotated[bool, flag("Browsers may not pause or search.", panel=PAGE)] = False,
+    imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
     """Show a recording from above, or export it."""
-    from cavmarl.core.errors import ConfigError, RecordingError
+    from cavmarl.core.errors import ConfigError, RecordingError, require_all
+
+    shows = video is not None or not (web or fcd or csv or mcap)
+    require_all(
+        RECORD_EXTRAS
+        | (WEB_EXTRAS if web else {})
+        | (VIDEO_EXTRAS if video else WINDOW_EXTRAS if shows else {})
+        | ({"mcap": "record"} if mcap else {})
+    )
     from cavmarl.recordings.recording import Recording
     from cavmarl.recordings.recording_exports import EXPORTS
 

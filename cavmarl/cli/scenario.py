@@ -16,12 +16,15 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from cavmarl.cli.output import (
+    VIDEO_EXTRAS,
+    WINDOW_EXTRAS,
     WORLD,
     JsonPath,
     Zones,
     about,
     about_file,
     add_command,
+    check_extras,
     number,
     with_world,
     write_json,
@@ -70,7 +73,10 @@ def run(
     env: Annotated[
         str,
         about(
-            "Environment: its name, its folder, or a map file.", "--map", metavar="ENV", panel=WORLD
+            "Environment: its name, its folder, a map file or a .sumocfg.",
+            "--map",
+            metavar="ENV",
+            panel=WORLD,
         ),
     ] = "grid4x4",
     place: Annotated[
@@ -108,6 +114,7 @@ def run(
 
     If an agent does not reach its goal, or causes a collision, exit with 1.
     """
+    check_extras(world, [driver], (picture, WINDOW_EXTRAS), (video, VIDEO_EXTRAS))
     from cavmarl.evaluate.scenarios.scenario_films import ScenarioCamera
     from cavmarl.evaluate.scenarios.scenario_runs import make_scenario, run_scenario
 

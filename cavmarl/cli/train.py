@@ -13,7 +13,16 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.config.registry import find_settings, programs
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, require_all
+
+EXTRAS = {  # optional modules of training programs
+    "torch": "train",
+    "stable_baselines3": "train",
+    "tensordict": "torchrl",
+    "torchrl": "torchrl",
+    "benchmarl": "benchmarl",
+    "ray": "rllib",
+}
 
 
 def train(
@@ -43,8 +52,21 @@ def train(
         raise ConfigError(
             f"there is no training program {name!r}: choose one of {', '.join(known)}"
         )
+    require_all(extras_of(known[name]))
     command = [sys.executable, str(known[name]), *with_config(options or [])]
     os.execv(sys.executable, command)  # signals and the exit code are then those of the program
+
+
+def extras_of(program: Path) -> dict[str, str]:
+    """Return the optional modules that a program imports, with their extras."""
+    extras = {}
+    for node in ast.parse(program.read_text(encoding="utf-8")).body:
+        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        for name in names:
+            if (module := name.partition(".")[0]) in EXTRAS:
+                extras[module] = EXTRAS[module]
+    return extras
 
 
 def with_config(words: list[str]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +13,10 @@ from rich.console import Console
 from cavmarl.cli.output import (
     OUTPUT,
     PAGE,
+    RECORD_EXTRAS,
+    VIDEO_EXTRAS,
+    WEB_EXTRAS,
+    WINDOW_EXTRAS,
     Backend,
     JsonPath,
     PolicyName,
@@ -21,6 +25,7 @@ from cavmarl.cli.output import (
     Workers,
     Zones,
     about,
+    check_extras,
     flag,
     recorded,
     with_world,
@@ -37,6 +42,8 @@ MOST_WORLDS = 16  # that one page can show
 
 if TYPE_CHECKING:
     from cavmarl.env.parallel import CavEnv
+    from cavmarl.render.animation import AnimationWriter
+    from cavmarl.render.video import VideoWriter
 
 
 @with_world()
@@ -80,7 +87,12 @@ def view(
     json_path: JsonPath = None,
 ) -> None:
     """Drive a world and show it from above."""
+    check_extras(
+        world, [policy], (web, WEB_EXTRAS), (not web, WINDOW_EXTRAS), (video, VIDEO_EXTRAS),
+        (record, RECORD_EXTRAS),
+    )  # fmt: skip
     from cavmarl.env.parallel import parallel_env
+    from cavmarl.render.video import VideoWriter
 
     kept = recorded(record, record_also)
     world = with_sensors_of_drivers(world, [policy])
@@ -122,7 +134,9 @@ def view(
     )
     made.ghosts_of = ghosts_of
     console = Console()
-    stats = drive(made, policy, seconds, world.seed, video, console)
+    with closing(made):
+        writer = None if video is None else VideoWriter(video, made.metadata["render_fps"])
+        stats = drive(made, policy, seconds, world.seed, writer, console)
     if video is not None:
         console.print(f"video: {video}", markup=False)
     write_json(json_path, {"video": str(video) if video else None, "traffic": stats})
@@ -159,22 +173,24 @@ def check_display() -> None:
 
 
 def drive(
-    world: CavEnv, policy: str, seconds: float, seed: int, video: Path | None, console: Console
+    world: CavEnv,
+    policy: str,
+    seconds: float,
+    seed: int,
+    writer: AnimationWriter | VideoWriter | None,
+    console: Console,
 ) -> dict[str, float]:
-    """Drive `world` for some simulated seconds; write a video if `video` is a path.
+    """Drive `world` for some simulated seconds; write its pictures if there is a `writer`.
 
     When an episode ends, the next one begins. Return the traffic statistics of the last episode.
     """
     from cavmarl.policies.loading import load_policy
-    from cavmarl.render.video import VideoWriter
 
     driver = load_policy(policy, world)
     steps = max(1, round(seconds / world.step_s))
     with ExitStack() as stack:
-        stack.callback(world.close)
-        writer = None
-        if video is not None:
-            writer = stack.enter_context(VideoWriter(video, world.metadata["render_fps"]))
+        if writer is not None:
+            stack.enter_context(writer)
         bar = stack.enter_context(progress_bar(console))
         observations, _ = world.reset(seed=seed)
         driver.reset(seed)

@@ -97,9 +97,9 @@ class Client:
             needs: capabilities that the node must have.
             wait_s: longest wait for a node in s.
             recovery_s: longest search in s for another node after a loss.
-            keys: zones, nodes, agents, background, max_cycles, num_envs, seed and overrides as in
-                `make_vec`, where nodes are those of the service; and name, under which the service
-                counts versions.
+            keys: `zones`, `nodes`, `agents`, `background`, `max_cycles`, `num_envs`, `seed` and
+                `overrides` as in `make_vec`; `nodes` is a number of nodes of the service; `name`:
+                name under which the service numbers the versions of the configuration.
 
         Raises:
             ServiceError: the request was refused; `problem` names the reason.

@@ -16,9 +16,9 @@ import httpx
 from cavmarl.core.errors import ServiceError
 
 T = TypeVar("T")
-RENEW_BEFORE_S = 60.0  # before a token expires, it is renewed
-AGAIN_S = 0.2  # between two attempts
-PAGE = 1000  # events in one answer
+RENEW_BEFORE_S = 60.0  # time before its expiry at which a token is renewed
+AGAIN_S = 0.2  # time between two attempts
+PAGE = 1000  # maximum number of events in one answer
 RETRIED_S = 10.0  # how long a request is repeated after a lost answer
 
 

@@ -1,12 +1,10 @@
 """The client's protocol with a world on a node, including recovery from the loss of the node.
 
 Commands are numbered. A node answers a repeated command from memory, and from time to time stores
-the
-state of its worlds with the service. The client keeps the commands since the last stored state. If
-the
-node is lost, the service selects another node, which loads that state, and the client repeats the
-later
-commands. Equal commands give equal bytes. The address of a node is not used after its lease.
+the state of its worlds with the service. The client keeps the commands since the last stored state.
+If the node is lost, the service selects another node, which loads that state, and the client
+repeats the later commands. Equal commands give equal bytes. The address of a node is not used after
+its lease.
 """
 
 from __future__ import annotations
@@ -56,7 +54,7 @@ class WorldFlows:
         self._recovery_s = recovery_s
         self._sent: list[SentCommand] = []  # commands after the stored state
         self._saved = 0  # number of commands that the stored state includes
-        self._is_pending = False  # whether the answer to the last command is missing
+        self._is_pending = False  # True while the answer to the last command is missing
         self._url = ""
         self._renew_s = 0.0
 
@@ -126,7 +124,7 @@ class WorldFlows:
         try:
             yield Ask("DELETE", self._url, token=self.assignment["token"])
         except httpx.TransportError:
-            return  # the node learns it with its next heartbeat
+            return  # the answer to the node's next heartbeat will end the session there
 
     def _command(self, sent: SentCommand) -> Flow[Arrays]:
         self._sent.append(sent)

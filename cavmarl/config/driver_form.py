@@ -79,7 +79,7 @@ def read_form(folder: Path) -> Form:
 
 
 def forms_in(policies: Iterable[str | Path]) -> dict[str, Form]:
-    """Return the form of each trained driver in `policies`, by name; scripts have no form.
+    """Return the form of each trained driver in `policies`, by name; files have no form.
 
     Raises:
         PolicyError: there is no driver of that name, or its `config.json` is invalid.
@@ -124,9 +124,9 @@ def form_of_driver(policy: str | Path) -> Form:
     if not forms:
         trained = ", ".join(name for name, path in agent_entries().items() if path.is_dir())
         raise PolicyError(
-            f"The driver '{policy}' is a script. A script has no sensors of its own: it accepts "
-            f"those of the environment, or says what it needs. Name a trained driver ({trained}), "
-            "or leave sensors_of (--sensors-of) out"
+            f"The driver '{policy}' is a script or a model file, which does not state sensors: it "
+            "accepts those of the environment, or says what it needs. Name a trained driver "
+            f"({trained}), or leave sensors_of (--sensors-of) out"
         )
     return common_form(forms)
 

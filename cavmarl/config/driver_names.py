@@ -10,14 +10,19 @@ from cavmarl.config.registry import agent_entries, agent_here
 from cavmarl.core.errors import PolicyError
 
 TOGETHER = "+"  # separates drivers that share the agents of a world
+SB3_FILE = ".zip"  # suffixes of the model files of other libraries
+TORCH_SCRIPT_FILES = (".pt", ".ts")
+ONNX_FILE = ".onnx"
+DRIVER_FILES = (".py", SB3_FILE, *TORCH_SCRIPT_FILES, ONNX_FILE)
 SHIELDED = "shielded:"  # before a driver; the built-in driver acts where it would brake harder
 
 
 def find_driver(policy: str | Path) -> Path:
-    """Return the `.py` file or the folder of one driver.
+    """Return the file or the folder of one driver.
 
     Args:
-        policy: the name of an entry of `agents/`, or the path of a folder or of a `.py` file.
+        policy: the name of an entry of `agents/`, or the path of a folder or of a file whose suffix
+            is in `DRIVER_FILES`.
 
     Raises:
         PolicyError: nothing has that name, or it is not a driver.
@@ -35,11 +40,13 @@ def find_driver(policy: str | Path) -> Path:
     path = Path(policy)
     if isdir(path):  # unlike Path.is_dir, isdir accepts names that no folder can have
         return path
-    if isfile(path) and path.suffix == ".py":
+    if isfile(path) and path.suffix in DRIVER_FILES:
         return path
     if isfile(path):
         raise PolicyError(
-            f"{path}: not a policy; give a folder with model.safetensors, or a .py with make_policy"
+            f"{path}: not a policy; give a folder with model.safetensors, a .py file with "
+            "make_policy, or a model of stable-baselines3 (.zip), TorchScript (.pt, .ts) or ONNX "
+            "(.onnx)"
         )
     if here is not None:
         raise PolicyError(f"policy '{policy}': {here} is code in this folder; give its path")

@@ -32,8 +32,9 @@ class MapConfig(Section, key="map"):
 
     Attributes:
         source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
-            the eclipse-sumo wheel. Or a list of map files, or a folder of them; the seed then draws
-            a map for each episode of each world.
+            the eclipse-sumo wheel. A `.sumocfg` stands for its network and signal programs. Or a
+            list of map files, or a folder of them; the seed then draws a map for each episode of
+            each world.
         programs: additional files with signal programs, named like `source`. If a signal has
             several programs, the last one runs.
         program: the program of each signal named here, whatever was loaded; may be `off`.
@@ -110,6 +111,8 @@ class EnvConfig(Section, key=""):
         version: increases whenever published results change.
         rig: sensors that are mounted on every agent's vehicle, by name; see
             docs/reference/sensors.md.
+        plugins: modules with terms, sensors, driver models and backends of users
+            (docs/guides/extending.md). They are imported before the world is made.
         horizon_s: time after which an episode is truncated; 0: depends on the size of the map.
     """
 
@@ -129,6 +132,7 @@ class EnvConfig(Section, key=""):
     terms: TermsConfig = field(default_factory=TermsConfig)
     rig: Rig = field(default_factory=dict)
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
+    plugins: tuple[str, ...] = ()
     horizon_s: float = 60.0
 
     def __post_init__(self) -> None:

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from cavmarl.config.env import BY_MAP, EnvConfig, MapConfig
+from cavmarl.config.population import PopulationConfig
 from cavmarl.config.scenario import path_of_code
+from cavmarl.config.traffic import TrafficConfig
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import (
     CavmarlError,
@@ -26,11 +28,14 @@ from cavmarl.core.errors import (
     UnknownEnvironmentError,
     require,
 )
+from cavmarl.core.extensions import load_plugins
+from cavmarl.core.xml_root import SUMO_CONFIG_SUFFIX, is_sumo_config
 
-MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
+_NATIVE = (".net.xml", ".net.xml.gz")  # read as they are; SUMO's netconvert converts the others
+MAP_SUFFIXES = (*_NATIVE, ".osm", ".osm.gz", ".osm.xml", ".xodr")
 
 PACKAGE = Path(__file__).resolve().parents[1]
-_SUMO_PREFIX = "sumo:"
+SUMO_PREFIX = "sumo:"
 
 
 def places(kind: str) -> list[Path]:
@@ -79,7 +84,8 @@ def find_entry(env: str | Path) -> Path:
     """Return the entry folder or the map file that `env` means.
 
     Args:
-        env: a name from `entries()`, a folder with an `env.yaml`, or a map file.
+        env: a name from `entries()`, a folder with an `env.yaml`, a map file, or a configuration of
+            SUMO.
 
     Raises:
         UnknownEnvironmentError: nothing has that name; the message lists all names.
@@ -95,9 +101,10 @@ def find_entry(env: str | Path) -> Path:
     if isfile(path / "env.yaml"):  # unlike Path.is_file, isfile accepts names that no file can have
         return path
     if isfile(path):
-        if not path.name.endswith(MAP_SUFFIXES):
+        if not path.name.endswith(MAP_SUFFIXES) and not is_sumo_config(path):
             raise UnknownEnvironmentError(
-                f"{path}: not a map file; the name must end in {' or '.join(MAP_SUFFIXES)}"
+                f"{path}: not a map file; the name must end in {' or '.join(MAP_SUFFIXES)}, or its "
+                "root element must be the <configuration> of SUMO"
             )
         return path
     if isdir(path):
@@ -121,21 +128,25 @@ def load_config(
 
     Args:
         env: see `find_entry`. A map file gets a default environment, whose horizon depends on the
-            map: see `make_world`.
+            map: see `make_world`. A configuration of SUMO also sets `traffic.demand`, and no
+            background vehicles are generated.
         zones: sets `zones.count`.
         sensor_workers: sets `workers.sensors`.
         agents: sets `population.agents`.
         background: sets `population.background`.
         max_cycles: sets `horizon_s` to this number of steps.
         overrides: dotted key → value, for all other keys: `{"sensors.lidar.rays": 64}`. As in an
-            env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file.
+            env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file. `plugins` are
+            added to those of the environment.
 
     Raises:
         UnknownEnvironmentError: nothing has that name.
-        ConfigError: a key, a type or a value is not allowed; the message suggests the nearest one.
+        ConfigError: a key, a type or a value is not allowed, or a plugin cannot be imported; the
+            message suggests the nearest one.
     """
     from cavmarl.config.io import read_yaml, validate
 
+    load_plugins_of(env, overrides)
     found = find_entry(env)
     if found.is_dir():
         base_dir, where = found, str(found / "env.yaml")
@@ -146,9 +157,7 @@ def load_config(
         config = validate(EnvConfig, keys, where)
     else:
         base_dir, where = found.parent, str(found)
-        config = EnvConfig(
-            name=_map_name(found), map=MapConfig(source=found.name), horizon_s=BY_MAP
-        )
+        config = _config_of_file(found)
     keywords = {
         "zones.count": zones,
         "workers.sensors": sensor_workers,
@@ -167,6 +176,9 @@ def load_config(
     values |= {key: value for key, value in given.items() if key != "horizon_s"}
     if values or max_cycles is not None:
         raw = dataclasses.asdict(config)
+        if isinstance(plugins := values.get("plugins"), list | tuple):
+            more = [name for name in plugins if name not in config.plugins]
+            values["plugins"] = [*config.plugins, *more]
         for key, value in values.items():
             is_named = key == "rig" and isinstance(value, str)
             shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
@@ -174,6 +186,39 @@ def load_config(
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
         config = validate(EnvConfig, raw, f"{where}, overridden")
     return config, base_dir
+
+
+def _config_of_file(path: Path) -> EnvConfig:
+    """Return the default configuration of a map file, or of a configuration of SUMO."""
+    config = EnvConfig(name=_map_name(path), map=MapConfig(source=path.name), horizon_s=BY_MAP)
+    if not is_sumo_config(path):
+        return config
+    return dataclasses.replace(
+        config,
+        traffic=TrafficConfig(demand=(path.name,)),
+        population=PopulationConfig(background=0),
+    )
+
+
+def load_plugins_of(env: str | Path, overrides: Mapping[str, object] | None = None) -> None:
+    """Import the plugins that the env.yaml of an environment and overrides name.
+
+    Raises:
+        UnknownEnvironmentError: nothing has that name.
+        ConfigError: env.yaml cannot be read, or a plugin cannot be imported.
+    """
+    from cavmarl.config.io import read_yaml
+
+    file = find_entry(env) / "env.yaml"
+    named = {str(file): read_yaml(file) if isfile(file) else None, "overrides": overrides}
+    for where, keys in named.items():
+        plugins = keys.get("plugins") if isinstance(keys, Mapping) else None
+        if not isinstance(plugins, list | tuple):
+            continue  # `validate` reports a value of another type
+        try:
+            load_plugins(name for name in plugins if isinstance(name, str))
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
 
 
 def find_settings(what: str, name: str) -> Path:
@@ -232,6 +277,11 @@ def _find_rig(name: str, base_dir: Path) -> Path:
     return rigs[name]
 
 
+def is_converted(source: str) -> bool:
+    """Return whether a source in `map.source` is a map file that netconvert converts."""
+    return source.endswith(MAP_SUFFIXES) and not source.endswith(_NATIVE)
+
+
 def resolve_maps(config: EnvConfig, base_dir: Path) -> list[Path]:
     """Return the files of `map.source`; those of a folder are sorted by name.
 
@@ -262,7 +312,7 @@ def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
 
 
 def _maps_of(source: str, base_dir: Path) -> list[Path]:
-    if source.startswith(_SUMO_PREFIX) or not isdir(base_dir / source):
+    if source.startswith(SUMO_PREFIX) or not isdir(base_dir / source):
         return [_resolve("map.source", source, base_dir, MapError)]
     names = sorted(path.name for path in (base_dir / source).iterdir())
     maps = [base_dir / source / name for name in names if name.endswith(MAP_SUFFIXES)]
@@ -307,9 +357,9 @@ def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:
 
 
 def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError]) -> Path:
-    if source.startswith(_SUMO_PREFIX):
+    if source.startswith(SUMO_PREFIX):
         home = Path(require("sumo", "sumo").SUMO_HOME).resolve()
-        path = (home / source.removeprefix(_SUMO_PREFIX)).resolve()
+        path = (home / source.removeprefix(SUMO_PREFIX)).resolve()
         if not path.is_relative_to(home):
             raise failure(f"{key} = {source!r}: must be inside of the eclipse-sumo wheel")
     else:
@@ -360,7 +410,8 @@ def _advice(env: str | Path, known: Mapping[str, Path]) -> str:
 
 def _map_name(path: Path) -> str:
     """Return a map file's name without its suffix."""
-    ending = max((s for s in MAP_SUFFIXES if path.name.endswith(s)), key=len)
+    suffixes = (*MAP_SUFFIXES, SUMO_CONFIG_SUFFIX)
+    ending = max((s for s in suffixes if path.name.endswith(s)), key=len, default="")
     return path.name.removesuffix(ending)
 
 

@@ -390,8 +390,8 @@ class SensorsConfig(Section, key="sensors"):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in self.registered:
-            there = name in REGISTERED_SENSORS
-            check(there, "sensors.registered", name, REGISTERED_SENSORS.advice())
+            if name not in REGISTERED_SENSORS:
+                check(False, "sensors.registered", name, REGISTERED_SENSORS.advice())
         once = len(set(self.registered)) == len(self.registered)
         self.need("registered", once, "must name each sensor once")
         is_any_on = bool(self.registered) or any(one.is_on for one in self._sections().values())
@@ -403,7 +403,7 @@ class SensorsConfig(Section, key="sensors"):
         return {name: value for name, value in named if isinstance(value, SensorSection)}
 
     def without_sight(self) -> SensorsConfig:
-        """Return the same sensors without those that see other vehicles or signals."""
+        """Return the same sensors, except sensors that see other vehicles or signals."""
         blind: dict[str, Any] = {
             name: section.without_sight() for name, section in self._sections().items()
         }

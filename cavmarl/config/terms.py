@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from cavmarl.config.checks import Section, Within, check, check_finite
+from cavmarl.config.checks import Section, Within, check_finite
 from cavmarl.config.removed_keys import removed_key
 from cavmarl.core.errors import ConfigError
-from cavmarl.core.extensions import REGISTERED_TERMS
+from cavmarl.core.extensions import HOW, REGISTERED_TERMS
 
 # The named terms of a step, in the order of every terms array (`rewards/kernels/terms.py`).
 TERMS = (
@@ -55,16 +55,8 @@ class TermsConfig(Section, key="terms"):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, weight in self.weights.items():
-            known = (*TERMS, *REGISTERED_TERMS.names)
-            if name not in known and (refusal := removed_key(f"terms.weights.{name}")):
-                raise ConfigError(refusal)
-            check(
-                name in known,
-                "terms.weights",
-                name,
-                f"no such term; must be one of {', '.join(known)}; or add one with "
-                "cavmarl.register_term",
-            )
+            if name not in TERMS and name not in REGISTERED_TERMS:
+                raise ConfigError(_unknown_term(name))
             check_finite(f"terms.weights.{name}", weight, -1e6, 1e6)
 
     @property
@@ -81,3 +73,11 @@ class TermsConfig(Section, key="terms"):
     def weight_of_each(self) -> tuple[float, ...]:
         """The weights of all terms, in the order of `names`."""
         return tuple(self.weights.get(name, 0.0) for name in self.names)
+
+
+def _unknown_term(name: str) -> str:
+    return removed_key(f"terms.weights.{name}") or (
+        f"terms.weights = {name!r}: no such term; must be one of "
+        f"{', '.join((*TERMS, *REGISTERED_TERMS))}. If a module registers it with "
+        f"cavmarl.register_term, {HOW}"
+    )

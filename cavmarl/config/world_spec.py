@@ -15,7 +15,7 @@ from cavmarl.config.driver_form import (
     with_form,
     with_sensors_of,
 )
-from cavmarl.config.registry import load_config
+from cavmarl.config.registry import load_config, load_plugins_of
 from cavmarl.core.seeds import check_seed
 
 
@@ -55,6 +55,8 @@ class WorldSpec:
         if isinstance(env, WorldSpec):
             return env
         driver = keys.pop("sensors_of", None)
+        if driver is not None:
+            load_plugins_of(env, keys.get("overrides"))  # the driver may have their sensors
         overrides = with_sensors_of(keys.get("overrides"), driver)
         given: dict[str, Any] = {**keys, "overrides": dict(overrides or {})}
         return cls(env=str(env), **given)
@@ -79,6 +81,7 @@ def with_sensors_of_drivers(spec: WorldSpec, policies: Iterable[str | Path]) -> 
         ConfigError: an override of the world contradicts the drivers.
         PolicyError: a driver cannot be found or read, or two drivers need different forms.
     """
+    load_plugins_of(spec.env, spec.overrides)  # the drivers may have their sensors
     forms = forms_in(policies)
     if not forms:
         return spec

@@ -1,4 +1,4 @@
 """Basics of all folders: errors, seeds, memory, and shared kernels.
 
-Imports nothing from the rest of the package.
+It imports nothing from the rest of the package.
 """

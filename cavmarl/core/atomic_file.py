@@ -1,8 +1,8 @@
 """Files that are either complete or absent, even if the process or the machine stops.
 
 A file is written in a draft folder beside its destination. The process holds a lock on that folder:
-the next draft in the same place removes folders whose process has ended. They stay if the file
-system has no locks.
+the next draft in the same place removes folders whose process has ended. If the file system has no
+locks, these folders stay.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def write_whole(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         draft.replace(path)
-    if os.name == "posix":  # otherwise, the old file may return after a power cut
+    if os.name == "posix":  # without this, the old file may return after a power cut
         parent = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(parent)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
-_REPORTED: set[Path] = set()
+from cavmarl.core.notices import print_once
 
 
 def cache_dir() -> Path:
@@ -18,14 +17,9 @@ def cache_dir() -> Path:
     return (Path(shared) if os.path.isabs(shared) else Path.home() / ".cache") / "cavmarl"
 
 
-def tell_unwritable(error: OSError) -> None:
+def report_unwritable(error: OSError) -> None:
     """Report once, on standard error, that the cache cannot be written."""
-    folder = cache_dir()
-    if folder not in _REPORTED:
-        _REPORTED.add(folder)
-        print(
-            f"cavmarl: {folder} cannot be written ({error.strerror or error}): every process has "
-            "to compile kernels and read maps again; set CAVMARL_CACHE_DIR to a writable folder",
-            file=sys.stderr,
-            flush=True,
-        )
+    print_once(
+        f"{cache_dir()} cannot be written ({error.strerror or error}), so every process must "
+        "compile kernels and read maps again; set CAVMARL_CACHE_DIR to a writable folder"
+    )

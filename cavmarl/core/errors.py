@@ -3,6 +3,7 @@
     CavmarlError
     ├── ConfigError            an invalid key, value, combination or division
     │   ├── UnknownEnvironmentError   no entry, path or map has that name
+    │   ├── UnknownArgumentError      a keyword argument that does not exist
     │   └── ScenarioError         a map without a place for a scenario
     ├── MapError               a map that cannot be read, built or driven on
     │   └── RouteError            there is no route between two places
@@ -26,18 +27,21 @@
     │   ├── WorkerFailureError    an exception in a worker, with its traceback
     │   ├── NodeRefusedError      a node that its caller has rejected
     │   └── NoAdmissibleWorkerError   every worker is too busy to get a shard
-    ├── ClockError             a clock that is advanced by another than its master
+    ├── ClockError             a clock that is not advanced by its master
     ├── FollowerError          an external stack that sends invalid data
-    │   └── FollowerLostError     it has ended, or has not answered in time
+    │   └── FollowerLostError     a stack that has ended, or has not answered in time
     ├── ServiceError           the coordination service, one of its nodes, or a request failed
     └── SumoError              SUMO as global traffic cannot continue
 
-A message says what is wrong, where, and what to do.
+Each message says what is wrong, where, and what to do.
 """
 
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 
@@ -55,6 +59,10 @@ class ConfigError(CavmarlError):
 
 class UnknownEnvironmentError(ConfigError):
     """No environment, folder or map file has that name."""
+
+
+class UnknownArgumentError(ConfigError, TypeError):
+    """A keyword argument that does not exist."""
 
 
 class ScenarioError(ConfigError):
@@ -121,8 +129,8 @@ class RecordingError(CavmarlError):
 class TrainingError(CavmarlError):
     """A training run that cannot start, continue or be written.
 
-    Another process writes to its folder, the folder has another run, its checkpoint is damaged, or
-    the disk is full.
+    Causes: another process writes to the folder, the folder has another run, the checkpoint is
+    damaged, or the disk is full.
     """
 
 
@@ -130,8 +138,7 @@ class ProtocolError(CavmarlError):
     """The hand-off protocol was violated, or cannot continue.
 
     For example: an event that is not allowed in a state; a vehicle that is lost, duplicated,
-        created
-    twice or at another epoch than planned; an invariant that does not hold.
+    created twice or at another epoch than planned; an invariant that does not hold.
     """
 
 
@@ -151,8 +158,8 @@ class LostTickError(ProtocolError):
 class MessageError(ProtocolError):
     """Bytes that are not a message of this run, or vehicles that cannot continue here.
 
-    They are truncated, damaged, or of another version, build, environment, run, vehicle or tick.
-    Also raised if the answer of a network simulator fits no packet.
+    The bytes are truncated, damaged, or of another version, build, environment, run, vehicle or
+    tick. Also raised if the answer of a network simulator fits no packet.
     """
 
 
@@ -218,7 +225,7 @@ class NoAdmissibleWorkerError(WorkerError):
 
 
 class ClockError(CavmarlError):
-    """A clock that is advanced by another than its master, or a second master.
+    """A clock that is not advanced by its master, or a second master.
 
     Also raised if a world is not at the tick at which its time master left it.
     """
@@ -227,7 +234,7 @@ class ClockError(CavmarlError):
 class FollowerError(CavmarlError):
     """An external stack has sent data that is invalid, not executable or not expected.
 
-    The world is intact and can be stepped on.
+    The world is intact and can continue.
     """
 
 
@@ -262,8 +269,8 @@ class ServiceError(CavmarlError):
 class SumoError(CavmarlError):
     """SUMO as global traffic cannot continue.
 
-    A second simulation in one process, a SUMO process that has ended or hangs, or SUMO data that
-    does not fit the world.
+    Causes: a second simulation in one process, a SUMO process that has ended or hangs, or SUMO data
+    that does not fit the world.
     """
 
 
@@ -273,9 +280,31 @@ class RegisteredFunctionError(CavmarlError):
 
 def missing(module: str | None, extra: str) -> MissingExtraError:
     """Return the error for a `module` that cannot be imported; it names the `extra` to install."""
-    return MissingExtraError(
-        f"'{module}' is not installed: pip install '.[{extra}]' in a checkout of cavmarl"
-    )
+    return MissingExtraError(f"'{module}' is not installed: {_installation([extra])}")
+
+
+def require_all(needed: Mapping[str, str]) -> None:
+    """Check optional modules without importing them; `needed`: module → extra.
+
+    Raises:
+        MissingExtraError: names all modules that are not installed, and one command for them.
+    """
+    absent = {module: extra for module, extra in needed.items() if find_spec(module) is None}
+    if absent:
+        names = " and ".join(f"'{module}'" for module in absent)
+        verb = "is" if len(absent) == 1 else "are"
+        extras = sorted(set(absent.values()))
+        raise MissingExtraError(f"{names} {verb} not installed: {_installation(extras)}")
+
+
+def _installation(extras: Sequence[str]) -> str:
+    """Return the command that adds extras to this installation: of a checkout, or of a wheel."""
+    checkout = Path(__file__).resolve().parents[2]
+    wanted = f"[{','.join(extras)}]"
+    if not (checkout / "pyproject.toml").is_file():
+        return f"pip install 'cavmarl{wanted}'"
+    place = "." if Path.cwd() == checkout else str(checkout)
+    return f"pip install -e '{place}{wanted}'"
 
 
 def require(module: str, extra: str) -> ModuleType:

@@ -1,7 +1,7 @@
-"""Arrays in huge pages, which save address translations: a tick reads many places in memory.
+"""Arrays in huge pages, which save address translations when a tick reads scattered memory.
 
 In a virtual machine, a page that is not in the processor's translation buffer costs two walks
-through page tables. Linux provides pages of 2 MiB on request, unless they are switched off
+through page tables. Linux provides pages of 2 MiB on request, unless these pages are switched off
 (`/sys/kernel/mm/transparent_hugepage/enabled`). On other systems, arrays are NumPy's own.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-PAGE = 1 << 21  # bytes
+PAGE = 1 << 21  # size of a huge page in bytes
 LEAST = 1 << 16  # bytes; smaller arrays gain nothing
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _TUNABLES = "GLIBC_TUNABLES"
@@ -59,7 +59,7 @@ def huge_copy(array: NDArray[Any], also_mapped: bool = False) -> NDArray[Any]:
     """Return the array in huge pages, with the same writeability.
 
     Arrays that are small, in huge pages already, or (unless `also_mapped`) in a mapped file are
-    returned as they are.
+    returned unchanged.
     """
     if array.nbytes < LEAST or (_is_mapped(array) and not also_mapped):
         return array
@@ -99,7 +99,7 @@ def _map(size: int) -> NDArray[np.uint8]:
     try:
         memory.madvise(mmap.MADV_HUGEPAGE)
     except OSError:
-        pass  # a kernel without huge pages: small pages work, too
+        pass  # this system has no huge pages; small pages work, too
     whole = np.frombuffer(memory, dtype=np.uint8)
     first = -whole.ctypes.data % PAGE
     return whole[first : first + size]

@@ -1,4 +1,4 @@
-"""Describes the machine and the code: processor, memory, system, packages, commit."""
+"""Description of the machine and the code: processor, memory, system, packages, commit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory-mapped files: only the parts that are used take up memory."""
+"""Memory-mapped files, where only the used parts take up memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Child processes that end with the process that started them, in any case.
+"""Child processes that always end with the process that started them.
 
 Ctrl-C in a terminal only interrupts the parent, which then ends its children.
 """
@@ -29,16 +29,16 @@ def is_fork(pid: int) -> bool:
 
 
 def refuse_fork(pid: int, things: str) -> None:
-    """Raise an error if this process is a fork of process `pid`, which made some objects.
+    """Raise an error if this process is a fork of process `pid`, which made `things`.
 
     Raises:
-        WorkerError: this is a fork. Both processes would use the same connection or file. `things`
-            describes the objects.
+        WorkerError: this is a fork. Both processes would use the same connection or file; `things`
+            describes it in the message.
     """
     if is_fork(pid):
         raise WorkerError(
-            f"{things} are those of process {pid}, and this is a fork of it: make the environment "
-            "here, after the fork"
+            f"{things} belong to process {pid}, and this process is a fork of it; make the "
+            "environment here, after the fork"
         )
 
 

@@ -1,4 +1,4 @@
-"""Progress bars for long operations: share done, rate, remaining time."""
+"""Progress bars for long operations, with the share done, the rate and the remaining time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rich.text import Text
 
 
 class RateColumn(ProgressColumn):
-    """Shows items per second, or the duration of an item."""
+    """A column with items per second, or with the duration of an item."""
 
     def render(self, task: Task) -> Text:
         """Return the text beside the bar of a task."""
@@ -31,7 +31,7 @@ class RateColumn(ProgressColumn):
 
 
 def progress_bar(console: Console) -> Progress:
-    """Return a bar that disappears at the end; without a terminal, it is never shown."""
+    """Return a bar that disappears at the end. Without a terminal, no bar is shown."""
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
@@ -48,7 +48,7 @@ def progress_bar(console: Console) -> Progress:
 
 @contextmanager
 def counting(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function of the items done and the total that updates a progress bar."""
+    """Yield a function that updates a progress bar with the number of items done and the total."""
     with progress_bar(console) as bar:
         task = bar.add_task(what)
         yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -1,8 +1,8 @@
 """Height and pitch of a vehicle over a whole drive, from GNSS, IMU and odometry.
 
-A Kalman filter and a backward smoother (Rauch, Tung, Striebel, 1965) over height, speed and pitch.
-The force along the body less the acceleration is the share of gravity, which gives the pitch. Pitch
-and speed give the change of the height, and GNSS keeps the height from drifting.
+A Kalman filter and a backward smoother (Rauch, Tung, Striebel, 1965) estimate height, speed and
+pitch. The force along the body minus the acceleration is a share of gravity, which gives the pitch.
+Pitch and speed give the change of the height, and GNSS keeps the height from drifting.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
 
-_DRIFT = (0.02, 0.3, 0.02)  # per square root of a second: m, m/s, rad
+_DRIFT = (0.02, 0.3, 0.02)  # model error per square root of a second: m, m/s, rad
 _FIRST = (3.0, 1.0, 0.1)
 
 
@@ -22,14 +22,14 @@ _FIRST = (3.0, 1.0, 0.1)
 class HeightTrack:
     """The readings of one drive, step by step."""
 
-    gnss_m: float  # standard deviations of a GNSS height and of a speed
+    gnss_m: float  # standard deviations of a GNSS height and, below, of a speed
     speed_mps: float
     _steps: list[tuple[float, float, float | None, float | None]] = field(default_factory=list)
 
     def add(
         self, elapsed_s: float, force_mps2: float, speed_mps: float | None, height_m: float | None
     ) -> None:
-        """Add a step: force along the body, speed by wheels, height by GNSS; None: no sample."""
+        """Add a step: force along the body, wheel speed, GNSS height; None: no sample."""
         self._steps.append((elapsed_s, force_mps2, speed_mps, height_m))
 
     def smoothed(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -135,14 +135,11 @@ class RegisteredFunction:
 
     def _ask(self, view: BatchView) -> NDArray[np.float32]:
         if self._batched:
-            answer = np.asarray(self._function(view), dtype=np.float32)
+            answer = self._numbers(self._function(view))
             answers = answer[:, np.newaxis] if answer.ndim == 1 else answer
             fits = answers.shape == (len(view.own), self._size)
         else:
-            each = [
-                np.atleast_1d(np.asarray(self._function(one), dtype=np.float32))
-                for one in view.single()
-            ]
+            each = [np.atleast_1d(self._numbers(self._function(one))) for one in view.single()]
             fits = all(one.shape == (self._size,) for one in each)
             answers = np.stack(each) if fits else each[0]
         if not fits or not np.isfinite(answers).all():
@@ -152,6 +149,19 @@ class RegisteredFunction:
                 "agent"
             )
         return answers
+
+    def _numbers(self, answer: Any) -> NDArray[np.float32]:
+        """Return an answer as an array; raise RegisteredFunctionError if it has no numbers."""
+        try:
+            found = np.asarray(answer)
+            if found.dtype.kind in "biuf":
+                return found.astype(np.float32)
+        except (TypeError, ValueError):  # rows of different lengths, for example
+            pass
+        raise RegisteredFunctionError(
+            f"registered function '{self._name}' returned {answer!r:.200}; it must return "
+            f"{self._size} finite number(s) per agent"
+        )
 
     def _check_order(self, view: BatchView, numbers: NDArray[np.float32]) -> None:
         """Compare the values with those for vehicles and agents in another order, and alone."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from cavmarl.core.compiled import IS_PLAIN
 from cavmarl.core.errors import ConfigError, require
-from cavmarl.core.extensions import REGISTERED_MODELS
+from cavmarl.core.extensions import HOW, REGISTERED_MODELS
 from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.kernels.models.registered_models import (
     FIRST_REGISTERED,
@@ -40,6 +40,11 @@ def model_names() -> tuple[str, ...]:
     return (*_CODES, *REGISTERED_MODELS.names)
 
 
+def has_model(name: str) -> bool:
+    """Return whether a name is in `model_names`."""
+    return name in _CODES or name in REGISTERED_MODELS
+
+
 def model_code(name: str, key: str = "traffic.model") -> int:
     """Return MODEL_* of a model by name.
 
@@ -52,8 +57,8 @@ def model_code(name: str, key: str = "traffic.model") -> int:
         return REGISTERED_MODELS[name]
     known = ", ".join(model_names())
     raise ConfigError(
-        f"{key} = {name!r} is not a driver model; choose one of {known}, or register the model "
-        "with cavmarl.register_driver_model"
+        f"{key} = {name!r} is not a driver model; choose one of {known}. If a module registers it "
+        f"with cavmarl.register_driver_model, {HOW}"
     )
 
 
@@ -79,9 +84,8 @@ def register_driver_model(name: str, model: Callable[..., float]) -> None:
     """
     if not IS_PLAIN:
         require("numba", "compile")
-    code = REGISTERED_MODELS[name] if name in REGISTERED_MODELS else None
-    if code is None:
-        code = FIRST_REGISTERED + len(REGISTERED_MODELS.names)
+    is_new = name not in REGISTERED_MODELS
+    code = FIRST_REGISTERED + len(REGISTERED_MODELS) if is_new else REGISTERED_MODELS[name]
     if code >= FIRST_REGISTERED + MAX_REGISTERED:
         raise ConfigError(
             f"driver model '{name}': {MAX_REGISTERED} models are registered, which is the maximum; "

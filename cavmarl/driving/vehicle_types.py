@@ -199,7 +199,7 @@ def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void
 def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
     """Return VTYPE (1,): the passenger car of the generator and of agents.
 
-    It has highway-env's parameters of IDM, and the size of highway-env's car (5 m × 2 m).
+    The car has highway-env's parameters of IDM, and the size of highway-env's car (5 m × 2 m).
     """
     types = np.zeros(1, dtype=VTYPE)
     car = types[0]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 RECORD_VERSION = 2
 
-# The order is that of use: the fields that every driver reads of others come first and share two
+# The fields are ordered by use: fields that drivers read of others come first and share two
 # cache lines; fields that are rarely read come last.
 VEHICLE = np.dtype(
     [
@@ -65,8 +65,8 @@ VEHICLE = np.dtype(
         ("tick", np.int64),  # the world's tick of this state
         ("to_go", np.float64),  # remaining distance to the goal, along the plan, m
         ("distance_m", np.float64),  # driven since departure
-        # s that the driven distance takes at the speed limit; for background vehicles, at the limit
-        # times the speed factor
+        # s that the driven distance takes at `free_speed`: at the speed limit, for background
+        # vehicles times the speed factor, but at most at the type's maximum speed
         ("free_s", np.float64),
         ("step_to_go", np.float64),  # to_go at the start of the current step
         ("step_jerk", np.float64),  # integral of |jerk| over the current step, m/s²

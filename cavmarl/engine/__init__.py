@@ -1,4 +1,4 @@
 """The simulation of worlds: the order of a tick, and the signals and outputs of all zones.
 
-It builds on `shards` and `handoff`; `parallel` runs it in several processes.
+This package builds on `shards` and `handoff`; `parallel` runs it in several processes.
 """

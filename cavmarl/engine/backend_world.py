@@ -26,28 +26,28 @@ class BackendWorld:
     def __init__(self, partition: ZonePartition, backends: Sequence[ShardBackend]) -> None:
         self._zones, self._count = partition.arrays, partition.count
         self.resume(backends)
-        self._shown: list[set[int]] = [set() for _ in backends]  # ids of each backend's ghosts
-        self._controls: dict[int, VehicleControl] = {}  # the latest of each vehicle
+        self._ghost_ids: list[set[int]] = [set() for _ in backends]  # ids of each backend's ghosts
+        self._controls: dict[int, VehicleControl] = {}  # the latest control of each vehicle
         self._seen: dict[int, NDArray[np.float32]] = {}
         self.tick = 0
         self.handed_over = 0
 
     def reset(self, seed: int, vehicles: NDArray[np.void]) -> None:
-        """Begin with the vehicles VEHICLE (n,), each owned by the zone in which it is."""
+        """Begin with the vehicles VEHICLE (n,), each owned by the zone that contains it."""
         zones = np.array([zone_of(self._zones, row["x"], row["y"]) for row in vehicles], dtype=int)
         self.tick = self.handed_over = 0
         self._controls.clear()
-        for backend, shown in zip(self._backends, self._shown, strict=True):
+        for backend, shown in zip(self._backends, self._ghost_ids, strict=True):
             backend.reset(seed)
             shown.clear()
             own = vehicles[zones == backend.zone].copy()
             own["owner"] = backend.zone
             backend.spawn(own)
-        self._share()
+        self._update_ghosts()
         self._sense()
 
     def resume(self, backends: Sequence[ShardBackend]) -> None:
-        """Replace the backends by others that have restored the snapshots of the former ones."""
+        """Replace the backends by backends that have restored their snapshots."""
         if [one.zone for one in backends] != [*range(self._count)]:
             raise ConfigError(
                 f"the backends run the zones {[one.zone for one in backends]}; pass one for each "
@@ -66,7 +66,7 @@ class BackendWorld:
             raise ConfigError(f"vehicle {min(left)} is in no zone; omit its controls")
         for backend in self._backends:
             backend.advance()
-        self._share()
+        self._update_ghosts()
         ticks = {backend.commit() for backend in self._backends}
         if len(ticks) > 1:
             raise ConfigError(
@@ -89,10 +89,10 @@ class BackendWorld:
         found = [backend.read_sensors() for backend in self._backends]
         self._seen = {vehicle: seen for some in found for vehicle, seen in some.items()}
 
-    def _share(self) -> None:
+    def _update_ghosts(self) -> None:
         """Update the ghosts of each backend: vehicles of other zones within its reach."""
         owned = [backend.read_vehicles() for backend in self._backends]
-        for backend, shown in zip(self._backends, self._shown, strict=True):
+        for backend, shown in zip(self._backends, self._ghost_ids, strict=True):
             limit = backend.reach_m * backend.reach_m
             others = np.concatenate(
                 [rows for zone, rows in enumerate(owned) if zone != backend.zone]
@@ -124,6 +124,6 @@ class BackendWorld:
                 if vehicle in self._controls:
                     target.apply_controls({vehicle: self._controls[vehicle]})
                 source.upsert_ghosts(state)
-                self._shown[number].discard(vehicle)
-                self._shown[source.zone].add(vehicle)
+                self._ghost_ids[number].discard(vehicle)
+                self._ghost_ids[source.zone].add(vehicle)
                 self.handed_over += 1

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.cache_folder import cache_dir, report_unwritable
 from cavmarl.core.compiled import IS_PLAIN, sources_digest
 from cavmarl.core.compiled.kernel_files import machine_digest, numba_version
 from cavmarl.core.compiled.machine_code import CompileListener, kernel_source, listeners
@@ -37,7 +37,7 @@ _ANNOUNCER = _Announcer()
 
 
 def prepare_kernels() -> None:
-    """Compile the kernels of a plain world in two processes, if this machine has none cached.
+    """Compile the kernels of a plain world in two processes, if no kernels are cached here.
 
     Afterwards, the first compilation of a kernel in this process prints a message on standard
     error.
@@ -81,11 +81,11 @@ def _marker(name: str) -> Path:
 
 
 def _can_cache() -> bool:
-    """Return whether compiled kernels can be cached on this machine; if not, print it once."""
+    """Return whether compiled kernels can be cached on this machine; if not, report it once."""
     try:
         _marker("plain").parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        tell_unwritable(error)
+        report_unwritable(error)
         return False
     return True
 

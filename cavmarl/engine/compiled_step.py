@@ -36,7 +36,7 @@ class CompiledStep:
             np.copyto(calls.controls, commands.controls)
             calls.chosen[:] = self._tick.shared.chosen[:] = True
         self._ticks.run()
-        self.group.face(*calls.members.sides.tolist())
+        self.group.set_sides(*calls.members.sides.tolist())
 
     def _add_tick(self, sequence: CallSequence) -> None:
         """Append the phases of a tick; see `Tick.run`."""

@@ -31,7 +31,7 @@ class ComponentContext(NamedTuple):
     shards: Sequence[Shard]  # one per zone; components read their rows
     division: ZonedShards  # of all shards
     travel: TripTables
-    outputs: Outputs  # of the agents
+    outputs: Outputs  # outputs of the agents
     zeros: Zeros  # allocates the arrays that outlive a tick
     frames: Frames  # samples of the agents' rigs
 
@@ -62,7 +62,7 @@ class Component(Protocol):
         ...
 
     def arrays(self) -> Iterator[NDArray[Any]]:
-        """Return all arrays (W, …) that outlive a tick, the same ones in each call.
+        """Return all arrays (W, …) that outlive a tick. Each call returns the same arrays.
 
         The hash of the state covers them. They must not depend on the division of a world or on
         the places of its rows. Records must have no padding, because padding is not saved.
@@ -70,5 +70,5 @@ class Component(Protocol):
         ...
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with saved arrays of the shapes of `arrays`; empty if nothing."""
+        """Return the fault of saved arrays with the shapes of `arrays`; empty if they are valid."""
         ...

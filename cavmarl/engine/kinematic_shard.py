@@ -51,7 +51,7 @@ class KinematicShard:
             huge_zeros, None,
         )  # fmt: skip
         self._shared = shared
-        self._refuse_what_is_shared(config, network)
+        self._refuse_shared_features(config, network)
         self._shard = tick.shards[zone]
         tick.executor = self._executor = ShardGroup([self._shard])
         self.zone = zone
@@ -65,7 +65,7 @@ class KinematicShard:
         self._is_moved = False  # `advance` is done, `commit` is not
         self.reset(0)
 
-    def _refuse_what_is_shared(self, config: EnvConfig, network: RoadNetwork) -> None:
+    def _refuse_shared_features(self, config: EnvConfig, network: RoadNetwork) -> None:
         size = self._shared.outputs.observations.shape[2]
         wrong = {
             "v2x, rig or scenario": bool(self._tick.attached),
@@ -78,8 +78,9 @@ class KinematicShard:
         for feature, is_used in wrong.items():
             if is_used:
                 raise ConfigError(
-                    f"{feature}: a world over backends cannot have it, because its zones share "
-                    "only vehicles; turn it off, or run the zones on nodes (make_vec(..., nodes=k))"
+                    f"{feature}: worlds over backends do not support this, because their zones "
+                    "share only vehicles; turn it off, or run the zones on nodes "
+                    "(make_vec(..., nodes=k))"
                 )
 
     def reset(self, seed: int) -> None:

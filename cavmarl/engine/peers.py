@@ -26,15 +26,15 @@ class Peers(Protocol):
 
     are_none: bool
 
-    def keep_own(self, chosen: NDArray[np.bool_]) -> None:
+    def drop_foreign_rows(self, chosen: NDArray[np.bool_]) -> None:
         """Drop other processes' vehicles, which a reset of the chosen worlds (W,) has made."""
         ...
 
-    def take_up(self, departures: DepartureQueue, side: int) -> None:
+    def resume_from(self, departures: DepartureQueue, side: int) -> None:
         """Resume from the restored rows of the zones, which are on `side`."""
         ...
 
-    def everybody(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
+    def all_zones(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
         """Return a context in which each process has the owned rows of all zones, on `side`.
 
         Changes of rows are kept in the process that owns them. All processes must count the same in
@@ -87,13 +87,13 @@ class NoPeers:
     def __init__(self, division: ZonedShards) -> None:
         self._division = division
 
-    def keep_own(self, chosen: NDArray[np.bool_]) -> None:
+    def drop_foreign_rows(self, chosen: NDArray[np.bool_]) -> None:
         """Do nothing: all vehicles belong to this process."""
 
-    def take_up(self, departures: DepartureQueue, side: int) -> None:
+    def resume_from(self, departures: DepartureQueue, side: int) -> None:
         """Do nothing: there are no other processes."""
 
-    def everybody(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
+    def all_zones(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
         """Return an empty context: this process has the rows of all zones."""
         return nullcontext()
 

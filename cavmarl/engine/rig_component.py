@@ -56,7 +56,7 @@ class RigComponent:
         return self.rig.arrays()
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return "": the arrays hold no indices, so any values are valid."""
+        """Return "", because the arrays hold no indices and any values are valid."""
         return ""
 
     def scenes(self) -> list[SensedScene]:

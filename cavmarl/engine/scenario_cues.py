@@ -34,18 +34,18 @@ class Cues:
         """Do nothing: the new actors of an episode have reset the cues."""
 
     def begin(self, commands: Commands) -> None:
-        """Record each cue whose time has come, or near which an agent is."""
+        """Record each cue whose time has come, or that has an agent nearby."""
         zoned, worlds = self._division.zoned, self._worlds
         rows = zoned.rows[self._division.side]
         self._note_cues(self._cues, rows, zoned.num_owned, worlds.ticks, worlds.cues)
 
     def end(self) -> None:
-        """Do nothing: scripted vehicles move with all others."""
+        """Do nothing: scripted vehicles move with all other vehicles."""
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return no arrays: the cues are in `Worlds`."""
         return iter(())
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return "": there are no arrays."""
+        """Return "", because there are no arrays."""
         return ""

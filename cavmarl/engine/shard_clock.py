@@ -25,8 +25,8 @@ class ShardClock(PhaseExecutor):
     def __init__(
         self,
         shards: Sequence[Shard],  # one per zone, in the order of zones
-        # One tick of `every` is run zone by zone, and its time stands for all of them. The first
-        # of these is not counted, because its calls are bound then.
+        # One tick in `every` ticks is run zone by zone, and its time stands for all of them. The
+        # first measured tick is not counted, because it also binds the calls.
         every: int = 1,
     ) -> None:
         self._alone = [ShardGroup((shard,)) for shard in shards]

@@ -93,14 +93,15 @@ class SharedOutputs:
 def make_outputs(
     config: EnvConfig,
     num_worlds: int,  # W
-    observations: NDArray[np.float32] | None = None,  # (W, A, D) to be used; None: allocated here
+    # (W, A, D) existing array; None: allocated here
+    observations: NDArray[np.float32] | None = None,
     zeros: Zeros = np.zeros,  # allocates all other outputs
 ) -> Outputs:
     """Return the outputs of W empty worlds."""
     agents = (num_worlds, config.population.num_ids)
     if observations is None:
         size = config.sensors.stack * frame_size(config.sensors)
-        # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
+        # Not `zeros`, because NumPy requests huge pages only for arrays that it fills.
         observations = np.full((*agents, size), 0.0, dtype=np.float32)
     vehicle_ids = zeros(agents, dtype=np.int64)
     vehicle_ids[...] = -1

@@ -57,7 +57,7 @@ class Simulation(WorldViews):
         frames: Frames | None = None,
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
         zeros: Zeros = huge_zeros,  # allocates the arrays that shards write
-        like: Simulation | None = None,  # of the same environment; its tables are shared
+        like: Simulation | None = None,  # worlds of the same environment, to share tables
         runs: Sequence[OpenRun] | None = None,  # one per world; None: made as `config.zones` says
         late_ticks: int = 0,  # extra ticks that a vehicle across a border may stay with its owner
     ) -> None:
@@ -133,7 +133,7 @@ class Simulation(WorldViews):
         tick.traffic.populate(tick.departures, worlds, chosen)
         tick.sumo.reset(chosen, worlds)
         tick.division.distribute(chosen)
-        tick.peers.keep_own(chosen)
+        tick.peers.drop_foreign_rows(chosen)
         tick.coordination.reset(chosen)
         tick.sumo.switch_signals(tick)
         for part in tick.attached:
@@ -177,7 +177,7 @@ class Simulation(WorldViews):
         self._tick.instrument(wrap)
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
-        """Report the phases of a tick: the executor's by `wrap(executor)`, components' by `note`.
+        """Report the phases of a tick: shards' phases to `wrap(executor)`, components' to `note`.
 
         A component with phases of its own (such as another simulator's step) has a method `trace`.
         """
@@ -212,16 +212,16 @@ class Simulation(WorldViews):
         self._put_back(saved)
         tick = self._tick
         tick.sumo.catch_up(self._shard.worlds)
-        tick.peers.keep_own(self.everywhere)
-        tick.peers.take_up(tick.departures, tick.division.side)
+        tick.peers.drop_foreign_rows(self.everywhere)
+        tick.peers.resume_from(tick.departures, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
-        """Resume like `load` where each process holds some zones; `home` is a zone of this one."""
+        """Resume like `load` if zones are divided among processes; `home` is a zone of this one."""
         self._put_back(saved, home)
         tick = self._tick
         tick.sumo.catch_up(self._shard.worlds)
         tick.departures.num_passing[:] = 0
-        tick.peers.take_up(tick.departures, tick.division.side)
+        tick.peers.resume_from(tick.departures, tick.division.side)
         tick.peers.share_rows(tick.departures, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:

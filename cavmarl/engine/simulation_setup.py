@@ -57,7 +57,7 @@ def call_rare_kernels(tick: Tick) -> None:
     tick.executor.gather(*division.gathering)
     division.rehearse_gathering()
     tick.traffic.settle(departures, tick.worlds)
-    division.changes.near(0, everybody=True)
+    division.changes.near(0, check_all=True)
     with suppress(ConfigError):
         division.changes.hand_over(0, Switch(-1, 0, 0, 0, False))
     book = HandoffLog(division, 0)

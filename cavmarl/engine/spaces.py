@@ -34,9 +34,8 @@ def _box(size: int) -> spaces.Box:
 def flat_observation_space(config: EnvConfig) -> spaces.Box:
     """Return one Box of all features of all sensors, for any `observation.kind`.
 
-    Features are within [-1, 1], except those that are left unscaled. With `sensors.stack` the
-    frames follow one another, oldest first. In the mode `sensors`, the Box has the samples of the
-    rig, in the order of its sensors.
+    Scaled features are within [-1, 1]. With `sensors.stack`, frames follow one another, oldest
+    first. In the mode `sensors`, the Box has the samples of the rig, in the order of its sensors.
     """
     if config.observation.mode == "sensors":
         boxes = [_frame_box(config, name) for name in config.rig]
@@ -104,9 +103,9 @@ def _feature_box(
 class ObservationPart:
     """One sensor's part of an observation."""
 
-    place: slice  # where its features lie in each frame of a flat observation
-    shape: tuple[int, ...]  # in a Dict observation; the frames of a stack are its first axis
-    dtype: DTypeLike  # in a Dict observation
+    place: slice  # range of its features in each frame of a flat observation
+    shape: tuple[int, ...]  # shape in a Dict observation; frames of a stack come first
+    dtype: DTypeLike  # dtype in a Dict observation
 
 
 def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
@@ -134,10 +133,10 @@ def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
 
 
 def named_observation(
-    parts: Mapping[str, ObservationPart],  # of `observation_parts`
+    parts: Mapping[str, ObservationPart],  # as from `observation_parts`
     frames: NDArray[np.float32],  # (…, stack, frame size): flat observations, reshaped
-) -> dict[str, NDArray[Any]]:  # an array (…, *shape) a sensor
-    """Return flat observations by sensor. They are views, except images, which become bytes."""
+) -> dict[str, NDArray[Any]]:  # one array (…, *shape) per sensor
+    """Split flat observations by sensor, as views; images are converted to bytes."""
     before = frames.shape[:-2]
     return {
         name: frames[..., part.place].reshape(*before, *part.shape).astype(part.dtype, copy=False)
@@ -146,8 +145,8 @@ def named_observation(
 
 
 def flat_observation(
-    names: Iterable[str],  # of the sensors in the order of the flat observation
-    named: Mapping[str, NDArray[Any]],  # an array a sensor, in any order
+    names: Iterable[str],  # sensors in the order of the flat observation
+    named: Mapping[str, NDArray[Any]],  # one array per sensor, in any order
     stack: int,  # frames in an observation
 ) -> NDArray[np.float32]:
     """Return the flat observation (stack · frame size,) from the observations by sensor."""

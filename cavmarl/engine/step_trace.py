@@ -21,7 +21,7 @@ SENSORS = "sensors"  # sensors make the frame of t + Δt
 STACK = "stack"  # the stack returns the controls for this frame
 QUEUE = "queue"  # the controls are queued for the next cycle
 
-# In the order of Algorithm 1.
+# The phases in the order of Algorithm 1.
 PHASES = (SUMO, MIRROR, TICK, SENSORS, STACK, QUEUE)
 
 # Phases of the executor that are phases of a cycle. A commit brings the world to t + Δt, after the

@@ -116,9 +116,9 @@ class SumoPhases:
             tick.traffic.settle(departures, worlds)
 
     def let_in(self, tick: Tick) -> None:
-        """Add vehicles that have entered in SUMO: as rows if it drives, else to the queue."""
+        """Add vehicles that have entered in SUMO: as rows if SUMO drives, else queued."""
         sumo, departures, worlds = self._sumo, tick.departures, tick.worlds
-        tick.meet()
+        tick.finish_phase()
         if not sumo.drives:
             sumo.order(departures, worlds)
         elif sumo.let_in(departures, worlds, tick.peers.running()):

@@ -39,7 +39,7 @@ class Tick:
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # one a zone
+        shards: Sequence[Shard],  # one per zone
         division: ZonedShards,  # of all shards
         traffic: NativeTraffic,  # departures, routes and arrivals
         shared: SharedOutputs,  # signals and outputs of all shards
@@ -56,7 +56,7 @@ class Tick:
         self.coordination: OwnershipRuntime = NoOwnershipRuntime()
         self.peers: Peers = NoPeers(division)
         self.sumo: GlobalTraffic = NoSumo()
-        self.meet: Callable[[], None] = _no_wait
+        self.finish_phase: Callable[[], None] = _no_wait
         self.note_phase: Callable[[str], None] = _ignore
         self._shard = shards[0]
         self._everywhere = np.ones(len(self._shard.worlds.ticks), dtype=np.bool_)
@@ -93,18 +93,18 @@ class Tick:
             self.begin_step(commands)
         self._advance(commands)
         if self.attached:
-            self.meet()
+            self.finish_phase()
         for part in self.attached:
             with self.all_rows("end" in part.reads_all, self.division.side):
                 part.end()
         if is_last:
             self.sense(self._everywhere)
-        self.meet()
+        self.finish_phase()
         self.coordination.end()
 
     def all_rows(self, needed: bool, side: int) -> AbstractContextManager[None]:
         """Return a context in which this process has the vehicles of all zones, if needed."""
-        return self.peers.everybody(self.departures, side) if needed else nullcontext()
+        return self.peers.all_zones(self.departures, side) if needed else nullcontext()
 
     def begin_step(self, commands: Commands) -> None:
         """Clear the sums of the step, and queue the vehicles that the caller inserts."""
@@ -157,9 +157,9 @@ class Tick:
         if begins_second and traffic.rerouting is not None:
             with (
                 self.all_rows(True, self.division.next_side),
-                self.division.everybody_next() as everybody,
+                self.division.all_next_rows() as all_zones,
             ):
-                traffic.rerouting.act(departures, everybody)
+                traffic.rerouting.act(departures, all_zones)
 
     def _enter(self) -> None:
         """Add departures that find a gap to `next_rows`."""
@@ -209,7 +209,7 @@ class Tick:
             self.sumo = SumoPhases(wrap(self.sumo.traffic))
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
-        """Report phases: the executor's by `wrap(executor)`, components' by `note`.
+        """Report phases: shards' phases to `wrap(executor)`, components' phases to `note`.
 
         A component with phases of its own has a method `trace`.
         """
@@ -226,7 +226,7 @@ class Tick:
     ) -> None:
         """Let the executor that `make` returns run the shards' phases in several processes."""
         team = make(self.shards, self.division.gathering)
-        self.executor, self.meet = team, team.meet
+        self.executor, self.finish_phase = team, team.finish_phase
         self._gathers = self.division.let_gather(team)
 
 

@@ -32,7 +32,7 @@ def make_tick(
     shared: SharedOutputs,  # signals and outputs of all zones
     frames: Frames,  # of the mounted sensors
     zeros: Zeros,  # allocates large arrays
-    # of another simulation of this environment with as many worlds; None: made here
+    # traffic of another simulation with the same environment and number of worlds; None: made here
     traffic: NativeTraffic | None,
     late_ticks: int = 0,  # see `divide`
 ) -> Tick:

@@ -29,11 +29,11 @@ class TrafficStats:
     arrived: int  # vehicles that reached their goal
     contacts: int  # vehicles that began to touch another vehicle
     removed: int  # agents removed after a collision or off the road
-    rerouted: int  # changes of route; a vehicle that was rerouted twice counts twice
-    mean_speed_mps: float  # over the vehicles in the world now
-    mean_trip_m: float  # over the arrived vehicles
-    mean_trip_s: float  # over the arrived vehicles
-    # over the arrived vehicles, time above that of the route at the speed of limits and driver
+    rerouted: int  # changes of route; one vehicle may count several times
+    mean_speed_mps: float  # mean over the vehicles in the world now
+    mean_trip_m: float  # mean over the arrived vehicles
+    mean_trip_s: float  # mean over the arrived vehicles
+    # mean over the arrived vehicles: trip time minus that at the speed of limit, driver and type
     mean_delay_s: float
 
 

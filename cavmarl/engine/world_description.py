@@ -9,6 +9,7 @@ from typing import Any
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import sources_digest
+from cavmarl.core.extensions import plugin_hashes
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
@@ -21,7 +22,10 @@ def describe_world(
     demand: DemandFile | SumoDemand | None,
     partition: ZonePartition,
 ) -> dict[str, Any]:
-    """Return the configuration, and the hashes of the roads, demand, zones and kernels."""
+    """Return the configuration, and the hashes of the roads, demand, zones and kernels.
+
+    `demand_tolerated` lists what was left out or replaced in the demand, with counts.
+    """
     resolved = asdict(config)
     text = json.dumps(resolved, sort_keys=True)
     return {
@@ -33,8 +37,10 @@ def describe_world(
         "map_source_sha256": network.source_hash,
         "map_content_sha256": network.content_hash,
         "demand_content_sha256": None if demand is None else demand.content_hash,
+        "demand_tolerated": [] if demand is None else list(demand.tolerated),
         "sumo": demand.version if isinstance(demand, SumoDemand) else None,
         "kernels": sources_digest(),
+        "plugins": plugin_hashes(config.registered, config.plugins),  # SHA-256 by module
         "zones": partition.count,
         "zones_content_sha256": partition.content_hash,
         "channel": asdict(config.v2x.channel)

@@ -66,10 +66,10 @@ class WorldFrame(NamedTuple):
     """One world between two steps. It owns its arrays."""
 
     world: int
-    tick: int  # since the reset
+    tick: int  # ticks since the reset
     time_s: float
     vehicles: NDArray[np.void]  # SEEN (n,), by id
-    signals: NDArray[np.int32]  # (num_signals,) PHASE rows that are on
+    signals: NDArray[np.int32]  # (num_signals,) active PHASE rows
     transfers: tuple[TransferInFlight, ...] = ()
     ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids of its ghosts
     ended: NDArray[np.void] = NONE_ENDED  # ENDED (m,): agents that are not among `vehicles`
@@ -80,7 +80,7 @@ class WorldFrame(NamedTuple):
 class FrameEvent(NamedTuple):
     """An event between two frames."""
 
-    tick: int  # of the later frame
+    tick: int  # tick of the later frame
     # departed, left, arrived, collision, off_road, wrong_way, red_light, out_of_time,
     # transferred, signal; inserted and closed: changes by the caller
     kind: str

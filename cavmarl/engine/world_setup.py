@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from cavmarl.config.registry import (
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.core.huge_pages import trim
+from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
@@ -31,7 +33,9 @@ from cavmarl.roads.joined_maps import join
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import map_name, source_hash
 from cavmarl.roads.sumo_net.signal_plans import with_outages, with_programs
+from cavmarl.roads.sumo_net.sumo_options import additional_files_of
 from cavmarl.traffic.demand import DemandFile, read_demand
+from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.native import capacity_of
 from cavmarl.traffic.scenarios.library import plan_scene
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand, read_sumo_demand
@@ -39,6 +43,8 @@ from cavmarl.traffic.sumo.sumo_input import read_input
 from cavmarl.zones.partition.zone_file import zones_for
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
+
+log = logging.getLogger(__name__)
 
 # Networks that are in use in this process. The key is whether there are agents, followed by the
 # names and hashes of the map files.
@@ -53,6 +59,12 @@ class World(NamedTuple):
     # vehicles in addition to the generator's, from a demand file or from SUMO
     demand: DemandFile | SumoDemand | None
     partition: ZonePartition
+
+    def tell_tolerated(self) -> None:
+        """Log what was left out or replaced in the demand, with counts; once per call."""
+        if self.demand is not None and self.demand.tolerated:
+            lines = "\n".join(self.demand.tolerated)
+            log.warning("%s: tolerated in the demand:\n%s", self.config.name, lines)
 
     @property
     def capacity(self) -> int:
@@ -95,7 +107,7 @@ def load_world(
 
 
 def make_world(config: EnvConfig, base_dir: Path) -> World:
-    """Load the world of a configuration, and derive its horizon from the map if it asks for that.
+    """Load the world of a configuration, whose horizon may be derived from the map.
 
     Raises the errors of `load_world`.
     """
@@ -103,14 +115,19 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
     if config.horizon_s == BY_MAP:
         step_s = config.clock.ctrl_dt_s
         config = replace(config, horizon_s=step_s * max(1, round(horizon_of(network) / step_s)))
-    files = resolve_demand(config, base_dir)
+    files = _demand_files(config, base_dir)
     demand: DemandFile | SumoDemand | None = None
     if config.traffic.source != "native":
         network = with_programs(network, read_input(files).additional_files)
         path = map_file(resolve_map(config, base_dir)).resolve()
         demand = read_sumo_demand(config, network, path, files)
     elif files:
-        demand = read_demand(files, network, on_bad_route=config.traffic.on_bad_route)
+        demand = read_demand(
+            files,
+            network,
+            on_bad_route=config.traffic.on_bad_route,
+            programs=_program_files(config, base_dir),
+        ).begun(config.horizon_s)
     scene = plan_scene(config.scenario, network)
     if scene is not None and scene.outages:
         network = with_outages(network, dict(scene.outages))
@@ -125,17 +142,48 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
         MapError: the map or a file of buildings or programs cannot be read, or a file does not fit
             the map.
     """
-    network = _joined(resolve_maps(config, base_dir), config.population.agents > 0)
+    paths = resolve_maps(config, base_dir)
+    network = _joined(paths, config.population.agents > 0)
     if len(network.maps) > 1:
-        _refuse_of_one_map(config)
+        _refuse_single_map_keys(config)
     buildings = resolve_buildings(config, base_dir)
     if buildings is not None:
         network = with_buildings(network, buildings)
-    return with_programs(network, resolve_programs(config, base_dir), config.map.program)
+    return with_programs(network, _program_files(config, base_dir), config.map.program)
+
+
+def _demand_files(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """Return the files of `traffic.demand`.
+
+    A configuration of SUMO that is the map, too, may name no demand; then there are no files.
+    """
+    files = resolve_demand(config, base_dir)
+    if files and files == resolve_maps(config, base_dir):
+        return files if any(read_sumo_config(path).files for path in files) else []
+    return files
+
+
+def _program_files(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """Return the files with signal programs: `map.programs`, and those that a map names.
+
+    If SUMO runs the traffic, it reads the files that its configuration names.
+    """
+    programs = resolve_programs(config, base_dir)
+    if config.traffic.source != "native":
+        return programs
+    maps = resolve_maps(config, base_dir)
+    named = [file for path in maps if is_sumo_config(path) for file in additional_files_of(path)]
+    if named and len(maps) > 1:
+        raise ConfigError(
+            f"map.source = {config.map.source!r}: a configuration of SUMO with additional files "
+            "must be the only map; name its net-file instead"
+        )
+    known = {file.resolve() for file in programs}
+    return [*(file for file in named if file.resolve() not in known), *programs]
 
 
 def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
-    """Return the network of map files. Worlds of one process share the network of the same files.
+    """Return the network of map files. Worlds of one process share a network of the same files.
 
     With agents, the network includes the swept areas of steered vehicles.
 
@@ -162,10 +210,13 @@ def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
             refused.append(str(error))
     if refused:
         raise MapError("\n".join(refused))
-    return _LOADED.setdefault((has_agents, *contents), join(networks))
+    network = join(networks)
+    for note in network.notes:
+        log.warning("%s: %s", network.name, note)
+    return _LOADED.setdefault((has_agents, *contents), network)
 
 
-def _refuse_of_one_map(config: EnvConfig) -> None:
+def _refuse_single_map_keys(config: EnvConfig) -> None:
     """Refuse keys that name elements of one map if there are several maps."""
     named = {
         "map.programs": config.map.programs,

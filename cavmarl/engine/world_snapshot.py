@@ -2,7 +2,7 @@
 
 Ownership is part of the state, but changes no result. Worlds with the same zones restore it, so
 that vehicles change their owners in the same ticks and the journal continues without a break.
-Worlds with different zones ignore it, and give each vehicle to the zone in which it is, as at a
+Worlds with different zones ignore it, and give each vehicle to the zone that contains it, as at a
 reset.
 """
 
@@ -33,15 +33,15 @@ Array = NDArray[Any]
 class Parts(NamedTuple):
     """The parts that keep the state of W worlds."""
 
-    worlds: Worlds  # of the first shard
-    division: ZonedShards  # of all shards
-    departures: DepartureQueue  # through which vehicles enter and leave
+    worlds: Worlds  # the worlds of the first shard
+    division: ZonedShards  # all shards
+    departures: DepartureQueue  # queue through which vehicles enter and leave
     traffic: NativeTraffic  # departures, routes and arrivals
-    outputs: Outputs  # of the agents, including the frames that the next observation stacks
+    outputs: Outputs  # agents' outputs, including the frames that the next observation stacks
     coordination: OwnershipRuntime  # decides ownership
     partition: ZonePartition  # the zones
     repartition_steps_done: int  # steps begun so far, which decide when zones are cut anew
-    has_past: bool  # whether an observation depends on the one before
+    has_past: bool  # whether an observation depends on the previous observation
     attached: tuple[Component, ...]  # components that act in each tick
     sumo: SumoTraffic | None  # the other simulator; None: there is none
 
@@ -68,9 +68,9 @@ def load(
     parts: Parts,
     saved: Sequence[Array],
     ownership: Sequence[SavedOwnership] | None,  # of each world, as `ownership_of` returns it
-    home: int | None = None,  # the zone of this process, if others hold some; see `put_back`
+    home: int | None = None,  # a zone of this process, if other processes exist; see `put_back`
 ) -> DepartureQueue:  # the departure queue, or a larger one
-    """Restore a state. Vehicles go to their former owners, or to the zones in which they are.
+    """Restore a state. Vehicles go to their former owners, or to the zones that contain them.
 
     Raises:
         JournalError: the journal does not contain the position that the state names.
@@ -80,7 +80,7 @@ def load(
     parts.division.align()
     for array in _fixed(parts):
         array[...] = next(rest)
-    # The keys determine all orders; the departure queue holds those that are due already.
+    # The keys determine all orders. Orders that are due already are in the departure queue.
     departures = parts.traffic.draw_orders(parts.departures, parts.worlds, everywhere)
     queue = next(rest)
     departures.queue[:, : queue.shape[1]] = queue
@@ -99,7 +99,7 @@ def load(
             np.split(np.concatenate(zones), np.cumsum(one.counts)[:-1])
             for zones, one in zip(vehicles, ownership, strict=True)
         ]
-        goes_on = _has_its_journals(parts, ownership)
+        goes_on = _can_continue_journals(parts, ownership)
         parts.division.put_back(owned, contacts, 0, keeps_epochs=goes_on)
         ownership = ownership if goes_on else None
     parts.coordination.go_on(ownership)
@@ -142,7 +142,7 @@ def ownership_of(parts: Parts, saved: Sequence[Array]) -> list[SavedOwnership] |
     return found
 
 
-def _has_its_journals(parts: Parts, ownership: Sequence[SavedOwnership]) -> bool:
+def _can_continue_journals(parts: Parts, ownership: Sequence[SavedOwnership]) -> bool:
     """Return whether all journals, if any, can continue from their position in a saved state.
 
     A state from a file has no position; the journal then begins a new episode.
@@ -214,7 +214,7 @@ def _shifted(
 
 
 def _stacked(shares: Sequence[Array]) -> Array:
-    """Return arrays of one world each, stacked; shorter ones are padded with zeros."""
+    """Stack arrays of one world each. Shorter arrays are padded with zeros."""
     if shares[0].ndim < 2:
         return np.concatenate(shares)
     longest = max(share.shape[1] for share in shares)
@@ -241,7 +241,7 @@ def _of_rerouting(parts: Parts) -> Iterator[Array]:
 
 
 def _put(target: Array, saved: Array) -> None:
-    """Copy the part that both arrays have: room for the orders of an episode grows on demand."""
+    """Copy the part that both arrays have, as the room for an episode's orders grows on demand."""
     shared = tuple(slice(min(pair)) for pair in zip(target.shape, saved.shape, strict=True))
     target[shared] = saved[shared]
 

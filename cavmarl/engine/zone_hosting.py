@@ -89,16 +89,16 @@ class ZoneHosting:
         self,
         partition: ZonePartition,
         vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world, of all zones
-        contacts: NDArray[np.int64],  # (W,) counted in all zones
+        contacts: NDArray[np.int64],  # (W,) number of contacts in all zones
     ) -> None:
-        """Change the zones where peers run some of them. Call `host_zones` afterwards."""
+        """Change the zones if peers run some of the zones. Call `host_zones` afterwards."""
         tick = self._tick
         everywhere = np.ones(len(contacts), dtype=np.bool_)
         self.set_zones(partition)
         tick.division.place(vehicles, contacts)
-        tick.peers.keep_own(everywhere)
+        tick.peers.drop_foreign_rows(everywhere)
         tick.coordination.reset(everywhere)
-        tick.peers.take_up(tick.departures, tick.division.side)
+        tick.peers.resume_from(tick.departures, tick.division.side)
 
     def measure_costs(self, every: int = 1) -> ShardClock:
         """Measure the processor time of each zone from now on, in one tick of `every`."""

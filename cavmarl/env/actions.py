@@ -234,7 +234,7 @@ class ActionDecoder:
         if self._continuous:
             if kinds != {np.ndarray} or {value.shape for value in values} != {(2,)}:
                 return None
-            if {value.dtype.kind for value in values} <= {"f", "i"}:
+            if {value.dtype.kind for value in values} == {"f"}:
                 pairs: NDArray[Any] = np.concatenate(values).reshape(-1, 2)
                 return pairs
         elif kinds == {int} or kinds == {np.int64}:
@@ -243,14 +243,21 @@ class ActionDecoder:
         return None
 
     def _as_numbers(self, value: Any, name: str) -> NDArray[Any]:
-        """Return an array of a dtype that can be cast without loss; raise an error for others."""
-        kind = "numbers" if self._continuous else "whole numbers"
+        """Return an array of a dtype that means an action; raise an error for others."""
+        kind = (
+            "floats (float32 or float64) in [-1, 1]"
+            if self._continuous
+            else "whole numbers (int64)"
+        )
         try:
             array = np.asarray(value)
         except ValueError as error:
             raise ActionError(f"{name}: not an array of {kind}: {error}") from error
-        if array.dtype.kind not in ("fiu" if self._continuous else "iu"):
-            raise ActionError(f"{name}: dtype is {array.dtype}; pass {kind}")
+        if array.dtype.kind not in ("f" if self._continuous else "iu"):
+            raise ActionError(
+                f"{name}: dtype is {array.dtype}; with action.kind = {self._config.kind}, pass "
+                f"{kind}"
+            )
         if array.dtype == np.uint64:
             # A cast of the largest values to int64 would wrap around.
             array = np.minimum(array, np.uint64(np.iinfo(np.int64).max)).astype(np.int64)

@@ -44,7 +44,7 @@ def parallel_env(
     """Make a PettingZoo parallel environment.
 
     Args:
-        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        env: name of an entry of `envs/`, a folder with an env.yaml, a map file, or a .sumocfg.
         lenient: for libraries that act for absent agents or beyond the bounds. Values are clipped,
             actions of absent agents are ignored, and a missing action repeats the agent's last one,
             or 0. Sets action.out_of_range, .missing_action, .late_actions; traffic_stats() counts.
@@ -138,12 +138,30 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._max_cycles = int(steps)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the observation space: the same object for all agents and calls."""
-        return self.observation_spaces[agent]
+        """Return the observation space: the same object for all agents and calls.
+
+        Raises:
+            ActionError: there is no such agent.
+        """
+        try:
+            return self.observation_spaces[agent]
+        except (KeyError, TypeError):
+            raise self._no_agent(agent) from None
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the action space: the same object for all agents and calls."""
-        return self.action_spaces[agent]
+        """Return the action space: the same object for all agents and calls.
+
+        Raises:
+            ActionError: there is no such agent.
+        """
+        try:
+            return self.action_spaces[agent]
+        except (KeyError, TypeError):
+            raise self._no_agent(agent) from None
+
+    def _no_agent(self, agent: object) -> ActionError:
+        first, last = self.possible_agents[0], self.possible_agents[-1]
+        return ActionError(f"no agent {agent!r}: the ids are {first} … {last} (possible_agents)")
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -153,6 +171,9 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         Args:
             seed: root of all random numbers; None begins the next episode of the last seed.
             options: not used; the API requires it.
+
+        Raises:
+            EpisodeError: after `close`.
         """
         self._session.reset(seed, np.ones(1, dtype=np.bool_))
         self._steps = 0
@@ -168,11 +189,11 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         left and more are still to enter, the world advances until one enters.
 
         Raises:
-            EpisodeError: before the first reset, or there are actions after all agents have left.
+            EpisodeError: before the first reset, after `close`, or there are actions after all
+                agents have left.
             ActionError: an action is invalid. Nothing has changed, and the step can be repeated.
         """
-        if not self._session.is_ready:
-            raise EpisodeError("step() before reset(): call env.reset(seed=…) first")
+        self._session.refuse_idle("step()")
         if not self.agents:
             if actions and self.config.action.late_actions == "error":
                 raise EpisodeError("the episode is over: call env.reset()")
@@ -264,10 +285,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             ActionError: there is no such agent.
         """
         if agent not in self.possible_agents:
-            raise ActionError(
-                f"no agent {agent!r}: the ids are {self.possible_agents[0]} … "
-                f"{self.possible_agents[-1]}"
-            )
+            raise self._no_agent(agent)
         k = self.possible_agents.index(agent)
         return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
 
@@ -280,7 +298,12 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._session.decoder.check(agent, action)
 
     def state(self) -> NDArray[np.float32]:
-        """Return the global state, within `state_space`: see `engine.spaces.global_state`."""
+        """Return the global state, within `state_space`: see `engine.spaces.global_state`.
+
+        Raises:
+            EpisodeError: before the first reset, or after `close`.
+        """
+        self._session.refuse_idle("state()")
         self.worlds.write_states()
         state: NDArray[np.float32] = self.worlds.arrays.states[0].copy()
         return state
@@ -298,7 +321,12 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         return {**self.worlds.traffic_stats(0), **self._session.decoder.tolerated()}
 
     def suggest_actions(self) -> dict[str, Any]:
-        """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent."""
+        """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent.
+
+        Raises:
+            EpisodeError: before the first reset, or after `close`.
+        """
+        self._session.refuse_idle("suggest_actions()")
         self.worlds.suggest()
         batch = self._session.decoder.encode(self.worlds.arrays.suggested)[0]
         return dict(zip(self.agents, batch[self._rows], strict=True))
@@ -318,6 +346,6 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
     def close(self) -> None:
         """Close the window and the recording, and end the worker processes, if there are any.
 
-        Without workers, the environment can still be used.
+        Afterwards, `reset` and `step` raise an EpisodeError.
         """
         self._session.close()

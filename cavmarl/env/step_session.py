@@ -61,6 +61,7 @@ class StepSession:
         self.events = DeclaredEvents(config, num_worlds)
         self.insertions = Insertions(config, worlds.world.network, num_worlds)
         self.is_ready = False
+        self._is_closed = False
         self.simulated_s = 0.0
         self._in_place = in_place
         self._first_seed = None if seed is None else check_seed(seed)
@@ -86,6 +87,7 @@ class StepSession:
         next episodes of the last seed. Random numbers of the first world depend on its number,
         `first_world`.
         """
+        self._refuse_closed("reset()")
         if seed is not None or not self.is_ready:
             seed = first_seed(seed, self._first_seed)
         self.worlds.arrays.chosen[:] = chosen
@@ -112,6 +114,15 @@ class StepSession:
         """Raise an EpisodeError that names a call if there has been no reset yet."""
         if not self.is_ready:
             raise EpisodeError(f"{call} before reset(): call reset(seed=…) first")
+
+    def refuse_idle(self, call: str) -> None:
+        """Raise an EpisodeError that names a call before the first reset, or after `close`."""
+        self._refuse_closed(call)
+        self.refuse_unready(call)
+
+    def _refuse_closed(self, call: str) -> None:
+        if self._is_closed:
+            raise EpisodeError(f"{call} after close(): make another environment")
 
     def frames(self, chosen: Sequence[int], ghosts: bool) -> list[WorldFrame]:
         """Return frames of some worlds as they are now; see `WorldsEnvironment.world_frames`."""
@@ -162,6 +173,7 @@ class StepSession:
         """Record all worlds from now on; see `WorldsEnvironment.record`."""
         if record is None:
             return
+        self._refuse_closed("record()")
         if self._recorder is not None:
             path = str(RecordOptions.of(record).path)
             raise EpisodeError(
@@ -172,7 +184,8 @@ class StepSession:
         self._recorder = WorldRecorder(record, self.worlds, standing)
 
     def close(self) -> None:
-        """End the recording, the window and the worlds."""
+        """End the recording, the window and the worlds; a second call does nothing more."""
+        self._is_closed = True
         if self._recorder is not None:
             recorder, self._recorder = self._recorder, None
             recorder.close()

@@ -48,7 +48,7 @@ def make_vec(
     """Make `num_envs` worlds of one environment that are stepped together.
 
     Args:
-        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        env: name of an entry of `envs/`, a folder with an env.yaml, a map file, or a .sumocfg.
         num_envs: number of worlds.
         autoreset_mode: when a world begins its next episode; see `CavVectorEnv`.
         copy: False returns observations without a copy; see `CavVectorEnv`.
@@ -192,7 +192,7 @@ class CavVectorEnv(WorldsEnvironment):
 
         Raises:
             ConfigError: reset_mask has another shape or dtype, or is given with a seed.
-            EpisodeError: reset_mask is given before the first reset.
+            EpisodeError: after `close`, or reset_mask is given before the first reset.
         """
         options = options or {}
         chosen = self._chosen(options.get("reset_mask"), seed)
@@ -238,11 +238,11 @@ class CavVectorEnv(WorldsEnvironment):
             that left: the same array as the observations if no agent left in the step.
 
         Raises:
-            EpisodeError: before the first reset, or with `DISABLED` if a world's episode is over.
+            EpisodeError: before the first reset, after `close`, or with `DISABLED` if a world's
+                episode is over.
             ActionError: the shape, the dtype or a value is wrong; nothing has changed.
         """
-        if not self._session.is_ready:
-            raise EpisodeError("step() before reset(): call vec.reset(seed=…) first")
+        self._session.refuse_idle("step()")
         if self._disabled:
             refuse_over(self._over)
         session = self._session
@@ -332,7 +332,12 @@ class CavVectorEnv(WorldsEnvironment):
         return {name: sensor.copy() for name, sensor in frames.items()}
 
     def suggest_actions(self) -> NDArray[Any]:
-        """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent."""
+        """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent.
+
+        Raises:
+            EpisodeError: before the first reset, or after `close`.
+        """
+        self._session.refuse_idle("suggest_actions()")
         self.worlds.suggest()
         return self._session.decoder.encode(self.worlds.arrays.suggested)
 
@@ -340,7 +345,11 @@ class CavVectorEnv(WorldsEnvironment):
         """Return the global states (W, S), each as from `CavEnv.state`; input of a central critic.
 
         For a world that resets in the same step, this is the state of the new episode.
+
+        Raises:
+            EpisodeError: before the first reset, or after `close`.
         """
+        self._session.refuse_idle("state()")
         self.worlds.write_states()
         return self.worlds.arrays.states.copy()
 
@@ -383,5 +392,8 @@ class CavVectorEnv(WorldsEnvironment):
         return tuple(frame for frame in frames if frame is not None) or None
 
     def close(self) -> None:
-        """End the recording and the worker processes, if any. Returned arrays stay valid."""
+        """End the recording and the worker processes, if any. Returned arrays stay valid.
+
+        Afterwards, `reset` and `step` raise an EpisodeError.
+        """
         self._session.close()

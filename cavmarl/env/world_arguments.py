@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
 from cavmarl.config.driver_form import with_sensors_of
-from cavmarl.config.registry import load_config
+from cavmarl.config.registry import load_config, load_plugins_of
 from cavmarl.config.removed_keys import removed_argument
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, UnknownArgumentError
 from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.drawn_worlds import check_rendering
@@ -70,26 +71,29 @@ def start_worlds(
     """Make the worlds that the arguments describe, after a check of all arguments.
 
     Args:
-        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        env: name of an entry of `envs/`, a folder with an env.yaml, a map file, or a .sumocfg.
         num_worlds: number of worlds.
         in_next_step: whether worlds reset in the next step; see `SteppedWorlds`.
         render_modes: allowed render modes.
         given: see `WorldArguments`.
 
     Raises:
-        TypeError: an argument has another name.
+        UnknownArgumentError: an argument has another name.
         ConfigError, PolicyError, MapError, WorkerError, MissingExtraError: see `make_vec`.
     """
     if refusal := next(filter(None, map(removed_argument, given)), None):
         raise ConfigError(refusal)
     known = WorldArguments.__annotations__
     if unknown := [name for name in given if name not in known]:
-        raise TypeError(
-            f"unexpected keyword argument {unknown[0]!r}: must be one of {', '.join(known)}"
+        close = difflib.get_close_matches(unknown[0], known, n=1)
+        meant = f"did you mean {close[0]}? " if close else ""
+        raise UnknownArgumentError(
+            f"unexpected keyword argument {unknown[0]!r}: {meant}It must be one of "
+            f"{', '.join(known)}; overrides sets every other key of env.yaml"
         )
-    backend = find_backend(given.get("backend"), given.get("workers"), given.get("nodes"))
     if (seed := given.get("seed")) is not None:
         check_seed(seed)
+    load_plugins_of(env, given.get("overrides"))  # the driver may have their sensors
     config, base_dir = load_config(
         env,
         zones=given.get("zones"),
@@ -99,8 +103,10 @@ def start_worlds(
         max_cycles=given.get("max_cycles"),
         overrides=with_sensors_of(given.get("overrides"), given.get("sensors_of")),
     )
+    backend = find_backend(given.get("backend"), given.get("workers"), given.get("nodes"))
     check_agents(config)
     check_rendering(config, given.get("render_mode"), backend, render_modes)
     check_recording(config, given.get("record"), backend)
     world = make_world(config, base_dir)
+    world.tell_tolerated()
     return make_worlds(world, base_dir, num_worlds, backend, in_next_step)

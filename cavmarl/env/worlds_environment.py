@@ -131,7 +131,7 @@ class WorldsEnvironment(OwnWorlds):
         self._session.insertions.no_barrier(world, edge)
 
     def closed_roads(self, world: int = 0) -> tuple[str, ...]:
-        """Return the ids of closed roads, including those that close in the next step."""
+        """Return the ids of closed roads, including roads that close in the next step."""
         return self._session.insertions.closed(world)
 
     def world_frames(self, chosen: Sequence[int] = (0,), ghosts: bool = False) -> list[WorldFrame]:

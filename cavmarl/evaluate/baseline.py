@@ -1,9 +1,8 @@
 """Baselines for a map: random actions, the built-in driver, a trained driver and an oracle.
 
 All drive the same trips under the rules of one environment on another map. The oracle is the
-built-in
-driver alone on the road. As nothing hinders it, it bounds what a driver in traffic can reach; the
-difference to it is the cost of traffic.
+built-in driver alone on the road. As nothing hinders it, it bounds what a driver in traffic can
+reach; the difference to it is the cost of traffic.
 """
 
 from __future__ import annotations
@@ -59,8 +58,8 @@ def run_baseline(
         policy: the trained driver.
         agents: number of agents in each world; None: as configured by the environment.
         background: number of background vehicles; None: as configured by the environment.
-        episodes: episodes of each driver in traffic; alone it drives one per agent and episode, up
-            to 64.
+        episodes: episodes of each driver in traffic. The oracle drives eight times as many, up to
+            64.
         seed: of the episodes.
         progress: as in `evaluate`.
 

@@ -15,8 +15,7 @@ def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
     """Return (num_conflicts,) the row of the same area on the foe's path, -1 where paths merge.
 
     After a merge both vehicles share a lane. That is following, which time to collision measures,
-    and not
-    an encroachment.
+    and not an encroachment.
     """
     links, conflicts = network.links, network.conflicts
     link = np.repeat(np.arange(len(links)), links["num_conflicts"])

@@ -31,16 +31,16 @@ from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.zones.partition.zone_statistics import imbalance
 
-MAX_VEHICLES = 100_000  # of the worlds that are stepped together
+MAX_VEHICLES = 100_000  # maximum number in all worlds that are stepped together
 MAX_WORLDS = 128
-TRACK_S = 0.5  # between two points of a track
+TRACK_S = 0.5  # time between two points of a track
 TIMED_TICKS = 16  # one of this many ticks is timed zone by zone
 
 Progress = Callable[
     [str, int, int], None
 ]  # called with policy, steps done, maximum number of steps
 Watcher = Callable[[CavVectorEnv], Callable[[], None]]
-"""Is given the worlds of a run; what it returns is called after each reset and step of them."""
+"""Called with the worlds of a run; returns a function to call after each reset and step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +154,7 @@ def derived_seed(seed: int, number: int) -> int:
 
 
 class _Part:
-    """The episodes of the worlds stepped together; the first `count` of them count."""
+    """The episodes of worlds that are stepped together; only the first `count` are evaluated."""
 
     def __init__(self, vec: CavVectorEnv, seen: RunWatch, count: int, *, tracked: bool) -> None:
         self._vec = vec
@@ -166,7 +166,7 @@ class _Part:
             vec.max_cycles,
             vec.step_s,
             np.array(vec.config.terms.weight_of_each),
-            # A trip with its own horizon that arrives is in time.
+            # If trips have a horizon of their own, every arrival is in time.
             math.inf if vec.config.traffic.trip_horizon else SLOWEST,
         )
         self._watch = EncounterWatch(vec, self._recorder)
@@ -193,7 +193,7 @@ class _Part:
         policy_seed: int,
         step_done: Callable[[int, int], None],
     ) -> None:
-        """Drive until each counting world has finished its episode."""
+        """Drive until each of the first `count` worlds has finished its episode."""
         vec = self._vec
         observations, infos = vec.reset(seed=seed, options={"first_world": first})
         driver.reset(policy_seed)

@@ -81,7 +81,7 @@ TRANSFERS_FILE = "transfers.csv"
 TRANSFER_COUNTS_FILE = "transfer_counts.json"
 RESULT_FILES = [TRIPS_FILE, EPISODES_FILE, TRACKS_FILE, MAP_FILE, SPEED_FILE]
 PLACES_FILE = "places.json"
-TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE, PLACES_FILE]  # of divided worlds
+TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE, PLACES_FILE]  # only for divided worlds
 
 
 def evaluate(
@@ -100,10 +100,8 @@ def evaluate(
     """Evaluate policies in `repeats` runs of `episodes` seeded episodes.
 
     All policies drive the same episodes: episode e of a run is the first one of world e of its
-    seed. If
-    the trained drivers among the policies need the same sensors, the worlds get these sensors. Two
-    or more
-    runs are driven in new processes, one after the other.
+    seed. If the trained drivers among the policies need the same sensors, the worlds get these
+    sensors. Two or more runs are driven in new processes, one after the other.
 
     Args:
         env: as in `make_vec`, like the keywords that are not listed here.
@@ -278,6 +276,7 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
     Returns the runs, and whether worlds have zones.
     """
     world = load_world(job.env, **job.keywords)
+    world.tell_tolerated()
     policies = describe_policies(job.policies)
     config, network, demand, partition = world
     unlogged = replace(config, zones=replace(config.zones, journal=""))
@@ -317,7 +316,7 @@ def _runs(job: EpisodeJob, seeds: list[int], journal: str, worlds: int) -> list[
             overrides["zones.journal"] = str(own)
             taken = [p for w in range(worlds) if (p := journal_path(str(own), w, worlds)).exists()]
             if taken:
-                raise JournalError(f"{taken[0]}: exists; take it away, or name another journal")
+                raise JournalError(f"{taken[0]}: exists; move it away, or name another journal")
         jobs.append(replace(job, seed=seed, run=run, overrides=overrides))
     return jobs
 
@@ -335,7 +334,7 @@ def _drive_all(
             runs.append(drive_run(job, progress, watcher))
         else:
             what = f"run {job.run} (seed {job.seed})"
-            runs.append(call_in_fresh_process(what, drive_run, job, hear=progress or _deaf))
+            runs.append(call_in_fresh_process(what, drive_run, job, hear=progress or _ignore))
     names = list(jobs[0].policies)
     speeds = {name: [asdict(run[name].speed) for run in runs] for name in names}
     write_table(folder / TRIPS_FILE, {n: _all(runs, n, "trips") for n in names}, TRIP)
@@ -361,7 +360,7 @@ def _write_failures(folder: Path, job: EpisodeJob, results: list[RunData]) -> No
     write_failures(path, kept, job.failures, found, world.network, name)
 
 
-def _deaf(policy: str, steps: int, most: int) -> None:
+def _ignore(policy: str, steps: int, most: int) -> None:
     """Ignore the progress."""
 
 

@@ -17,10 +17,10 @@ from cavmarl.sensors.sensed_shapes import Shape, observed_shapes
 
 CLIP_S = 10.0
 REACH_M = 70.0  # radius around the end of the trip that a clip shows
-MOST_KEPT_BYTES = 256 << 20  # decimals of observations
+MOST_KEPT_BYTES = 256 << 20  # limit of memory for observations
 NO_SENSORS = "observes nothing that can be drawn"
 TOO_MANY = f"observations of ten seconds are more than {MOST_KEPT_BYTES >> 20} MB and were not kept"
-_DRAWN = ("rays", "links")  # kinds of shapes
+_DRAWN = ("rays", "links")  # the kinds of shapes that the page draws
 
 # Causes, worst first.
 FATES = ("collision", "off_road", "red_light", "wrong_way", "stood", "blocked", "out_of_time")
@@ -61,7 +61,7 @@ class FailureClips:
         self._length = max(2, math.ceil(CLIP_S / step_s) + 1)
         self._observations = observations
         self._keeps = self._length * observations.nbytes <= MOST_KEPT_BYTES
-        # of each world (frame, observations (A, D) if kept)
+        # world → its last frames, each with observations (A, D) if they are kept
         self._recent: dict[int, deque[tuple[WorldFrame, NDArray[np.float32] | None]]] = {}
         self.failures: list[Failure] = []
 

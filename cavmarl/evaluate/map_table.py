@@ -19,9 +19,8 @@ def rows_by_map(
 ) -> dict[str, list[dict[str, Any]]]:
     """Return for each policy one row per map, worst success first; nothing for one map.
 
-    `tables`: TRIP and EPISODE records. `names`: names of the maps. Maps without counting trips are
-    left
-    out.
+    `tables`: TRIP and EPISODE records. `names`: names of the maps. Maps without counted trips are
+    left out.
     """
     if len(names) < 2:
         return {}

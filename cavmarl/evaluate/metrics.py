@@ -25,7 +25,7 @@ class Metric:
     name: str  # key in a report, and name of the column
     label: str  # name in tables
     unit: str  # unit of the values times `scale`; empty for plain numbers
-    per: Per  # what a run has one value for: trips or episodes
+    per: Per  # each trip, each episode or each run has a value
     meaning: str  # one line
     better: Better = None  # whether higher or lower is better; None: neither
     share: bool = False  # values are yes or no, so their mean is a share
@@ -76,7 +76,8 @@ METRICS = (
            "agents that arrived in an hour of simulated time", "more"),
     Metric("background_arrivals_per_h", "others arriving", "1/h", "episode",
            "background vehicles that arrived in an hour of simulated time", "more"),
-    _arrived("delay_s", "delay", "time lost against driving at the limit", "less"),
+    _arrived("delay_s", "delay", "time lost against driving at the limit, or at the type's maximum "
+             "speed", "less"),
     _arrived("duration_s", "duration", "from the first decision to the goal"),
     Metric("mean_speed_mps", "speed", "m/s", "trip", "way made towards the goal over time"),
     Metric("mean_speeding", "speeding", "%", "trip",
@@ -113,7 +114,7 @@ METRICS = (
 def metric_values(
     metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void]
 ) -> NDArray[np.float64]:
-    """Return the values (N,) of a metric, NaN for none; only counting trips are used."""
+    """Return the values (N,) of a metric, NaN for none; only counted trips are used."""
     if metric.per == "episode":
         return np.asarray(episodes[metric.name], dtype=np.float64)
     rows = trips[trips["counted"]]

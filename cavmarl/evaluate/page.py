@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,8 +22,29 @@ TEMPLATE = Path(__file__).with_name("page.html.j2")
 NOTHING = "-"
 
 
-def write_page(folder: Path, path: Path) -> None:
-    """Write the page of a results folder of `evaluate`."""
+@dataclass(frozen=True)
+class Story:
+    """What a page tells before the results of an evaluation: a training, and pictures of it.
+
+    Attributes:
+        title: headline of the page.
+        paragraphs: text.
+        compared: names of the metrics in a short table.
+        curve: `progress.csv` of the training.
+        films: caption → animated WebP, which becomes a part of the page.
+        commands: (command, purpose) of what to try next.
+    """
+
+    title: str
+    paragraphs: Sequence[str]
+    compared: Collection[str]
+    curve: Path
+    films: Mapping[str, Path]
+    commands: Sequence[tuple[str, str]]
+
+
+def write_page(folder: Path, path: Path, story: Story | None = None) -> None:
+    """Write the page of a results folder of `evaluate`; it begins with `story`, if there is one."""
     require("matplotlib", "report")
     jinja2 = require("jinja2", "report")
     report = load_report(folder)
@@ -28,7 +52,28 @@ def write_page(folder: Path, path: Path) -> None:
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
-    write_text(path, template.render(_content(folder, report)))
+    told = None if story is None else _told(story, report)
+    write_text(path, template.render(_content(folder, report), story=told))
+
+
+def _told(story: Story, report: EvaluationReport) -> dict[str, Any]:
+    """Return the parts of a story as the template shows them."""
+    from cavmarl.evaluate import plots
+
+    with story.curve.open(encoding="utf-8", newline="") as file:
+        curve = plots.plot_learning(list(csv.DictReader(file)))
+    rows = _rows(report, rewards=False)
+    return {
+        "title": story.title,
+        "paragraphs": story.paragraphs,
+        "rows": [row for row in rows if row["metric"].name in story.compared],
+        "curve": curve,
+        "films": {
+            caption: base64.b64encode(film.read_bytes()).decode()
+            for caption, film in story.films.items()
+        },
+        "commands": story.commands,
+    }
 
 
 def _content(folder: Path, report: EvaluationReport) -> dict[str, Any]:

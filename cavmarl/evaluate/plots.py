@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -203,6 +203,24 @@ def _ways(tracks: Rows) -> list[NDArray[np.float64]]:
     jumps = np.hypot(*np.diff(places, axis=0).T) > MAX_JUMP_M
     cuts = np.flatnonzero(jumps | (np.diff(rows["agent"]) != 0)) + 1
     return [way for way in np.split(places, cuts) if len(way) > 1]
+
+
+def plot_learning(rows: Sequence[Mapping[str, str]]) -> str:
+    """Plot a training: success and collisions of the last trips, by decisions.
+
+    `rows`: of its `progress.csv`.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained")
+        decisions = [float(row["agent_steps"]) / 1e6 for row in rows]
+        for axes, (name, outcome) in zip(
+            figure.subplots(1, 2), (("success", "arrived"), ("collision", "collision")), strict=True
+        ):
+            shares = [100.0 * float(row[name]) for row in rows]
+            axes.plot(decisions, shares, color=OUTCOMES[outcome][1])
+            axes.set_title(f"{name}, % of the last 1,000 trips")
+            axes.set_xlabel("million decisions")
+        return _svg(figure)
 
 
 def _figure(height_in: float) -> tuple[Figure, Axes]:

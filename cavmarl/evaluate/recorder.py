@@ -15,7 +15,7 @@ PET_HORIZON_S = 10.0  # a pass after a longer time is no encounter
 SLOWEST = 3.0  # longest duration of a success, as a multiple of the free travel time
 STILL_S = 10.0  # a vehicle that has stood this long when its trip is cut counts as standing
 MIN_DISTANCE_M = 1.0  # shortest trip whose delay per kilometre is compared
-JERK_UNIT_MPS3 = 10.0  # of the term `comfort`
+JERK_UNIT_MPS3 = 10.0  # unit of the term `comfort`
 MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
 
 _TERM = {name: k for k, name in enumerate(TERMS)}
@@ -24,9 +24,8 @@ _TERM = {name: k for k, name in enumerate(TERMS)}
 class Recorder:
     """Records W worlds with A agents through one episode each.
 
-    A trip counts if it began in the first half of its episode. So each counting trip has at least
-    half an
-    episode to end, and which trips count does not depend on how they end.
+    A trip counts if it began in the first half of its episode. So each counted trip has at least
+    half an episode to end, and which trips count does not depend on how they end.
 
     `weights` (T,) are the weights of the terms in the reward. `slowest` is the longest duration of
     a success as a multiple of the free travel time.
@@ -62,8 +61,8 @@ class Recorder:
         self.still_s = np.zeros(shape)  # written by `StandingWatch`
         self.would_go = np.zeros(
             shape, dtype=np.bool_
-        )  # written by `StandingWatch`: would the built-in driver stand there
-        self.maps = np.zeros(num_worlds, dtype=np.int64)  # of each world
+        )  # written by `StandingWatch`: whether the built-in driver would drive on
+        self.maps = np.zeros(num_worlds, dtype=np.int64)  # map of each world
 
     def add(
         self,

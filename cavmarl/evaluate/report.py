@@ -1,10 +1,8 @@
 """`EvaluationReport`: the results of an evaluation as frozen values.
 
 Two kinds of spread are kept apart. *Between runs*: each run has its own seed and gives one mean;
-the
-interval contains the mean of all such runs. *Within a run*: the spread of trips or episodes of one
-run
-says nothing about another run.
+the interval contains the mean of all such runs. *Within a run*: the spread of trips or episodes of
+one run says nothing about another run.
 """
 
 from __future__ import annotations
@@ -67,7 +65,7 @@ class PairedDifference:
 
     @property
     def distinct(self) -> bool:
-        """Whether the interval excludes 0."""
+        """True if the interval excludes 0."""
         found = self.between_run_ci95
         return found is not None and not found.low <= 0.0 <= found.high
 
@@ -76,12 +74,12 @@ class PairedDifference:
 class PolicyReport:
     """All results of one policy."""
 
-    trips: int  # number of counting trips in all runs
+    trips: int  # number of counted trips in all runs
     metrics: Mapping[str, Found]  # by the names of `metrics.METRICS`
-    # by metric, paired differences from the first policy; empty for itself
+    # metric → paired difference from the first policy; empty for the first policy
     minus_first: Mapping[str, PairedDifference]
     speed: tuple[Speed, ...]  # speed of each run; not reproducible
-    # between zones, in all runs; None in undivided worlds. Milliseconds are not repeatable.
+    # transfers between zones in all runs; None: undivided worlds. Their times are not repeatable.
     transfers: TransferSummary | None = None
 
     def __getitem__(self, metric: str) -> Found:

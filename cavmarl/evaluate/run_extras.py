@@ -53,7 +53,7 @@ class RunWatch:
         return () if self._clips is None else self._clips.failures
 
     def begin(self, first: int, running: NDArray[np.bool_]) -> None:
-        """Observe the worlds after a reset; the first of them is in this episode."""
+        """Observe the worlds after a reset; `first` is the episode of the first world."""
         self._first = first
         if self._clips is not None:
             self._clips.begin()

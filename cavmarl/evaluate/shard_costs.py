@@ -86,8 +86,7 @@ def measure_shards(
     """Return the costs of all zones of the first `worlds` worlds of a seed.
 
     The cost of a zone is the median of `PARTS` parts of the steps, so one-time work such as loading
-    a
-    kernel does not count. `told` is called with the steps done and the total.
+    a kernel does not count. `told` is called with the steps done and the total.
     """
     if steps < PARTS:
         raise ConfigError(f"steps = {steps}: must be at least {PARTS}")

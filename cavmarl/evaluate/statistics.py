@@ -53,8 +53,7 @@ def mean_interval(means: Values) -> Interval | None:
     """Return the interval of the mean of independent runs (R,) by Student's t.
 
     mean ± t(0.975, R - 1) · sd / √R, where sd is that of the run means. None for fewer than two
-    runs, or if
-    all runs have the same value, which says nothing about the spread of other runs.
+    runs, or if all runs have the same value, which says nothing about the spread of other runs.
     """
     error = _error_of(means)
     if error == 0.0:
@@ -83,8 +82,7 @@ def run_share_interval(shares: Values, total: int) -> Interval | None:
     """Return the interval of the mean of shares (R,) of independent runs.
 
     Each end is the wider one of `bounded_interval` and Wilson's interval of all trips, so runs that
-    happen to
-    agree do not make it too narrow. None for fewer than two runs.
+    happen to agree do not make it too narrow. None for fewer than two runs.
     """
     if shares.size < 2 or total == 0:
         return None

@@ -1,4 +1,4 @@
-"""Standing agents, and whether they have to stand: explains trips that do not end."""
+"""Detection of agents that stand, with or without a reason, to explain unfinished trips."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cavmarl.core.records.codes import ACTION_FASTER
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import STILL_S, Recorder
 
-ASK_S = 5.0  # between two queries of the built-in driver's action
+ASK_S = 5.0  # time between two queries of the built-in driver's action
 STILL_MPS = 0.1  # a slower vehicle stands
 GO_MPS2 = 0.5  # acceleration with which the built-in driver would start
 
@@ -30,7 +30,7 @@ class StandingWatch:
         moved_m = np.abs(recorder.places_m - self._places_m).sum(axis=2)
         stands = mask & (
             moved_m < STILL_MPS * self._vec.step_s
-        )  # a new agent without an earlier place
+        )  # False for a new agent, as its earlier place is NaN
         recorder.still_s = np.where(stands, recorder.still_s + self._vec.step_s, 0.0)
         self._places_m[:] = np.where(mask[..., None], recorder.places_m, np.nan)
         if step % self._every == 0 and (recorder.still_s >= STILL_S - ASK_S).any():

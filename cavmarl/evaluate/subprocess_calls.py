@@ -1,8 +1,7 @@
 """Function calls in new processes that share only the files on disk.
 
 A call is pickled to the standard input of a program, which pickles progress and the result to
-standard
-output. Unlike `multiprocessing`, this does not import the caller's script again.
+standard output. Unlike `multiprocessing`, this does not import the caller's script again.
 """
 
 from __future__ import annotations
@@ -33,11 +32,9 @@ def call_in_fresh_process(
 ) -> Found:
     """Return `call(*given)` from a new interpreter, or raise the CavmarlError that it raised.
 
-    With `hear`, `call` gets one more argument, a function whose argument is passed to `hear` here.
-    If the
-    process dies, an `EvaluationError` names `what` it did. `began` is called with the process, so
-    that
-    another thread can end it.
+    If `hear` is given, `call` gets a further argument: a function that passes its own arguments to
+    `hear` in this process. If the new process dies, an `EvaluationError` names `what` it did.
+    `began` is called with the process, so that another thread can end it.
     """
     program = start_python(["-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert program.stdin is not None

@@ -88,9 +88,8 @@ def run_suite(
     """Evaluate the policies in every world, each in its own folder in `out`.
 
     If the suite sets the number of agents, trips that end are replaced (respawn), so that the
-    number stays
-    the same. `began` is called before each world. Policies, episodes, repeats and seed are as in
-    `evaluate`.
+    number stays the same. `began` is called before each world. Policies, episodes, repeats and seed
+    are as in `evaluate`.
     """
     reports = {}
     keys: dict[str, object] = {} if suite.agents is None else {"population.mode": "respawn"}

@@ -31,7 +31,7 @@ TRIP = np.dtype(
     [
         ("run", np.int64),
         ("episode", np.int64),
-        ("agent", np.int64),  # index of its agent
+        ("agent", np.int64),  # index of the agent
         ("map", np.int64),  # number of the map among those of the environment
         ("began_s", np.float64),  # time of the episode at its first decision
         ("counted", np.bool_),  # whether it began in the first half of its episode
@@ -39,22 +39,22 @@ TRIP = np.dtype(
         ("collision", np.bool_),
         ("off_road", np.bool_),
         ("unfinished", np.bool_),  # cut by the horizon of the episode or of the trip
-        ("blocked", np.bool_),  # and how: it stood, and the built-in driver would have stood, too;
-        ("stood", np.bool_),  # it stood, and the built-in driver would have driven;
-        ("out_of_time", np.bool_),  # it was under way
-        # arrived in time, without a red light and never the wrong way; in time is within SLOWEST
-        # times the free time, where trips have no horizon of their own
+        ("blocked", np.bool_),  # unfinished: stood where the built-in driver would stand, too
+        ("stood", np.bool_),  # unfinished: stood where the built-in driver would drive on
+        ("out_of_time", np.bool_),  # unfinished: was moving
+        # arrived in time, never entered a junction at red, never drove the wrong way. In time:
+        # within the trip's horizon, or within SLOWEST times the free time if it has none
         ("success", np.bool_),
         ("red_light", np.bool_),  # whether it ever entered a junction at red
         ("wrong_way", np.bool_),  # whether it ever drove against its lane
         ("reward", np.float64),  # sum over the trip
         ("duration_s", np.float64),  # from its first decision to its end
         ("distance_m", np.float64),  # progress towards the goal
-        ("mean_speed_mps", np.float64),  # of these two
-        ("delay_s", np.float64),  # time lost compared with driving at the limit
+        ("mean_speed_mps", np.float64),  # distance over duration
+        ("delay_s", np.float64),  # time lost compared with driving at `free_speed`
         ("mean_jerk_mps3", np.float64),  # mean |jerk|
         ("mean_speeding", np.float64),  # mean speed above the limit, as a share of it
-        ("least_ttc_s", np.float64),  # least time to collision; TTC_HORIZON_S: that and above
+        ("least_ttc_s", np.float64),  # least time to collision, at most TTC_HORIZON_S
         ("short_ttc_share", np.float64),  # share of the trip with less than SHORT_TTC_S
         ("least_pet_s", np.float64),  # least post-encroachment time; NaN: none up to PET_HORIZON_S
         ("end_x_m", np.float64),  # its place before its last step
@@ -72,12 +72,12 @@ EPISODE = np.dtype(
         ("agent_arrivals_per_h", np.float64),  # of simulated time
         ("background_arrivals_per_h", np.float64),
         ("jain_speed", np.float64),  # of the mean speeds of its trips that count
-        ("gini_delay", np.float64),  # of their delays a kilometre
+        ("gini_delay", np.float64),  # of the delays per kilometre of these trips
         ("zone_imbalance", np.float64),  # max / mean of vehicles by zone; NaN: undivided
         ("v2x_reception_ratio", np.float64),  # packets received over packets in range; NaN: no V2X
         ("v2x_latency_s", np.float64),  # mean, from sending to receiving
         ("v2x_busy_ratio", np.float64),  # share of time in which the channel is busy
-        *((reward_column(term), np.float64) for term in TERMS),  # that part of the return
+        *((reward_column(term), np.float64) for term in TERMS),  # the term's part of the return
     ]
 )
 
@@ -90,21 +90,21 @@ TRANSFER = np.dtype(
     [
         ("run", np.int64),
         ("episode", np.int64),
-        ("tick", np.int64),  # of the whole run of its world: resets do not turn it back
+        ("tick", np.int64),  # counted over the whole run of the world, not reset with it
         ("vehicle", np.int64),
         ("source", np.int64),
         ("target", np.int64),
         ("epoch", np.int64),
-        ("forced", np.bool_),  # the state rode along, since the target was not ready in time
-        ("removed", np.bool_),  # it left the world in that tick
+        ("forced", np.bool_),  # state attached: the target was not ready in time
+        ("removed", np.bool_),  # the vehicle left the world in that tick
         ("approached", np.int64),  # tick of the first state at the target; -1: none
-        ("waited", np.int64),  # ticks behind the border
-        ("offers", np.int64),  # states that arrived
+        ("waited", np.int64),  # ticks with the old owner after the crossing
+        ("offers", np.int64),  # number of states that arrived at the target
         ("state_bytes", np.int64),
-        ("prepare_depth_m", np.float64),  # outside of the source's zone at the first state
-        ("switch_depth_m", np.float64),  # at the switch
-        ("release_depth_m", np.float64),  # when the switch was committed
-        ("ms", np.float64),  # from the first state until the target had confirmed; not repeatable
+        ("prepare_depth_m", np.float64),  # distance outside of the source's zone at the first state
+        ("switch_depth_m", np.float64),  # the same at the switch
+        ("release_depth_m", np.float64),  # the same when the switch was committed
+        ("ms", np.float64),  # from the first state to the target's confirmation; not repeatable
     ]
 )
 

@@ -37,7 +37,7 @@ from cavmarl.evaluate.provenance.manifest import hash_of_file
 from cavmarl.policies.loading import policy_files
 
 RESULT_FOLDER = "result"
-TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # files that are the same each time
+TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # files whose bytes are reproducible
 SHARES = ("success", "collision", "off_road", "red_light")
 
 
@@ -106,7 +106,7 @@ class Cross:
     tables: Mapping[str, Mapping[str, NDArray[np.void]]]
 
     def share(self, driver: str, others: str, column: str) -> float | None:
-        """Return the share of a driver's counting trips among others; None: it had none."""
+        """Return a share of a driver's counted trips among others; None: it had no trips."""
         trips = self.tables[driver][others]
         return float(trips[column].mean()) if len(trips) else None
 
@@ -161,8 +161,7 @@ def cross(
     """Evaluate each driver among the vehicles of each other driver.
 
     All pairs drive the same episodes. Agents with even numbers belong to the driver, odd ones to
-    the other
-    driver.
+    the other driver.
 
     Raises:
         ConfigError: the environment has fewer than two agents.
@@ -186,7 +185,7 @@ def cross(
     return Cross(tuple(policies), tables)
 
 
-# Compare the map file only: a changed reader shows in the driving.
+# The world is compared by its map file; a changed map reader changes the trips instead.
 _WORLD_KEYS = ("environment", "map_source_sha256", "demand_content_sha256")
 _KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
 

@@ -106,11 +106,11 @@ class ZonedShards:
             return
         first = self._shards[0].worlds
         for w in np.flatnonzero(chosen).tolist():
-            everybody = first.rows[w, : first.num_owned[w]].copy()
+            vehicles = first.rows[w, : first.num_owned[w]].copy()
             for shard in self._shards:
                 worlds = shard.worlds
                 worlds.num_owned[w] = take_own(
-                    self.zones, shard.zone, everybody, len(everybody), worlds.rows[w]
+                    self.zones, shard.zone, vehicles, len(vehicles), worlds.rows[w]
                 )
                 worlds.num_contacts[w] = 0
                 worlds.num_outer[w] = -1
@@ -162,7 +162,8 @@ class ZonedShards:
     def let_gather(self, executor: Executor) -> bool:
         """Let the shards renew their ghosts in the phase `gather`. Return whether they do.
 
-        A shard that gathers reads all others. So this is used only if all zones see each other.
+        A shard that gathers reads all other shards. So this is used only if all zones see each
+        other.
         """
         if len(self._halo.near) == self.count**2:
             self._gatherers = executor
@@ -170,13 +171,13 @@ class ZonedShards:
 
     def note_gathered(self) -> None:
         """Record vehicles near a border, after all shards have gathered."""
-        self._note_those_near(self.book)
+        self._note_near_vehicles(self.book)
 
     def rehearse_gathering(self) -> None:
         """Call the kernel of `note_gathered` without keeping its results."""
-        self._note_those_near(make_book(*self._first_side.shape))
+        self._note_near_vehicles(make_book(*self._first_side.shape))
 
-    def _note_those_near(self, book: BorderRecords) -> None:
+    def _note_near_vehicles(self, book: BorderRecords) -> None:
         self._note_gathered(self.zones, self.borders, self._zoned, self.next_side, book)
 
     def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
@@ -194,7 +195,7 @@ class ZonedShards:
         vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world
         contacts: NDArray[np.int64],  # (W,) as `contacts` counts them
     ) -> None:
-        """Give every vehicle to the zone in which it is, independent of its former owner."""
+        """Give every vehicle to the zone that contains it, independent of its former owner."""
         first = self._shards[0].worlds
         # Steps of an unfinished tick may belong to other rows.
         self._zoned.step_at[...] = 0
@@ -301,7 +302,7 @@ class ZonedShards:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     @contextmanager
-    def everybody_next(self) -> Iterator[Worlds]:
+    def all_next_rows(self) -> Iterator[Worlds]:
         """Yield the owned `next_rows` of all zones as one shard. Changes are written back."""
         first = self._shards[0].worlds
         if len(self._shards) == 1:

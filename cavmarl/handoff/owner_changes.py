@@ -38,10 +38,10 @@ class OwnerChanges:
         self.hand_over_all = specialized(hand_over)
         self.release_all = specialized(release)
 
-    def near(self, w: int, everybody: bool) -> list[Near]:
-        """Return vehicles near a border, by committed rows; `everybody`: check all rows anew."""
+    def near(self, w: int, check_all: bool) -> list[Near]:
+        """Return vehicles near a border, by committed rows. `check_all`: search all rows anew."""
         division = self._division
-        if everybody:
+        if check_all:
             self._look(
                 division.zones, division.borders, division.zoned, division.side, w, True, 0,
                 division.book,
@@ -106,7 +106,7 @@ class OwnerChanges:
         )
 
     def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
-        """Give vehicles that are not recorded yet to the zones in which they are now."""
+        """Give vehicles that are not recorded yet to the zones that contain them now."""
         settled = []
         for vehicle, zone, state in births:
             _, row = self.find(w, vehicle)

@@ -1,8 +1,7 @@
 """`Repartitioner`: new zones for running worlds whose vehicles are unevenly distributed.
 
-This is an extension, off by default: the paper's zones are fixed. The zones change between two
-ticks. In the next tick, each vehicle outside of its owner's new zone is handed over as at any
-border. So no result depends on repartitioning.
+This is off by default. The zones change between two ticks. In the next tick, each vehicle outside
+of its owner's new zone is handed over as at any border. So no result depends on repartitioning.
 """
 
 from __future__ import annotations
@@ -68,10 +67,10 @@ class Repartitioner:
         self._tolerance = tolerance
 
     def before_step(self, partition: ZonePartition) -> ZonePartition | None:
-        """Count a step that begins. Return its zones if they have changed.
+        """Count a step that begins. Return new zones if the zones change before it.
 
-        After a change, the owners of vehicles may be far away from them until the next tick hands
-        them over. No caller may read vehicles before that.
+        After a change, vehicles may be far from their owners' zones until the next tick hands them
+        over. No caller may read vehicles before that.
         """
         self.steps += 1
         if not is_due(self.steps, self._every):

@@ -59,7 +59,7 @@ def divide(
     fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
     wide_m = halo_m(config, reach_m, partition.count, fastest_mps, late_ticks)
     touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps, late_ticks)
-    # Only agents sense.
+    # Background vehicles have no sensors.
     has_agents = config.population.agents > 0
     sensed_m = _needed_m(config, sensing_m, fastest_mps, late_ticks) if has_agents else 0.0
     near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))
@@ -110,7 +110,7 @@ def halo_m(
     config: EnvConfig,  # its `zones.halo_m` is used if it is set
     reach_m: float,  # the farthest look of any driver
     zones: int,  # number of zones
-    fastest_mps: float = MAX_SPEED_MPS,  # longest move in a tick / tick, with jumps on the map
+    fastest_mps: float = MAX_SPEED_MPS,  # longest move in a tick, jumps included, over its duration
     late_ticks: int = 0,  # see `divide`
 ) -> float:
     """Return how far zones see beyond their borders, in m.
@@ -136,7 +136,8 @@ def halo_m(
 def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
     """Return whether drivers consider only vehicles along the roads, so that halos can be smaller.
 
-    Scripts put vehicles beside the roads, and SUMO anywhere. A configured halo is used as it is.
+    Scripts may place vehicles beside the roads, and SUMO anywhere. A configured halo is not
+    reduced.
     """
     free = traffic.scene is not None or traffic.sumo is not None
     return config.zones.halo_m is None and not free

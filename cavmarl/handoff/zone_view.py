@@ -14,12 +14,12 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class TransferInFlight(NamedTuple):
-    """A transfer of a vehicle from one zone to another that is not complete."""
+    """An incomplete transfer of a vehicle from one zone to another."""
 
     vehicle: int
     source: int  # the zone that owns the vehicle
     target: int  # the zone to which it is offered or switched
-    state: str  # of the protocol, for display
+    state: str  # state in the protocol, for display
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def view_zones(
     partition: ZonePartition,
     halo_m: float,  # how far each zone sees beyond its borders
     world: int = 0,
-    transfers: Sequence[TransferInFlight] = (),  # of that world
+    transfers: Sequence[TransferInFlight] = (),  # transfers in that world
 ) -> ZoneView:
     """Return a view of the shards' vehicles in one world."""
     held = [shard.worlds for shard in shards]

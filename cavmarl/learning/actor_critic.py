@@ -31,13 +31,14 @@ LOG_2_PI = math.log(2.0 * math.pi)
 class ActorCritic(nn.Module):
     """A policy and a value function: two tanh networks, or two heads of one body with LayerNorm.
 
-    Both get observations normalised by `mean` and `deviation`: buffers that training updates and
-    that are saved with the weights. With a `state_size` the value function is a central critic,
-    which also gets the state of the whole world (Yu et al. 2022).
+    Both networks get observations normalised by `mean` and `deviation`. These buffers are updated
+    by training and saved with the weights. With a `state_size`, the
+    value function is a central critic, which also gets the state of the whole world (Yu et al.
+    2022).
 
     Continuous actions are normally distributed around the actor's output, with one learned
-    deviation per action. The environment gets them clipped to [-1, 1]; learning uses the unclipped
-    ones. Discrete actions are categorical.
+    deviation per action. The environment gets clipped actions in [-1, 1]; learning uses the
+    unclipped actions. Discrete actions are categorical.
 
     Args:
         config: sizes and kind of action.
@@ -144,7 +145,7 @@ class ActorCritic(nn.Module):
         return log_probs.gather(-1, actions.unsqueeze(-1)).squeeze(-1), entropy
 
     def distance(self, output: Tensor, actions: Tensor) -> Tensor:
-        """Return losses (N,) of `forward`'s output for actions: squares or cross-entropy."""
+        """Return imitation losses (N,) of `forward`'s output: squared errors or cross-entropy."""
         if self.continuous:
             return (output - actions).square().sum(-1)
         return nn.functional.cross_entropy(output, actions, reduction="none")

@@ -85,7 +85,7 @@ def _broken(path: Path, why: str) -> TrainingError:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert OSError, while a file of a run is written, to a TrainingError with a cure."""
+    """Raise a TrainingError with a cure if the code inside cannot write a file of a run."""
     try:
         yield
     except OSError as error:

@@ -122,7 +122,7 @@ class Log:
         return sizes
 
     def close(self) -> None:
-        """Close the files; a write that a full disk has refused is not tried again."""
+        """Close the files and ignore errors; after a full disk, failed writes are not repeated."""
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""`Opponents`: fixed drivers for some of the seats, from which nothing is learned."""
+"""`Opponents`: fixed drivers that drive for some agents; training ignores what they experience."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ Mask = NDArray[np.bool_]
 
 
 class Opponents:
-    """Fixed drivers, each with its share of the seats, drawn once; and drivers to imitate.
+    """Fixed drivers, each for a random share of the agents, and drivers to imitate.
 
     Attributes:
-        absent: (W, A) seats of the learning driver.
+        absent: (W, A) agents of the learning driver, which have no opponent.
     """
 
     def __init__(self, names: str, vec: CavVectorEnv, share: float, seed: int) -> None:
-        """`names`: of drivers, comma-separated. Raises PolicyError: a driver does not fit `vec`."""
+        """Load the comma-separated `names`. Raises PolicyError: a driver does not fit `vec`."""
         self._vec, self._seed = vec, seed
         self._drivers = [load_policy(name, vec) for name in names.split(",") if name]
         self._to_reset = [*self._drivers]
         drawn = np.random.default_rng(seed).random((vec.num_envs, vec.num_agents))
-        self._seats = np.floor(drawn / max(share, 1e-9))  # driver of each seat
+        self._seats = np.floor(drawn / max(share, 1e-9))  # driver of each agent
         self.absent: Mask = self._seats >= len(self._drivers)
 
     def begin(self) -> None:
-        """Reset all drivers, so that a resumed run has the same ones."""
+        """Reset all drivers with the seed, so that they act the same in a resumed run."""
         for driver in self._to_reset:
             driver.reset(self._seed)
 
     def example(self, name: str) -> Callable[[Tensor, Mask], Tensor]:
-        """Return a function of a driver's actions (W, A, …) to imitate; '': the built-in driver."""
+        """Return a function that gives a driver's actions (W, A, …); '': the built-in driver."""
         if not name:
             return lambda observations, mask: torch.from_numpy(self._vec.suggest_actions())
         driver = load_policy(name, self._vec)
@@ -48,7 +48,7 @@ class Opponents:
         )
 
     def act(self, observations: NDArray[np.float32], mask: Mask, actions: NDArray[Any]) -> None:
-        """Overwrite the actions (W, A, …) of the opponents' seats."""
+        """Overwrite the actions (W, A, …) of the agents that opponents drive."""
         for k, driver in enumerate(self._drivers):
             theirs = self._seats == k
             actions[theirs] = driver.act_batch(observations, mask & theirs)[theirs]

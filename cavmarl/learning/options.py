@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 RESUME = "folder of a run to continue; its settings apply, except for its length"
 DRIVER = "driver: {folder}  (cavmarl evaluate ENV --policy {folder})"
 
+PLUGINS = "plugins"  # setting of the option --import, which can be repeated
+
 S = TypeVar("S", bound="DataclassInstance")
 
 
@@ -47,11 +49,17 @@ def given_options(
     for field in fields(kind):
         of, meaning = get_args(hints[field.name])
         action: Any = argparse.BooleanOptionalAction if of is bool else "store"
+        if field.name == PLUGINS:
+            action = "append"
         extra = {} if of is bool else {"type": of, "metavar": of.__name__.upper()}
         shown = f"{meaning} (default: {field.default!r})"
-        parser.add_argument(_option(field.name), action=action, help=shown, **extra)
+        option = _option(field.name)
+        parser.add_argument(option, dest=field.name, action=action, help=shown, **extra)
     parser.add_argument("--config", metavar="FILE", type=Path, help="YAML file of these settings")
-    return vars(parser.parse_args(words))
+    given = vars(parser.parse_args(words))
+    if PLUGINS in given:
+        given[PLUGINS] = ",".join(given[PLUGINS])
+    return given
 
 
 def settings_of(kind: type[S], given: Mapping[str, Any]) -> S:
@@ -148,4 +156,4 @@ def run_to_end(act: Callable[[], None], goes_on: str) -> int:
 
 
 def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+    return "--import" if name == PLUGINS else f"--{name.replace('_', '-')}"

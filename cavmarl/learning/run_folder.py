@@ -86,10 +86,10 @@ def parse_run(kind: type[S], words: Sequence[str] | None, text: str | None) -> S
 
 
 class RunFolder:
-    """The folder of a run, from its first file to its last, used by one process at a time.
+    """The folder of a run and its files; only one process at a time may use it.
 
     Args:
-        settings: of the run; a non-empty `resume` continues the run.
+        settings: settings of the run; a non-empty `resume` continues the run.
         world: the environment of the training.
         plans: assignment of shards to workers.
 

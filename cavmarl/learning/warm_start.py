@@ -1,4 +1,4 @@
-"""`begin_with`: start a run with a driver's weights if the run observes the same or more."""
+"""`begin_with`: start a run with a driver's weights if the run has the driver's observations."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int
 
 
 def _names(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
-    """Return for each element of an observation: frames before the newest, sensor, feature."""
+    """Return (age in frames, sensor, feature) of each element of an observation."""
     names, stack = feature_names(sensors), sensors.stack
     return [(stack - 1 - frame, *name) for frame in range(stack) for name in names]
 

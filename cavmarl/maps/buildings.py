@@ -1,6 +1,6 @@
-"""Buildings on a map: walls that end rays, and footprints as convex parts.
+"""Buildings on a map: walls that rays hit, and footprints as convex parts.
 
-They are read from OpenStreetMap or SUMO's polygon files.
+Buildings are read from OpenStreetMap or SUMO's polygon files.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 
 Ring = NDArray[np.float64]
 
-DEFAULT_HEIGHT_M = 8.0  # of a building whose height is not given
+DEFAULT_HEIGHT_M = 8.0  # height of a building if the file does not give it
 LEVEL_M = 3.0  # height of a level, if only the number of levels is given
 
-# Values of building=* that rays pass under, or that have no walls.
+# Values of building=* for buildings without walls, or that rays pass under.
 _NO_WALLS = frozenset(("no", "roof", "carport", "canopy", "demolished", "ruins"))
 _METRES = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
 _MOST_HEIGHT_M = 1000.0
-_DIGITS = 6  # of a metre; nearly level sides would have huge slopes
+_DIGITS = 6  # corners are rounded to µm, because nearly level sides would have huge slopes
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
 
     Args:
         path: OpenStreetMap (<osm>), or a SUMO file with <poly> elements; may be gzipped.
-        geo: georeference of the map; None: it has none.
+        geo: georeference of the map; None: the map has none.
 
     Raises:
         MapError: the file is broken or belongs to another map, or its coordinates are geographic
@@ -162,8 +162,8 @@ class _Reader(ContentHandler):
         if math.dist(offset, ours) > 0.01:
             raise self._error(
                 "location",
-                f"has the offset {attrs['netOffset']}, the map {ours[0]:.2f},{ours[1]:.2f}: these "
-                "buildings belong to another network",
+                f"has the offset {attrs['netOffset']}, but the map has "
+                f"{ours[0]:.2f},{ours[1]:.2f}: these buildings belong to another network",
             )
 
     def _error(self, name: str, problem: str) -> MapError:
@@ -181,7 +181,7 @@ def _finite(place: tuple[float, ...]) -> tuple[float, float]:
 
 
 def _osm_buildings(path: Path, osm: _Reader, geo: GeoReference | None) -> Iterator[Footprint]:
-    """Yield closed ways and multipolygons that are buildings and completely in the extract."""
+    """Yield the buildings among closed ways and multipolygons that are completely in the file."""
     for element in [*osm.ways.values(), *osm.relations]:
         if not element.is_building:
             continue
@@ -219,7 +219,7 @@ def _closed(ways: list[list[str]]) -> list[list[str]]:
 
 
 def _rings(rings: list[Ring]) -> tuple[Ring, ...]:
-    """Return rings of at least three corners, rounded to µm, without the repeated first one."""
+    """Return rings of at least three corners, rounded to µm, without the repeated first corner."""
     rounded = [np.round(ring, _DIGITS) for ring in rings]
     opened = [ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rounded]
     return tuple(ring for ring in opened if len(ring) >= 3)
@@ -244,7 +244,7 @@ def _project(path: Path, ring: Ring, geo: GeoReference | None) -> Ring:
     return project(path, ring, geo)
 
 
-# Buildings farther than this from the bounding box of all roads are beyond any sensor's range.
+# No sensor reaches buildings farther than this from the bounding box of all roads.
 FARTHEST_M = 300.0
 LARGEST_M = 5000.0
 MOST_CORNERS = 4000
@@ -254,11 +254,10 @@ def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
     """Return a network with the buildings of a file.
 
     Returns:
-        A network with another `source_hash`, as it has several sources.
+        A network whose `source_hash` covers both files.
 
     Raises:
-        MapError: see `read_footprints`; or no building is on the map, or one is too large to be
-            a building.
+        MapError: see `read_footprints`; or no building is on the map, or a building is too large.
     """
     found = read_footprints(path, network.geo)
     near = [footprint for footprint in found if _is_near(network, footprint)]
@@ -267,7 +266,7 @@ def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
     if not near:
         raise MapError(
             f"{path}: none of its {len(found)} buildings is within {FARTHEST_M:g} m of the map "
-            f"'{network.name}': give the file that this map was made from"
+            f"'{network.name}': give the file from which this map was built"
         )
     parts = [convex_parts(footprint.rings) for footprint in near]
     digest = hashlib.sha256(f"{network.source_hash}\0buildings={source_hash(path)}".encode())
@@ -291,7 +290,7 @@ def _is_near(network: RoadNetwork, footprint: Footprint) -> bool:
 
 
 def _check_size(path: Path, footprint: Footprint) -> None:
-    """Raise an error for an object that is too large for a building, and for memory."""
+    """Raise an error for an object that is too large to be a building, and to fit into memory."""
     corners = np.concatenate(footprint.rings)
     size_m = float(np.ptp(corners, axis=0).max())
     if size_m > LARGEST_M or len(corners) > MOST_CORNERS:
@@ -302,7 +301,7 @@ def _check_size(path: Path, footprint: Footprint) -> None:
 
 
 def walls_of(footprints: list[Footprint]) -> NDArray[np.void]:
-    """Return WALL (num_walls,): the sides of all rings, building by building."""
+    """Return WALL (num_walls,): the sides of all rings, sorted by building."""
     rows = [
         (*start, *end, footprint.height_m, number)
         for number, footprint in enumerate(footprints)
@@ -316,9 +315,9 @@ def walls_of(footprints: list[Footprint]) -> NDArray[np.void]:
 def convex_parts(rings: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
     """Return the inside of some rings as trapezoids (n, 4, 2), by the even-odd rule.
 
-    Between the heights of two consecutive corners, the sides that pass through, sorted from left to
-    right, bound the inside in pairs. If sides cross between corners, which footprints do not, the
-    parts overlap a little.
+    Horizontal lines through all corners divide the plane into strips. The sides that pass through a
+    strip, sorted from left to right, bound the inside in pairs. If sides cross, which does not
+    happen in valid footprints, the parts overlap a little.
     """
     sides = np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings])
     low = sides[:, :, 1].min(axis=1)

@@ -1,7 +1,7 @@
-"""Checks whether a map is fit to drive on: statistics, and places that look wrong.
+"""Checks whether vehicles can drive on a map: statistics, and places that look wrong.
 
-Lengths are those that the map gives (SUMO's `length`), so sums equal those of sumolib. Unless the
-name says otherwise, edges and lanes are those open to passenger cars.
+Lengths are taken from the map (SUMO's `length`), so sums are equal to sumolib's. Unless the name
+says otherwise, edges and lanes are the edges and lanes open to passenger cars.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
-# Slower than walking or faster than any car: more likely a wrong unit than a speed limit.
+# A limit below walking speed or above the speed of any car probably has a wrong unit.
 _SPEED_RANGE_MPS = (1.0, 70.0)
 _STEEP = 0.15
-_ROUNDING = 0.005  # error of grades, as positions are rounded to the centimetre
+_ROUNDING = 0.005  # error of grades, because positions are rounded to the centimetre
 _STUB_M = 1.0  # shorter lanes do not allow an estimate of the grade
 _WELL_CONNECTED = 0.9
 _GREEN = [SIGNAL_STATES.index(letter) for letter in "gGosOY"]
@@ -34,7 +34,7 @@ class MapReport:
 
     name: str  # name of the network
     source_hash: str
-    road_km: float  # total length of all edges; below: of all lanes
+    road_km: float  # total length of all edges; `lane_km`: of all lanes
     lane_km: float
     edges: int
     lanes: int
@@ -46,22 +46,22 @@ class MapReport:
     extent_m: tuple[float, float, float, float]  # min x, min y, max x, max y of the lanes
     elevation_m: tuple[float, float]  # lowest and highest point of the lanes
     max_grade: float  # steepest slope of a lane, as a ratio
-    connected_edges: int  # edges in the largest part in which every edge reaches every other
-    connected_share: float  # share of these edges in all edges
+    connected_edges: int  # edges in the largest strongly connected part
+    connected_share: float  # `connected_edges` as a share of all edges
     horizon_s: float  # default duration of an episode, if only the map is given
     dead_ends: tuple[str, ...]  # edges that lead nowhere
-    lanes_without_successor: tuple[str, ...]  # lanes that lead nowhere, of edges that do not
+    lanes_without_successor: tuple[str, ...]  # lanes that lead nowhere, except on dead ends
     junctions_without_right_of_way: tuple[str, ...]  # where lanes meet without a rule
     signals_without_lanes: tuple[str, ...]  # traffic lights that control no lane
     lanes_never_green: tuple[str, ...]  # lanes whose signal never opens any movement
-    # signal programs (signal/program) that are simplified: a choice between following phases,
-    # delay-based and NEMA control run with their stated durations, and limits of single links
-    # are ignored
+    # signal programs (signal/program) that are simplified: programs with a choice between following
+    # phases, delay-based and NEMA programs run with their stated durations, and limits of single
+    # links are ignored
     programs_simplified: tuple[str, ...]
     self_loops: tuple[str, ...]  # edges that end where they begin
     steep_lanes: tuple[str, ...]  # lanes that climb more than 15 %, the steepest first
     speed_outliers: tuple[str, ...]  # lanes with a speed limit below 1 or above 70 m/s
-    problems: tuple[str, ...]  # why the map cannot be driven on; empty if it can
+    problems: tuple[str, ...]  # reasons why cars cannot drive on the map; empty if they can
     notes: tuple[str, ...]  # other remarks
 
     @property
@@ -73,7 +73,7 @@ class MapReport:
 
 
 def check_map(source: str | Path | RoadNetwork) -> MapReport:
-    """Collect statistics of a SUMO network, and find what makes it unfit.
+    """Collect statistics of a SUMO network, and find problems for driving.
 
     Raises MapError: the network cannot be read; see `read_network`.
     """
@@ -119,7 +119,7 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
         horizon_s=horizon_of(network),
         **findings,
         problems=tuple(cars.problems()),
-        notes=tuple(_notes(findings, share, grade)),
+        notes=tuple(_notes(network.notes, findings, share, grade)),
     )
 
 
@@ -172,7 +172,7 @@ class _Cars:
                 "--keep-edges.by-vclass)"
             ]
         if not len(self.links) and len(self.edges) > 1:
-            return ["no edge leads to another: the map has no connections (build it again)"]
+            return ["no edge leads to another edge: the map has no connections: build it again"]
         return []
 
     def _edge_ids(self, rows: NDArray[np.int64]) -> tuple[str, ...]:
@@ -231,12 +231,14 @@ def _lanes_never_green(network: RoadNetwork) -> tuple[str, ...]:
     return tuple(network.lane_ids[row] for row in sorted(shut))
 
 
-def _notes(findings: dict[str, tuple[str, ...]], share: float, grade: float) -> list[str]:
-    notes = []
+def _notes(
+    of_map: tuple[str, ...], findings: dict[str, tuple[str, ...]], share: float, grade: float
+) -> list[str]:
+    notes = list(of_map)
     if share < _WELL_CONNECTED:
         notes.append(
-            f"only {share:.0%} of the edges reach one another: trips from other edges may end at "
-            "the map's border"
+            f"only {share:.0%} of the edges are in the largest connected part: trips from other "
+            "edges may end at the map's border"
         )
     for name, ids in findings.items():
         if ids:

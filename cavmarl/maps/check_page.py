@@ -1,4 +1,4 @@
-"""A page with a picture of a map and marks at the places that look wrong."""
+"""A page with a picture of a map and marks at its defects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _STYLE = "body{font:14px sans-serif;margin:2em}td,th{text-align:left;padding:2px
 
 
 def write_check_page(path: Path, network: RoadNetwork, defects: Sequence[Defect]) -> None:
-    """Write the page; raises ConfigError if that is not possible."""
+    """Write the page; raises ConfigError if the file cannot be written."""
     kinds = list(dict.fromkeys(defect.kind for defect in defects))
     color = {kind: _COLORS[n % len(_COLORS)] for n, kind in enumerate(kinds)}
     min_x, min_y, max_x, max_y = network.extent_m

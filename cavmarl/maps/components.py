@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 def strong_components(num_nodes: int, arcs: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the component of every node of a directed graph.
 
-    Kosaraju's algorithm without recursion: a city's graph is deeper than Python's stack.
+    Kosaraju's algorithm without recursion, because a city's graph is deeper than Python's stack.
 
     `arcs`: (num_arcs, 2) from-node, to-node.
 

@@ -1,4 +1,4 @@
-"""Places of a map that look wrong, each with its kind and position."""
+"""Defects of a map: places that look wrong, each with its kind and position."""
 
 from __future__ import annotations
 
@@ -14,12 +14,18 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.net_document import NetDocument, points_of
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.polylines import clean_shape
+from cavmarl.roads.sumo_net.road_corners import find_corners
+from cavmarl.roads.sumo_net.shared_strips import Road, Strip, find_strips
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 CAR_WIDTH_M = 1.8
 LEVEL_M = 3.0  # lanes with a larger difference in height are a bridge and the road below it
-STEP_M = 0.1  # in height, between lanes that lead into each other
-SEARCHES = ("crossings", "signals", "lanes", "steps", "parts", "stop lines", "buildings")
+STEP_M = 0.1  # minimum difference in height of lanes that lead into each other
+SEARCHES = (
+    "crossings", "signals", "lanes", "steps", "parts", "stop lines", "strips", "corners",
+    "buildings",
+)  # fmt: skip
 _DEEP_M = 1.0  # maximum distance of a stop line inside its junction
 
 Points = NDArray[np.float64]
@@ -45,11 +51,11 @@ def find_defects(
     buildings: Path | None = None,
     told: Callable[[str], None] = lambda stage: None,
 ) -> list[Defect]:
-    """Return everything that looks wrong, kind by kind.
+    """Return all defects of a map, sorted by kind.
 
     Args:
         network: the map.
-        path: the map's file, which has rules and shapes of junctions.
+        path: the map's file, for the rules and shapes of junctions.
         buildings: OSM or SUMO polygons; None: buildings are not checked.
         told: called with each of `SEARCHES` as it begins.
 
@@ -65,6 +71,8 @@ def find_defects(
         lambda: _steps(network),
         lambda: _unreachable_parts(network),
         lambda: _stop_lines_inside(network, document),
+        lambda: _shared_strips(network, document),
+        lambda: _tight_corners(network),
     ]
     if buildings is not None:
         searches.append(lambda: _buildings_on_roads(with_buildings(network, buildings)))
@@ -76,7 +84,7 @@ def find_defects(
 
 
 def cut_off_edges(network: RoadNetwork) -> list[int]:
-    """Return EDGE rows for cars that are connected to the largest part in neither direction."""
+    """Return edges for cars (EDGE rows) that neither reach the largest part nor are reached."""
     from cavmarl.maps.components import strong_components
 
     open_lanes = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
@@ -115,7 +123,7 @@ def _middle(network: RoadNetwork, edge: int) -> tuple[float, float]:
 def _unruled_crossings(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
     """Find paths that cross in a junction without a rule or a signal.
 
-    The rules are taken from the file, because the reader adds missing rules.
+    The rules are read from the file, because the network has added rules where the file has none.
     """
     links = network.links
     rules = {
@@ -166,7 +174,7 @@ def _path(network: RoadNetwork, link: int) -> Points:
 
 
 def crossing_of(one: Points, other: Points) -> tuple[float, float] | None:
-    """Return where two polylines (n, 3) cross on one level, in the plane, or None."""
+    """Return the position in the plane where two polylines (n, 3) cross on one level, or None."""
     if len(one) < 2 or len(other) < 2:
         return None
     a, b = one[:-1, None], one[1:, None]
@@ -231,6 +239,44 @@ def _stop_lines_inside(network: RoadNetwork, document: NetDocument) -> Iterator[
             yield Defect("stop line inside a junction", network.lane_ids[lane], x, y, deep)
 
 
+def _shared_strips(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
+    """Find opposite lanes on the same strip, where the file draws them: the reader moves them."""
+    for strip in strips_of(network, document):
+        for one, other in strip.lanes:
+            x, y = network.lane_polyline(one)[0, :2].tolist()
+            words = f"with {network.lane_ids[other]}; driven {strip.apart_m:.1f} m aside"
+            yield Defect("opposite lanes on one strip", network.lane_ids[one], x, y, words)
+
+
+def strips_of(network: RoadNetwork, document: NetDocument) -> list[Strip]:
+    """Return the edges of a network's file that have lanes on the same strip."""
+    drawn = {lane.id: lane.points for lane in document.lanes}
+    lanes = network.lanes[: np.count_nonzero(~network.lanes["internal"])]
+    shapes = [clean_shape(_with_height(drawn[id_])) for id_ in network.lane_ids[: len(lanes)]]
+    roads = [
+        Road(range(first, first + number), begin, end)
+        for first, number, begin, end in network.edges[~network.edges["internal"]][
+            ["first_lane", "num_lanes", "from_junction", "to_junction"]
+        ].tolist()
+    ]
+    return find_strips(shapes, lanes["width_m"].tolist(), roads, network.left_hand)
+
+
+def _with_height(points: Points) -> list[tuple[float, float, float]]:
+    return [(x, y, z[0] if z else 0.0) for x, y, *z in points.tolist()]
+
+
+def _tight_corners(network: RoadNetwork) -> Iterator[Defect]:
+    """Find corners inside roads that the reader has no room to round."""
+    cars = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
+    for lane in np.flatnonzero(cars).tolist():
+        shape = network.lane_polyline(lane)
+        for corner in find_corners(shape):
+            x, y = shape[(corner.first + corner.last) // 2, :2].tolist()
+            angle = f"{abs(np.degrees(corner.turn)):.0f} degrees"
+            yield Defect("corner too tight for a car", network.lane_ids[lane], x, y, angle)
+
+
 def _inside(place: Points, rim: Points) -> bool:
     one, other = rim, np.roll(rim, -1, axis=0)
     spans = (one[:, 1] > place[1]) != (other[:, 1] > place[1])
@@ -247,7 +293,7 @@ def _to_rim(place: Points, rim: Points) -> float:
 
 
 def _buildings_on_roads(network: RoadNetwork) -> Iterator[Defect]:
-    """Find lanes with points under a roof: the building covers the road, or has a passage."""
+    """Find lanes with points under a roof; the building may have a passage for the road."""
     lane_of = np.repeat(np.arange(len(network.lanes)), network.lanes["num_points"])
     places = np.stack([network.points["x"], network.points["y"]], axis=1)
     seen: set[int] = set()

@@ -22,7 +22,7 @@ _ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendri
 
 
 class _Root(ContentHandler):
-    """Remembers the root element; the parser reports broken or malicious XML."""
+    """Stores the name of the root element; the parser reports broken or malicious XML."""
 
     def __init__(self) -> None:
         super().__init__()

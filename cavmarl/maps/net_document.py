@@ -64,7 +64,7 @@ class NetDocument:
         except (ParseError, DefusedXmlException, ValueError, OSError) as error:
             raise MapError(f"{path}: cannot be read ({error}): build it again") from error
         if root.tag != "net":
-            raise MapError(f"{path}: <{root.tag}> not a SUMO network: give a .net.xml file")
+            raise MapError(f"{path}: <{root.tag}> is not a SUMO network: give a .net.xml file")
         self.root = root
         self.lanes = [
             DocumentLane(edge, lane) for edge in root.iter("edge") for lane in edge.iter("lane")
@@ -88,7 +88,7 @@ class NetDocument:
 
 
 def points_of(element: Element) -> Points:
-    """Return the `shape` of an element; (0, 2) if it has none."""
+    """Return the `shape` of an element, (n, 2) or (n, 3); (0, 2) if it has none."""
     words = [word.split(",") for word in element.get("shape", "").split()]
     if not words:
         return np.zeros((0, 2))
@@ -100,7 +100,7 @@ def points_of(element: Element) -> Points:
 
 
 def shape_text(plane: list[str], heights_m: Points) -> str:
-    """Return a `shape` of positions as they were written, with heights."""
+    """Return a `shape` of positions in the plane, as they are in the file, with heights."""
     return " ".join(
         f"{place},{height:.{HEIGHT_DIGITS}f}"
         for place, height in zip(plane, heights_m.tolist(), strict=True)

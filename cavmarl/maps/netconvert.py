@@ -2,7 +2,7 @@
 
 The same source and options give the same bytes: netconvert's comment with the date is removed.
 
-Each network file names its source (`maps.provenance`). Heights are added here.
+Each network file names its source (`maps.provenance`). This module also adds heights.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from typing import Any
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.notices import print_once
+from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument
@@ -32,9 +34,12 @@ from cavmarl.maps.netconvert_process import (
     run_netconvert,
     sumo_home,
 )
+from cavmarl.maps.opendrive_source import TYPE_MAP, OpenDriveSource
 from cavmarl.maps.osm_roads import OsmRoads
+from cavmarl.maps.osm_source import LANE_OPTIONS, prepare_osm
 from cavmarl.maps.provenance import (
     NOT_STATED,
+    NOTE_SEPARATOR,
     OSM_ATTRIBUTION,
     OSM_LICENCE,
     RoadDefaults,
@@ -43,7 +48,9 @@ from cavmarl.maps.provenance import (
     read_provenance,
     road_defaults,
 )
+from cavmarl.maps.traffic_sides import NEAR_M, Side, sides_at
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
+from cavmarl.roads.sumo_net.sumo_options import map_of_config
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 
 Box = tuple[float, float, float, float]
@@ -57,7 +64,8 @@ OSM_OPTIONS = (
     "--tls.join",
     "--keep-edges.by-vclass=passenger",
     "--remove-edges.isolated",
-    "--output.original-names",  # of the ways of each lane: for bridges, names, defaults
+    *LANE_OPTIONS,
+    "--output.original-names",  # ids of the ways of each lane, for bridges, names, defaults
 )
 OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
 
@@ -65,8 +73,14 @@ _INPUT = {"sumo": "--sumo-net-file", "osm": "--osm-files", "opendrive": "--opend
 _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.typ.xml"}
 _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
 
+_ISOLATED = "Removed a road without junctions"  # begins a warning
+_TOLERANT = "--ignore-errors"
+_LEFT_HAND = "--lefthand"
+# Increase the number if a source is converted in another way, so that the cache converts it anew.
+_CONVERSION = "conversion 2"
+
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
-_FAR_M = 100_000.0  # from the origin; farther away, the projection distorts lengths
+_FAR_M = 100_000.0  # farther from the origin, the projection distorts lengths
 
 Origin = tuple[float, float]  # latitude and longitude, degrees
 Told = Callable[[str], None]
@@ -83,19 +97,20 @@ class BuildResult:
     """The result of a build."""
 
     path: Path  # the SUMO network
-    source: Path  # the file it was made from
-    kind: MapKind  # of the source
+    source: Path  # the file from which it was built
+    kind: MapKind  # kind of the source
     options: tuple[str, ...]  # netconvert's options; empty if a SUMO network was copied
     # netconvert's warnings, counted by their text without names and numbers
     warnings: dict[str, int]
     # changes that netconvert reports: joined junctions, guessed roundabouts …
     corrections: tuple[str, ...]
-    # with `tolerant`, ignored errors of netconvert; the objects that they name were left out
+    # with `tolerant`, ignored errors of netconvert; the objects named there were left out
     dropped: tuple[str, ...]
     provenance: dict[str, str]  # origin of the map, as written in its file
-    defaults: tuple[RoadDefaults, ...] = ()  # missing values of OSM from the type map
+    defaults: tuple[RoadDefaults, ...] = ()  # missing values, from the type map
+    notes: tuple[str, ...] = ()  # what the source contains and the network does not, with counts
     heights: HeightReport | None = None
-    levels: int = 0  # lanes that cross on a bridge or in a tunnel, without `heights`
+    levels: int = 0  # number of lanes that cross on a bridge or in a tunnel; 0 with `heights`
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self) | {"path": str(self.path), "source": str(self.source)}
@@ -107,6 +122,7 @@ def build_network(
     *,
     options: Sequence[str] = (),
     bbox: Box | None = None,
+    side: Side | None = None,
     origin: Origin | None = None,
     heights: HeightOptions | None = None,
     licences: tuple[str, str] = ("", ""),
@@ -118,38 +134,51 @@ def build_network(
 
     Args:
         source: OpenStreetMap or OpenDRIVE, which netconvert converts to a network, or a SUMO
-            network, which is copied. May be gzipped.
-        target: destination of the network, gzipped if it ends in `.gz`. Default: the cache, or
-            the source itself if nothing has to be done.
+            network, which is copied, or a configuration of SUMO, which names a network. May be
+            gzipped.
+        target: path of the network, gzipped if it ends in `.gz`. Default: in the cache, or the
+            source itself if it needs no changes.
         options: additional options for netconvert.
         bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
             OSM, otherwise metres in the source's own frame.
+        side: side of the road on which vehicles drive; None: OSM: that of the country, OpenDRIVE:
+            the `rule` of the roads. A SUMO network has its own.
         origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
             the roads, in UTM.
-        heights: terrain models for the roads; nothing moves in the plane. Without them, the ground
-            is flat, and bridges and tunnels of OSM leave it where they cross roads.
-        licences: licences of the source and of the terrain models, if not the default ones.
-        tolerant: let netconvert leave out what it cannot use instead of failing.
+        heights: terrain models for the roads; positions in the plane do not change. Without models,
+            the ground is flat, and bridges and tunnels of OSM have heights where they cross roads.
+        licences: licences of the source and of the terrain models; empty: the default.
+        tolerant: let netconvert leave out objects that it cannot use instead of failing.
         timeout_s: time limit of netconvert; None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
         told: called with each of `STAGES` as it begins.
 
     Raises:
-        ConfigError: `bbox` is empty, or the origin is not on the earth or far from the map.
+        ConfigError: `bbox` is empty, the origin is not on the earth or too far from the map, or the
+            source is a SUMO network and `side` is given.
         MapError: the source is broken, malicious or not a map; netconvert fails (its output is in
-            the message); the result has no drivable lane; the heights cannot be used; or the target
-            cannot be written.
+            the message); the result has no drivable lane; the heights cannot be used; the roads
+            have no common traffic side; or the target cannot be written.
         MissingExtraError: netconvert, or a package for heights and levels, is not installed.
     """
     source = Path(source)
+    if is_sumo_config(source):
+        source = map_of_config(source)
     kind = map_kind(source)
     chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *_centred(source, kind, origin), *options)
     if tolerant and chosen:
-        chosen += ("--ignore-errors",)
+        chosen += (_TOLERANT,)
+    if side is not None and kind == "sumo":
+        raise ConfigError(
+            f"--traffic-side {side}: {source} is a SUMO network, which has its own side "
+            "(lefthand of <net>): remove the option, or build the network from its source again"
+        )
     if target is None and not chosen and heights is None:
         read_network(source)
         return BuildResult(source, source, kind, (), {}, (), (), read_provenance(source))
     place = Path(target) if target else _cache_entry(source, chosen, heights)
-    made = _Build(source, kind, place, chosen, origin, heights, licences, timeout_s, told)
+    made = _Build(
+        source, kind, place, chosen, bbox, side, origin, heights, licences, timeout_s, told
+    )
     try:
         made.run()
     except OSError as error:
@@ -159,12 +188,13 @@ def build_network(
         path=place,
         source=source,
         kind=kind,
-        options=chosen,
+        options=made.options,
         warnings=made.log.warnings(),
         corrections=made.log.corrections(),
         dropped=made.log.errors(),
         provenance=read_provenance(place),
         defaults=made.defaults,
+        notes=made.notes,
         heights=made.report,
         levels=made.levels,
     )
@@ -173,25 +203,36 @@ def build_network(
 def map_file(path: str | Path) -> Path:
     """Return the SUMO network of a map file: the file itself, or the result of netconvert.
 
+    A configuration of SUMO stands for the network that it names. What netconvert had to ignore or
+    to guess is printed once per process.
+
     Raises MapError: see `build_network`.
     """
     path = Path(path)
+    if is_sumo_config(path):
+        path = map_of_config(path)
     if path.name.endswith((".net.xml", ".net.xml.gz")):
         return path
     kind = map_kind(path)
     if kind == "sumo":
         return path
     entry = _cache_entry(path, _OPTIONS[kind])
-    return entry if entry.exists() else build_network(path).path
+    if not entry.exists():
+        build_network(path)
+    told = read_provenance(entry)
+    for key in ("traffic side", "defaults", "notes"):
+        if not told.get(key, "right").startswith("right"):
+            print_once(f"{path}: {key}: {told[key]}")
+    return entry
 
 
 def _cache_entry(
     source: Path, options: Sequence[str], heights: HeightOptions | None = None
 ) -> Path:
     require("sumo", "sumo")
-    words = [source_hash(source), version("eclipse-sumo"), *options]
+    words = [source_hash(source), version("eclipse-sumo"), _CONVERSION, *options]
     if heights is None:
-        words.append("levels 4")  # of bridges and tunnels; the number is the algorithm's version
+        words.append("levels 4")  # version of the algorithm for bridges and tunnels
     else:
         words += [*map(source_hash, heights.models), repr(heights)]
     digest = hashlib.sha256("\0".join(words).encode())
@@ -213,12 +254,12 @@ def _centred(source: Path, kind: MapKind, origin: Origin | None) -> tuple[str, .
     latitude, longitude = origin
     if kind != "osm":
         raise ConfigError(
-            f"--origin: {source} has its own frame: an origin is only for OpenStreetMap"
+            f"--origin: {source} has its own frame: leave it out; only OpenStreetMap needs it"
         )
     if not (abs(latitude) < 90.0 and abs(longitude) <= 180.0):
         raise ConfigError(
-            f"--origin {latitude:g},{longitude:g}: not a latitude and longitude: give LAT,LON in "
-            "degrees"
+            f"--origin {latitude:g},{longitude:g}: not a latitude and a longitude: give LAT,LON "
+            "in degrees"
         )
     projection = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +x_0=0 +y_0=0"
     projection += " +datum=WGS84 +units=m +no_defs"
@@ -231,6 +272,8 @@ class _Build:
     kind: MapKind
     place: Path
     options: tuple[str, ...]
+    bbox: Box | None
+    side: Side | None
     origin: Origin | None
     heights: HeightOptions | None
     licences: tuple[str, str]
@@ -238,21 +281,24 @@ class _Build:
     told: Told
     log: BuildLog = field(default_factory=BuildLog)
     defaults: tuple[RoadDefaults, ...] = ()
+    notes: tuple[str, ...] = ()
+    roads: OsmRoads | None = None  # of OSM
+    decided: str = ""  # the traffic side, and by what it was decided
     report: HeightReport | None = None
     levels: int = 0
 
     def run(self) -> None:
-        """Make the network beside its destination, and move it there when it is complete."""
+        """Write the network to a folder beside the target, and move it when it is complete."""
         place = self.place
         if place.exists() and place.samefile(self.source):
             raise MapError(f"{place}: the target is the source: give another target")
         place.parent.mkdir(parents=True, exist_ok=True)
-        cache = cache_dir() / "maps"  # shared by all builds, so that one cleans up after another
+        cache = cache_dir() / "maps"  # one folder for all builds, so a build removes old drafts
         with draft_folder(cache if place.is_relative_to(cache) else place.parent) as folder:
             draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
             if self.options:
-                self.log = _convert(self.kind, self.source, draft, self.options, self.timeout_s)
+                self.log = self._convert(self._prepared(folder), draft)
             else:
                 draft.write_bytes(read_bytes(self.source))
             content = self._finished(draft)
@@ -261,12 +307,80 @@ class _Build:
             _check_readable(self.source, draft, self.log)
             os.replace(draft, place)
 
+    def _prepared(self, folder: Path) -> Path:
+        """Return the file for netconvert: the source, or a copy of it in a form that it reads."""
+        if self.kind == "osm":
+            self.roads = OsmRoads(self.source)
+            self.roads.refuse_without_roads()
+            self._drive_on(self.side or self._side_of_place(self.roads), "the place of its roads")
+            copy = folder / "source.osm"
+            left_hand = _LEFT_HAND in self.options
+            self.notes = prepare_osm(self.source, self.roads, copy, left_hand)
+            return copy if copy.exists() else self.source
+        if self.kind != "opendrive":
+            return self.source
+        roads = OpenDriveSource(self.source, tolerant=_TOLERANT in self.options)
+        self._drive_on(roads.use_side(self.side), "the rule of its roads")
+        self.defaults, self.notes = roads.defaults, roads.notes()
+        if not roads.changed:
+            return self.source
+        copy = folder / "source.xodr"
+        copy.write_bytes(roads.content())
+        return copy
+
+    def _drive_on(self, side: Side, reason: str) -> None:
+        self.decided = f"{side} (by {'option' if self.side else reason})"
+        if side == "left" and _LEFT_HAND not in self.options:
+            self.options += (_LEFT_HAND,)
+
+    def _side_of_place(self, roads: OsmRoads) -> Side:
+        """Return the traffic side of the country; raises MapError if there are both or neither."""
+        west, south, east, north = self.bbox or (-180.0, -90.0, 180.0, 90.0)
+        ways = (way for way in roads.ways.values() if way.for_cars)
+        nodes = {node for way in ways for node in way.nodes}
+        places = [roads.places[node] for node in sorted(nodes & roads.places.keys())]
+        inside = [(x, y) for x, y in places if west <= x <= east and south <= y <= north]
+        sides = sides_at(inside or [(west, south), (east, north)])
+        if len(sides) == 1:
+            return sides.pop()
+        problem = (
+            "its roads are in places with left-hand and with right-hand traffic"
+            if sides
+            else f"all its roads are within {NEAR_M / 1e3:g} km of a border between left-hand and "
+            "right-hand traffic"
+        )
+        raise MapError(
+            f"{self.source}: {problem}: a network has one side; crop the map (--bbox), or choose "
+            f"the side: cavmarl map build {self.source} --traffic-side left or right"
+        )
+
+    def _convert(self, prepared: Path, draft: Path) -> BuildLog:
+        arguments = [_INPUT[self.kind], str(prepared), "-o", str(draft), *self.options]
+        if self.kind in _TYPE_MAP:
+            types = [sumo_home() / "data" / "typemap" / _TYPE_MAP[self.kind]]
+            if self.kind == "opendrive":
+                types.append(draft.with_name("lanes.typ.xml"))
+                types[-1].write_bytes(TYPE_MAP)
+            arguments += ["-t", ",".join(map(str, types))]
+        cures = Cures(
+            f"crop the map (cavmarl map build {self.source} --bbox …) or allow more time "
+            f"(--timeout-s, or {TIME_LIMIT})",
+            "keep an area with roads: --bbox WEST,SOUTH,EAST,NORTH, "
+            + ("in degrees" if self.kind == "osm" else "in metres")
+            if self.bbox is not None
+            else "repair the source"
+            if _TOLERANT in self.options
+            else "repair the source, or drop its broken parts: "
+            f"cavmarl map build {self.source} --tolerant",
+        )
+        return run_netconvert(arguments, self.source, self.timeout_s, cures)
+
     def _finished(self, draft: Path) -> bytes:
-        """Return the network with additions to netconvert's output: heights and origin."""
+        """Return the network with the map's origin and heights added to netconvert's output."""
         if not self.options and self.heights is None:
             return draft.read_bytes()
         self.told(STAGES[1])
-        roads = OsmRoads(self.source) if self.kind == "osm" else None
+        roads = self.roads
         document = NetDocument(draft)
         _check_near(self.source, document, self.origin)
         if roads is not None:
@@ -283,7 +397,7 @@ class _Build:
         return content.replace(b"<net ", facts + b"<net ", 1)
 
     def _facts(self, document: NetDocument) -> dict[str, str]:
-        """Return the map's origin, for its file."""
+        """Return the origin of the map, to be written into its file."""
         facts = read_provenance(self.source) if self.kind == "sumo" else {}
         if not facts:
             facts = {"source": self.source.name, "source sha256": source_hash(self.source)}
@@ -297,8 +411,14 @@ class _Build:
             facts |= {"projection": document.geo.projection, "offset": offset}
         if self.origin is not None:
             facts["origin"] = f"latitude {self.origin[0]!r}, longitude {self.origin[1]!r}"
+        if self.decided:
+            facts["traffic side"] = self.decided
         if self.defaults:
-            facts["defaults"] = defaults_text(self.defaults)
+            facts["defaults"] = defaults_text(
+                self.defaults, "edges" if self.kind == "osm" else "roads"
+            )
+        if self.notes:
+            facts["notes"] = NOTE_SEPARATOR.join(self.notes)
         if self.levels:
             facts["levels"] = f"{self.levels} crossings of lanes on bridges and in tunnels"
         if self.heights is not None and self.report is not None:
@@ -321,26 +441,15 @@ def _check_near(source: Path, document: NetDocument, origin: Origin | None) -> N
         )
 
 
-def _convert(
-    kind: MapKind, source: Path, draft: Path, options: Sequence[str], timeout_s: float | None
-) -> BuildLog:
-    arguments = [_INPUT[kind], str(source), "-o", str(draft), *options]
-    if kind in _TYPE_MAP:
-        arguments += ["-t", str(sumo_home() / "data" / "typemap" / _TYPE_MAP[kind])]
-    cures = Cures(
-        f"crop the map (cavmarl map build {source} --bbox …) or allow more time (--timeout-s, or "
-        f"{TIME_LIMIT})",
-        "repair the source"
-        if "--ignore-errors" in options
-        else f"repair the source, or drop its broken parts: cavmarl map build {source} --tolerant",
-    )
-    return run_netconvert(arguments, source, timeout_s, cures)
-
-
 def _check_readable(source: Path, draft: Path, log: BuildLog) -> None:
     try:
         read_network(draft)
     except MapError as error:
+        if any(text.startswith(_ISOLATED) for text in log.warnings()):
+            raise MapError(
+                f"{source}: no two roads for cars meet, and netconvert removes a road without "
+                "junctions: export a larger area, in which streets cross"
+            ) from error
         message = f"{source}: {str(error).removeprefix(f'{draft}: ')}"
         reported = (*log.errors(), *log.warnings())
         if reported:

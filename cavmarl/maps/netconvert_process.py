@@ -1,4 +1,4 @@
-"""A run of netconvert as a process, and its output."""
+"""Runs netconvert as a process, and reads its output."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.core.processes import dying_with_parent
 from cavmarl.roads.sumo_net.xml_source import limit
 
 MAX_NETCONVERT_S = 600
-TIME_LIMIT = "CAVMARL_MAX_NETCONVERT_S"  # environment variable for another limit
+TIME_LIMIT = "CAVMARL_MAX_NETCONVERT_S"  # environment variable that changes this limit
 _SHOWN_LINES = 10
 _QUOTED = re.compile(r"'[^']*'")
 _NUMBERED = re.compile(r"\S*\d\S*")
@@ -23,7 +23,7 @@ _CORRECTION = re.compile(r"^(Joined|Guessed|Removed) |^[1-9]\d* .*(removed|compu
 
 
 class BuildLog:
-    """The output of a run with `--verbose` and without aggregated warnings."""
+    """The output of netconvert with `--verbose` and without aggregated warnings."""
 
     def __init__(self, stdout: str = "", stderr: str = "") -> None:
         self._stdout = stdout.splitlines()
@@ -40,7 +40,7 @@ class BuildLog:
         return dict(kinds.most_common())
 
     def corrections(self) -> tuple[str, ...]:
-        """Return netconvert's own changes, in its words."""
+        """Return netconvert's messages about its changes to the network."""
         lines = (line.strip().rstrip(".") for line in self._stdout if line.startswith(" "))
         return tuple(line for line in lines if _CORRECTION.search(line))
 
@@ -65,11 +65,11 @@ def run_netconvert(
 ) -> BuildLog:
     """Run netconvert of the `eclipse-sumo` wheel.
 
-    `source`: the file for messages. `timeout_s`: None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
-    `cures`: advice for messages.
+    `source`: the map file, for messages. `timeout_s`: time limit; None: `CAVMARL_MAX_NETCONVERT_S`,
+    or 600 s. `cures`: advice for messages.
 
     Raises:
-        ConfigError: that variable is not a whole number above 0.
+        ConfigError: the environment variable is not a whole number above 0.
         MapError: netconvert fails or takes too long.
         MissingExtraError: netconvert is not installed.
     """

@@ -1,7 +1,8 @@
-"""Information of OpenStreetMap that netconvert does not use: levels, names, missing tags."""
+"""Data of OpenStreetMap that netconvert does not use: levels, names, missing tags."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,17 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
+_MOST_KINDS = 5  # in an error message
 _TAGS = frozenset(
-    ("highway", "bridge", "tunnel", "layer", "name", "ref", "lanes", "maxspeed", "width")
+    "highway bridge tunnel layer name ref lanes maxspeed width oneway busway motorcar "
+    "motor_vehicle motor_vehicle:forward motor_vehicle:backward vehicle turn:lanes "
+    "turn:lanes:forward turn:lanes:backward lanes:bus lanes:bus:forward lanes:bus:backward "
+    "lanes:psv lanes:psv:forward lanes:psv:backward".split()
+)
+# Kinds of road that netconvert's type map opens to passenger cars.
+_FOR_CARS = frozenset(
+    "motorway motorway_link trunk trunk_link primary primary_link secondary secondary_link "
+    "tertiary tertiary_link unclassified residential living_street unsurfaced construction".split()
 )
 _ON_THE_GROUND = frozenset(("no", "building_passage", "covered", "culvert"))
 
@@ -25,7 +35,7 @@ class RoadWay:
 
     @property
     def level(self) -> int:
-        """Level above (bridges) or below (tunnels) the ground; 0: on it."""
+        """Level above (bridges) or below (tunnels) the ground; 0: on the ground."""
         for key, sign in (("bridge", 1), ("tunnel", -1)):
             if self.tags.get(key, "no") not in _ON_THE_GROUND:
                 try:
@@ -34,6 +44,16 @@ class RoadWay:
                     layer = sign
                 return layer if layer * sign > 0 else sign
         return 0
+
+    @property
+    def for_cars(self) -> bool:
+        return self.tags.get("highway") in _FOR_CARS
+
+    @property
+    def closed_to_cars(self) -> bool:
+        """Whether the most specific tag of access for motor vehicles closes the way."""
+        keys = ("motorcar", "motor_vehicle", "vehicle")
+        return next((self.tags[key] for key in keys if key in self.tags), "yes") == "no"
 
     @property
     def name(self) -> str:
@@ -58,6 +78,20 @@ class OsmRoads(ContentHandler):
         self._locator: Any = None
         self._path = path
         read_xml(path, self)
+
+    def refuse_without_roads(self) -> None:
+        """Raise MapError if no way is a road for cars."""
+        if any(way.for_cars for way in self.ways.values()):
+            return
+        kinds = Counter(way.tags["highway"] for way in self.ways.values())
+        listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(_MOST_KINDS))
+        found = (
+            f"its ways with a highway tag are: {listed}" if kinds else "no way has a highway tag"
+        )
+        raise MapError(
+            f"{self._path}: the extract has no road for cars: {found}; export an area with streets "
+            "(highway=residential, tertiary, …), with the ways and their nodes"
+        )
 
     def startElement(self, name: str, attrs: Any) -> None:
         try:

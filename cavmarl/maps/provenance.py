@@ -20,6 +20,7 @@ OSM_LICENCE = (
 )
 OSM_ATTRIBUTION = "© OpenStreetMap contributors, https://www.openstreetmap.org/copyright"
 NOT_STATED = "not stated: see the source"
+NOTE_SEPARATOR = "; "
 
 _TITLE = "map built by cavmarl"
 _HEAD_BYTES = 1 << 16
@@ -31,11 +32,11 @@ _GUESSED = {"lanes": "numLanes", "maxspeed": "speed", "width": "width"}
 class RoadDefaults:
     """Values from netconvert's type map for roads of one kind without the tag."""
 
-    kind: str  # OSM's `highway`, as named by netconvert
-    edges: int
+    kind: str  # OSM's `highway`, as named by netconvert; the type of a road of OpenDRIVE
+    edges: int  # of OSM; roads of OpenDRIVE
     guessed: str  # lanes, maxspeed or width
-    value: str  # the most frequent one; speeds in m/s, widths in m
-    used_for: int  # edges
+    value: str  # the most frequent value; speeds in m/s, widths in m
+    used_for: int  # number of edges or roads without the value
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -49,7 +50,7 @@ def head_of(facts: Mapping[str, str]) -> bytes:
 
 
 def read_provenance(path: Path) -> dict[str, str]:
-    """Return the origin of a map from its file; empty if it has none."""
+    """Return the origin of a map from its file; empty if the file does not give it."""
     try:
         with path.open("rb") as raw:
             head = raw.read(_HEAD_BYTES)
@@ -89,8 +90,9 @@ def road_defaults(document: NetDocument, roads: OsmRoads) -> tuple[RoadDefaults,
     )
 
 
-def defaults_text(defaults: Iterable[RoadDefaults]) -> str:
+def defaults_text(defaults: Iterable[RoadDefaults], counted: str) -> str:
+    """Return the defaults for a comment; `counted` is what their numbers count: edges or roads."""
     return "; ".join(
-        f"{row.kind} {row.guessed}={row.value} ({row.used_for} of {row.edges} edges)"
+        f"{row.kind} {row.guessed}={row.value} ({row.used_for} of {row.edges} {counted})"
         for row in defaults
     )

@@ -1,4 +1,4 @@
-"""Repairs a network without its source: netconvert writes it again."""
+"""Repairs a network without its source, by writing it again with netconvert."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ from pathlib import Path
 
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.errors import MapError
-from cavmarl.maps.defects import Defect, cut_off_edges, find_defects
+from cavmarl.maps.defects import Defect, cut_off_edges, find_defects, strips_of
 from cavmarl.maps.net_document import NetDocument
 from cavmarl.maps.netconvert_process import run_netconvert
 from cavmarl.maps.provenance import head_of, read_provenance
+from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 
 _TIMEOUT_S = 600.0
 
 
 def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str], list[Defect]]:
-    """Write a network without unconnected parts, and with new right of way and signals.
+    """Write a network again, without unconnected parts and with new right of way and signals.
+
+    Opposite edges on the same strip are drawn where the reader moves them.
 
     Args:
         source: a SUMO network.
@@ -40,10 +43,12 @@ def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str
         draft = folder / "mended.net.xml"
         run_netconvert([*arguments, "-o", str(draft)], source, _TIMEOUT_S)
         facts = read_provenance(source) | {"mended": f"{len(cut)} edges removed"}
-        draft.write_bytes(NetDocument(draft).content(head_of(facts)))
+        document = NetDocument(draft)
+        _move_apart(document, read_network(draft))
+        draft.write_bytes(document.content(head_of(facts)))
         after = find_defects(read_network(draft), draft)
         os.replace(draft, target)
-    done = [f"removed edge {name}: cut off from the rest" for name in cut]
+    done = [f"edge {name}: removed, because it is not connected to the rest" for name in cut]
     left = {(defect.kind, defect.name) for defect in after}
     done += [
         f"{defect.kind} {defect.name}: repaired"
@@ -51,3 +56,25 @@ def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str
         if (defect.kind, defect.name) not in left and defect.kind != "unreachable part"
     ]
     return done, after
+
+
+def _move_apart(document: NetDocument, network: RoadNetwork) -> None:
+    """Draw edges on the same strip, and the paths at their ends, as the reader has moved them."""
+    moved = {
+        lane
+        for strip in strips_of(network, document)
+        for lane in (*strip.one.lanes, *strip.other.lanes)
+    }
+    lanes, links = network.lanes, network.links
+    ends = links[lanes["link"]][["from_lane", "to_lane"]].tolist()
+    rows = {
+        network.lane_ids[row]: row
+        for row in range(len(lanes))
+        if row in moved or (lanes["internal"][row] and not moved.isdisjoint(ends[row]))
+    }
+    for lane in document.lanes:
+        if lane.id in rows:
+            size = lane.points.shape[1]
+            places = network.lane_polyline(rows[lane.id])[:, :size].tolist()
+            lane.element.set("shape", " ".join(",".join(f"{x:.3f}" for x in p) for p in places))
+            lane.element.set("customShape", "1")

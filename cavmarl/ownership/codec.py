@@ -252,7 +252,7 @@ def _message_hints(kind: type[Message]) -> tuple[tuple[str, Any], ...]:
 class _Plain:
     """A STEP or DONE with empty lists only, converted at once.
 
-    Most are of this form, and this takes a quarter of the time of a conversion field by field.
+    Most of these messages have this form. A conversion field by field takes four times as long.
     """
 
     def __init__(self, number: int, kind: type[Message]) -> None:

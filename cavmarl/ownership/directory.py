@@ -49,7 +49,7 @@ class StoreError(ProtocolError):
     """The rows in the store differ from the rows that zones reported."""
 
     def __init__(self, zones: tuple[int, ...]) -> None:
-        super().__init__(f"zones {list(zones)} stored other rows than reported; host them anew")
+        super().__init__(f"zones {list(zones)}: stored and reported rows differ; host them anew")
         self.zones = zones  # zones that need a new host, which repeats the tick
 
 
@@ -99,7 +99,7 @@ class Directory:
             directory.table.apply(record)
         return directory
 
-    def know(self, neighbours: Neighbours) -> None:
+    def set_neighbours(self, neighbours: Neighbours) -> None:
         """Set the zones between which vehicles may change."""
         self._decisions.neighbours = neighbours
 
@@ -176,8 +176,8 @@ class Directory:
 
     def resend(
         self,
-        zones: Iterable[int] | None = None,  # only these
-        # needed only after `restore`; else the payloads of `begin` are used
+        zones: Iterable[int] | None = None,  # zones that get their STEP again; None: all
+        # zone → payload of its STEP, needed after `restore`; None: those given to `begin`
         payloads: Mapping[int, bytes] | None = None,
     ) -> Output:
         """Return the STEPs of zones that have not answered, to send them again."""
@@ -260,7 +260,7 @@ class Directory:
 
     def on_message(self, message: Message) -> Output:
         """Process a message. Late and foreign messages are dropped and counted."""
-        reason = self._misfit(message)
+        reason = self._reason_to_drop(message)
         if reason is not None:
             self.dropped[type(message).__name__, reason] += 1
             return SILENCE
@@ -275,9 +275,9 @@ class Directory:
                 return self._on_need(message)
         return SILENCE
 
-    # Inside
+    # Internal
 
-    def _misfit(self, message: Message) -> str | None:
+    def _reason_to_drop(self, message: Message) -> str | None:
         table = self.table
         if message.run != self.run:
             return "run"
@@ -335,7 +335,7 @@ class Directory:
 def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -> Step:
     """Return the lease of a zone's present host for the tick in progress.
 
-    States are attached for vehicles whose switch is forced, and for those that must be sent again.
+    States are attached for vehicles whose switch is forced or whose state must be sent again.
     """
     plan = table.planned
     enter = tuple(

@@ -20,8 +20,8 @@ from cavmarl.ownership.limits import Limits
 class Distances:
     """The three distances of a world."""
 
-    approach_m: float  # before the border; within it, the vehicle is offered
-    hysteresis_m: float  # beyond the border; up to it, the owner does not change
+    approach_m: float  # distance before the border from which a vehicle is offered
+    hysteresis_m: float  # distance beyond the border up to which the owner does not change
     overlap_m: float  # width of the strip around a zone that the zone sees (B)
 
     def __post_init__(self) -> None:

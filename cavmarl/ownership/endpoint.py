@@ -68,7 +68,7 @@ class Endpoint:
 
     def on_message(self, message: Message) -> Reaction:
         """Process a message. Late and foreign messages are dropped and counted."""
-        reason = self._misfit(message)
+        reason = self._reason_to_drop(message)
         if reason is not None:
             return self._drop(message, reason)
         match message:
@@ -121,7 +121,7 @@ class Endpoint:
 
     def _end_lease(self, tick: int) -> None:
         self.tick, self.lease = tick, None
-        self.offers.owed.clear()  # unanswered offers are of the tick before
+        self.offers.unanswered.clear()  # the previous tick's offers
 
     def offer(self, approaches: Iterable[Approach]) -> tuple[Message, ...]:
         """Offer all approaching vehicles of a tick to other zones, after `complete`."""
@@ -139,7 +139,7 @@ class Endpoint:
 
     def refuse(self, message: Prepare) -> Reaction:
         """Answer a PREPARE with a NACK, because the host has no room."""
-        if self._misfit(message) is not None:
+        if self._reason_to_drop(message) is not None:
             return self.on_message(message)
         refused = tuple(
             Refused(
@@ -160,7 +160,7 @@ class Endpoint:
             self._limits.schema, offers,
         )  # fmt: skip
 
-    def _misfit(self, message: Message) -> str | None:
+    def _reason_to_drop(self, message: Message) -> str | None:
         if message.run != self.run:
             return "run"
         newer = isinstance(message, Step) and message.episode > self.episode

@@ -35,7 +35,7 @@ class Refusal(IntEnum):
 
 
 class In(NamedTuple):
-    """The zone must own the vehicle; with `forced`, the state is attached."""
+    """An order to own the vehicle; with `forced`, its state is attached."""
 
     vehicle: int
     epoch: int
@@ -45,7 +45,7 @@ class In(NamedTuple):
 
 
 class Out(NamedTuple):
-    """The zone must give up the vehicle; `epoch` is that of the ownership that ends."""
+    """An order to give up the vehicle; `epoch` is that of the ownership that ends."""
 
     vehicle: int
     epoch: int
@@ -68,7 +68,7 @@ class Offer(NamedTuple):
 
 
 class Held(NamedTuple):
-    """The sender has exactly this state."""
+    """A confirmation that the sender has exactly this state."""
 
     vehicle: int
     epoch: int
@@ -76,14 +76,14 @@ class Held(NamedTuple):
 
 
 class Withdrawn(NamedTuple):
-    """The replica is not needed."""
+    """A notice that the replica is not needed."""
 
     vehicle: int
     epoch: int
 
 
 class Refused(NamedTuple):
-    """The sender refuses the state."""
+    """A notice that the sender refuses the state."""
 
     vehicle: int
     epoch: int
@@ -91,14 +91,14 @@ class Refused(NamedTuple):
 
 
 class Confirmed(NamedTuple):
-    """The new owner has advanced the vehicle of an IN."""
+    """A confirmation that the new owner has advanced the vehicle of an IN."""
 
     vehicle: int
     epoch: int
 
 
 class Removed(NamedTuple):
-    """The vehicle has left the world; `reason` is the runtime's code."""
+    """A vehicle that has left the world; `reason` is the runtime's code."""
 
     vehicle: int
     reason: int

@@ -1,4 +1,4 @@
-"""The source's side of an approach: its offers to other zones, and offers without an answer.
+"""The source's side of an approach: its offers to other zones, answered or not.
 
 For each vehicle and target, a tick has at most one PREPARE or ABORT. A PREPARE without an answer is
 sent at most A times in its tick. After a refusal, the target gets no offer for some ticks.
@@ -29,37 +29,37 @@ class Offers:
 
     Attributes:
         open: (vehicle, target) → epoch of the last offer, if it has not been withdrawn.
-        owed: (vehicle, target) → offer of this tick without an answer.
-        barred: (vehicle, target) → first tick in which the vehicle may be offered again.
+        unanswered: (vehicle, target) → offer of this tick without an answer.
+        refused_until: (vehicle, target) → first tick in which the vehicle may be offered again.
     """
 
     def __init__(self, limits: Limits) -> None:
         self.open: dict[tuple[int, int], int] = {}
-        self.owed: dict[tuple[int, int], Offer] = {}
-        self.barred: dict[tuple[int, int], int] = {}
+        self.unanswered: dict[tuple[int, int], Offer] = {}
+        self.refused_until: dict[tuple[int, int], int] = {}
         self.attempts = 0
         self._limits = limits
 
     def renew(
         self, tick: int, approaches: Iterable[Approach], epochs: Mapping[int, int]
     ) -> tuple[dict[int, tuple[Offer, ...]], dict[int, tuple[Withdrawn, ...]]]:
-        """Replace the offers by those of a new tick.
+        """Replace the offers of the last tick.
 
         Returns:
             Target → offers, and target → earlier offers that are withdrawn.
         """
-        self.barred = {pair: until for pair, until in self.barred.items() if until > tick}
-        before, self.open, self.owed, self.attempts = self.open, {}, {}, 1
+        self.refused_until = {pair: t for pair, t in self.refused_until.items() if t > tick}
+        before, self.open, self.unanswered, self.attempts = self.open, {}, {}, 1
         for vehicle, target, state in approaches:
             if vehicle not in epochs:
                 raise ProtocolError(f"a zone offers vehicle {vehicle}, but does not own it")
             pair, epoch = (vehicle, target), epochs[vehicle]
-            if pair in self.barred:
+            if pair in self.refused_until:
                 if pair in before:
                     self.open[pair] = before[pair]
                 continue
             self.open[pair] = epoch
-            self.owed[pair] = Offer(vehicle, epoch, state_digest(state), state)
+            self.unanswered[pair] = Offer(vehicle, epoch, state_digest(state), state)
         ended: defaultdict[int, list[Withdrawn]] = defaultdict(list)
         for (vehicle, target), epoch in before.items():
             if (vehicle, target) not in self.open:
@@ -81,19 +81,19 @@ class Offers:
 
     def answered(self, ack: Ack) -> None:
         for vehicle, epoch, digest in ack.entries:
-            offer = self.owed.get((vehicle, ack.zone))
+            offer = self.unanswered.get((vehicle, ack.zone))
             if offer is not None and (offer.epoch, offer.digest) == (epoch, digest):
-                del self.owed[vehicle, ack.zone]
+                del self.unanswered[vehicle, ack.zone]
 
     def refused(self, nack: Nack) -> None:
         """Stop offers to a target for some ticks, unless the state was damaged in transit."""
         for vehicle, _, reason in nack.entries:
-            if reason is not Refusal.DIGEST and (vehicle, nack.zone) in self.owed:
-                del self.owed[vehicle, nack.zone]
-                self.barred[vehicle, nack.zone] = nack.tick + 1 + self._limits.backoff
+            if reason is not Refusal.DIGEST and (vehicle, nack.zone) in self.unanswered:
+                del self.unanswered[vehicle, nack.zone]
+                self.refused_until[vehicle, nack.zone] = nack.tick + 1 + self._limits.backoff
 
     def _by_target(self) -> dict[int, tuple[Offer, ...]]:
         targets: defaultdict[int, list[Offer]] = defaultdict(list)
-        for (_, target), offer in self.owed.items():
+        for (_, target), offer in self.unanswered.items():
             targets[target].append(offer)
         return {target: tuple(sorted(offers)) for target, offers in sorted(targets.items())}

@@ -18,7 +18,7 @@ class OwnershipPlan:
     """The changes of owner between the committed tick and the next tick."""
 
     record: Begin  # the logged decision
-    # zone → tally of its vehicles after IN, OUT and SPAWN, before removals
+    # zone → tally of its vehicles after IN, OUT and SPAWN, and before removals
     expected: Mapping[int, OwnedTally]
     switches: dict[int, Switch] = field(default_factory=dict)  # vehicle → its switch
     births: dict[int, int] = field(default_factory=dict)  # vehicle → its zone

@@ -35,7 +35,7 @@ class Replicas:
     def __init__(self, limits: Limits) -> None:
         self.held: dict[int, Replica] = {}  # vehicle → replica
         self.fences: dict[int, tuple[int, int]] = {}
-        self._heard: defaultdict[int, list[int]] = defaultdict(list)  # tick → vehicles
+        self._fenced_at: defaultdict[int, list[int]] = defaultdict(list)  # tick → vehicles
         self._limits = limits
 
     def state(self, vehicle: int) -> State:
@@ -84,10 +84,10 @@ class Replicas:
     def expire(self, now: int) -> None:
         """Drop replicas that have not been refreshed for the lifetime, with their fences."""
         last = now - self._limits.lifetime
-        if not self._heard or min(self._heard) > last:
+        if not self._fenced_at or min(self._fenced_at) > last:
             return
-        for tick in sorted(tick for tick in self._heard if tick <= last):
-            for vehicle in self._heard.pop(tick):
+        for tick in sorted(tick for tick in self._fenced_at if tick <= last):
+            for vehicle in self._fenced_at.pop(tick):
                 if self.fences.get(vehicle, (0, now))[1] <= last:
                     del self.fences[vehicle]
                     if vehicle in self.held:
@@ -99,4 +99,4 @@ class Replicas:
 
     def _raise_fence(self, vehicle: int, epoch: int, tick: int) -> None:
         self.fences[vehicle] = max((epoch, tick), self.fences.get(vehicle, (-1, -1)))
-        self._heard[tick].append(vehicle)
+        self._fenced_at[tick].append(vehicle)

@@ -55,7 +55,7 @@ class Table:
         self.plan: OwnershipPlan | None = None  # of the tick in progress, or None
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())
-        self._moves: list[_Move] = []  # not in the tallies yet
+        self._moves: list[_Move] = []  # moves that the tallies do not include yet
 
     @property
     def tallies(self) -> dict[int, OwnedTally]:
@@ -122,16 +122,16 @@ class Table:
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
         # With more moves than vehicles, `tallies` counts anew and ignores the moves. One surplus
-        # move is enough to tell, because every new vehicle adds a move.
+        # move is kept, so that `tallies` notices this: every new vehicle adds a move.
         del moves[len(owners) + 1 :]
         self.tick = tick
 
     def go_on(
         self,
         run: bytes,
-        episode: int,  # -1: none has begun
+        episode: int,  # -1: no episode has begun
         tick: int,  # the committed tick
-        owners: dict[int, tuple[int, int]],  # at that tick
+        owners: dict[int, tuple[int, int]],  # owners at `tick`
         seen: SeenIds,
     ) -> None:
         """Resume as the table of a coordinator whose zones are all in one process.
@@ -161,7 +161,7 @@ class Table:
             JournalError: a correct coordinator does not write this record here.
             ProtocolError: the record is wrong for one vehicle or zone.
         """
-        match record:  # the frequent ones first
+        match record:  # frequent records first
             case Begin():
                 self._begin(record)
             case Commit():

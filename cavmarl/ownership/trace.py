@@ -1,8 +1,8 @@
 """Traces: the coordinator's records and all delivered messages, in order.
 
-A driver adds each record when it is logged, and each message when it is delivered, before the
-receiver may drop it. `trace_check` checks a trace without the code of the protocol; `Trace.text`
-formats it for people.
+The program that runs the parties adds each record when it is logged, and each message when it is
+delivered, before the receiver may drop it. `trace_check` checks a trace without the code of the
+protocol; `Trace.text` formats it for people.
 """
 
 from __future__ import annotations

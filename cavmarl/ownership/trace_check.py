@@ -95,9 +95,9 @@ def check_trace(entries: Iterable[TraceEntry], longest_deferral: int, lifetime: 
             raise ProtocolError(f"entry {number}, {describe(entry)}: {error}") from None
 
 
-def _require(holds: bool, otherwise: str) -> None:
+def _require(holds: bool, problem: str) -> None:
     if not holds:
-        raise ProtocolError(otherwise)
+        raise ProtocolError(problem)
 
 
 class TraceChecker:
@@ -107,14 +107,14 @@ class TraceChecker:
         self,
         longest_deferral: int,  # ticks that a vehicle may have an owner whose zone it has left
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
-        # zones and coordinator are in one process, so that there are only records, and possibly
-        # only those of ticks with changes
+        # whether zones and coordinator are in one process. The trace then has only records, and
+        # possibly only those of ticks with changes
         is_direct: bool = False,
         near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
     ) -> None:
         self._is_direct, self.near = is_direct, near
         self.owners: dict[int, Owner] = {}  # vehicle → owner at the committed tick
-        self.changes: list[OwnerStep] = []  # of the last COMMIT
+        self.changes: list[OwnerStep] = []  # changes in the last COMMIT
         self._longest, self._lifetime = longest_deferral, lifetime
         self._run, self._episode, self._tick = b"", -1, 0
         self._tallies: defaultdict[int, OwnedTally] = defaultdict(OwnedTally)
@@ -123,13 +123,13 @@ class TraceChecker:
         self._incarnations: dict[int, int] = {}
         self._fenced: set[int] = set()
         self._fences: dict[tuple[int, int], tuple[int, int]] = {}
-        self._heard: defaultdict[int, set[tuple[int, int]]] = defaultdict(set)  # tick → fences
-        self._holdings: defaultdict[int, set[Holding]] = defaultdict(set)  # by tick
-        self._ready: set[tuple[int, int, int, int, int]] = set()  # acknowledged, with the tick
+        self._fenced_at: defaultdict[int, set[tuple[int, int]]] = defaultdict(set)  # tick → fences
+        self._holdings: defaultdict[int, set[Holding]] = defaultdict(set)  # tick → holdings
+        self._ready: set[tuple[int, int, int, int, int]] = set()  # states of ACKs, and their tick
         self._begun: Begin | None = None
-        self._orders: defaultdict[int, _Orders] = defaultdict(_Orders)  # by zone, of that BEGIN
+        self._orders: defaultdict[int, _Orders] = defaultdict(_Orders)  # zone → its orders
         self._dones: dict[int, Done] = {}
-        self._judges: dict[type, Callable[[Any], None]] = {
+        self._checks: dict[type, Callable[[Any], None]] = {
             Reset: self._reset, Host: self._host, Fence: self._fence, Begin: self._begin,
             Commit: self._commit, Step: self._step, Prepare: self._prepare, Abort: self._abort,
             Ack: self._ack, Done: self._done,
@@ -137,15 +137,15 @@ class TraceChecker:
 
     def take(self, entry: TraceEntry) -> None:
         item = entry.item
-        judge = self._judges.get(type(item))
+        check = self._checks.get(type(item))
         if isinstance(item, Record):
-            _require(judge is not None, "unknown record")
-        elif self._foreign(item) or (type(item) is Ack and entry.destination != COORDINATOR):
+            _require(check is not None, "unknown record")
+        elif self._is_foreign(item) or (type(item) is Ack and entry.destination != COORDINATOR):
             return
-        if judge is not None:
-            judge(item)
+        if check is not None:
+            check(item)
 
-    def _foreign(self, message: Message) -> bool:
+    def _is_foreign(self, message: Message) -> bool:
         return message.run != self._run or message.episode != self._episode
 
     def _reset(self, record: Reset) -> None:
@@ -156,7 +156,7 @@ class TraceChecker:
         self._tallies.clear()
         self._begun, self._dones = None, {}
         self._fences, self._ready = {}, set()
-        self._heard.clear()
+        self._fenced_at.clear()
         self._holdings.clear()
 
     def go_on(self, table: KnownOwners) -> None:
@@ -193,7 +193,7 @@ class TraceChecker:
             owner = self.owners.get(vehicle)
             _require(owner == (source, epoch - 1), f"v{vehicle} is owned by {owner}")
             known = self.near is None or target in self.near[source]
-            _require(known or vehicle in record.teleports, f"v{vehicle} goes to no neighbour")
+            _require(known or vehicle in record.teleports, f"{target} is no neighbour of {source}")
             waited = self._deferred.get(vehicle, 0)
             if forced:
                 _require(waited >= self._longest, f"v{vehicle} is forced after {waited} ticks")
@@ -201,8 +201,8 @@ class TraceChecker:
                 self._require_ready(vehicle, target, epoch - 1)
         for vehicle, ticks in record.deferred:
             follows = ticks == self._deferred.get(vehicle, 0) + 1
-            _require(follows and vehicle in self.owners, f"v{vehicle} cannot wait for tick {ticks}")
-            _require(ticks <= self._longest, f"v{vehicle} waits longer than {self._longest} ticks")
+            _require(follows and vehicle in self.owners, f"v{vehicle}: wrong deferral {ticks}")
+            _require(ticks <= self._longest, f"v{vehicle} is deferred too long")
         for vehicle, _, _ in record.births:
             _require(vehicle not in self._born, f"v{vehicle} is born twice")
             self._born.add(vehicle)
@@ -230,42 +230,42 @@ class TraceChecker:
         _require(step.tick <= newest, "was sent before it was logged")
         if begun is None or step.tick != begun.tick:
             return
-        _require(step.committed == self._tick, "tells of a tick that is not committed")
+        _require(step.committed == self._tick, "refers to a tick that is not committed")
         orders = self._orders[step.zone]
         _require(
             {(entry.vehicle, entry.epoch) for entry in step.enter} == orders.entered
             and {(entry.vehicle, entry.epoch) for entry in step.leave} == orders.left
             and {entry.vehicle for entry in step.spawn} == orders.born,
-            "says something else than BEGIN",
+            "contradicts its BEGIN",
         )
 
     def _prepare(self, message: Prepare) -> None:
         process = (message.target, self._incarnations.get(message.target, 0))
         for vehicle, epoch, digest, state in message.entries:
-            if state_digest(state) == digest and self._hear(
+            if state_digest(state) == digest and self._raise_fence(
                 message.target, vehicle, epoch, message.tick
             ):
                 self._holdings[message.tick].add((*process, vehicle, epoch, digest))
 
     def _abort(self, message: Abort) -> None:
         for vehicle, epoch in message.entries:
-            self._hear(message.target, vehicle, epoch, message.tick)
+            self._raise_fence(message.target, vehicle, epoch, message.tick)
 
-    def _hear(self, zone: int, vehicle: int, epoch: int, tick: int) -> bool:
+    def _raise_fence(self, zone: int, vehicle: int, epoch: int, tick: int) -> bool:
         newest = self._fences.get((zone, vehicle), (-1, -1))
         kept = self._fences[zone, vehicle] = max(newest, (epoch, tick))
-        self._heard[kept[1]].add((zone, vehicle))
+        self._fenced_at[kept[1]].add((zone, vehicle))
         return (epoch, tick) > newest
 
     def _ack(self, message: Ack) -> None:
         process = (message.zone, message.incarnation)
         if self._incarnations.get(message.zone) != message.incarnation:
-            return  # of a replaced process, whose further messages are not in the trace
+            return  # from a replaced process, whose further messages are not in the trace
         for vehicle, epoch, digest in message.entries:
             holding = (*process, vehicle, epoch, digest)
             known = holding in self._holdings.get(message.tick, ())
             expired = message.tick < self._tick - self._lifetime
-            _require(known or expired, f"acknowledges v{vehicle}, which that host never held so")
+            _require(known or expired, f"acknowledges an unknown state of v{vehicle}")
             self._ready.add((*process, vehicle, epoch, message.tick))
 
     def _done(self, message: Done) -> None:
@@ -287,7 +287,7 @@ class TraceChecker:
             removed: list[Removed] = []
             for zone in zones:
                 removed += self._confirmed(zone, changed)
-            _require(record.removed == tuple(sorted(removed)), "removes others than the zones did")
+            _require(record.removed == tuple(sorted(removed)), "differs from the zones' removals")
         self.changes = [
             OwnerStep(vehicle, self.owners.get(vehicle), after)
             for vehicle, after in changed.items()
@@ -311,10 +311,11 @@ class TraceChecker:
         """Add the removals of a zone's DONE to the changes, and return them."""
         done = self._dones.get(zone)
         if done is None:
-            raise ProtocolError(f"zone {zone} has not said DONE")
+            raise ProtocolError(f"zone {zone} has sent no DONE")
         confirmed = {(entry.vehicle, entry.epoch) for entry in done.confirmed}
         _require(
-            confirmed == self._orders[zone].entered, f"zone {zone} did not CONFIRM what came in"
+            confirmed == self._orders[zone].entered,
+            f"zone {zone} did not CONFIRM the vehicles that entered",
         )
         for entry in done.removed:
             owner = changed.get(entry.vehicle, self.owners.get(entry.vehicle))
@@ -337,8 +338,8 @@ class TraceChecker:
         oldest = self._tick - self._lifetime
         for tick in [tick for tick in self._holdings if tick < oldest]:
             del self._holdings[tick]
-        for tick in [tick for tick in self._heard if tick < oldest]:
-            for key in self._heard.pop(tick):
+        for tick in [tick for tick in self._fenced_at if tick < oldest]:
+            for key in self._fenced_at.pop(tick):
                 if self._fences.get(key, (0, oldest))[1] < oldest:
                     del self._fences[key]
         self._ready = {ready for ready in self._ready if ready[4] >= self._tick}

@@ -38,13 +38,13 @@ class TransferSummary:
     deferred: int  # sum over vehicles of ticks with the old owner after the crossing
     refused: int  # states that a target refused
     aborted: int  # approaches that ended without a transfer
-    # by phase: `acknowledge`, no answer by the end of the tick (same as `deferred`); `switch`, no
-    # answer by the deadline (same as `forced`); `replica`, states that were neither used nor
-    # withdrawn in their lifetime
+    # phase → number of timeouts. `acknowledge`: no answer by the end of the tick (same as
+    # `deferred`); `switch`: no answer by the deadline (same as `forced`); `replica`: states that
+    # were neither used nor withdrawn in their lifetime
     timeouts: Mapping[str, int]
-    latency_ticks: Spread  # from the first state at the target to its confirmation
+    latency_ticks: Spread  # ticks from the first state at the target to its confirmation
     waited_ticks: Spread  # the part of `latency_ticks` after the crossing
-    latency_ms: Spread  # as `latency_ticks`, by the clock
+    latency_ms: Spread  # the same as `latency_ticks`, by the clock
     state_bytes: Spread  # size of a vehicle's state
     # distance outside of the owner's zone at the first state; negative inside
     prepare_depth_m: Spread
@@ -56,7 +56,7 @@ class TransferSummary:
     def of(
         cls,
         rows: Iterable[Transfer],  # for the percentiles
-        # of a `TransferLog`, or the sum over several; they may include more transfers than `rows`
+        # counts of one or more `TransferLog`s; they may include more transfers than `rows`
         counts: Mapping[str, int],
     ) -> TransferSummary:
         """Return the statistics of transfers."""

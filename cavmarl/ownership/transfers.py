@@ -38,13 +38,13 @@ class Transfer(NamedTuple):
     target: int  # the new owner
     epoch: int  # of the new ownership
     forced: bool  # whether the state was attached, because the target was not ready in time
-    removed: bool  # whether the vehicle left the world in that tick
+    removed: bool  # whether the vehicle left the world in tick `tick`
     approached: int  # tick of the first state that arrived at the target, or -1
     waited: int  # ticks for which the source kept the vehicle after the crossing
     offers: int  # number of states that arrived at the target, including repeats
-    state_bytes: int  # size of the last of them; 0 if both zones are in one process
-    # distance outside of the owner's zone when the first state arrived; negative inside; None:
-    # unknown
+    state_bytes: int  # size of the last state; 0 if both zones are in one process
+    # distance outside of the owner's zone when the first state arrived; negative inside;
+    # None: unknown
     prepare_depth_m: float | None = None
     switch_depth_m: float | None = None  # the same when the switch was decided
     # distance outside of the old zone when the switch was committed; None: unknown, or the vehicle
@@ -74,21 +74,21 @@ class TransferLog:
     """A log of transfers, made from records and delivered messages.
 
     Attributes:
-        ask: called before each access, so that its caller can add outstanding entries.
+        ask: called before each access, so that the coordinator can add outstanding entries.
     """
 
     def __init__(
         self,
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
     ) -> None:
-        self.episode = -1  # of the newest record
+        self.episode = -1  # episode of the newest record
         self.ask: Callable[[], None] = lambda: None
         self._rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
         self._later: deque[tuple[int, Callable[[], Iterable[Transfer]]]] = deque()
         self._num_later = 0
         self._counts: Counter[str] = Counter()
         self._lifetime = lifetime
-        self._approaches: dict[tuple[int, int, int], _Approach] = {}  # vehicle, target, epoch
+        self._approaches: dict[tuple[int, int, int], _Approach] = {}  # by vehicle, target, epoch
         self._waited: dict[int, int] = {}
         self._begun: Begin | None = None
 

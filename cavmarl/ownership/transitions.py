@@ -20,7 +20,7 @@ class _Word(StrEnum):
 
 
 class Party(_Word):
-    """The owners of states."""
+    """The kinds of things that have a state."""
 
     VEHICLE = "a vehicle, at the coordinator"
     ZONE = "a zone, at the coordinator"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.extensions import REGISTERED_BACKENDS
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_starters import system_of
@@ -39,31 +39,24 @@ class MakeWorlds(Protocol):
         ...
 
 
-_REGISTERED: dict[str, MakeWorlds] = {}
-
-
 def register_backend(name: str, make: MakeWorlds) -> None:
-    """Add a backend, which the argument `backend` of `make_vec` and `parallel_env` can name.
+    """Register a backend for the argument `backend` of `make_vec` and `parallel_env`.
 
     Args:
         name: of the backend.
         make: makes its worlds, which must behave like worlds of this process.
 
     Raises:
-        ConfigError: the name is not an identifier, or a backend of cavmarl has it.
+        ConfigError: the name is not an identifier, or is taken.
     """
-    if not name.isidentifier():
-        raise ConfigError(f"backend {name!r}: a name has letters, digits and _ only")
-    if name in OWN:
-        raise ConfigError(f"backend '{name}': one of cavmarl's own; take another name")
-    _REGISTERED[name] = make
+    REGISTERED_BACKENDS.add(name, make, make, OWN)
 
 
 def find_backend(
     backend: str | None = None, workers: int | None = None, nodes: int | None = None
 ) -> BackendName:
-    """Read where worlds run; arguments and errors as of `read_backend`."""
-    return read_backend(backend, workers, nodes, _REGISTERED)
+    """Read where worlds run. Arguments and errors are as in `read_backend`."""
+    return read_backend(backend, workers, nodes, REGISTERED_BACKENDS)
 
 
 def shows_state(backend: BackendName) -> bool:
@@ -96,4 +89,5 @@ def make_worlds(
         make = NodeWorlds if by_zones else NodeGroups
         system = system_of(backend)
         return make(world, base_dir, num_worlds, backend, in_next_step, system=system)
-    return _REGISTERED[backend.kind](world, base_dir, num_worlds, count, in_next_step)
+    made: MakeWorlds = REGISTERED_BACKENDS[backend.kind]
+    return made(world, base_dir, num_worlds, count, in_next_step)

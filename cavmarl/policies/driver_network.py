@@ -89,7 +89,7 @@ class LayerTable:
 def _aligned(size: int) -> NDArray[np.float32]:
     """Return an array whose data begin with a cache line, so that no SIMD load crosses two lines.
 
-    It makes the evaluation about a seventh faster, and changes no result.
+    The alignment makes the evaluation about a seventh faster, and changes no result.
     """
     array = np.empty(size + LINE_FLOATS, dtype=np.float32)
     first = -array.ctypes.data // array.itemsize % LINE_FLOATS
@@ -133,7 +133,7 @@ class DriverNetwork:
             observations: (N, D).
 
         Raises:
-            PolicyError: D is another number.
+            PolicyError: D is not the network's number of inputs.
         """
         return self._run(self._layers, observations)
 

@@ -27,6 +27,7 @@ from cavmarl.core.tracebacks import fault_in
 from cavmarl.engine.spaces import flat_observation_space
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.model_files import make_policy, model_files
 from cavmarl.policies.policy import Environment, NetworkPolicy, Policy, SharedPolicy
 from cavmarl.policies.shield import ShieldedPolicy
 
@@ -35,15 +36,18 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
     """Load a policy for an environment.
 
     Args:
-        policy: a name of `agents/`, a folder with model.safetensors and config.json, or a `.py`
-            file that defines `make_policy(env)`. Policies joined by `+` share the agents in turn
-            (`merge_ippo+idm`: agents 0, 2, … and agents 1, 3, …). After `shielded:`, the built-in
-            driver acts instead of the policy whenever it would brake harder.
+        policy: a name of `agents/`, a folder with model.safetensors and config.json, a `.py` file
+            that defines `make_policy(env)`, or a model file of stable-baselines3 (`.zip`),
+            TorchScript (`.pt`, `.ts`) or ONNX (`.onnx`); see docs/guides/evaluate.md. Policies
+            joined by `+` share the agents in turn (`merge_ippo+idm`: agents 0, 2, … and agents 1,
+            3, …). After `shielded:`, the built-in driver acts instead of the policy whenever it
+            would brake harder.
         env: a `CavEnv`, possibly wrapped, or a `CavVectorEnv`.
 
     Raises:
         PolicyError: the policy does not exist, a file is broken, or a network was made for other
             observations or actions than this environment's.
+        MissingExtraError: the library of a model file is not installed.
     """
     if isinstance(env, ParallelEnv):
         env = env.unwrapped
@@ -58,16 +62,18 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
     path = find_driver(policy)
     if path.is_dir():
         return _load_network_policy(path, env)
+    if path.suffix != ".py":
+        return make_policy(path, env)
     return _load_script(path, env)
 
 
 def policy_files(policy: str | Path) -> tuple[Path, ...]:
-    """Return the files of a policy: its script, or its weights and their configuration."""
+    """Return the files of a policy: its script or model, or its weights and configuration."""
     if parts := shared_drivers(policy):
         return tuple(dict.fromkeys(file for part in parts for file in policy_files(part)))
     path = find_driver(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
     if not path.is_dir():
-        return (path,)
+        return model_files(path)
     files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
     for file in files:
         if not file.is_file():
@@ -106,7 +112,7 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
         lines = (f"{key} is {there} for it, {ours} here" for key, (there, ours) in unlike.items())
         cure = {key: there for key, (there, _) in unlike.items()}
         raise PolicyError(
-            f"The policy {name} expects different {_parts(unlike)} from those that this "
+            f"The policy {name} expects different {_parts(unlike)} than this "
             f"environment provides ({'; '.join(lines)}). It observes {config.sensed} numbers, and "
             f"this environment gives {size}. Add --sensors-of {name} to the command, or "
             f"sensors_of={name!r} in Python, or pass these overrides: {cure}"

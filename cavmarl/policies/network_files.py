@@ -46,7 +46,7 @@ class NetworkConfig:
         sensors: the sensors of the observation.
         action: the kind of actions.
         hidden: widths of the hidden layers of actor and critic.
-        seed: of the training.
+        seed: seed of the training.
         agent_steps: number of decisions used for learning.
         state_size: numbers of the world's state that the critic gets beside the observation; the
             actor never gets them.

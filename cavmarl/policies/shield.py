@@ -1,4 +1,4 @@
-"""`ShieldedPolicy`: a driver replaced by the built-in driver where that brakes harder."""
+"""`ShieldedPolicy`: a driver that the built-in driver overrides where the latter brakes harder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
 
 class ShieldedPolicy(Policy):
-    """Uses the built-in driver's action wherever it brakes, and harder than the driver.
+    """Uses the built-in driver's action if that action brakes, and brakes harder than the driver's.
 
     The built-in driver reads the world's state, not observations. So results with a shield are not
     comparable with results of the driver alone.
@@ -26,7 +26,7 @@ class ShieldedPolicy(Policy):
         self.driver.reset(seed)
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Return the driver's actions (W, A, 2), or the built-in driver's where it brakes harder.
+        """Return the actions (W, A, 2): those of the built-in driver where they brake harder.
 
         Raises PolicyError: actions are discrete.
         """

@@ -1,10 +1,10 @@
 """`python -m cavmarl.prebuild`: compile the kernels of the package, and maintain their list.
 
-compile         compile the kernels of a plain world, or all with --all, for this machine's cache
+compile         compile the kernels of a plain world (--all: all kernels) into this machine's cache
 build FOLDER    compile all kernels for the wheel's processor, and link them into a library
-record FOLDER   add the calls in FOLDER, from programs with `CAVMARL_KERNEL_CALLS=FOLDER`, to the
-                list of kernels, and remove calls that are no longer possible
-check FOLDER    exit with 1 if such a call, or a kernel called from Python, is not in the list
+record FOLDER   add the calls in FOLDER, recorded by programs with `CAVMARL_KERNEL_CALLS=FOLDER`, to
+                the list of kernels, and remove calls that have become impossible
+check FOLDER    exit with 1 if a call in FOLDER, or a kernel called from Python, is not in the list
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def build(folder: Path, processes: int) -> None:
     """Compile each call of the list for the wheel's processor, and link the library."""
     from cavmarl.prebuild.linking import FEATURES, PROCESSOR, link
 
-    # Numba reads these variables on import, in this process and in those that compile.
+    # Numba reads these variables on import, in this process and in the compiling processes.
     os.environ["NUMBA_CPU_NAME"] = PROCESSOR
     os.environ["NUMBA_CPU_FEATURES"] = FEATURES
     from cavmarl.prebuild.compile_calls import compile_into_cache, kernel_file, usable_processes
@@ -73,7 +73,7 @@ def compile_here(processes: int, is_all: bool) -> None:
 
 
 def record(folder: Path) -> None:
-    """Write the list again: recorded calls, and calls of the old list that are still possible."""
+    """Update the list: add recorded calls, and remove calls that have become impossible."""
     known = called_kernels()
     plain = _calls_of_plain_worlds()
     found = {*recorded_calls(folder), *plain, *filter(can_be_made, read_manifest())}
@@ -111,7 +111,7 @@ def _calls_of_plain_worlds() -> set[KernelCall]:
 def check(folder: Path) -> int:
     """Report recorded calls and kernels that are not in the list; return the exit code."""
     calls = marked(read_manifest(), set())
-    # A call that is covered does not change the merged list.
+    # A call that the list covers does not change the merged list.
     unknown = {call.name for call in merged(calls | recorded_calls(folder)) - calls}
     unknown |= called_kernels() - {call.name for call in calls}
     for name in sorted(unknown):

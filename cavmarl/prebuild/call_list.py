@@ -1,9 +1,8 @@
 """`kernel_calls.json`: each kernel that Python calls, with the argument types of these calls.
 
-The calls are recorded: programs and tests run with `CAVMARL_KERNEL_CALLS`, and their calls are
-    merged
-into the file (`python -m cavmarl.prebuild record FOLDER`). Bundles in several calls are written
-once.
+Programs and tests that run with `CAVMARL_KERNEL_CALLS` record their calls, and `python -m
+cavmarl.prebuild record FOLDER` merges them into the file. A bundle that occurs in several calls is
+written once.
 """
 
 from __future__ import annotations
@@ -40,10 +39,10 @@ class KernelCall(NamedTuple):
 def read_manifest(path: Path = MANIFEST) -> list[KernelCall]:
     """Return all calls in the file."""
     if not path.exists():
-        return []  # nothing has been recorded yet
+        return []  # no calls have been recorded yet
     document = json.loads(path.read_text("utf-8"))
     bundles: list[Any] = []
-    for bundle in document["bundles"]:  # each may contain earlier ones
+    for bundle in document["bundles"]:  # bundles may contain bundles before them
         bundles.append(_expand(bundle, bundles))
     return [
         KernelCall(name, json.dumps(_expand(kinds, bundles)), is_plain)
@@ -98,7 +97,7 @@ def can_be_made(call: KernelCall) -> bool:
 
 
 def _fits(annotation: str, kind: Any) -> bool:
-    """Return whether a parameter may accept a bundle of this kind; other kinds pass."""
+    """Return whether a parameter may accept an argument; only bundles are checked."""
     is_bundle = isinstance(kind, dict) and "bundle" in kind
     is_named = annotation != str(inspect.Parameter.empty)
     return not (is_bundle and is_named) or kind["bundle"].rpartition(":")[2] in annotation
@@ -132,13 +131,13 @@ def _merge(one: Any, other: Any) -> Any:
 
 
 def marked(calls: Iterable[KernelCall], plain: Set[KernelCall]) -> set[KernelCall]:
-    """Return the calls with a flag for those that plain worlds make."""
+    """Return the calls with `is_plain` set for calls in `plain`."""
     unmarked = {call._replace(is_plain=False) for call in calls}
     return {call._replace(is_plain=call in plain) for call in unmarked}
 
 
 def _fold(kind: Any, bundles: dict[str, int]) -> Any:
-    """Replace each bundle by its number; new bundles are added to `bundles`."""
+    """Replace each bundle by its number, and add new bundles to `bundles`."""
     if isinstance(kind, list):
         return [_fold(item, bundles) for item in kind]
     if not isinstance(kind, Mapping):

@@ -17,7 +17,7 @@ from cavmarl.core.compiled.kernel_files import CompiledKernel, KernelFile
 from cavmarl.core.compiled.signatures import example_arguments
 from cavmarl.prebuild.call_list import KernelCall
 
-_LINE_S = 5.0  # between two lines if the output is not a terminal
+_LINE_S = 5.0  # time between two lines if the output is not a terminal
 
 
 def kernel_file(call: KernelCall) -> KernelFile:
@@ -66,12 +66,12 @@ def _function_of(call: KernelCall) -> Any:
 
 
 def _weight(call: KernelCall) -> int:
-    """Return an estimate of the compile time of a kernel: it grows with its arguments."""
+    """Return a number that grows with the compile time of a kernel: the size of its arguments."""
     return len(call.signature) ** 2
 
 
 class _Progress:
-    """A line about compiled kernels, with the remaining time estimated from the time so far."""
+    """Prints the number of compiled kernels, and the remaining time estimated from it."""
 
     def __init__(self, calls: Sequence[KernelCall], output: TextIO) -> None:
         self._count = len(calls)
@@ -108,6 +108,6 @@ class _Progress:
 
 
 def usable_processes() -> int:
-    """Return the number of processes that compile: two, or one on a single core."""
+    """Return the number of compiling processes: two, or one on a single core."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return min(2, cores or 1)

@@ -17,9 +17,9 @@ _CORE = ("core.math", "core.records")  # folders of kernels besides those named 
 def called_kernels() -> frozenset[str]:
     """Return the names of all kernels that modules of the package call from Python.
 
-    They are found in the sources: kernels that a module outside of the folders of kernels imports
-        or
-    defines, and kernels called by plain functions beside them (`roads.kernels.plans.plan_goal`).
+    The sources are searched for kernels that a module outside of the folders of kernels imports or
+    defines, and for kernels called by plain functions beside them
+    (`roads.kernels.plans.plan_goal`).
     """
     trees = {_module_of(path): ast.parse(path.read_bytes()) for path in _PACKAGE.rglob("*.py")}
     defined = {module: set(_defined(tree)) for module, tree in trees.items()}
@@ -64,7 +64,7 @@ def _defined(tree: ast.Module) -> Iterator[str]:
 
 
 def _is_made(statement: ast.stmt) -> TypeGuard[ast.Assign]:
-    """Return whether a statement gives a name to the result of a factory."""
+    """Return whether a statement assigns the result of a factory to a name."""
     return (
         isinstance(statement, ast.Assign)
         and isinstance(statement.value, ast.Call)
@@ -81,7 +81,7 @@ def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
 
 
 def _called_by_plain(tree: ast.Module, kernels: set[str]) -> Iterator[str]:
-    """Yield kernels that the same file uses outside of kernels and factories."""
+    """Yield kernels that a file uses outside of kernels and factories."""
     for statement in tree.body:
         is_of_kernels = _is_made(statement) or (
             isinstance(statement, ast.FunctionDef)

@@ -43,7 +43,7 @@ def find_linker() -> list[str]:
     """Return the command of a C compiler that can link.
 
     Raises:
-        KernelError: this machine has none.
+        KernelError: this machine has no C compiler.
     """
     for name in ("cc", "gcc", "clang"):
         if found := shutil.which(name):
@@ -51,7 +51,7 @@ def find_linker() -> list[str]:
     if find_spec("ziglang") is not None:
         return [sys.executable, "-m", "ziglang", "cc"]
     raise KernelError(
-        "no C compiler to link the kernels with: install gcc or clang, or run `pip install ziglang`"
+        "no C compiler to link the kernels: install gcc or clang, or run `pip install ziglang`"
     )
 
 
@@ -61,7 +61,7 @@ def link(kernels: Sequence[CompiledKernel], folder: Path) -> None:
     Raises:
         KernelError: there is no linker, or it failed.
     """
-    for kernel in kernels:  # modules that use tables of addresses define them
+    for kernel in kernels:  # modules that use tables of addresses also define them
         importlib.import_module(kernel.name.rpartition(".")[0])
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / LIBRARY_FILE
@@ -107,7 +107,7 @@ def _index_of(kernels: Iterable[CompiledKernel]) -> dict[str, Any]:
 def _common_object() -> bytes:
     """Return the common object: tables of addresses, and a function that queries the processor.
 
-    It targets the oldest x86-64, as it runs before the processor is known.
+    It targets the oldest x86-64, because it runs before the processor is known.
     """
     module = ir.Module("common")
     module.triple = binding.get_process_triple()

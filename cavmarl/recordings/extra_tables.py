@@ -106,7 +106,7 @@ def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArr
 def take_rows(extras: Mapping[str, NDArray[np.void]], episode: int, tick: int) -> Any:
     """Yield (table, `ExtraRows`) of a frame; rows of later ticks belong to the previous episode.
 
-    They were sent in the step in which the world restarted.
+    Such rows are from the step in which the world restarted.
     """
     for name, rows in extras.items():
         late = rows["tick"] > tick

@@ -39,7 +39,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 COMMIT_S = 0.8  # wall time between parts, so that each is on disk within a second
-MOST_WAITING_BYTES = 256 << 20  # of unwritten frames, above which `add` waits
+MOST_WAITING_BYTES = 256 << 20  # size of unwritten frames above which `add` waits
 
 
 class RecordingWriter:
@@ -272,7 +272,7 @@ class _WorldParts:
         elif last is not None:
             found = events_between(last.frame, frame)
             self._events += (RecordedEvent(episode, event) for event in found)
-        if last is not None and not self._frames:  # the last frame is committed; compare now
+        if last is not None and not self._frames:  # the last frame is committed and compared
             self._memory.give_back(last.frame.vehicles)
         self._last = RecordedFrame(episode, frame)
         self._frames.append(self._last)

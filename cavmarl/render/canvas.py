@@ -101,7 +101,7 @@ Part = tuple[Sequence[int], Sequence[Sequence[float]]]  # colour with alpha, cor
 
 # Stamps are drawn at this multiple of their size, then reduced, for subpixel edges.
 STAMP_DETAIL = 4
-# Text is also drawn large and reduced, because small letters are set unevenly.
+# Text is also drawn large and reduced, because small letters would be spaced unevenly.
 TEXT_DETAIL = 4
 _QUIET = "PYGAME_HIDE_SUPPORT_PROMPT"
 
@@ -188,7 +188,7 @@ _SHADOW = (0, 0, 0, 50)
 
 RING_WIDTH_PX = 3.0
 CASING_PX = 1.3  # width of dark edges, which show on any background
-HEAD_PX = 12.0  # from the ring to the tip
+HEAD_PX = 12.0  # length of an arrow head, from the ring to the tip
 
 
 def opaque(color: Color) -> tuple[int, int, int, int]:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 WALKER_M = 1.0  # shorter scripted road users are pedestrians
 MIN_RADIUS_PX = 4.5
 CORNERS = 12
-DEPTH = 0.6  # of the shoulders, as a share of their width
+DEPTH = 0.6  # depth of a pedestrian's shoulders, as a share of their width
 HEAD = 0.5
 RIM_PX = 1.0
 COLLIDED_PX = 2.5

@@ -1,6 +1,6 @@
 """The static part of a picture: land, buildings, roads and markings.
 
-Also the stop lines, in the colours of their signals.
+This module also draws the stop lines, in the colours of their signals.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.network import RoadNetwork
 
-BEFORE_END_M = 12.0  # from the arrow's foot to the stop line
+BEFORE_END_M = 12.0  # distance from an arrow's foot to the stop line
 MIN_LANE_M = 25.0
 STROKE_M = 0.22
 HEAD_M = 1.1

@@ -67,7 +67,7 @@ class Window:
             self._window = None
 
 
-# Smallest extent that a following camera shows, and its share of movement per picture.
+# A following camera: smallest extent that it shows, and share of the way that it moves per picture.
 FOLLOW_M = 150.0
 FOLLOW_SHARE = 0.12
 MARGIN_PX = 50.0  # margin for the overlays in the corners

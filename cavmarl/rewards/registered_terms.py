@@ -29,7 +29,7 @@ def register_term(
     reach_m: float = 0.0,
     batched: bool = False,
 ) -> None:
-    """Add a term, which `terms.weights` can name like the package's terms.
+    """Register a term; `terms.weights` can then name it like the package's terms.
 
     Args:
         name: name of the term.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.core.atomic_file import write_whole
-from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.cache_folder import cache_dir, report_unwritable
 from cavmarl.core.mapped_file import mapped
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import (
@@ -33,8 +33,8 @@ from cavmarl.roads.network import (
 )
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
-# Increase this if the reader returns other rows for the same file; record types are hashed, too.
-FORMAT = 49
+# Increase this if the reader returns other rows for a file. Record types are hashed, too.
+FORMAT = 50
 
 _DIGEST_BYTES = 32  # each entry begins with the SHA-256 of the rest; damaged entries are not read
 _ALIGNED = 64  # arrays begin at multiples of this number of bytes
@@ -59,7 +59,9 @@ _DTYPES = {
     "roofs": np.dtype(np.float64),
     "roof_height": np.dtype(np.float64),
 }
-_IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "junction_kinds")
+_TEXTS = (
+    "lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "junction_kinds", "notes",
+)  # fmt: skip
 
 
 def load_network(path: str | Path) -> RoadNetwork:
@@ -89,12 +91,12 @@ def _cached(path: Path, what: str, make: Callable[[Path], RoadNetwork]) -> RoadN
         try:
             _store(entry, network)
         except OSError as error:
-            tell_unwritable(error)
+            report_unwritable(error)
     return network
 
 
 def network_layout() -> str:
-    """Return a short hash of the record types of a packed network; other layouts cannot be read."""
+    """Return a short hash of the layout of packed networks, for names of cache entries."""
     columns = [dtype.descr for dtype in _DTYPES.values()]
     return hashlib.sha256(repr((FORMAT, columns)).encode()).hexdigest()[:12]
 
@@ -107,7 +109,7 @@ def pack_network(network: RoadNetwork) -> bytes:
         content = getattr(network, name).tobytes()
         sizes[name] = len(content)
         pieces += [content, bytes(-len(content) % _ALIGNED)]
-    facts: dict[str, Any] = {name: getattr(network, name) for name in _IDS}
+    facts: dict[str, Any] = {name: getattr(network, name) for name in _TEXTS}
     facts["left_hand"] = network.left_hand
     facts["geo"] = None if network.geo is None else asdict(network.geo)
     head = json.dumps({"sizes": sizes, "told": facts}).encode()
@@ -118,7 +120,7 @@ def pack_network(network: RoadNetwork) -> bytes:
 
 
 def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadNetwork | None:
-    """Return a network that `pack_network` packed with the same layout, or None if damaged.
+    """Return a network that `pack_network` packed in the same layout, or None if it is damaged.
 
     Its arrays are views of the packed bytes.
 
@@ -141,7 +143,7 @@ def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadN
         values[key] = np.frombuffer(view[at : at + size], dtype=kind)
         at += size
     facts = head["told"]
-    values |= {key: tuple(facts[key]) for key in _IDS}
+    values |= {key: tuple(facts[key]) for key in _TEXTS}
     values["roofs"] = values["roofs"].reshape(-1, 4, 2)
     values["geo"] = None if facts["geo"] is None else GeoReference(**facts["geo"])
     return RoadNetwork(name=name, source_hash=digest, left_hand=facts["left_hand"], **values)

@@ -6,16 +6,16 @@ import numpy as np
 
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
-CROSSINGS = 3.0  # times the free-flow time of a trip across the map, as others slow it down
+CROSSINGS = 3.0  # times the free-flow time of a trip across the map, because traffic is slower
 LEAST_S, MOST_S, ROUND_S = 60.0, 900.0, 10.0
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 def horizon_of(network: RoadNetwork) -> float:
-    """Return the duration in s of three trips across a map: its width plus its height.
+    """Return the duration in s of three trips over the map: along its width and its height.
 
-    The speed is that of a car that drives every lane once at its limit. The result is rounded to
-    tens and limited to [60, 900]. Of several maps, the longest duration counts.
+    The speed is the average of a car that drives every lane once at its limit. The result is
+    rounded to tens and limited to [60, 900]. For several maps, it is the longest duration.
     """
     return max(_horizon_on(network, number) for number in range(len(network.maps)))
 

@@ -1,7 +1,7 @@
-"""Several maps as one network: an episode uses one map, and no road leads to another.
+"""Several maps as one network: an episode uses one map, and no road connects two maps.
 
-Maps are placed side by side, so far apart that no search for roads reaches two of them. Ids are
-those of the source with the prefix `NAME/`.
+Maps are placed side by side, so far apart that no search for roads reaches two of them. Each id
+gets the prefix `NAME/` of its map.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from cavmarl.roads.network import MAP, RoadNetwork
 APART_M = 1000.0  # distance between the lanes of two maps
 WHOLE_M = 1000.0  # maps are moved by multiples of this length
 
-# The arrays to which index fields refer. -1 does not change.
+# For each index field, the array to which it refers. -1 ("none") does not change.
 POINTERS: dict[str, dict[str, str]] = {
     "lanes": {
         "left": "lanes", "right": "lanes", "successor": "lanes", "link": "links",
@@ -101,6 +101,11 @@ def join(networks: Sequence[RoadNetwork]) -> RoadNetwork:
         program_ids=tuple(own for one in networks for own in one.program_ids),
         junction_kinds=kinds,
         left_hand=first.left_hand,
+        notes=tuple(
+            f"{name}: {note}"
+            for name, one in zip(names, networks, strict=True)
+            for note in one.notes
+        ),
         joined=_map_rows(networks, starts),
         map_names=names,
     )
@@ -115,7 +120,7 @@ def _map_rows(networks: Sequence[RoadNetwork], starts: dict[str, list[int]]) -> 
 
 
 def _names(networks: Sequence[RoadNetwork]) -> tuple[str, ...]:
-    """Return the names of the maps; repeated names get a number."""
+    """Return the names of the maps, with a number appended to repeated names."""
     names: list[str] = []
     for one in networks:
         count = sum(other.name == one.name for other in networks[: len(names)])
@@ -124,7 +129,7 @@ def _names(networks: Sequence[RoadNetwork]) -> tuple[str, ...]:
 
 
 def _places(networks: Sequence[RoadNetwork]) -> list[tuple[float, float]]:
-    """Return the offset of each map in a square grid, whose cells are as large as the largest."""
+    """Return the offset of each map in a square grid; the largest map fits into a cell."""
     extents = np.array([one.extent_m for one in networks])
     side = float((extents[:, 2:] - extents[:, :2]).max()) + APART_M
     pitch = WHOLE_M * math.ceil(side / WHOLE_M + 1.0)

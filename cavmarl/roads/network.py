@@ -6,7 +6,7 @@ the arc length along it and `d` the lateral offset, positive to the left.
 
 Every lane has one row, including junction-internal lanes. A *link* is one permitted movement over a
 junction: from the end of a lane, along a chain of internal lanes, to the start of an outgoing lane.
-Records are used instead of plain arrays so that a kernel takes one argument instead of ten.
+Records are used instead of plain arrays so that a kernel has one parameter instead of ten.
 
 An index of -1 means "none".
 """
@@ -49,7 +49,7 @@ POINT = record(
     ("x", np.float64),  # m
     ("y", np.float64),  # m
     ("z", np.float64),  # m
-    ("s", np.float64),  # m from the start of its lane, in the plane
+    ("s", np.float64),  # m from the start of the lane, in the plane
     # direction of the segment that starts here (the last point repeats the previous one)
     ("cos", np.float64),
     ("sin", np.float64),
@@ -66,14 +66,13 @@ LANE = record(
     ("speed_mps", np.float64),  # speed limit
     ("width_m", np.float64),
     ("internal", np.bool_),  # inside a junction
-    # vehicles that turn into its road yield at its end, from `MERGES_M` before it on
+    # at the lane's end, vehicles turn into its road and yield to vehicles within `MERGES_M` of it
     ("merges", np.bool_),
     ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
     ("right", np.int32),
     ("successor", np.int32),  # internal lanes: the LANE that follows (internal or normal)
     ("link", np.int32),  # internal lanes: the LINK that this lane is part of
-    # LINK rows of the movements from this lane's end, sorted by from-lane; none for internal lanes
-    # (see `successor`)
+    # LINK rows of the movements from this lane's end; none for internal lanes (see `successor`)
     ("first_link", np.int32),
     ("num_links", np.int32),
     ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
@@ -81,12 +80,14 @@ LANE = record(
     ("edge", np.int32),  # EDGE row; also for internal lanes
     # internal lanes: path length of the link before this lane
     ("link_offset_m", np.float64),
-    ("stop_back_m", np.float64),  # from the stop line to the end, where other paths sweep
+    ("stop_back_m", np.float64),  # from the stop line to the end, which other paths sweep over
     # into[first_into : first_into + num_into]: LANE rows that lead here (internal lanes if the map
     # has them)
     ("first_into", np.int32),
     ("num_into", np.int32),
-    ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
+    # bit k set: VEHICLE_CLASSES[k] may drive here; bit NO_CHANGE_LEFT + k or NO_CHANGE_RIGHT + k
+    # set: it must not change lanes to that side (a solid line)
+    ("permissions", np.uint32),
     ("index", np.int32),  # position on its edge, 0 = at the kerb
     ("min_x", np.float64),  # bounding box of the polyline, m
     ("min_y", np.float64),
@@ -100,20 +101,20 @@ EDGE = record(
     ("first_lane", np.int32),
     ("num_lanes", np.int32),
     ("internal", np.bool_),
-    ("from_junction", np.int32),  # JUNCTION rows; the same for internal edges
+    ("from_junction", np.int32),  # JUNCTION rows; both are the same for internal edges
     ("to_junction", np.int32),
     ("length_m", np.float64),
     ("speed_mps", np.float64),
 )
 
 LINK = record(
-    ("from_lane", np.int32),  # LANE that it leaves; the lane's end is the stop line
-    ("to_lane", np.int32),  # LANE that it reaches
+    ("from_lane", np.int32),  # LANE before the junction; its end is the stop line
+    ("to_lane", np.int32),  # LANE after the junction
     ("first_internal", np.int32),  # first LANE of the chain inside the junction
     # lane after the end of from_lane: first_internal, or to_lane
     ("next_lane", np.int32),
     ("length_m", np.float64),  # length of the chain of internal lanes
-    ("fork_m", np.float64),  # part of its path that is near paths from the same lane
+    ("fork_m", np.float64),  # length of the part of its path that is near paths from the same lane
     ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
     ("junction", np.int32),
     ("index", np.int32),  # the link's bit in its junction's request, response and foes
@@ -126,8 +127,8 @@ LINK = record(
     ("num_conflicts", np.int32),
     ("first_sweep", np.int32),  # SWEEP rows, sorted by the foe's LINK row and sizes
     ("num_sweeps", np.int32),
-    ("swept_by", np.int32),  # the smallest size class of vehicles that sweep over its cars
-    ("swept_m", np.float64),  # rears up to here, in m from the stop line, are watched by others
+    ("swept_by", np.int32),  # the smallest size class of vehicles that sweep over cars on this link
+    ("swept_m", np.float64),  # other drivers watch rears up to here, in m from the stop line
 )
 
 CONFLICT = record(
@@ -143,11 +144,13 @@ CONFLICT = record(
 
 SWEEP = record(
     ("foe", np.int32),  # LINK of the same junction, but from another lane
-    ("own", np.int32),  # size class (`SIZE_LENGTHS_M`) of the vehicle on this link,
-    ("other", np.int32),  # and of the vehicle on the foe
-    ("enter_m", np.float64),  # from the stop line to where a front begins to be in the way,
-    ("leave_m", np.float64),  # and where a rear no longer is; both may be outside the junction,
-    ("foe_enter_m", np.float64),  # and a body longer than the shared area leaves before it enters
+    ("own", np.int32),  # size class (`SIZE_LENGTHS_M`) of the vehicle on this link
+    ("other", np.int32),  # size class of the vehicle on the foe
+    # from the stop line to where a front begins to obstruct the foe, and where a rear stops doing
+    # so; may be outside the junction; if the body is longer than the shared area, leave < enter
+    ("enter_m", np.float64),
+    ("leave_m", np.float64),
+    ("foe_enter_m", np.float64),  # the same on the foe's path
     ("foe_leave_m", np.float64),
 )
 
@@ -174,8 +177,8 @@ PROGRAM = record(
     ("offset_s", np.float64),  # delay of all phases
     ("cycle_s", np.float64),  # sum of the phases' durations
     ("controller", np.int32),  # actuated: its index in a world's controllers
-    ("detector_gap_s", np.float64),  # actuated: from a detector to the stop line, at the limit
-    ("simplified", np.bool_),  # SUMO has rules for it that are not implemented
+    ("detector_gap_s", np.float64),  # actuated: time from a detector to the stop line, at the limit
+    ("simplified", np.bool_),  # the program has rules in SUMO that are not implemented
 )
 
 PHASE = record(
@@ -183,20 +186,20 @@ PHASE = record(
     ("min_ms", np.int64),  # actuated: bounds of the duration, in SUMO's unit of time
     ("max_ms", np.int64),
     ("following", np.int32),  # actuated: the next PHASE
-    ("green", np.bool_),  # some letter is green and none is yellow: it may be prolonged
+    ("green", np.bool_),  # some letter is green and none is yellow: the phase may be prolonged
     ("first_state", np.int32),  # phase_states[first_state : first_state + num_links]
-    ("first_detector", np.int32),  # phase_detectors that prolong it
+    ("first_detector", np.int32),  # phase_detectors that prolong the phase
     ("num_detectors", np.int32),
 )
 
 SWITCH = record(
     ("signal", np.int32),
-    ("at_s", np.float64),  # since the beginning
+    ("at_s", np.float64),  # since the beginning of the episode
     ("program", np.int32),  # PROGRAM that runs from then on
 )
 
 DETECTOR = record(
-    ("lane", np.int32),  # LANE of the detector; its signal may be one lane farther on
+    ("lane", np.int32),  # LANE of the detector; its signal may be at the end of the next lane
     ("s_m", np.float64),  # position on that lane
     ("max_gap_s", np.float64),  # maximum time between two vehicles if the second prolongs the green
 )
@@ -204,7 +207,8 @@ DETECTOR = record(
 PLACE = record(
     ("next", np.int32),  # the next PLACE of the same lane
     ("detector", np.int32),
-    ("s_m", np.float64),  # of the detector in the lane's s; outside of its ends for adjacent lanes
+    # s of the detector on this lane; outside of the lane for lanes before or after the detector's
+    ("s_m", np.float64),
 )
 
 # Rows of one map are contiguous; in a network of several maps, a world uses one.
@@ -217,8 +221,8 @@ MAP = record(
     ("num_programs", np.int32),
 )
 
-# Maps with smaller files are copied to memory. A tick reads many places of a map: from the small
-# pages of a file, it takes a tenth longer, but the processes of a machine share that memory.
+# Maps with smaller files are copied to memory with huge pages. A tick reads many places of a map.
+# With the small pages of a mapped file, it takes a tenth longer, but processes share the memory.
 COPIED = 1 << 27
 
 # Fields of a network for kernels, in the order of `RoadArrays`.
@@ -239,7 +243,7 @@ class GeoReference:
 
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
-    """An immutable road map; see the module for frames, and the dtypes for fields.
+    """An immutable road map; see the module for frames, and the record types for fields.
 
     Arrays are read-only; ids are the names in the source, by row.
     """
@@ -267,8 +271,10 @@ class RoadNetwork:
     signal_ids: tuple[str, ...]
     program_ids: tuple[str, ...]
     junction_kinds: tuple[str, ...]  # SUMO's junction types, by `JUNCTION["kind"]`
-    geo: GeoReference | None = None  # position on the earth; None: the map does not say
+    geo: GeoReference | None = None  # position on the earth; None: not given by the map
     left_hand: bool = False  # whether the map has left-hand traffic
+    # Where the lanes differ from those of the source, and what is not simulated, with counts
+    notes: tuple[str, ...] = ()
     joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # if several
     map_names: tuple[str, ...] = ()  # if there are several maps
     # WALL (num_walls,) of the buildings, if they were requested; see `maps.buildings`
@@ -286,9 +292,9 @@ class RoadNetwork:
 
     @cached_property
     def arrays(self) -> RoadArrays:
-        """The tables for kernels; after the first access, the fields are the same arrays.
+        """The tables for kernels, in huge pages; those of a large map stay in the mapped file.
 
-        They are in huge pages; those of a large map stay in the memory-mapped cache file.
+        The first access replaces the fields of the network by the same arrays.
         """
         file = file_of(self.lanes)
         is_copied = file is not None and len(file) <= COPIED
@@ -301,7 +307,7 @@ class RoadNetwork:
         return RoadArrays(*found)
 
     def let_go(self) -> None:
-        """Release the memory of a cached map; parts that are used again are read again."""
+        """Release the memory of a cached map; a later access reads the file again."""
         file = file_of(self.lanes)
         if file is not None:
             let_go(file)
@@ -328,7 +334,7 @@ class RoadNetwork:
 
     @cached_property
     def room_m(self) -> tuple[float, float, float, float]:
-        """(min_x, min_y, max_x, max_y) of an area in which each of the maps fits, if moved."""
+        """(min_x, min_y, max_x, max_y) of an area into which each of the maps fits, if moved."""
         if len(self.maps) == 1:
             return self.extent_m
         extents = np.array([self.extent_of(number) for number in range(len(self.maps))])
@@ -344,8 +350,8 @@ class RoadNetwork:
     def _places(self) -> tuple[NDArray[np.int32], NDArray[np.void]]:
         """The first PLACE of every lane, (num_lanes,), and the PLACE rows.
 
-        A vehicle belongs to the lane of its centre, but its ends may extend onto other lanes. So a
-        detector is also listed for the internal lanes before and after its own lane.
+        A vehicle belongs to the lane of its centre, but its body may extend onto the lane before or
+        after it. So a detector is also listed for the internal lanes before and after its lane.
         """
         found: list[tuple[int, int, float]] = []
         for number, detector in enumerate(self.detectors):
@@ -372,7 +378,7 @@ class RoadNetwork:
 
     @cached_property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """(min_x, min_y, max_x, max_y) of all lanes; other nodes do not count."""
+        """(min_x, min_y, max_x, max_y) of all lanes; nodes without lanes do not count."""
         return _extent(self.lanes)
 
     def lane_polyline(self, lane: int) -> NDArray[np.float64]:
@@ -422,7 +428,7 @@ def _extent(lanes: NDArray[np.void]) -> tuple[float, float, float, float]:
 
 
 def content_of(array: NDArray[Any]) -> bytes:
-    """Return the bytes of an array, of records field by field, as their padding is undefined."""
+    """Return the bytes of an array; records are read by field, because padding is undefined."""
     names = array.dtype.names
     if names is None:
         return array.tobytes()

@@ -13,15 +13,17 @@ from cavmarl.roads.network import POINT
 
 Shape = NDArray[np.float64]
 
-# SUMO writes centimetres: two points closer than a tenth of that are the same.
+# SUMO rounds to centimetres, so points at a tenth of that distance are the same.
 SAME_POINT_M = 1e-3
 # Length of an internal lane whose ends coincide (SUMO joins lanes that meet).
 STUB_M = 0.01
+CURVE_M = 1.0  # between the points of a smooth curve
+MOST_POINTS = 24
 UNLIKE_M = 3.0  # a neighbour's end this far from the ends of a lane adds a point to the lane
 
 
 def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
-    """Drop points that repeat the previous point in the plane; (n, 3) metres, n ≥ 1.
+    """Drop points that repeat the previous point in the plane; return (n, 3) metres, n ≥ 1.
 
     Raises MapError: the shape has no points.
     """
@@ -34,7 +36,7 @@ def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
 
 
 def refuse_points(shapes: Sequence[Shape], names: Sequence[str]) -> None:
-    """Check that normal lanes have a length; their ids are for the message.
+    """Check that lanes outside junctions have a length; `names` are their ids, for the message.
 
     Raises MapError: a lane has no length.
     """
@@ -62,9 +64,9 @@ def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
 
 
 def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
-    """Add a point where an adjacent lane begins or ends, if it is far from the lane's own ends.
+    """Add a point where an adjacent lane begins or ends, if that is far from the lane's own ends.
 
-    So positions between two points correspond linearly to positions on the neighbour.
+    Then positions between two points correspond linearly to positions on the neighbour.
 
     Args:
         shapes: one (n, 3) array per lane row; changed in place.
@@ -82,6 +84,52 @@ def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
             before, after = sizes[:k].sum() + along[k], sizes[k:].sum() - along[k]
             if min(before, after) > UNLIKE_M and SAME_POINT_M < along[k] < sizes[k] - SAME_POINT_M:
                 shapes[row] = np.insert(shape, k + 1, places[k], axis=0)
+
+
+def smooth_curve(before: Shape, after: Shape) -> Shape:
+    """Return a cubic curve from the end of one lane to the start of another, tangent to both."""
+    start, end = before[-1], after[0]
+    leaves, arrives = _direction(before[-2:]), _direction(after[:2])
+    chord = float(hypot_all(*(end - start)[:2]))
+    cos_turn = float(leaves[0] * arrives[0] + leaves[1] * arrives[1])
+    # With these handles, the curve is a circular arc if both ends lie on one.
+    handle = chord * 2.0 / (3.0 * (1.0 + np.sqrt(max(0.5 * (1.0 + cos_turn), 0.0))))
+    number = int(np.clip(np.ceil(chord / CURVE_M), 8, MOST_POINTS))
+    t = np.linspace(0.0, 1.0, number + 1)[:, None]
+    u = 1.0 - t
+    curve = (
+        u * u * u * start
+        + 3.0 * t * u * u * (start + handle * leaves)
+        + 3.0 * t * t * u * (end - handle * arrives)
+        + t * t * t * end
+    )
+    s = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(curve[:, :2], axis=0).T))])
+    curve[:, 2] = start[2] + (end[2] - start[2]) * s / max(s[-1], SAME_POINT_M)  # a constant slope
+    return without_repeats(curve)
+
+
+def _direction(pair: Shape) -> NDArray[np.float64]:
+    step = pair[1] - pair[0]
+    step[2] = 0.0
+    direction: NDArray[np.float64] = step / hypot_all(step[0], step[1])
+    return direction
+
+
+def shape_length(shape: Shape) -> float:
+    return float(hypot_all(*np.diff(shape[:, :2], axis=0).T).sum())
+
+
+def cut_shape(shape: Shape, at_m: float) -> tuple[Shape, Shape]:
+    """Return the parts of a polyline before and after a position in m along it."""
+    s = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(shape[:, :2], axis=0).T))])
+    point = np.array([[np.interp(at_m, s, shape[:, axis]) for axis in range(3)]])
+    near, far = s < at_m - SAME_POINT_M, s > at_m + SAME_POINT_M
+    return np.concatenate([shape[near], point]), np.concatenate([point, shape[far]])
+
+
+def without_repeats(shape: Shape) -> Shape:
+    step = hypot_all(*np.diff(shape[:, :2], axis=0).T)
+    return np.ascontiguousarray(shape[np.concatenate([[True], step > SAME_POINT_M])])
 
 
 def point_rows(shapes: Sequence[Shape]) -> tuple[NDArray[np.void], NDArray[np.int32]]:

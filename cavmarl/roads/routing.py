@@ -1,7 +1,7 @@
 """Plans: for each goal, the lane-level way from every lane.
 
-A plan is a table over all lanes, not a list of edges. A vehicle that misses a turn, or must change
-lanes, has a new way at once. A record that moves to another zone carries its way as one number.
+A plan is a table over all lanes, not a list of edges. A vehicle that misses a turn or changes lanes
+has a new way at once. A record that moves to another zone describes its way by one number.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 PLAN = record(
     ("next", np.int32),  # LANE after this lane's end; -1: lane of the goal, or no way
-    ("link", np.int32),  # LINK that leads there; -1 inside junctions
-    ("shift", np.int32),  # value to add to a vehicle's way there, see `lanes.route_following`
+    ("link", np.int32),  # LINK that leads to `next`; -1 inside junctions
+    ("shift", np.int32),  # value to add to a vehicle's way on `next`, see `lanes.route_following`
     ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0: this lane is best
     ("changes", np.int16),  # lane changes to the best lane of this edge
-    ("turnarounds", np.int16),  # U-turns on the way: plans turn round where a road ends
-    # distance from the lane's start before a lane change is needed, m
+    ("turnarounds", np.int16),  # U-turns on the way: plans turn round only where a road ends
+    # distance from the lane's start after which a lane change is needed, m
     ("room", np.float64),
     ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
 )
@@ -42,7 +42,7 @@ def make_plans(
     """Return the plans of several goals.
 
     `goal_edges`: EDGE rows of the goals. `vehicle_class`: one of `VEHICLE_CLASSES`; lanes that
-    forbid it are not used. `roads`: arrays to use instead of the network's.
+    forbid it are not used. `roads`: arrays to use instead of the arrays of the network.
 
     Returns PLAN (len(goal_edges), num_lanes), read-only.
     """
@@ -78,9 +78,9 @@ def way(network: RoadNetwork, plan: NDArray[np.void], lane: int) -> list[int]:
             return lanes
 
 
-@lru_cache(maxsize=1)  # the shards of a world are created one after another from the same network
+@lru_cache(maxsize=1)  # the shards of a world are created in sequence from the same network
 def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
-    """Return a grid of `cell_m` over the map with the lanes whose surface may reach each cell."""
+    """Return a grid over the map with the lanes whose surface may reach each cell of `cell_m`."""
     min_x, min_y, max_x, max_y = (float(bound) for bound in network.extent_m)
     margin = float(network.lanes["width_m"].max()) + 2.0
     min_x, min_y = min_x - margin, min_y - margin
@@ -93,7 +93,7 @@ def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
     piece, row = _counted(low, high)
     part, column = _counted(left[piece], right[piece])
     cells = row[part].astype(np.int64) * num_x + column
-    # Sorted by cell, in a cell by lane, each once.
+    # Sort by cell, then by lane, without duplicates.
     cell, member = np.divmod(
         np.unique(cells * len(network.lanes) + lanes[piece[part]]), len(network.lanes)
     )
@@ -109,7 +109,7 @@ def _pieces(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return straight pieces of centre lines up to `most_m`: LANE row, x and y of both ends.
 
-    Bounding boxes of long diagonal segments would cover the map.
+    Long diagonal segments are divided, because their bounding boxes would cover the map.
     """
     rows = network.lanes
     owner, first = _counted(rows["first_point"], rows["first_point"] + rows["num_points"] - 2)
@@ -137,7 +137,7 @@ def _cells_along(
 def _counted(
     first: NDArray[Any], last: NDArray[Any]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return each number of each range, both ends included: the range's row, and the number."""
+    """List the numbers in each range, including both ends: the row of the range, and the number."""
     counts = np.maximum(last - first + 1, 0).astype(np.int64)
     owner = np.repeat(np.arange(len(counts)), counts)
     before = np.cumsum(counts) - counts

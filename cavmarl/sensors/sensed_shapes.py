@@ -35,7 +35,7 @@ from cavmarl.sensors.observed import layout
 MOST_RAYS = 360
 MOST_POINTS = 2000
 MOST_PIXELS = 64_000
-GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # `units` is for the noise
+GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # `units` is that of the noise
 FARTHEST = 1.0 - 1e-6  # a ray with at least this share of the range has hit nothing
 
 Shape = dict[str, Any]

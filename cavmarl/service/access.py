@@ -1,10 +1,8 @@
 """Access control: identities, secrets, tokens and the keys that sign them.
 
 A secret has 256 random bits. It is shown once, and the store keeps only its hash. A client
-exchanges
-it for a bearer token, which lives for minutes, and a refresh token, which can be used once. Tokens
-are
-signed with Ed25519, so nodes verify the tokens of sessions with public keys alone.
+exchanges it for a bearer token, which lives for minutes, and a refresh token, which can be used
+once. Tokens are signed with Ed25519, so nodes verify the tokens of sessions with public keys alone.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ MOST_VERIFIED = 10_000
 
 
 class Access:
-    """The caller's identity, as the log says."""
+    """The identities, tokens and signing keys of a service, according to its event log."""
 
     def __init__(self, log: EventLog, wall_s: Callable[[], float] = time.time) -> None:
         self._log = log

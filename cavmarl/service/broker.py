@@ -35,8 +35,8 @@ from cavmarl.service.service_records import (
 )
 from cavmarl.service.zone_nodes import ZoneNodes
 
-SHOWN_EXCLUSIONS = 10  # in an event
-MOST_SCORES = 100  # sent to a node for its pages
+SHOWN_EXCLUSIONS = 10  # maximum number of excluded nodes that an event lists
+MOST_SCORES = 100  # maximum number of LoadScores that a node gets for its pages
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class BrokerRules:
     beat_s: float = 1.0  # between two heartbeats of a node
     missed_beats: int = 3  # missed heartbeats after which a node is down
     lease_s: float = 30.0  # lifetime of a session's token; the client then asks for a new one
-    idle_s: float = 600.0  # after which an idle session ends
+    idle_s: float = 600.0  # idle time after which a session ends
     keep_s: float = 3600.0  # how long ended sessions can be read
     keep_nodes_s: float = 86_400.0  # how long nodes that are down or have left are kept
     max_placements: int = 10  # nodes that a job may lose before it fails
@@ -68,7 +68,7 @@ class Broker:
         self.rules = rules or BrokerRules()
         self.live: dict[str, LiveNode] = {}
         self.refusals = 0
-        self.waiting = 0  # maximum number of requests that wait for a node
+        self.waiting = 0  # number of requests that wait for a node
         self.took_s: Callable[[float], None] = lambda _: (
             None
         )  # called with the duration of each selection
@@ -91,7 +91,7 @@ class Broker:
     # Nodes
 
     def register(self, identity: IdentityRecord, body: NodeBody) -> NodeRecord:
-        """Register a node, first or again; reports of its earlier process are ignored."""
+        """Register a node, or register it again; reports of its earlier process are ignored."""
         known = self.log.state.nodes.get(body.name)
         owner = known and self.log.state.identities.get(known.identity)
         if owner and owner.id != identity.id and not owner.revoked:
@@ -233,8 +233,7 @@ class Broker:
         """Open a session and assign it to a node.
 
         A job for which no node is free waits at most `wait_s`. If `key` belongs to an earlier
-        request, return
-        the session of that request.
+        request, return the session of that request.
 
         Raises:
             NoNodeError: no node can accept a session.
@@ -345,7 +344,7 @@ class Broker:
             self._drop(before)
 
     def hand_over(self, session: SessionRecord, body: TransfersBody) -> None:
-        """Record vehicles of a session that have changed zone, and vehicles that are about to."""
+        """Record vehicles that have changed zone, and vehicles whose change is prepared."""
         if body.transfers:
             data = {"number": body.at, "transfers": body.transfers}
             self._tell(session, "handed_over", data)
@@ -360,7 +359,7 @@ class Broker:
         """Record that a job is done or has failed."""
         self._end(session, status, session.node or "service", message)
 
-    # Within
+    # Private methods
 
     def _of_key(self, identity: IdentityRecord, data: dict[str, Any]) -> SessionRecord | None:
         """Return the session that an identity opened earlier with a request key."""

@@ -84,6 +84,12 @@ def _check(document: dict[str, Any]) -> None:
     if environment not in entries():
         known = ", ".join(entries())
         raise problem("refused", f"there is no environment '{environment}': choose one of {known}")
+    if "plugins" in document["overrides"]:
+        raise problem(
+            "refused",
+            "plugins: name modules, which are code, and cannot be overridden; the service and its "
+            "nodes import those that the env.yaml of their own environment names",
+        )
     for text in _texts(document["overrides"]):
         if not _PLAIN.fullmatch(text):
             raise problem(

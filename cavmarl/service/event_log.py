@@ -33,7 +33,7 @@ class EventLog:
         self.store = store
         self.state = Infrastructure()
         self.sequence = 0  # sequence number of the last event
-        self.changed = asyncio.Condition()  # called after each write and by `stir`
+        self.changed = asyncio.Condition()  # notified after each write and by `stir`
         self.is_broken = False
         self.wall_s = wall_s
         self._digest = ""

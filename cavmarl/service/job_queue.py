@@ -1,8 +1,7 @@
 """The queue of jobs that wait for a node, in the order of their arrival.
 
 Searching for a node takes time. Jobs of the same kind therefore share one search, and failed
-searches
-of all jobs and waiting requests have a rate limit.
+searches of all jobs and waiting requests have a rate limit.
 """
 
 from __future__ import annotations

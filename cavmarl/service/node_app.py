@@ -1,9 +1,9 @@
 """The HTTP interface of a node: worlds of sessions, opened with the tokens of their leases.
 
 A token names the session, its node and the node's incarnation. The service has signed it, so the
-node
-needs no other authority. The node saves a session's state with the service before it executes a
-command, never after it, so a saved state never includes a command whose answer may have been lost.
+node needs no other authority. The node saves a session's state with the service before it executes
+a command, never after it, so a saved state never includes a command whose answer may have been
+lost.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorld, SessionWor
 
 MAX_ACTIONS_BYTES = 16 * 1024 * 1024
 HOLD_S = 5.0  # how long a command waits for a paused session before the client must ask again
-TEND_S = 0.1  # between two checks for requests of pages
+TEND_S = 0.1  # time between two checks for requests of pages
 
 router = APIRouter(
     prefix="/v1/worlds/{session}", route_class=StrictRoute, responses=PROBLEM, tags=["worlds"]
@@ -188,7 +188,7 @@ async def _command(
         return world.command(word, number, seed, content, is_quiet)
 
     world.is_commanded = (
-        True  # a change by a page would be neither in this command nor in the saved state
+        True  # pages wait: their change would be neither in this command nor in the saved state
     )
     try:
         if number == world.number + 1:

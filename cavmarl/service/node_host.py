@@ -28,7 +28,7 @@ from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
 
 MOST_MESSAGE = 2000
-TELL_S = 0.5  # between two progress reports of a job
+TELL_S = 0.5  # time between two progress reports of a job
 DRAIN_S = 60.0  # after which a drained node ends even if sessions are left
 
 
@@ -36,12 +36,12 @@ DRAIN_S = 60.0  # after which a drained node ends even if sessions are left
 class NodeOptions:
     """Where a node listens, and what it offers."""
 
-    service: str  # its URL
+    service: str  # URL of the service
     secret: str
     name: str
     host: str = "127.0.0.1"
-    port: int = 0  # for clients; 0 picks a free port
-    simulator_port: int | None = None  # announced to clients; None: the same
+    port: int = 0  # port for clients; 0 picks a free port
+    simulator_port: int | None = None  # port that clients are told; None: `port`
     slots: int = 4
     capabilities: tuple[str, ...] = ()
     allowed: tuple[str, ...] = ()
@@ -203,7 +203,7 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
                 await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
         except CavmarlError as error:
             status, message = "failed", str(error)[:MOST_MESSAGE]
-        except asyncio.CancelledError:  # it is closed, or another node hosts it
+        except asyncio.CancelledError:  # the job is closed, or another node has it
             for process in started:
                 process.kill()
             raise

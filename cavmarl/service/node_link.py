@@ -20,8 +20,8 @@ from cavmarl.client.clients import AsyncClient
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.configurations import world_keywords
 
-NEW_S = 5.0  # for so long a session may be here before a beat's answer names it
-GPU_EVERY = 5  # beats
+NEW_S = 5.0  # time for which a new session is kept without being announced by the service
+GPU_EVERY = 5  # heartbeats between two measurements of the GPUs
 JOIN_S = 60.0  # time in which the nodes of a session's zones must connect
 MOST_ROWS = 1000  # transfers in one body, which is limited to 256 KiB
 
@@ -62,7 +62,7 @@ class NodeLink:
         found = await self.ask("POST", "/nodes", json=self._body)
         self.incarnation = found.json()["incarnation"]
         self.is_draining = found.json()["draining"]
-        psutil.cpu_percent(None)  # from now on
+        psutil.cpu_percent(None)  # the next call returns the use since this call
 
     async def beat(
         self,
@@ -168,7 +168,7 @@ class NodeLink:
         await self.ask("PUT", f"/sessions/{session}/door", json=self._doors[session])
 
     async def tell_transfers(self, session: str, number: int, rows: dict[str, list[Any]]) -> None:
-        """Report vehicles that have changed zone, and vehicles that are prepared to."""
+        """Report vehicles that have changed zone, and vehicles whose change is prepared."""
         told, prepared = rows["transfers"], rows["prepared"][-MOST_ROWS:]
         for first in range(0, max(len(told), 1), MOST_ROWS):
             some = told[first : first + MOST_ROWS]

@@ -1,4 +1,4 @@
-"""Checks of what nodes report: clocks that are off and impossible loads."""
+"""Checks of the reports of nodes, for wrong clocks and impossible loads."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from cavmarl.service.event_log import EventLog
 
 
 class NodeReports:
-    """Records each irregularity once, and a clock again when it is right.
+    """Checks the reports of nodes; records each fault once, and when a clock is right again.
 
     Args:
         log: the event log of the service.
@@ -18,7 +18,7 @@ class NodeReports:
         self._log, self._max_skew_s = log, max_skew_s
         self._skewed: set[str] = set()
         self._odd: set[str] = set()
-        self._ahead_s = log.wall_s() - now_s  # the wall clock of the node
+        self._ahead_s = log.wall_s() - now_s  # wall clock minus the clock for heartbeats
 
     def watch_own_clock(self, now_s: float) -> None:
         """Record a jump of the service's wall clock, on which tokens and leases depend."""

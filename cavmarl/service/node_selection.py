@@ -1,11 +1,8 @@
 """Selection of a node for a session: exclusions first, then eq. (1) and (2) of `balance`.
 
-Besides the load of a node, its slots, its capabilities, the identities that it serves and the age
-of
-its last heartbeat count. A session assigned since the last heartbeat is not part of the reported
-load.
-It counts as one slot's share of the processor, so that concurrent requests do not all go to the
-node
+A node is also excluded by its slots, its capabilities, the identities that it serves, or the age of
+its last heartbeat. A session assigned since the last heartbeat is not part of the reported load. It
+counts as one slot's share of the processor, so that concurrent requests do not all go to the node
 that was idle a second ago. That share never excludes a node.
 """
 
@@ -104,7 +101,7 @@ def choose(
     avoided: Sequence[str] = (),  # nodes that the client cannot reach
     rule: LoadRule = DEFAULT_RULE,
 ) -> Chosen:
-    """Return the admissible node with the lowest score, or the preferred one if about as good.
+    """Return the admissible node with the lowest score, or the preferred one if about equal.
 
     Raises:
         NoNodeError: all nodes are excluded.

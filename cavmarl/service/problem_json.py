@@ -88,7 +88,7 @@ async def _on_validation(request: Request, error: Exception) -> JSONResponse:
     ]
     detail = "; ".join(places)
     beat = _BEAT.fullmatch(request.scope["path"])
-    identity = getattr(request.state, "identity", None)  # empty: the body is not JSON
+    identity = getattr(request.state, "identity", None)  # None: the body is not JSON
     if beat and identity and request.app.state.on_misreport:
         request.app.state.on_misreport(identity, beat[1], detail)
     return _refuse(request, "bad-body", detail)

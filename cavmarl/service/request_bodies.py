@@ -18,8 +18,8 @@ Whole = Annotated[int, Field(ge=0, lt=1 << 53)]  # JSON represents these integer
 Words = Annotated[list[Word], Field(max_length=64)]
 
 
-NO_OTHERS: Any = {"additionalProperties": False}  # keys than those of the pattern
-MAX_WAIT_S = 7 * 86_400.0  # of a job
+NO_OTHERS: Any = {"additionalProperties": False}  # refuse keys that do not match the pattern
+MAX_WAIT_S = 7 * 86_400.0  # largest `wait_s` of a job
 
 
 class _Body(BaseModel):
@@ -87,14 +87,14 @@ class SessionBody(_Body):
 
 
 class ResolveBody(_Body):
-    """A client's question where its session is."""
+    """A client's request for the node and the token of its session."""
 
     unreachable: Annotated[list[Name], Field(max_length=16)] = []
     wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
 
 
 class TransfersBody(_Body):
-    """Vehicles of a session that have changed zone, or are prepared to."""
+    """Vehicles of a session that have changed zone, or whose change is prepared."""
 
     at: Whole  # number of commands up to the report
     # world, episode, tick, vehicle, source, target, epoch

@@ -160,7 +160,7 @@ class Assignment(_Answer):
     simulator_port: int
     configuration: Sha256
     lease_s: float
-    expires_s: float  # of the wall clock
+    expires_s: float  # wall-clock time
     token: str
 
 
@@ -183,7 +183,7 @@ class Session(_Answer):
     needs: list[str]
     preferred: str | None
     wait_s: float | None  # longest wait of a job for its first node
-    opened_s: float  # of the wall clock
+    opened_s: float  # wall-clock time
     state: Literal["queued", "active", "closed", "done", "failed"]
     node: str | None
     incarnation: int
@@ -245,7 +245,7 @@ class EventLine(_Answer):
     actor: str
     subject: str
     owner: str
-    data: dict[str, Any]  # by kind
+    data: dict[str, Any]  # its keys depend on `kind`
     digest: str
 
 

@@ -107,7 +107,7 @@ def node_answer(service: Service, node: NodeRecord) -> response_bodies.NodeStatu
 
 
 def session_answer(service: Service, session: SessionRecord) -> response_bodies.Session:
-    """Return a session or a job, without what only its node needs."""
+    """Return a session or a job, without the fields that only its node needs."""
     found = asdict(session)
     del found["saved_blob"], found["owners"]
     live = service.broker.live.get(session.node or "")

@@ -22,7 +22,7 @@ BYTES: dict[int | str, dict[str, Any]] = {
         "content": {OCTETS: {"schema": {"type": "string"}}},
     }
 }
-CONTENT = {  # of a request whose body is no document
+CONTENT = {  # OpenAPI schema of a request whose body is bytes
     "requestBody": {
         "required": True,
         "content": {OCTETS: {"schema": {"type": "string"}}},

@@ -41,7 +41,7 @@ open_routes = make_router("/v1", "open")
 nodes = make_router("/v1/nodes", "nodes")
 worlds = make_router("/v1", "sessions")
 records = make_router("/v1", "records")
-ROUTERS = (nodes, worlds, ownership, records, open_routes)  # heartbeats are most of the requests
+ROUTERS = (nodes, worlds, ownership, records, open_routes)  # most frequent first: heartbeats
 
 PAGE = 1000
 IdempotencyKey = Annotated[

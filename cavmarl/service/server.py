@@ -23,7 +23,7 @@ from cavmarl.service.rate_limit import RateLimit
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700
 MAX_HEAD_BYTES = 16 * 1024
-HEAD_S = 10.0  # time limit for receiving a head
+HEAD_S = 10.0  # time limit for receiving the head of a request
 SERVER_HEADER: list[tuple[str, str]] = [("server", "cavmarl")]
 
 
@@ -127,7 +127,7 @@ def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
 
 
 class BoundedHeads(HttpToolsProtocol):
-    """A protocol that closes connections with long or slow heads, which the parser would accept."""
+    """HTTP that closes connections with long or slow request heads; the parser accepts these."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)

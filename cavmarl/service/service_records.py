@@ -1,8 +1,7 @@
 """The records of the service: nodes, sessions, identities, keys and configurations.
 
 All records follow from the event log: only `Infrastructure.apply` changes them, so replaying the
-log
-gives the same records again. Values of heartbeats are not part of the log.
+log gives the same records again. Values of heartbeats are not part of the log.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ Role = Literal["viewer", "client", "operator", "admin", "node"]
 
 SessionState = Literal["queued", "active", "closed", "done", "failed"]
 SESSION_OVER = ("closed", "done", "failed")
-KEPT_OWNERS = 10_000  # of a world
+KEPT_OWNERS = 10_000  # maximum number of owners that are kept for each world
 
 
 class LogEvent(NamedTuple):
@@ -66,10 +65,10 @@ class SessionRecord:
     wait_s: float | None = None  # longest wait of a job for its first node in s; None: no limit
     state: SessionState = "queued"
     node: str | None = None
-    incarnation: int = 0  # of that node
+    incarnation: int = 0  # incarnation of `node`
     placements: int = 0
     reason: str = ""  # why that node was chosen
-    score: float = 0.0  # of that node, then
+    score: float = 0.0  # of that node when it was chosen
     excluded: list[dict[str, Any]] = field(
         default_factory=list
     )  # some excluded nodes, with reasons
@@ -80,7 +79,7 @@ class SessionRecord:
     message: str = ""
     key: str = ""  # key that identifies a repeated request
     zone_nodes: int = 0  # number of nodes that host its zones; 0: its own node hosts all
-    members: list[str] = field(default_factory=list)  # these nodes
+    members: list[str] = field(default_factory=list)  # names of the nodes that host its zones
     told_number: int = 0  # number of commands up to the last report of transfers
     # world → episode, and vehicle → [owner, epoch] of vehicles that changed zone
     owners: dict[str, OwnerTable] = field(default_factory=dict)
@@ -192,7 +191,7 @@ class Infrastructure:
             if event.data["job"] is not None:
                 self.waiting[event.subject] = None
             return
-        if word in ("refused", "timeout"):  # the outcome is recorded beside it
+        if word in ("refused", "timeout"):  # changes no record
             return
         if word == "forgotten":
             del self.sessions[event.subject]

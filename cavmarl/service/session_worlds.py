@@ -20,7 +20,7 @@ from cavmarl.service.error_names import problem
 from cavmarl.viewer.live_env import ShownEnv
 from cavmarl.viewer.web_options import WebOptions
 
-SAVED_EVERY = 50  # commands
+SAVED_EVERY = 50  # number of commands between two saved states
 TOLD_OF_TRANSFERS = ("episode", "tick", "vehicle", "source", "target", "epoch")
 
 
@@ -36,7 +36,7 @@ class SessionWorld:
     Attributes:
         number: number of commands so far.
         saved: number of commands that the state stored with the service includes.
-        is_changed: whether a page has changed the worlds since then.
+        is_changed: whether a page has changed the worlds since that state was stored.
         is_commanded: whether a command is running, so that pages have to wait.
     """
 
@@ -57,7 +57,7 @@ class SessionWorld:
         )  # number of transfers of each world reported to the service
         self._last = b""  # the answer to the last command
         self.is_changed = self.is_commanded = False
-        self._page: ShownEnv | None = None  # that shows them
+        self._page: ShownEnv | None = None  # the pages of the worlds
         self._tokens = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
         # (W,) worlds that a page has restarted since the last command
         self._anew = np.zeros(document["num_envs"], dtype=np.bool_)

@@ -38,13 +38,13 @@ class Executor(Protocol):
 class TeamExecutor(Executor, Protocol):
     """Runs phases in several processes. Some phases return before all shards have run them."""
 
-    def meet(self) -> None:
-        """Wait until all shards have run the last phase."""
+    def finish_phase(self) -> None:
+        """Wait until all shards have run the latest phase."""
         ...
 
 
 class PhaseExecutor(ABC):
-    """An executor that treats all phases alike: `run` runs, measures or records each phase."""
+    """An executor with one method for all phases: `run` runs, measures or records a phase."""
 
     @abstractmethod
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:

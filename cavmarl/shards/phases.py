@@ -14,9 +14,9 @@ class PhaseRule(NamedTuple):
 
     method: Callable[..., None]  # of `ShardGroup`; it calls the kernel of the phase
     is_shared: bool = False  # whether workers share its zones; if not, one process runs all zones
-    is_late: bool = False  # whether the next phase needs its results of the same zone only
-    is_early: bool = False  # whether it needs no results of other zones from the phase before
-    is_beside: bool = False  # whether it is outside of a tick, and so outside of a zone's cost
+    is_late: bool = False  # whether the next phase needs this phase's results of its own zone only
+    is_early: bool = False  # whether it needs no results of the previous phase in other zones
+    is_beside: bool = False  # whether it runs outside of a tick, and is no part of a zone's cost
 
 
 class Phase(Enum):

@@ -17,7 +17,7 @@ from cavmarl.sensors.observed import layout
 
 
 class RegisteredOutputs:
-    """Caller of the registered sensors and terms of a configuration."""
+    """Calls the registered sensors and terms of a configuration."""
 
     def __init__(self, config: EnvConfig, network: RoadNetwork) -> None:
         self._network = network

@@ -42,7 +42,7 @@ class RowCheck:
 
     Attributes:
         indices: ranges of the fields by which kernels index tables, except `way`.
-        steps: number of rows that `way` can point at after the lane is added to it.
+        steps: limit of `way` plus the lane, which is the index of a row.
     """
 
     def __init__(self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int) -> None:
@@ -75,7 +75,7 @@ class RowCheck:
             "blinker": range(-1, 2),
             "leg": range(MOST + 1),
             "order": range(-1, MOST + 1),
-            "owner": range(MOST + 1),  # may be of different zones; a load overwrites it
+            "owner": range(MOST + 1),  # may name a zone of other partitions; a load overwrites it
             "epoch": range(MOST + 1),
             "transfer": range(AUTHORITATIVE, AUTHORITATIVE + 1),
         }
@@ -89,7 +89,7 @@ class RowCheck:
     def wrong(
         self,
         rows: NDArray[np.void],  # VEHICLE (n,)
-        tail: NDArray[np.void] | None = None,  # PLAN (n,) the last steps; None: the present ones
+        tail: NDArray[np.void] | None = None,  # PLAN (n,) the last steps; None: the present steps
         num_orders: int = MOST,  # of the world's demand
     ) -> str:
         """Return what is wrong with one of these vehicles of one world; empty if nothing."""
@@ -153,7 +153,7 @@ class RowCheck:
         wrong = (rows["id"] < 0) | (rows["tick"] < 0) | (rows["order"] >= num_orders)
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id or tick is")
+        return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id or tick is invalid")
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
         """Check that a route begins with a step of its lane. Follow it if its lanes may differ."""
@@ -172,7 +172,7 @@ class RowCheck:
             planned |= (behind >= 0) & (at < travel.num_fixed) & (behind % lanes == lane)
         drives = (rows["driver"] == DRIVER_BACKGROUND) | (rows["driver"] == DRIVER_AGENT)
         follow = drives & ~planned
-        if self._is_moved:  # SUMO sends the routes again after the load
+        if self._is_moved:  # after the load, SUMO sends the routes again
             follow &= at < travel.num_fixed
         rows, lane, way = rows[follow], lane[follow], way[follow]
         for _ in range(_LONGEST_WAY):

@@ -1,7 +1,7 @@
 """`Shard`: the vehicles of one zone in W worlds.
 
-A shard has the arrays of its vehicles, its part of the map, its sensors and its terms. It knows
-neither the coordinator nor another shard. A `ShardGroup` runs the ticks of one or more shards.
+A shard has the arrays of its vehicles, its part of the map, its sensors and its terms. It has no
+access to the coordinator or to other shards. A `ShardGroup` runs the ticks of one or more shards.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ SUGGESTED_HORIZON_S = 1.0  # time in which a suggested target speed is to be rea
 # The state of one actuated signal program in a world.
 CONTROLLER = np.dtype(
     [
-        ("phase", np.int64),  # the present PHASE row
-        ("since_ms", np.int64),  # when the phase began, since reset
-        ("next_ms", np.int64),  # when to decide whether the phase continues
+        ("phase", np.int64),  # index of the present PHASE row
+        ("since_ms", np.int64),  # time since the reset at which the phase began
+        ("next_ms", np.int64),  # time of the next decision whether the phase continues
     ],
     align=True,
 )
@@ -60,7 +60,7 @@ class Commands:
     # (W, A, 2) throttle in m/s² and steering in rad; continuous actions
     controls: NDArray[np.float64]
     meta_actions: NDArray[np.int64]  # (W, A) ACTION_* codes; discrete actions
-    # (W, A) CAUSE_* of events that agents report to others, 0: none; (0, 0): no messages
+    # (W, A) CAUSE_* of the events that agents send in messages, 0: none; (0, 0): no messages
     declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
     # (W, I, 3) INSERT_* code, LANE and position in m of inserted vehicles; (0, 0, 3): insertions
     # are not configured
@@ -137,7 +137,7 @@ class Shard:
         )
         self.outputs = outputs
         self.mail: Mail | None = None  # messages that agents have received; None: no messages
-        self.untold = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)
+        self.no_reports = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)
         self.messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
@@ -153,9 +153,9 @@ class Shard:
 
     def align(self) -> None:
         """Use the first buffer for all rows, after a tick that was abandoned."""
-        self.face(0, 0)
+        self.set_sides(0, 0)
 
-    def face(self, side: int, next_side: int) -> None:
+    def set_sides(self, side: int, next_side: int) -> None:
         self.side, self.next_side = side, next_side
         self.row_sides[:] = side, next_side
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
@@ -190,9 +190,9 @@ def make_worlds(
 ) -> Worlds:
     """Return the arrays of W empty worlds with room for `capacity` vehicles each.
 
-    Agents' commands take effect `latency_ticks` later; scripts wait for `num_cues` cues. The rows
-    are those of a zone of `zoned`, if given. The state that all zones share (ticks, keys, signals,
-    detections, cues) is that of `common`, if given; otherwise `zeros` allocates it.
+    Agents' commands take effect `latency_ticks` later; scripts wait for `num_cues` cues. If
+    `zoned` is given, the rows are views of its zone `zone`. The state that all zones share (ticks,
+    keys, signals, detections, cues) is that of `common`, if given; else `zeros` allocates it.
     """
     if zoned is None:
         zoned = make_zone_state(1, num_worlds, capacity)

@@ -77,13 +77,13 @@ class ShardGroup:
     def turn(self) -> None:
         """Put the next rows into the other buffer, in a tick that sorts rows by lane."""
         if self.first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
-            self.face(self.first.side, 1 - self.first.side)
+            self.set_sides(self.first.side, 1 - self.first.side)
 
-    def face(self, side: int, next_side: int) -> None:
+    def set_sides(self, side: int, next_side: int) -> None:
         """Set the buffers of the committed and of the next rows."""
         if self.sides != (side, next_side):
             for shard in self.shards:
-                shard.face(side, next_side)
+                shard.set_sides(side, next_side)
 
     def move(self, commands: Commands) -> None:
         """Run `advance` without `turn`."""
@@ -125,7 +125,7 @@ class ShardGroup:
 
     def commit(self) -> None:
         """Make the next rows the committed ones."""
-        self.face(self.first.next_side, self.first.next_side)
+        self.set_sides(self.first.next_side, self.first.next_side)
 
     def detect(self) -> None:
         """Record when owned vehicles cover the detectors of actuated signals."""
@@ -305,7 +305,7 @@ class GroupCalls:
             travel=first.travel,
             lane_grid=first.lane_grid,
             optional=first.optional,
-            objects=first.untold if first.mail is None else first.mail.objects,
+            objects=first.no_reports if first.mail is None else first.mail.objects,
             tick_s=clock.sim_dt_s,
             ticks_per_step=clock.ticks_per_step,
             stack=self._config.sensors.stack,

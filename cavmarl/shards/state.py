@@ -49,7 +49,7 @@ STATE = (
     StateArray(DepartureQueue, "num_entered", (S, D), 9),
     StateArray(DepartureQueue, "counts", (S,)),
     StateArray(DepartureQueue, "sums", (S,)),
-    StateArray(Outputs, "observations", (S,)),  # saved where an observation has earlier frames
+    StateArray(Outputs, "observations", (S,)),  # saved if observations contain earlier frames
     StateArray(Outputs, "terms", (S,)),
     StateArray(Outputs, "rewards", (S,)),
     StateArray(Outputs, "terminated", (S,)),
@@ -62,11 +62,11 @@ STATE = (
 
 @cache
 def names_of(bundle: type[tuple[Any, ...]], use: Use) -> tuple[str, ...]:
-    """Return the fields of a bundle with a use, in the order of the table or of the digest."""
+    """Return the fields of a bundle with a use, in the order of the table or the digest."""
     kept = (entry for entry in STATE if entry.bundle is bundle and use in entry.uses)
     return tuple(entry.name for entry in sorted(kept, key=lambda entry: entry.place * (use is D)))
 
 
 def arrays_of(source: Any, bundle: type[tuple[Any, ...]], use: Use) -> Iterator[NDArray[Any]]:
-    """Return a source's arrays of a bundle with a use; any shard has those of `SharedState`."""
+    """Return a source's arrays of a bundle with a use. For `SharedState`, pass any shard."""
     return (getattr(source, name) for name in names_of(bundle, use))

@@ -8,7 +8,8 @@
                  agent
 
 All numbers are little-endian. The map, the vehicle types and the table of routes are the same in
-all processes of a world, so the record contains indices into them. Sensors read anew.
+all processes of a world, so the record contains indices into them. The state has no readings of
+sensors, which are taken again.
 
 Reader and writer must have the same layout of the record. The header has a digest of the layout,
 and a change of it needs a new major version (`RECORD_VERSION`). A minor version may append data
@@ -122,8 +123,8 @@ class TransferCodec:
         rows: NDArray[np.void],  # VEHICLE (W, C)
         world: int,
         i: int,
-        # of the state, as `unpack` expects it. `VEHICLE["tick"]` is lower by one in vehicles that
-        # entered after the reset
+        # tick of the state, as `unpack` expects it. In vehicles that entered after the reset,
+        # `VEHICLE["tick"]` is lower by one
         tick: int,
     ) -> bytes:
         """Return the state of a vehicle."""
@@ -140,7 +141,7 @@ class TransferCodec:
     def unpack(
         self, data: bytes, vehicle: int, tick: int, rows: NDArray[np.void], world: int, i: int
     ) -> None:
-        """Write a state to `rows[world, i]` and its agent's arrays; nothing if it is refused."""
+        """Write a state to `rows[world, i]` and its agent's arrays; if refused, write nothing."""
         header = self.header(data)
         if (header.vehicle, header.tick) != (vehicle, tick):
             raise MessageError(

@@ -64,7 +64,7 @@ def _room(
 
 
 def with_room(departures: DepartureQueue, num_orders: int) -> DepartureQueue:
-    """Return the queue with room for at least `num_orders` orders, all of which may wait."""
+    """Return the queue with room for at least `num_orders` orders, even if all of them wait."""
     num_worlds, present = departures.orders.shape
     more = num_orders - present
     if more <= 0:

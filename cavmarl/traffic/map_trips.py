@@ -31,7 +31,7 @@ def for_each_map(network: RoadNetwork, make: Callable[[int], T]) -> list[T]:
     """Return `make(row)` for each MAP row.
 
     Raises:
-        CavmarlError: `make` failed; of the class of the first error, with all messages.
+        CavmarlError: `make` failed; has the class of the first error and all messages.
     """
     found: list[T] = []
     refused: list[CavmarlError] = []
@@ -82,7 +82,7 @@ class MapTrips:
         edges = self._drivable_edges(MIN_GOAL_M)
         leaves = [e for e in edges if self._is_way_out(e)]
         rest = [e for e in edges if e not in set(leaves)]
-        # Ways out of the map come first. The other edges are picked evenly by row, for any seed.
+        # Ways out of the map come first. Other edges are picked evenly by row, not at random.
         candidates = leaves + rest
         named += acted
         wanted = max(self.traffic.goals, len(named))

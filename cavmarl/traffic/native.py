@@ -297,8 +297,8 @@ class NativeTraffic:
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
         """Return the largest distance that any driver looks ahead, in m.
 
-        If all drivers brake as SUMO's do, it follows from the fastest of them. IDM reacts to any
-        leader, and agents may drive at any speed; then it is `VIEW_M`.
+        If all drivers brake as in SUMO, the fastest driver determines the distance. Otherwise it is
+        `VIEW_M`: IDM reacts to any leader, and agents may drive at any speed.
         """
         own = self.population
         if self.file is None or own.agents + own.background + own.insertions > 0:
@@ -457,12 +457,20 @@ class NativeTraffic:
     def _check_room_of(self, number: int) -> None:
         metres = self.trips_of(number).metres
         room = int(metres / (float(self.blank["length"][0]) + JAM_GAP_M))
-        wanted = self.population.agents + self.population.background
-        if wanted > room:
+        agents, background = self.population.agents, self.population.background
+        if agents + background > room:
+            default = PopulationConfig.background
+            stated = f"{background}, the default" if background == default else f"{background}"
+            cure = "set population.agents (agents=N, --agents N) to fewer"
+            if background:
+                most = max(room - agents, 0)
+                cure = f"set population.background (background=N, --background N) to {most} or less"
+                cure += ", and use fewer agents" if agents > room else ""
             raise CapacityError(
-                f"population.agents + population.background = {wanted}: the map "
-                f"'{self.network.name_of(number)}' has {metres / 1000.0:.1f} km of lanes, room for "
-                f"{room} vehicles bumper to bumper; ask for fewer"
+                f"population.agents + population.background = {agents + background} (the "
+                f"background is {stated}): the map '{self.network.name_of(number)}' has "
+                f"{metres / 1000.0:.1f} km of lanes, room for {room} vehicles bumper to bumper; "
+                f"{cure}"
             )
 
 

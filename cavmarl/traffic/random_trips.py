@@ -131,7 +131,7 @@ def _largest_part(network: RoadNetwork) -> tuple[list[list[int]], NDArray[np.int
     if not in_part.any():
         raise RouteError(
             f"map '{network.name}': no edge can be reached again without a U-turn, so routes "
-            "cannot be of any length; write demand with origins and destinations by hand"
+            "cannot have the wanted length; write demand with origins and destinations by hand"
         )
     chosen = part == np.argmax(in_part)
     into: list[list[int]] = [[] for _ in range(len(network.edges))]

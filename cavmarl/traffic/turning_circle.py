@@ -104,8 +104,8 @@ class _Trial:
         ends = lanes[0], begin_m, lanes[-1], end_m
         stays = self._drives(*ends)
         if stays:
-            # The drive so far aims as before the first link of the map. Aiming at this turn, the
-            # car may cut the corner at any speed until its centre is off the road.
+            # The first drive aims as for link 0. A car that aims at this turn may cut the corner:
+            # the turn is too tight only if its centre leaves the road at each of the speeds.
             self._plan["link"][0, lanes[0]] = link
             stays = any(self._drives(*ends, speed, False) for speed in (TRIAL_MPS, FASTER_MPS))
             self._plan["link"][0, lanes[0]] = 0

@@ -60,7 +60,7 @@ from cavmarl.v2x.v2x_messages import (
 
 Zeros = Callable[..., NDArray[Any]]
 Watch = Callable[[int, int, NDArray[np.void], NDArray[np.void]], None]
-"""Called with a world, a tick, and views of what is sent in it: PACKET (n,) and REPORT (m,)."""
+"""A function of a world, a tick, and views of the PACKET (n,) and REPORT (m,) sent in the tick."""
 
 CELL_M = 100.0  # cell size of the grid of packets of a tick
 BODY_CELL_M = 25.0  # cell size of the grid of perceived vehicles
@@ -127,7 +127,7 @@ class Bus:
             self._network = before
 
     def watch(self, watch: Watch) -> None:
-        """Call `watch` with the messages of each tick from now on; repeated ticks call it again."""
+        """Call `watch` with the messages of every later tick, and again if a tick is repeated."""
         self._watchers = (*self._watchers, watch)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
@@ -336,7 +336,7 @@ def _make_scratch(
         spare=np.zeros(capacity, STATION),
         receivers=np.zeros(num_receivers, RECEIVER),
         bodies=make_grid(network.room_m, BODY_CELL_M, capacity, len(network.maps) > 1),
-        everybody=np.zeros(capacity, zoned.rows.dtype),
+        vehicles=np.zeros(capacity, zoned.rows.dtype),
         next_cams=np.zeros(mail.last_cams.shape[1], mail.last_cams.dtype),
         near=np.zeros(MAX_NEAR, np.int32),
         near_squared=np.zeros(MAX_NEAR),
@@ -369,7 +369,7 @@ class V2xStatistics:
     received: int  # pairs in which the packet was received
     delays: NDArray[np.int64]  # (65,) number of receptions by delay in ticks
     mean_latency_s: float  # mean of the receptions
-    # (40, 2) reachable and received, in bands of `BAND_M`; of lossy channels only
+    # (40, 2) pairs reachable and received, by distance in bands of `BAND_M`; lossy channels only
     bands: NDArray[np.int64]
     busy_mean: float  # channel busy ratio, mean over receivers and ticks
     busy_max: float  # largest channel busy ratio

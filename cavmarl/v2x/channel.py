@@ -37,8 +37,8 @@ def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: floa
     The power in dB is normally distributed around P = tx - loss(1 m) - 10 n log10(d), so the
     probability is Φ((P - sensitivity) / σ).
 
-    `config`: its `path_loss_exponent` is not 0. `distance_m`: between the antennas, at least 1 m is
-    used. `extra_db`: additional loss, as by a building.
+    `config`: its `path_loss_exponent` is not 0. `distance_m`: between the antennas; less
+    than 1 m counts as 1 m. `extra_db`: additional loss, such as that of a building.
     """
     lost_db = 10.0 * config.path_loss_exponent * log10(max(distance_m, 1.0))
     power_dbm = config.tx_power_dbm - reference_loss_db() - lost_db - extra_db
@@ -64,8 +64,8 @@ def airtime_s(config: ChannelConfig) -> float:
 def hidden_share(distance_m: float, sensing_m: float) -> float:
     """Return the share of the stations heard by a receiver that the sender does not hear.
 
-    Both hear stations within `sensing_m`; the density of stations is assumed to be uniform, so the
-    share is that of a part of a circle.
+    Both hear stations within `sensing_m`. The density of stations is assumed to be uniform, so the
+    share is the part of the receiver's circle that lies outside the sender's circle.
     """
     half = 0.5 * distance_m / sensing_m
     if half >= 1.0:
@@ -76,7 +76,7 @@ def hidden_share(distance_m: float, sensing_m: float) -> float:
 def chances_among_others(busy: float, hidden: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probabilities (n,) that no hidden station disturbs a packet.
 
-    The sender does not wait for hidden stations. These send at random, and a packet is lost if one
+    The sender does not wait for hidden stations. They send at random, and a packet is lost if one
     of them begins within two packet times: exp(-2 G), where G is their channel load (Abramson: "The
     ALOHA system", 1970; Tobagi, Kleinrock: "Packet switching in radio channels: part II, the hidden
     terminal problem", 1975).

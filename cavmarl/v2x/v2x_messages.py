@@ -221,7 +221,7 @@ RECEPTION = record(
 
 
 class Exchange(NamedTuple):
-    """One tick of one world for a network simulator; the arrays are views, not to be kept."""
+    """One tick of one world for a network simulator; the arrays are only valid in the call."""
 
     world: int
     tick: int  # tick of the world, from 1 after a reset
@@ -256,7 +256,7 @@ def check_receptions(
     """Refuse impossible receptions.
 
     `receptions`: the answer to `sent`. `latency_ticks`: the longest delay. `num_packets`:
-    (latency_ticks + 1,) packets in flight, by tick modulo that.
+    (latency_ticks + 1,) number of packets in flight, by tick modulo latency_ticks + 1.
 
     Returns:
         the receptions sorted by receiver, tick and packet, so that the order of the answer is

@@ -1,4 +1,4 @@
 """Checks that results are bit for bit the same: determinism, divisions, faults, kills.
 
-It builds on `evaluate`; `cli` runs it.
+This package builds on `evaluate`; `cli` runs the checks.
 """

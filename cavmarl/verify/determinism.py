@@ -2,7 +2,7 @@
 
 The interpreters have different `PYTHONHASHSEED` and run at the same time, while a fourth process
 keeps a processor busy. Their hashes are compared after each step. At the first difference, the
-interpreters stop and save their states. So a difference that cannot be reproduced is found, too.
+interpreters stop and save their states. So even a difference that cannot be reproduced is found.
 """
 
 from __future__ import annotations

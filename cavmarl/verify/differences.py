@@ -26,10 +26,10 @@ class Difference:
 
     step: int  # number of the step; 0 is the reset
     tick: int  # the world's tick after the step
-    # `vehicle`, the name of another array, or `hidden state`: state that is hashed, but is in no
-    # array (queue and random keys)
+    # `vehicle`, the name of another array, or `hidden state`: hashed state that is in no array
+    # (queue and random keys)
     what: str
-    vehicle: int | None  # least id of the vehicles that differ; None: it is not about a vehicle
+    vehicle: int | None  # least id of the vehicles that differ; None: no vehicle differs
     field: str  # first field of the vehicle that differs, or the place in the array
     values: tuple[Any, Any]  # in the two runs; None where a vehicle is missing
 

@@ -46,7 +46,7 @@ class _Connection:
 
 
 class FaultyNetwork:
-    """A proxy for connections; `strike` injects a fault into one of them.
+    """A proxy for connections; `inject` injects a fault into one of them.
 
     Attributes:
         done: number of injected faults of each kind.
@@ -73,7 +73,7 @@ class FaultyNetwork:
         found: Place = listener.getsockname()
         return found
 
-    def strike(self, kind: NetworkFault) -> None:
+    def inject(self, kind: NetworkFault) -> None:
         """Inject a fault into a random connection."""
         with self._lock:
             if not self._connections:
@@ -120,7 +120,7 @@ class FaultyNetwork:
                     self._start(partial(self._carry, connection, direction))
 
     def _late(self, source: socket.socket) -> Iterator[bytes]:
-        """Yield the received pieces, each after the latency."""
+        """Yield the received pieces, each delayed by the latency."""
         due: deque[tuple[float, bytes]] = deque()
         while True:
             wait_s = max(due[0][0] - time.perf_counter(), 0.0) if due else None

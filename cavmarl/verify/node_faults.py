@@ -23,8 +23,8 @@ KILL, STOP, ANY = "kill", "stop", "any"
 SIGNALS = {KILL: signal.SIGKILL, STOP: signal.SIGSTOP}
 FAULTS = (*map(str, NetworkFault), KILL, STOP)
 PER_RUN = {NetworkFault.DELAY: 10, KILL: 35, ANY: 5}  # number of faults in a run, by kind
-OTHERS = 2  # number of faults in a run of any other kind
-APART = 4  # steps between two faults that may cost a node, and after the last of them
+OTHERS = 2  # number of faults in a run, for all other kinds
+APART = 4  # steps between two faults that may cost a node, and after the last such fault
 WAIT_S = 0.05  # between two steps, while a lost node is replaced
 REPLACED_S = 60.0  # limit for the replacement of a lost node
 TIMEOUT_S = 1.0  # time without a frame, after which a node gets a ping
@@ -164,16 +164,16 @@ def _run(
     try:
         pair = ComparedWorlds(spec, line.nodes, zones, 1, policy, network.route)
         drawn = random.Random(f"{line.nodes} {line.fault} {seed}")
-        strikes = _Strikes(line, num, pair, network, drawn)
+        planned = _PlannedFaults(line, num, pair, network, drawn)
         try:
-            found = pair.compare(steps, strikes.due, lambda step: None, strikes.are_left)
+            found = pair.compare(steps, planned.due, lambda step: None, planned.are_left)
             if found.different is None:
                 line.equal += 1
             else:
                 line.wrong_seeds.append(seed)
         except WorkerDeathError:
             line.ended += 1
-        line.injected += strikes.signalled
+        line.injected += planned.signalled
         line.injected += Counter({str(fault): num for fault, num in network.done.items()})
         line.lost += pair.worlds.pool.losses
         line.recoveries += pair.worlds.pool.recoveries
@@ -181,8 +181,8 @@ def _run(
         network.close()
 
 
-class _Strikes:
-    """The faults of a run. Each happens while all nodes live, some steps after the one before."""
+class _PlannedFaults:
+    """The faults of a run. Each happens while all nodes live, some steps after the last fault."""
 
     def __init__(
         self,
@@ -214,10 +214,10 @@ class _Strikes:
         self._next_step = step + (1 if self._is_harmless else APART)
         if kind in SIGNALS:
             return partial(self._signal, kind)
-        return partial(self._network.strike, NetworkFault(kind))
+        return partial(self._network.inject, NetworkFault(kind))
 
     def _is_replaced_later(self, step: int) -> bool:
-        """Wait shortly if a lost node is not replaced yet. Return whether to wait more.
+        """Wait shortly if a lost node is not replaced yet. Return whether to wait longer.
 
         After the replacement, `APART` steps follow, so that two nodes keep each state again. After
         `REPLACED_S` without a replacement, the faults continue.
@@ -231,4 +231,4 @@ class _Strikes:
         return time.monotonic() < self._waits_until_s
 
     def _signal(self, kind: str) -> None:
-        self.signalled[kind] += self._pair.strike(self._drawn, SIGNALS[kind])
+        self.signalled[kind] += self._pair.signal_node(self._drawn, SIGNALS[kind])

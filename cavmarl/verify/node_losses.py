@@ -1,4 +1,4 @@
-"""Check that worlds over nodes equal undivided worlds, also if nodes are killed."""
+"""Check that worlds over nodes equal undivided worlds, even if nodes are killed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import DrivenRun, same_bytes
 
 FIRST_STEPS = 5  # steps without kills, to measure the duration of a step
-LATEST = 1.5  # latest time of a kill, in durations of a step: some kills are between two steps
+LATEST = 1.5  # latest time of a kill, in durations of a step; some kills happen between two steps
 
 
 @dataclass(frozen=True)
@@ -108,14 +108,14 @@ def verify_nodes(
         pair = ComparedWorlds(spec, number, count, worlds, policy)
         drawn = random.Random(spec.seed)
         struck = drawn.sample(range(FIRST_STEPS, steps), min(kills, number - 1))
-        kill = partial(pair.strike, drawn, signal.SIGKILL)
+        kill = partial(pair.signal_node, drawn, signal.SIGKILL)
         due = partial(_due, dict[int, Callable[[], object]].fromkeys(struck, kill))
         found.append(pair.compare(steps, due, note))
     return NodeReport(spec.env, count, worlds, steps, tuple(found))
 
 
-def _due(strikes: Mapping[int, Callable[[], object]], step: int) -> Callable[[], object] | None:
-    return strikes.get(step)
+def _due(planned: Mapping[int, Callable[[], object]], step: int) -> Callable[[], object] | None:
+    return planned.get(step)
 
 
 class ComparedWorlds:
@@ -128,10 +128,10 @@ class ComparedWorlds:
         zones: int,
         worlds: int,
         policy: str | Path,
-        route: Route = straight,  # from a place to the place that nodes call to reach it
+        route: Route = straight,  # maps a place to the place that nodes call to reach it
     ) -> None:
         self._nodes = nodes
-        self._struck: set[int] = set()  # processes that have got a signal
+        self._signalled: set[int] = set()  # processes that have got a signal
         whole = make_vec(spec.env, num_envs=worlds, **spec.keywords)
         config, base_dir = load_config(spec.env, zones=zones, **spec.keywords)
         world = make_world(config, base_dir)
@@ -148,7 +148,8 @@ class ComparedWorlds:
         steps: int,
         due: Callable[[int], Callable[[], object] | None],  # step → fault during it, or None
         note: Callable[[int], None],  # called with the number of completed steps
-        goes_on: Callable[[int], bool] = lambda step: False,  # whether to run more than `steps`
+        # whether to run more than `steps`
+        must_continue: Callable[[int], bool] = lambda step: False,
     ) -> NodeRun:
         """Drive and compare the worlds, then close the nodes."""
         different: int | None = None
@@ -158,11 +159,11 @@ class ComparedWorlds:
         drawn = random.Random(steps)
         try:
             step = -1
-            while (step := step + 1) < steps or goes_on(step):
+            while (step := step + 1) < steps or must_continue(step):
                 first = self._runs[0].step()
-                if strike := due(step):  # at a random time in the next step or soon after it
+                if inject := due(step):  # at a random time in the next step or soon after it
                     latest_s = 1e-3 * LATEST * statistics.median(calm_ms)
-                    timers.append(Timer(drawn.uniform(0.0, latest_s), strike))
+                    timers.append(Timer(drawn.uniform(0.0, latest_s), inject))
                     timers[-1].start()
                 before, began = self.worlds.pool.recoveries, time.perf_counter()
                 second = self._runs[1].step()
@@ -187,12 +188,12 @@ class ComparedWorlds:
             self._nodes, self.worlds.pool.losses, migrations, different, median_ms, above_ms
         )
 
-    def strike(self, drawn: random.Random, number: signal.Signals) -> bool:
-        """Send a signal to a random node that has not got one. Return whether there is one."""
-        living = [pid for pid in self.worlds.pool.pids if pid not in self._struck]
+    def signal_node(self, drawn: random.Random, number: signal.Signals) -> bool:
+        """Send a signal to a random node that has got none. Return whether there is such a node."""
+        living = [pid for pid in self.worlds.pool.pids if pid not in self._signalled]
         if living:
             pid = drawn.choice(living)
-            self._struck.add(pid)
+            self._signalled.add(pid)
             with suppress(ProcessLookupError):
                 os.kill(pid, number)
                 return True

@@ -24,7 +24,7 @@ JUMP_S = 0.3  # longest jump of a clock
 NODE_KINDS = (FrameKind.REPORT, FrameKind.MESSAGES, FrameKind.SHARE, FrameKind.KEEP)
 RECOVERY_KINDS = (FrameKind.SYNC, FrameKind.REPORT, FrameKind.GIVE, FrameKind.MISSED)
 CALLER_KINDS = (FrameKind.COMMAND, FrameKind.RECOVER)
-LATER_FRAMES = 4  # a process dies at one of this number of next frames of a kind
+LATER_FRAMES = 4  # a process dies at one of its next frames of a kind, up to this number
 
 
 class Fault(StrEnum):
@@ -32,7 +32,7 @@ class Fault(StrEnum):
 
     DELAY = "delay"  # a frame and its successors on the connection arrive up to 0.5 s late
     SPLIT = "split"  # a frame arrives in two pieces
-    OVERTAKE = "overtake"  # a frame arrives after frames that were sent later over other links
+    OVERTAKE = "overtake"  # a frame arrives after frames that were sent later on other links
     SLOW = "slow"  # the zones of a node take longer
     CLOCK_SKEW = "clock_skew"  # a clock jumps forward, and continues at another rate
     STALE_HEARTBEAT = "stale_heartbeat"  # a node answers a ping late, but within the time limit
@@ -48,7 +48,7 @@ class Fault(StrEnum):
     STOP_CALLER = "stop_caller"  # the caller stops for up to 30 s, and continues
     KILL = "kill"  # a node dies at any time
     KILL_AT_POINT = "kill_at_point"  # a node dies while it sends a frame of a random kind
-    KILL_IN_RECOVERY = "kill_in_recovery"  # a node dies, and another node dies in the recovery
+    KILL_IN_RECOVERY = "kill_in_recovery"  # a node dies, and another node dies during the recovery
     END_CALLER = "end_caller"  # the caller dies at any time; all nodes must end
     END_CALLER_AT_POINT = "end_caller_at_point"  # the caller dies while it sends a frame
 
@@ -64,7 +64,7 @@ DEATHS = (*NODE_DEATHS, *CALLER_DEATHS)
 FAULTS = tuple(fault for fault in Fault if fault not in CALLER_DEATHS)
 SEVERE = tuple(fault for fault in FAULTS if fault not in TOLERATED)  # each may cost a node
 
-# The probability of a fault for each frame that is sent.
+# Probability of each fault, per sent frame.
 TOLERATED_RATES: Mapping[Fault, float] = {
     Fault.DELAY: 0.15,
     Fault.SPLIT: 0.15,
@@ -76,14 +76,14 @@ TOLERATED_RATES: Mapping[Fault, float] = {
 SEVERE_RATES: Mapping[Fault, float] = dict.fromkeys(SEVERE, 3e-4) | dict.fromkeys(
     NODE_DEATHS, 1.5e-3
 )
-# With rates, severe faults have a distance, so that worlds recover from most of them. Tolerated
-# faults are short, so that many of them together stay below the time limits.
+# Severe faults that are drawn by rate are some seconds apart, so that worlds recover from most of
+# them. Tolerated faults are short, so that many of them together stay below the time limits.
 SEVERE_APART_S = (0.0, 1.0)
 SHORT_DELAY_S = 0.01
 SHORT_LAG_S = 0.005
 SHORT_JUMP_S = 0.002
-# With this delay of a report, both the fastest and the slowest clock of a caller send a ping, and
-# get the answer, which follows the report, in time.
+# If a report is late by this time, callers with the fastest and with the slowest clock send a ping.
+# The answer follows the report and arrives in time.
 STALE_S = (1.28, 1.45)
 
 
@@ -127,7 +127,7 @@ class SimulatedFaults:
         """
         self._calm_until_s = self._machine.now_s
 
-    def happen(self, fault: Fault) -> None:
+    def inject(self, fault: Fault) -> None:
         """Inject a fault into a random process or connection, now or soon."""
         drawn = self._drawn
         match fault:
@@ -146,9 +146,9 @@ class SimulatedFaults:
                 self._change_next_frame(fault, self._connection_end())
             case _:
                 if node := self._node():
-                    self._happen_to_node(fault, node)
+                    self._inject_into_node(fault, node)
 
-    def _happen_to_node(self, fault: Fault, node: SimulatedProcess) -> None:
+    def _inject_into_node(self, fault: Fault, node: SimulatedProcess) -> None:
         drawn, machine = self._drawn, self._machine
         match fault:
             case Fault.SLOW:
@@ -202,10 +202,10 @@ class SimulatedFaults:
         self._end_at_frame(fault, process, kind, share, self._drawn.randrange(later))
 
     def _end_caller_at_point(self) -> None:
-        """End the caller while it sends a command, or orders the recovery from a node's death."""
+        """End the caller while it sends a command or orders the recovery from a node's death."""
         drawn, kind = self._drawn, self._drawn.choice(CALLER_KINDS)
         if kind is FrameKind.RECOVER:
-            self.happen(Fault.KILL)
+            self.inject(Fault.KILL)
         share, left = drawn.choice((0.0, 0.5, 1.0)), drawn.randrange(2)
         self._end_at_frame(Fault.END_CALLER_AT_POINT, self._machine.caller, kind, share, left)
 
@@ -275,7 +275,7 @@ class SimulatedFaults:
             case Fault.LOST_HEARTBEAT:
                 end.due = self._held(fault, end, drawn.uniform(3.0, 30.0))
             case Fault.REORDER:
-                end.due = partial(self._kept_back, end)
+                end.due = partial(self._swapped, end)
             case _:
                 change = {
                     Fault.SPLIT: _split,
@@ -305,7 +305,7 @@ class SimulatedFaults:
 
         return hold
 
-    def _kept_back(self, end: SimulatedSocket, data: bytes) -> list[bytes]:
+    def _swapped(self, end: SimulatedSocket, data: bytes) -> list[bytes]:
         end.due = self._counted(Fault.REORDER, lambda following: [following, data])
         return []
 
@@ -322,10 +322,10 @@ class SimulatedFaults:
         for fault, rate in self._rates:
             value -= rate
             if value < 0.0:
-                self._happen_at_frame(fault, end)
+                self._inject_at_frame(fault, end)
                 return
 
-    def _happen_at_frame(self, fault: Fault, end: SimulatedSocket) -> None:
+    def _inject_at_frame(self, fault: Fault, end: SimulatedSocket) -> None:
         machine, drawn = self._machine, self._drawn
         process = end.owner
         if fault in SEVERE:
@@ -341,7 +341,7 @@ class SimulatedFaults:
         elif fault is Fault.STALE_HEARTBEAT:
             self._stale.add(process)
         elif fault in (*NODE_DEATHS, Fault.STOP, Fault.PARTITION, Fault.LOST_HEARTBEAT):
-            machine.at(0.0, partial(self.happen, fault))
+            machine.at(0.0, partial(self.inject, fault))
         else:
             self._change_next_frame(fault, end, SHORT_DELAY_S)
 

@@ -34,11 +34,11 @@ ADDRESS = "node"
 ALIVE_S = 25.0  # time without an answer, after which the system ends a connection
 LATEST_S = 0.002  # longest delay of bytes
 JOIN_S = 5.0  # limit for the end of a thread
-MAX_MOVES = 2_000_000  # largest number of turns of all processes in a run
+MAX_MOVES = 2_000_000  # limit of the turns of all processes in a run
 
 
 class ProcessEndedError(BaseException):
-    """Unwinds the thread of a process that was ended from outside."""
+    """Unwinds the thread of a process that another process has ended."""
 
 
 class SimulatedProcess:
@@ -65,7 +65,7 @@ class SimulatedProcess:
         self.sockets: list[SimulatedSocket | SimulatedListener] = []
         self.on_send: Callable[[bytes], int | None] = lambda data: None
         self.failure: BaseException | None = None
-        self.newest_come = -1  # largest number of the received frames, in the order of sending
+        self.newest_received = -1  # number of the newest received frame, in the order of sending
         self._machine = machine
 
     def clock_s(self) -> float:
@@ -123,7 +123,7 @@ class SimulatedMachine:
         """Start a process. It runs when other processes wait."""
         process = self._new(name)
 
-        def whole() -> None:
+        def run_and_finish() -> None:
             process.baton.acquire()
             try:
                 if not process.is_ended:
@@ -135,7 +135,7 @@ class SimulatedMachine:
             finally:
                 self._finish(process)
 
-        thread = threading.Thread(target=whole, daemon=True)
+        thread = threading.Thread(target=run_and_finish, daemon=True)
         self._threads.append(thread)
         thread.start()
         return process
@@ -222,7 +222,7 @@ class SimulatedMachine:
         for thread in self._threads:
             thread.join(JOIN_S)
             if thread.is_alive():
-                raise AssertionError("a process does not end")
+                raise AssertionError(f"a process does not end within {JOIN_S:g} s")
 
 
 class SimulatedSocket:
@@ -234,7 +234,7 @@ class SimulatedSocket:
         due: the fault of the next frame; it returns the pieces that are delivered.
         on_arrival: called when the next frame arrives, with whether the receiver already has a
             frame that was sent later over another connection.
-        held_until_s: no bytes of this direction arrive before this time.
+        held_until_s: no bytes in this direction arrive before this time.
         is_mute: whether no sent bytes arrive, without notice to the sender.
     """
 
@@ -244,7 +244,7 @@ class SimulatedSocket:
         self._machine, self.owner = machine, owner
         self._number = next(machine.numbers)
         self.other: SimulatedSocket | None = None
-        self.come: deque[bytes] = deque()
+        self.received: deque[bytes] = deque()
         self.has_ended = self.is_closed = self.is_mute = False
         self.due: Callable[[bytes], list[bytes]] | None = None
         self.on_arrival: Callable[[bool], None] | None = None
@@ -257,7 +257,7 @@ class SimulatedSocket:
 
     @property
     def closed(self) -> bool:
-        return self.has_ended and not self.come
+        return self.has_ended and not self.received
 
     def send(self, pieces: Sequence[Bytes]) -> int:
         machine, data = self._machine, b"".join(map(bytes, pieces))
@@ -283,7 +283,7 @@ class SimulatedSocket:
         return len(data)
 
     def fall_silent(self) -> None:
-        """Deliver no more bytes of this direction. Both ends break off after `ALIVE_S`."""
+        """Deliver no more bytes in this direction. Both ends close after `ALIVE_S`."""
         assert self.other is not None
         self.is_mute = True
         for end in (self, self.other):
@@ -304,31 +304,31 @@ class SimulatedSocket:
         at_s = max(machine.now_s, self.held_until_s) + machine.random.uniform(0.0, LATEST_S)
         self._last_s = max(self._last_s, at_s)
 
-        def come() -> None:
+        def arrive() -> None:
             if chunk is None:
                 other.has_ended = True
             elif chunk:
-                other.come.append(chunk)
+                other.received.append(chunk)
                 receiver = other.owner
                 if arrived is not None:
-                    arrived(receiver.newest_come > number)
-                receiver.newest_come = max(receiver.newest_come, number)
+                    arrived(receiver.newest_received > number)
+                receiver.newest_received = max(receiver.newest_received, number)
 
-        # A delay from now could round to a time before that of the bytes sent earlier.
-        machine.at_time(self._last_s, come)
+        # Now plus the delay could round to a time before the arrival of earlier bytes.
+        machine.at_time(self._last_s, arrive)
 
     def receive(self, room: memoryview) -> int:
-        if not self.come:
+        if not self.received:
             return 0
-        chunk = self.come.popleft()
+        chunk = self.received.popleft()
         size = min(len(room), len(chunk))
         room[:size] = chunk[:size]
         if size < len(chunk):
-            self.come.appendleft(chunk[size:])
+            self.received.appendleft(chunk[size:])
         return size
 
     def is_readable(self) -> bool:
-        return bool(self.come) or self.has_ended
+        return bool(self.received) or self.has_ended
 
     def close(self) -> None:
         if not self.is_closed:
@@ -369,19 +369,19 @@ class _Poll:
 
     def __init__(self, machine: SimulatedMachine, process: SimulatedProcess) -> None:
         self._machine, self._process = machine, process
-        self._ones: dict[int, SimulatedSocket | SimulatedListener] = {}
+        self._registered: dict[int, SimulatedSocket | SimulatedListener] = {}
 
     def register(self, one: Any, events: int) -> None:
-        self._ones[one.fileno()] = one
+        self._registered[one.fileno()] = one
 
     def modify(self, one: Any, events: int) -> None:
-        self._ones[one.fileno()] = one
+        self._registered[one.fileno()] = one
 
     def unregister(self, one: Any) -> None:
-        del self._ones[one.fileno()]
+        del self._registered[one.fileno()]
 
     def _ready(self) -> list[tuple[int, int]]:
-        return [(n, select.POLLIN) for n, one in self._ones.items() if one.is_readable()]
+        return [(n, select.POLLIN) for n, one in self._registered.items() if one.is_readable()]
 
     def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
         machine, (_, rate) = self._machine, self._process.clock

@@ -51,13 +51,13 @@ from cavmarl.verify.simulated_machine import (
 )
 
 TIMEOUT_S = 1.0  # time without a frame, after which a node gets a ping
-STARTED = (-2.0, 0.5)  # range of the decimal logarithm of a node's start in s
+STARTED = (-2.0, 0.5)  # range of log10 of the time that a node's start takes, s
 THOUGHT_S = 0.15  # longest pause of the caller between two steps
-WITHIN_S = 0.03  # latest time of a planned fault after the begin of its step
+WITHIN_S = 0.03  # latest time of a planned fault after its step begins
 MAX_SEEDS = 1_000_000
 PATIENCE_S = 100.0  # limit for nodes to notice the end of the caller
 FIRST_STEPS = 2  # number of steps without planned faults
-HASHED = 4  # the hash of the state is also compared, in one step of this number
+HASHED = 4  # steps between two comparisons of the state's hash
 
 NONE, TWO, FOUR = "none", "two_at_once", "any_four"
 MANY_TOLERATED, MANY = "many_tolerated", "many"  # faults by rate, drawn for each frame
@@ -138,7 +138,7 @@ class SimulatedLine:
     ended: int = 0  # runs that ended with `WorkerDeathError`: no living node kept some state
     caller_ended: int = 0  # runs in which the caller died, and all nodes ended by themselves
     wrong: list[str] = field(default_factory=list)  # descriptions of all other runs
-    wrong_seeds: list[int] = field(default_factory=list)  # of these other runs
+    wrong_seeds: list[int] = field(default_factory=list)  # seeds of the runs in `wrong`
 
     @property
     def deaths(self) -> int:
@@ -262,7 +262,7 @@ def verify_simulated_nodes(
     with _quiet():
         for n, line in enumerate(lines):
             for k in range(seeds):
-                _Run(world, base_dir, reference, line, first_seed + k).whole()
+                _Run(world, base_dir, reference, line, first_seed + k).execute()
                 if progress is not None:
                     progress(n * seeds + k + 1, len(lines) * seeds)
     return SimulatedCampaign(given.env, count, steps, tuple(lines))
@@ -281,10 +281,10 @@ class _Run:
         self._machine.caller.clock = random_clock(self._drawn)
         self._faults = SimulatedFaults(self._machine, self._drawn, RATES.get(line.mix, {}))
         self._losses = 0  # number of lost nodes
-        # numbers of lost and of living nodes at the last state that all nodes have kept
+        # number of lost and of living nodes at the last state that all nodes have kept
         self._losses_before, self._living = 0, line.nodes
 
-    def whole(self) -> None:
+    def execute(self) -> None:
         """Do the run, and add its result to its line."""
         line, machine = self._line, self._machine
         line.runs += 1
@@ -298,7 +298,7 @@ class _Run:
         finally:
             machine.close()
             line.injected += self._faults.injected
-        if not wrong and self._losses and self._bears_all:
+        if not wrong and self._losses and self._must_lose_no_node:
             wrong = f"{self._losses} nodes were lost to faults that must be tolerated"
         if wrong:
             line.wrong.append(f"{counts_by_name(self._faults.injected.items())}: {wrong}")
@@ -316,7 +316,7 @@ class _Run:
             self._drive()
         except WorkerDeathError as error:
             lost = self._losses - self._losses_before
-            if lost < min(2, self._living):  # the state of a lost node is kept by the next one
+            if lost < min(2, self._living):  # the next node keeps the state of a lost node
                 raise AssertionError(f"ended after {lost} losses in a row: {error}") from error
             return "ended"
         except ProcessEndedError:
@@ -326,8 +326,8 @@ class _Run:
         return "equal"
 
     @property
-    def _bears_all(self) -> bool:
-        """Whether no fault of this run may cost a node."""
+    def _must_lose_no_node(self) -> bool:
+        """Return whether no fault of this run may cost a node."""
         return self._line.mix in (NONE, MANY_TOLERATED, *TOLERATED)
 
     def _planned(self) -> dict[int, list[Fault]]:
@@ -368,7 +368,7 @@ class _Run:
             for step, wanted in enumerate(reference.results):
                 for fault in planned.get(step, ()):
                     delay_s = self._drawn.uniform(0.0, WITHIN_S)
-                    machine.at(delay_s, partial(self._faults.happen, fault))
+                    machine.at(delay_s, partial(self._faults.inject, fault))
                 before = worlds.pool.losses, worlds.pool.replacements
                 living = len(worlds.pool.pids)
                 until_s = machine.now_s + self._drawn.uniform(0.0, THOUGHT_S)

@@ -25,7 +25,7 @@ from cavmarl.verify.differences import Arrays, DrivenRun, same_bytes
 
 FIRST_STEPS = 10  # steps without kills, to measure the duration of a step
 PINGS = 500
-LATEST = 1.5  # latest time of a kill, in durations of a step: some workers are idle then
+LATEST = 1.5  # latest time of a kill, in durations of a step; some workers are idle then
 STOPS = 0.25  # share of workers that are stopped instead of killed
 
 
@@ -36,12 +36,12 @@ class Kill:
     signal: str  # name of the signal
     worker: int  # index of the worker
     step: int  # after which the death was noticed
-    idle: bool  # whether the worker was idle; then the next command to it noticed the death
+    idle: bool  # whether the worker was idle; if so, its next command noticed the death
     cause: str  # of the death, according to the pool
     # from the signal, or from the next command to an idle worker, until the pool noticed the death
     noticed_ms: float
-    replaced_ms: float  # from then until the successor had its command
-    recovered_ms: float  # from the notice until the successor had completed the command
+    replaced_ms: float  # from that time until the successor had its command
+    recovered_ms: float  # from the same time until the successor had completed the command
 
 
 @dataclass(frozen=True)
@@ -177,11 +177,11 @@ class _Killer:
         """Return the median duration of the steps without a death, in ms."""
         return 1000.0 * statistics.median(self._calm_s)
 
-    def watch(self, run: Callable[[], Arrays], step: int, strikes: bool) -> Arrays:
+    def watch(self, run: Callable[[], Arrays], step: int, sends_signal: bool) -> Arrays:
         timer = None
-        if strikes:
+        if sends_signal:
             delay_s = self.random.uniform(0.0, LATEST * statistics.median(self._calm_s))
-            timer = Timer(delay_s, self._strike, (self._choose(),))
+            timer = Timer(delay_s, self._signal, (self._choose(),))
             timer.start()
         began = time.monotonic()
         result = run()
@@ -201,7 +201,7 @@ class _Killer:
         how = signal.SIGSTOP if self.random.random() < STOPS else signal.SIGKILL
         return self.random.choice(alive or [0]), how
 
-    def _strike(self, target: tuple[int, signal.Signals]) -> None:
+    def _signal(self, target: tuple[int, signal.Signals]) -> None:
         worker, how = target
         self._sent[worker] = how, time.monotonic()
         os.kill(self.pool.pids[worker], how)

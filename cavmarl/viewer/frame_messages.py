@@ -28,7 +28,7 @@ FRAME_MESSAGE = 3
 ROSTER_HEAD = struct.Struct("<BBxxIII")  # message, whole, version, rows, number of removed ids
 # message, flags, world, version, time, tick, pace, vehicles, signals, ghost zones
 FRAME_HEAD = struct.Struct("<BBHIdIfIII")
-PAUSED = 1  # flag of a frame
+PAUSED = 1  # flag of a frame: the world is paused
 
 ROSTER_ROW = np.dtype(
     [

@@ -12,10 +12,10 @@ from cavmarl.viewer.subscribers import Audience, Wishes
 
 FRAMES_HZ = 20.0
 DETAILS_HZ = 5.0
-# Events on the time line; departures and signal changes are too many.
+# Events on the time line; departures and signal changes are too frequent.
 TIME_LINE = frozenset({"collision", "off_road", "red_light", "arrived", "wrong_way", "transferred"})
 ASKED = frozenset({"inserted", "closed", "opened"})  # answers to pages, sent at once
-MOST_EVENTS = 50  # per frame
+MOST_EVENTS = 50  # largest number of events sent with a frame
 
 FrameSource = Callable[[bool], WorldFrame]
 """Returns the present frame; the argument says whether to include ghosts."""
@@ -36,7 +36,7 @@ class FramePublisher:
         self._encoder = encoder
         self._has_events = has_events
         self._last: WorldFrame | None = None
-        self._shown: tuple[Wishes, bool, float] | None = None  # with pause and pace
+        self._shown: tuple[Wishes, bool, float] | None = None  # wishes, pause, pace
         self._published_s = self._detailed_s = 0.0
         self.is_new = True
         self.published = 0

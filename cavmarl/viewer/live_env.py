@@ -34,10 +34,10 @@ class ShownEnv:
         options: options of the server. With control, a step waits while a page has paused the
             worlds.
         title: description of what drives the worlds.
-        looks_itself: whether to call `look` after each reset and step of `env`; otherwise call
-            `look`, or `turn` and `moved` where nothing may wait.
+        looks_itself: whether to call `look` after each reset and step of `env`. If not, the caller
+            calls `look`, or, where it must not wait, `turn` and `moved`.
         tell: called with lines of text: the address, and a generated token.
-        reset: restarts the episode of a world by index; None: pages may not.
+        reset: restarts the episode of a world by index; None: pages may not restart episodes.
 
     Attributes:
         address: address of the page.

@@ -22,8 +22,8 @@ from cavmarl.viewer.page_requests import PageRequest
 
 P = ParamSpec("P")
 
-MAX_TEXTS = 256  # queued for one watcher
-MAX_REQUESTS = 1000  # queued for the world
+MAX_TEXTS = 256  # maximum number of texts queued for one watcher
+MAX_REQUESTS = 1000  # maximum number of requests queued for the world
 
 
 @dataclass(eq=False)
@@ -32,7 +32,7 @@ class PageWatcher:
 
     number: int
     has_version: int = 0  # version of the roster
-    newest: Publication | None = None  # not sent yet
+    newest: Publication | None = None  # newest frame, if it is not sent yet
     texts: deque[str] = field(default_factory=deque)
     news: asyncio.Event = field(default_factory=asyncio.Event)
     vehicle: int | None = None  # id of the watched vehicle
@@ -72,7 +72,7 @@ class Wishes:
 
     watchers: int = 0
     vehicles: frozenset[int] = frozenset()
-    sensed: frozenset[int] = frozenset()  # vehicles of which sensors are included
+    sensed: frozenset[int] = frozenset()  # vehicles whose sensors are included
     ghosts_of: tuple[int, ...] = ()
 
 

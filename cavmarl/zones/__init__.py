@@ -1,4 +1,4 @@
 """The geometry of a division: zones of a map, their borders, and visibility across borders.
 
-It depends on `roads` and `driving`; `shards` and `handoff` use it.
+This package depends on `roads` and `driving`; `shards` and `handoff` use it.
 """

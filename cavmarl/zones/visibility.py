@@ -23,8 +23,8 @@ class Visibility:
 
     network: RoadNetwork
     travel: TripTables  # the types of vehicles, and how far drivers look
-    halo_m: float  # vehicles farther away are not seen
-    sure_m: float  # all nearer vehicles are seen; if it is `halo_m`, roads set no limit
+    halo_m: float  # zones see no vehicles farther away
+    sure_m: float  # zones see all nearer vehicles; if it is `halo_m`, roads have no influence
     outside_m: float  # distance outside of its zone of a vehicle whose transfer is late
 
     def halo(self, partition: ZonePartition) -> Halo:

@@ -70,7 +70,7 @@ def test_a_central_critic_meta_actions_and_named_observations_run(tmp_path: Path
     assert experiment.n_iters_performed == 2
 
 
-def test_the_seed_decides(tmp_path: Path) -> None:
+def test_the_seed_determines_the_results(tmp_path: Path) -> None:
     assert run(tmp_path / "one")[1] == run(tmp_path / "other")[1]
 
 
@@ -81,7 +81,7 @@ def test_every_entry_is_a_task() -> None:
     assert CavTask.RING.get_task().config == {"env": "ring"}
 
 
-def test_what_benchmarl_decides_is_refused() -> None:
+def test_settings_that_benchmarl_decides_are_refused() -> None:
     from cavmarl.adapters.benchmarl_task import CavTaskClass
 
     with pytest.raises(ConfigError, match=r"^num_envs: this view sets it"):

@@ -77,7 +77,7 @@ pytestmark = [
 
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("view", VIEWS)
-def test_a_copy_goes_on_as_the_first_one(view: str, how: str) -> None:
+def test_a_copy_continues_like_the_original(view: str, how: str) -> None:
     make, step = VIEWS[view]
     env = make()
     for _ in range(3):

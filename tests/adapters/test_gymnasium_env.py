@@ -73,7 +73,7 @@ def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None
         gymnasium.make("cavmarl/ring-v5", **arguments)
 
 
-def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
+def test_the_spec_has_the_horizon_and_makes_an_equal_environment() -> None:
     world = make()
     assert world.spec is not None
     assert world.spec.max_episode_steps == 40
@@ -86,7 +86,7 @@ def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
         assert cut.unwrapped.render() is None
 
 
-def test_the_infos_say_what_highway_envs_say() -> None:
+def test_infos_equal_those_of_highway_env() -> None:
     """It drives as the built-in driver, or straight on at full throttle, into others."""
     ends = {"crashed": 0, "is_success": 0}
     for seed in range(4):

@@ -186,12 +186,12 @@ def test_the_same_seed_gives_the_same_rows() -> None:
         ({"overrides": {"population.mode": "opened"}}, r"population\.mode"),
     ],
 )
-def test_rows_that_cannot_be_are_refused(arguments: dict[str, Any], message: str) -> None:
+def test_invalid_rows_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         gymnasium.make_vec("cavmarl/mergeAgents-v6", num_envs=ROWS, **arguments)
 
 
-def test_rows_without_autoreset_begin_anew_when_they_are_told_to() -> None:
+def test_rows_without_autoreset_begin_anew_on_reset() -> None:
     """With one row a world each row by itself; the others go on."""
     rows = make(num_worlds=ROWS, autoreset_mode="Disabled")
     assert rows.autoreset_mode is AutoresetMode.DISABLED
@@ -214,7 +214,7 @@ def test_rows_of_a_world_begin_anew_together() -> None:
     rows = make(autoreset_mode="Disabled")
     rows.reset(seed=5)
     first = np.arange(ROWS) == 0
-    with pytest.raises(ConfigError, match="row 0, which has not ended: its world continues"):
+    with pytest.raises(ConfigError, match="row 0, which has not ended, but not all rows"):
         rows.reset(options={"reset_mask": first})
     with pytest.raises(ConfigError, match=r"must be \(8,\) and bool, one value per row"):
         rows.reset(options={"reset_mask": first[:WORLDS]})
@@ -260,7 +260,7 @@ def test_torchrls_wrapper_takes_the_rows(autoreset: str) -> None:
     assert told["next", "done"].any(dim=1).all(), "each row ends and goes on"
 
 
-def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
+def test_the_spec_has_the_horizon_and_makes_an_equal_environment() -> None:
     rows = make()
     assert rows.spec.id == "cavmarl/mergeAgents-v6"
     assert rows.spec.max_episode_steps == 12

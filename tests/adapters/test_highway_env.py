@@ -76,7 +76,7 @@ def test_observations_have_highway_envs_shapes(
     assert env.reset(seed=0)[0].shape == shape
 
 
-def test_the_wheel_turns_to_the_right_where_it_does_there(make: Any) -> None:
+def test_steering_has_the_sign_of_highway_env(make: Any) -> None:
     config = {
         "action": {"type": "ContinuousAction"},
         "observation": {"type": "Kinematics", "features": ["y"], "normalize": False,
@@ -130,15 +130,15 @@ def test_faster_drives_faster_and_is_rewarded(make: Any) -> None:
     [
         ({"observation": {"type": "Grayscale"}}, "must be one of Kinematics"),
         ({"action": {"type": "Meta"}}, "must be one of DiscreteMetaAction"),
-        ({"vehicle_count": 5}, "vehicle_count: no such key"),
-        ({"controlled_vehicles": 2}, "drives many"),
+        ({"vehicle_count": 5}, "vehicle_count: unknown key"),
+        ({"controlled_vehicles": 2}, "for several agents"),
         ({"lanes_count": 7}, "must be one of 3, 4"),
-        ({"policy_frequency": 20}, "not be below the first"),
+        ({"policy_frequency": 20}, "not be below policy_frequency"),
         ({"duration": -1}, "duration = -1: must be above 0"),
         ({"action": {"type": "ContinuousAction", "steering_range": [-1, 2]}}, "symmetric"),
     ],
 )
-def test_what_it_does_not_have_is_refused(config: dict[str, Any], told: str, make: Any) -> None:
+def test_unsupported_features_are_refused(config: dict[str, Any], told: str, make: Any) -> None:
     with pytest.raises(ConfigError, match=told):
         make("highway", config=config)
 

@@ -58,7 +58,9 @@ def drive(step: Callable[[NDArray[np.float32]], Any], count: int) -> list[Any]:
 
 @pytest.mark.parametrize("autoreset", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 @pytest.mark.parametrize("workers", WORKERS)
-def test_in_the_workers_of_gymnasiums_async_vector(workers: int, autoreset: AutoresetMode) -> None:
+def test_worlds_run_in_workers_of_gymnasiums_async_vector(
+    workers: int, autoreset: AutoresetMode
+) -> None:
     make = partial(OneRow, workers)
     here = gymnasium.vector.SyncVectorEnv([make, make], autoreset_mode=autoreset)
     there = AsyncVectorEnv([make, make], autoreset_mode=autoreset, context="forkserver")
@@ -72,7 +74,7 @@ def test_in_the_workers_of_gymnasiums_async_vector(workers: int, autoreset: Auto
 
 
 @pytest.mark.parametrize("workers", WORKERS)
-def test_in_the_workers_of_stable_baselines3(workers: int) -> None:
+def test_worlds_run_in_workers_of_stable_baselines3(workers: int) -> None:
     sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     envs = sb3.common.vec_env
     make = partial(OneRow, workers)
@@ -89,7 +91,7 @@ def test_in_the_workers_of_stable_baselines3(workers: int) -> None:
 
 @pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
 @pytest.mark.parametrize("workers", WORKERS)
-def test_in_an_actor_of_ray(workers: int) -> None:
+def test_worlds_run_in_a_ray_actor(workers: int) -> None:
     ray = pytest.importorskip("ray", reason="needs the extra: ray")
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     try:

@@ -43,7 +43,7 @@ def cluster() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_worlds_agents_are_rllibs(mode: str) -> None:
+def test_rllib_gets_the_agents_of_the_world(mode: str) -> None:
     """All that the world says reaches RLlib once, though its episodes may end earlier."""
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
@@ -85,7 +85,7 @@ def test_the_worlds_agents_are_rllibs(mode: str) -> None:
     assert (handed_on > 0) == (mode == "open")
 
 
-def test_a_cut_is_no_end() -> None:
+def test_a_truncation_is_no_termination() -> None:
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
     env = CavRllibEnv(config("closed"))

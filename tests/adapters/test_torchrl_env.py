@@ -100,7 +100,7 @@ def test_agents_end_singly_and_their_world_goes_on() -> None:
     assert rollout["next", "truncated"][:, -1].all()
 
 
-def test_the_seed_decides() -> None:
+def test_the_seed_determines_the_results() -> None:
     def episode(env: Any, seed: int) -> Any:
         env.set_seed(seed)
         return env.rollout(20, wild, break_when_any_done=False)
@@ -131,7 +131,7 @@ def test_a_world_can_be_reset_before_it_is_over() -> None:
     assert rollout["step_count"].max() == 4
 
 
-def test_what_is_kept_is_not_overwritten() -> None:
+def test_kept_tensors_are_not_overwritten() -> None:
     env = make()
     state = env.reset()
     kept = [state.clone(), state]

@@ -28,7 +28,9 @@ def alone(costs: list[float], snapshot: LoadSnapshot, rule: BalanceRule | None =
 
 @settings(deadline=None)
 @given(st.lists(COSTS, min_size=3, max_size=7), st.integers(1, 3))
-def test_equal_workers_take_at_most_what_graham_says(costs: list[float], workers: int) -> None:
+def test_the_makespan_of_equal_workers_is_within_grahams_bound(
+    costs: list[float], workers: int
+) -> None:
     problem = alone(costs, idle_snapshot(workers), STRICT)
     bound = 4.0 / 3.0 - 1.0 / (3.0 * workers)
     assert make_plan(problem).placement.makespan_s <= bound * least_makespan_s(problem) + 1e-12
@@ -38,14 +40,14 @@ def test_equal_workers_take_at_most_what_graham_says(costs: list[float], workers
 @given(
     st.lists(COSTS, min_size=3, max_size=7), st.lists(st.floats(0.0, 0.85), min_size=2, max_size=3)
 )
-def test_unequal_workers_take_at_most_twice_the_least(
+def test_the_makespan_of_unequal_workers_is_at_most_twice_the_least(
     costs: list[float], cpus: list[float]
 ) -> None:
     problem = alone(costs, busy(*cpus), STRICT)
     assert make_plan(problem).placement.makespan_s <= 2.0 * least_makespan_s(problem) + 1e-12
 
 
-def test_most_small_plans_are_the_best_there_are() -> None:
+def test_most_small_plans_are_optimal() -> None:
     draw = random.Random(0)
     best = 0
     for _ in range(100):
@@ -56,7 +58,7 @@ def test_most_small_plans_are_the_best_there_are() -> None:
     assert best > 60
 
 
-def test_the_first_shard_goes_where_the_score_is_least() -> None:
+def test_the_first_shard_goes_to_the_worker_with_the_lowest_score() -> None:
     plan = make_plan(alone([1.0, 0.0, 0.0], busy(0.5, 0.1, 0.3)))
     assert plan.homes[0] == 1
 
@@ -67,7 +69,9 @@ def test_the_first_shard_goes_where_the_score_is_least() -> None:
     st.lists(st.floats(0.0, 0.85), min_size=1, max_size=4),
     st.randoms(use_true_random=False),
 )
-def test_no_order_counts(costs: list[float], cpus: list[float], draw: random.Random) -> None:
+def test_the_order_of_the_input_does_not_matter(
+    costs: list[float], cpus: list[float], draw: random.Random
+) -> None:
     problem = Problem(row(costs), grid(1, len(costs)), busy(*cpus))
     shards, workers = list(problem.shards), list(problem.snapshot.workers)
     draw.shuffle(shards)
@@ -86,18 +90,18 @@ def test_no_order_counts(costs: list[float], cpus: list[float], draw: random.Ran
         ([1e6, 1e-6, 1e6, 1e-6], [1e6, 1e6]),
     ],
 )
-def test_strange_loads(costs: list[float], loads: list[float]) -> None:
+def test_plans_for_extreme_costs_and_loads(costs: list[float], loads: list[float]) -> None:
     plan = make_plan(alone(costs, idle_snapshot(2)))
     assert sorted(worker.load_s for worker in plan.workers()) == pytest.approx(sorted(loads))
 
 
-def test_shards_that_cost_nothing_are_shared_out_by_number() -> None:
+def test_shards_without_cost_are_divided_by_number() -> None:
     plan = make_plan(alone([0.0] * 9, idle_snapshot(3)))
     assert [worker.shards for worker in plan.workers()] == [3, 3, 3]
     assert plan.imbalance == 1.0
 
 
-def test_worlds_stay_whole_where_that_is_about_as_fast() -> None:
+def test_worlds_stay_whole_if_that_is_about_as_fast() -> None:
     plan = make_plan(Problem(row([1.0] * 64, worlds=16), grid(2, 2), idle_snapshot(2)))
     assert plan.placement.cut_pairs == 0
     assert plan.imbalance == 1.0
@@ -130,13 +134,13 @@ def test_keeping_neighbours_together_costs_at_most_the_tolerance(
     assert make_plan(problem).placement.makespan_s <= bound * least_makespan_s(problem) + 1e-12
 
 
-def test_nobody_is_given_a_shard_while_he_is_excluded() -> None:
+def test_an_excluded_worker_gets_no_shard() -> None:
     plan = make_plan(alone([1.0] * 4, busy(0.0, 0.86, 0.0)))
     assert set(plan.homes) == {0, 2}
     assert [str(reason) for reason in plan.rejections] == ["worker 1: cpu 0.86 > 0.85"]
 
 
-def test_who_is_excluded_keeps_what_balance_does_not_take() -> None:
+def test_an_excluded_worker_keeps_the_shards_that_balancing_does_not_move() -> None:
     quiet = BalanceRule(tolerance=5.0)
     problem = replace(alone([1.0] * 4, busy(0.0, 0.86), quiet), present=(0, 0, 1, 1))
     assert make_plan(problem).moves == ()
@@ -146,7 +150,7 @@ def test_who_is_excluded_keeps_what_balance_does_not_take() -> None:
     assert {move.source for move in drained.moves} == {1}
 
 
-def test_who_has_nothing_left_is_slow_and_not_endless() -> None:
+def test_a_fully_used_worker_is_slow_but_its_tick_is_finite() -> None:
     used_up = Candidate(1, Utilisation(1.0, 1.0, 1.0))
     snapshot = LoadSnapshot((*busy(0.0).workers, used_up), "none", "")
     problem = replace(alone([1.0] * 3, snapshot), present=(0, 1, 1))
@@ -183,7 +187,7 @@ def test_nothing_moves_within_the_tolerance() -> None:
 @given(
     st.lists(COSTS, min_size=4, max_size=12), st.integers(1, 5), st.randoms(use_true_random=False)
 )
-def test_rounds_of_constant_loads_are_bounded_help_and_come_to_rest(
+def test_rounds_with_constant_loads_improve_and_end(
     costs: list[float], most: int, draw: random.Random
 ) -> None:
     snapshot = idle_snapshot(3)
@@ -212,7 +216,7 @@ def test_noise_moves_nothing() -> None:
     assert moves == 0
 
 
-def test_a_load_that_goes_to_and_fro_is_not_followed() -> None:
+def test_an_alternating_load_moves_no_shards() -> None:
     smooth = SmoothCosts(newest=0.1)
     plan = make_plan(alone([1.0] * 8, idle_snapshot(2)))
     moves = []
@@ -229,7 +233,7 @@ def _next(plan: Plan, costs: list[float]) -> Plan:
     return make_plan(replace(plan.problem, shards=row(costs), present=plan.homes))
 
 
-def test_a_jam_that_stays_is_taken_apart() -> None:
+def test_a_lasting_jam_is_divided_among_workers() -> None:
     plan = make_plan(Problem(row([1.0] * 16), grid(4, 4), idle_snapshot(4)))
     jam = [8.0 if zone in (0, 1, 4, 5) else 1.0 for zone in range(16)]
     rounds = [plan := _next(plan, jam) for _ in range(10)]
@@ -245,12 +249,12 @@ def test_a_jam_that_stays_is_taken_apart() -> None:
         ({"shards": row([1.0, -1.0])}, "zone 1: cost_s = -1"),
         ({"shards": row([1.0, math.inf])}, "zone 1: cost_s = inf"),
         ({"shards": row([1.0, 1.0, 1.0])}, "zone 2: the zone must be below 2"),
-        ({"shards": (*row([1.0]), *row([2.0]))}, "world 0, zone 0: is named twice"),
+        ({"shards": (*row([1.0]), *row([2.0]))}, "world 0, zone 0: is repeated"),
         ({"snapshot": idle_snapshot(3)}, "3 workers for 2 shards"),
         ({"present": (0,)}, "1 present workers of 2 shards"),
     ],
 )
-def test_what_cannot_be_placed_is_refused(change: dict[str, object], said: str) -> None:
+def test_invalid_problems_are_refused(change: dict[str, object], said: str) -> None:
     problem = Problem(row([1.0, 1.0]), ((1,), (0,)), idle_snapshot(2))
     with pytest.raises(ConfigError, match=said):
         replace(problem, **change)  # type: ignore[arg-type]
@@ -269,7 +273,7 @@ def test_rules_are_checked(rule: dict[str, float], said: str) -> None:
         BalanceRule(**rule)  # type: ignore[arg-type]
 
 
-def test_weights_change_who_is_given_more() -> None:
+def test_weights_change_the_distribution() -> None:
     full = LoadSnapshot(
         (Candidate(0, Utilisation(0.0, 0.8)), Candidate(1, Utilisation(0.4, 0.0))), "none", ""
     )

@@ -52,7 +52,7 @@ def test_another_snapshot_gives_another_plan(plan: Plan) -> None:
     assert replan(first, idle_snapshot(1)).homes == (0,) * 8
 
 
-def test_what_follows_from_a_plan(plan: Plan) -> None:
+def test_values_that_are_derived_from_a_plan(plan: Plan) -> None:
     document = plan.to_dict()
     assert [worker["worker"] for worker in document["workers"]] == [0, 1, 2]
     assert sum(worker["load_s"] for worker in document["workers"]) == pytest.approx(0.014)
@@ -98,12 +98,12 @@ def test_zones_are_named_by_runs() -> None:
         ({"neighbors": [["x"], [], [], []]}, "neighbors is 'x'"),
     ],
 )
-def test_what_is_no_plan_is_refused(plan: Plan, change: dict[str, Any], said: str) -> None:
+def test_a_file_without_a_plan_is_refused(plan: Plan, change: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         plan_from_dict(plan.to_dict() | change)
 
 
-def test_a_share_that_is_none_is_refused_in_a_stored_plan(plan: Plan) -> None:
+def test_an_invalid_share_in_a_stored_plan_is_refused(plan: Plan) -> None:
     document = plan.to_dict()
     document["snapshot"]["workers"][0]["use"]["cpu"] = 12.0
     with pytest.raises(ConfigError, match="utilisation cpu = 12"):
@@ -124,7 +124,7 @@ def test_a_share_that_is_none_is_refused_in_a_stored_plan(plan: Plan) -> None:
         (("snapshot", "workers", 0, "available"), 1, "available is 1, must be true or false"),
     ],
 )
-def test_a_value_of_a_plan_that_is_none_is_named(
+def test_an_invalid_value_in_a_stored_plan_is_named(
     plan: Plan, path: tuple[str | int, ...], value: object, said: str
 ) -> None:
     document = plan.to_dict()

@@ -18,13 +18,13 @@ def balancer() -> Balancer:
     return Balancer(Problem(equal_costs(4, 4), grid(2, 2), idle_snapshot(2)))
 
 
-def test_worlds_of_which_nothing_is_known_are_shared_out_whole(balancer: Balancer) -> None:
+def test_unmeasured_worlds_are_distributed_whole(balancer: Balancer) -> None:
     homes = balancer.plan.homes
     assert [len({*homes[first : first + 4]}) for first in (0, 4, 8, 12)] == [1, 1, 1, 1]
     assert homes.count(0) == homes.count(1) == 8
 
 
-def test_a_round_goes_by_what_was_measured(balancer: Balancer) -> None:
+def test_a_round_uses_the_measured_costs(balancer: Balancer) -> None:
     heavy = balancer.plan.homes[0]
     costs = [4.0 if home == heavy else 1.0 for home in balancer.plan.homes]
     balancer.measure(reversed(row(costs, worlds=4)))
@@ -52,7 +52,7 @@ def test_a_round_may_go_by_other_costs_and_another_rule(balancer: Balancer) -> N
     assert plan.problem.rule == strict
 
 
-def test_who_is_lost_is_replaced_in_a_round(balancer: Balancer) -> None:
+def test_shards_of_a_lost_worker_are_placed_in_the_next_round(balancer: Balancer) -> None:
     left = LoadSnapshot(idle_snapshot(2).workers[1:], "none", "")
     assert set(balancer.round(left).homes) == {1}
 

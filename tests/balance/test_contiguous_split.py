@@ -80,7 +80,7 @@ def test_rounds_move_little_and_get_near_the_best_row(problem: Problem) -> None:
     assert plan.placement.makespan_s <= best_row_s(problem) + costliest / slowest + 1e-9
 
 
-def test_what_one_has_too_much_goes_on_from_worker_to_worker() -> None:
+def test_surplus_shards_are_passed_from_worker_to_worker() -> None:
     snapshot = idle_snapshot(3)
     problem = replace(worlds([3.0, 3.0, 2.0, 2.0, 1.0], snapshot), present=(0, 0, 1, 1, 2))
     plan = make_plan(problem)
@@ -95,7 +95,7 @@ def test_equal_worlds_are_shared_out_evenly() -> None:
     assert make_plan(nothing).homes == (0, 0, 0, 1, 1, 1)
 
 
-def test_who_is_excluded_is_given_nothing_more() -> None:
+def test_an_excluded_worker_gets_no_more_shards() -> None:
     present = (0, 0, 0, 0, 1, 2)
     problem = replace(worlds([1.0] * 6, busy(0.0, 0.9, 0.0)), present=present)
     assert make_plan(problem).homes == present  # the way to worker 2 leads through worker 1
@@ -103,7 +103,7 @@ def test_who_is_excluded_is_given_nothing_more() -> None:
         make_plan(replace(problem, present=None))
 
 
-def test_a_worker_that_is_lost_begins_a_new_row() -> None:
+def test_the_loss_of_a_worker_starts_a_new_row() -> None:
     balancer = Balancer(worlds([1.0] * 6, idle_snapshot(3)))
     left = LoadSnapshot(idle_snapshot(3).workers[1:], "none", "")
     assert balancer.round(left).homes == (1, 1, 1, 2, 2, 2)
@@ -114,7 +114,7 @@ def test_workers_that_are_in_no_row_are_refused() -> None:
         replace(worlds([1.0] * 3, idle_snapshot(2)), present=(0, 1, 0))
 
 
-def test_a_row_is_read_as_it_was_written() -> None:
+def test_a_plan_in_a_row_is_read_as_it_was_written() -> None:
     problem = replace(
         worlds([1.0, 1.0, 4.0], idle_snapshot(2)), present=(0, 1, 1), cost_source="number"
     )

@@ -36,7 +36,7 @@ def test_zones_follow_the_measured_cost(town: tuple[object, np.ndarray]) -> None
     assert found.moved == moved > 0
 
 
-def test_other_zones_keep_their_numbers_where_they_can(town: tuple[object, np.ndarray]) -> None:
+def test_new_zones_keep_old_numbers_if_possible(town: tuple[object, np.ndarray]) -> None:
     network, places = town
     halves = cut_map(network, "strips", 2)  # type: ignore[arg-type]
     for rects in (halves.rects, halves.rects[::-1]):
@@ -47,7 +47,7 @@ def test_other_zones_keep_their_numbers_where_they_can(town: tuple[object, np.nd
         assert found.moved < len(places) / 2
 
 
-def test_zones_stay_where_they_are_good_enough(town: tuple[object, np.ndarray]) -> None:
+def test_zones_do_not_change_if_the_gain_is_small(town: tuple[object, np.ndarray]) -> None:
     network, places = town
     first = cut_map(network, "grid", 4)  # type: ignore[arg-type]
     counts = np.bincount(first.zones_of(places), minlength=4)

@@ -34,7 +34,7 @@ def fleet(*uses: tuple[float, float, float]) -> list[Candidate]:
     return [Candidate(number, Utilisation(*use)) for number, use in enumerate(uses)]
 
 
-def test_the_defaults_are_the_papers() -> None:
+def test_the_default_rule_is_that_of_the_paper() -> None:
     assert LoadRule().weights == (0.6, 0.2, 0.2)
     assert LoadRule().thresholds == (0.85, 0.90, 0.95)
 
@@ -72,7 +72,7 @@ def test_a_threshold_is_strict_to_the_last_bit(resource: str, threshold: float) 
 
 
 @given(FLEETS)
-def test_nobody_above_a_threshold_is_chosen_and_nobody_admissible_is_better(
+def test_the_best_worker_below_all_thresholds_is_chosen(
     workers: list[Candidate],
 ) -> None:
     def fits(use: Utilisation) -> bool:
@@ -91,7 +91,7 @@ def test_nobody_above_a_threshold_is_chosen_and_nobody_admissible_is_better(
 
 
 @given(FLEETS)
-def test_the_order_of_workers_never_counts(workers: list[Candidate]) -> None:
+def test_the_order_of_workers_does_not_matter(workers: list[Candidate]) -> None:
     def choose(order: tuple[Candidate, ...]) -> object:
         try:
             return select(order)
@@ -154,7 +154,7 @@ def test_the_margin_itself_is_near_enough() -> None:
     assert select(workers, LoadRule(margin=math.nextafter(0.1, 0.0)), preferred=1).worker == 0
 
 
-def test_nobody_admissible_says_every_reason() -> None:
+def test_the_error_without_admissible_workers_has_every_reason() -> None:
     workers = [*fleet((0.9, 0.95, 0.1)), Candidate(1, Utilisation(0.0, 0.0), available=False)]
     with pytest.raises(NoAdmissibleWorkerError, match="no admissible worker") as caught:
         select(workers)
@@ -166,7 +166,7 @@ def test_nobody_admissible_says_every_reason() -> None:
     assert all(str(reason) in str(caught.value) for reason in caught.value.rejections)
 
 
-def test_nobody_at_all_is_nobody_admissible() -> None:
+def test_without_workers_no_worker_is_admissible() -> None:
     with pytest.raises(NoAdmissibleWorkerError, match="there are no workers"):
         select([])
 
@@ -176,7 +176,7 @@ def test_an_unknown_preferred_worker_is_refused() -> None:
         select(fleet((0.0, 0.0, 0.0)), preferred=7)
 
 
-def test_a_worker_twice_is_refused() -> None:
+def test_a_repeated_worker_is_refused() -> None:
     with pytest.raises(ConfigError, match="must be named once"):
         select([Candidate(0, Utilisation(0.0, 0.0))] * 2)
 
@@ -210,7 +210,7 @@ def test_weights_are_checked(weights: tuple[float, float, float], said: str) -> 
 
 
 @pytest.mark.parametrize("weights", [WEIGHTS, (1.0, 0.0, 0.0), (0.1, 0.2, 0.7), (1 / 3,) * 3])
-def test_weights_that_sum_to_one_are_taken(weights: tuple[float, float, float]) -> None:
+def test_weights_that_sum_to_one_are_accepted(weights: tuple[float, float, float]) -> None:
     assert LoadRule(weights).weights == weights
 
 

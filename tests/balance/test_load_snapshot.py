@@ -27,7 +27,7 @@ def test_a_snapshot_of_this_machine_is_of_shares() -> None:
     assert found.origin == "measured"
 
 
-def test_without_a_tool_for_gpus_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_nvidia_smi_there_is_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     found = take_snapshot({0: None}, interval_s=0.01)
     assert found.gpu_source == "none"
@@ -83,7 +83,7 @@ def test_a_snapshot_goes_to_json_and_back() -> None:
     assert snapshot_from_dict(json.loads(json.dumps(taken.to_dict()))) == taken
 
 
-def test_no_worker_or_one_twice_is_no_snapshot() -> None:
+def test_a_snapshot_needs_distinct_workers() -> None:
     with pytest.raises(ConfigError, match="no workers"):
         idle_snapshot(0)
     with pytest.raises(ConfigError, match="must be named once"):

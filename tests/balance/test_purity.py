@@ -14,7 +14,7 @@ IMPURE = {"datetime", "multiprocessing", "os", "random", "shutil", "socket", "su
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_what_a_file_imports(path: Path) -> None:
+def test_pure_modules_import_only_allowed_modules(path: Path) -> None:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -31,5 +31,5 @@ def test_what_a_file_imports(path: Path) -> None:
             assert path.stem == "probe" or top not in IMPURE, name
 
 
-def test_there_are_files() -> None:
+def test_the_list_of_files_is_not_empty() -> None:
     assert len(FILES) > 10

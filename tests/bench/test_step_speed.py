@@ -134,10 +134,10 @@ def test_numbers_out_of_range_are_refused(wrong: dict[str, int]) -> None:
         measure_step_speed(**wrong)
 
 
-def test_without_highway_env_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_highway_env_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(module: str) -> None:
         raise ModuleNotFoundError(name=module)
 
     monkeypatch.setattr("cavmarl.core.errors.importlib.import_module", absent)
-    with pytest.raises(MissingExtraError, match=r"pip install '\.\[bench\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install .*\[bench\]'"):
         measure_step_speed(agents=1)

@@ -58,7 +58,7 @@ def test_ratios_are_of_the_same_turn() -> None:
     ("wrong", "said"),
     [({"agents": 0}, "agents = 0"), ({"repeats": 0}, "repeats"), ({"worlds": 3}, "3 worlds")],
 )
-def test_numbers_that_cannot_be_are_refused(wrong: dict[str, int], said: str) -> None:
+def test_invalid_numbers_are_refused(wrong: dict[str, int], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         measure_training(**wrong)
 

@@ -51,7 +51,7 @@ def row_of(found: BalanceReplay, name: str) -> StrategyResult:
     return row
 
 
-def test_what_static_and_perfect_take_is_known_for_loads_that_stand_still(
+def test_static_and_perfect_times_of_constant_loads(
     network: RoadNetwork,
 ) -> None:
     found = replay_traces([still(network, [30, 30, 10, 10], idle_snapshot(2))], FREE)
@@ -64,7 +64,7 @@ def test_what_static_and_perfect_take_is_known_for_loads_that_stand_still(
     assert row_of(found, "balanced").verdict == "one trace tells nothing"
 
 
-def test_where_nothing_can_be_won_nothing_moves(network: RoadNetwork) -> None:
+def test_without_a_possible_gain_nothing_moves(network: RoadNetwork) -> None:
     trace = still(network, [20, 20, 20, 20], idle_snapshot(2))
     found = replay_traces([trace, trace], BalanceRule())
     for row in found.rows:
@@ -156,7 +156,7 @@ def test_an_environment_can_be_recorded() -> None:
     assert all(row.ratio > 0.0 for row in found.rows)
 
 
-def test_what_cannot_be_replayed_is_refused(network: RoadNetwork) -> None:
+def test_recordings_that_cannot_be_replayed_are_refused(network: RoadNetwork) -> None:
     with pytest.raises(ConfigError, match="at least one"):
         replay_traces([], FREE)
     with pytest.raises(ConfigError, match="rounds = 3"):

@@ -34,7 +34,7 @@ def test_more_programs_than_worlds() -> None:
         measure_ceiling("ring", worlds=2, programs=3)
 
 
-def test_a_program_that_cannot_begin(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_program_that_cannot_start_is_an_error(capfd: pytest.CaptureFixture[str]) -> None:
     before = {*multiprocessing.active_children()}
     with pytest.raises(WorkerError, match="has ended"):
         measure_ceiling("no such place", worlds=2)
@@ -66,7 +66,7 @@ def test_the_program_compares_workers(tmp_path: Path, capsys: pytest.CaptureFixt
         (("--at-least", "-1"), "--at-least -1: must be a number above 0"),
     ],
 )
-def test_numbers_that_cannot_be_are_refused(
+def test_invalid_numbers_are_refused(
     words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:

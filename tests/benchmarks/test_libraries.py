@@ -11,7 +11,7 @@ def test_every_view_is_measured_or_says_how_to_install_it() -> None:
     assert [row["view"] for row in found.rows] == list(libraries.VIEWS)
     for row in found.rows:
         if row["step_ms"] is None:
-            assert "pip install '.[" in row["missing"]
+            assert "pip install" in row["missing"]
         else:
             assert row["step_ms"] > 0.0
     assert found.to_dict()["agents"] == 3

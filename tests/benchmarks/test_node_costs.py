@@ -60,7 +60,7 @@ def test_the_parameters_are_found() -> None:
     assert costs.tick(10**6, 16, 1e-3, 64) == pytest.approx(KNOWN.tick(10**6, 16, 1e-3, 64))
 
 
-def test_what_would_be_negative_is_none() -> None:
+def test_negative_estimates_become_none() -> None:
     samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
     cheap = [replace(s, caller_s=1e-4 / max(s.nodes, 1)) for s in samples]
     assert fitted(cheap, KNOWN.caches).caller_node_s == 0.0
@@ -122,5 +122,5 @@ def test_too_few_runs_are_refused() -> None:
     [("2500", "1,2"), ("2500,2500", "1,2"), ("100,2500", "1,2"), ("2500,9000", "2")],
 )
 def test_too_few_runs_are_refused_before_the_first(vehicles: str, nodes: str) -> None:
-    with pytest.raises(ConfigError, match="two sizes from 400 on, and the nodes 1 and 2"):
+    with pytest.raises(ConfigError, match="two sizes of at least 400, and the nodes 1 and 2"):
         benchmark.measure(vehicles, nodes)

@@ -52,5 +52,5 @@ def test_a_city_over_nodes_takes_turns(tmp_path: Path) -> None:
     assert turn.ticks_per_step == 2
 
 
-def test_both_are_listed() -> None:
+def test_both_programs_are_listed() -> None:
     assert {"node_latencies", "node_limit"} <= set(programs())

@@ -39,7 +39,7 @@ from tests.support.sumo_worlds import tiny_file
 pytestmark = pytest.mark.integration
 
 
-def test_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_programs_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     main([])
     shown = capsys.readouterr().out
     assert {command.name for command in app.registered_commands} == set(KEPT)
@@ -169,7 +169,7 @@ def test_the_phases_are_the_step() -> None:
     assert found.facts["plain_ns"] > 0.0
 
 
-def test_one_world_is_split() -> None:
+def test_worlds_over_several_zones_are_measured() -> None:
     found = splits.measure("ring", "9,12", agents=3, steps=2, repeats=2)
     assert [row["vehicles"] for row in found.rows] == [9, 12]
     assert all(len(row["split_ms"]) == 2 for row in found.rows)
@@ -219,7 +219,7 @@ def test_every_sensor_of_the_rig_is_measured() -> None:
         (splits.measure, {"env": "ring", "vehicles": "many"},
          "--vehicles many: must be"),
         (splits.measure, {"env": "ring", "vehicles": "2", "agents": 3},
-         "2 vehicles: agents alone are 3"),
+         "2 vehicles: must be at least the 3 agents"),
         (vectorization.measure, {"agents": 5, "workers": 2}, "5 agents over 2 workers"),
         (node_latencies.measure, {"env": "ring", "nodes": 1}, "--nodes 1"),
         (node_limit.measure, {"vehicles": 1}, "--vehicles 1: must be at least 800"),
@@ -231,7 +231,7 @@ def test_every_sensor_of_the_rig_is_measured() -> None:
         (selection.measure, {"choices": 0}, "choices = 0"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_measured_is_refused(
+def test_unmeasurable_settings_are_refused(
     measure: Callable[..., BenchmarkReport], arguments: dict[str, Any], told: str
 ) -> None:
     with pytest.raises(ConfigError, match=told):

@@ -46,7 +46,7 @@ def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 3.0, 1e3, 1e6])
-def test_rigs_of_any_load_can_be(factor: float) -> None:
+def test_rigs_of_any_load_are_valid(factor: float) -> None:
     rig = load_rig(find_settings("rig", "ten_sensors"))
     plain, _ = load_config("grid4x4", overrides={"rig": rig, "clock.ctrl_dt_s": 0.05})
     heavy = scaled(plain, dict.fromkeys(rig, factor), 20.0)
@@ -67,6 +67,6 @@ def test_a_loaded_rig_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 
 @pytest.mark.parametrize("load", [0.0, -1.0, 1e5])
-def test_a_load_that_cannot_be_is_refused(load: float, tmp_path: Path) -> None:
+def test_an_invalid_load_is_refused(load: float, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="must be above 0"):
         rig_load.measure("grid4x4", load, tmp_path / "rig.yaml")

@@ -89,7 +89,7 @@ def test_resources_are_those_of_all_processes(found: SensorBench) -> None:
         assert window.got_bytes > 6 * 32 * 18 * 3
 
 
-def test_both_placements_are_told(found: SensorBench) -> None:
+def test_both_placements_are_reported(found: SensorBench) -> None:
     shares = found.shares(2)
     assert shares["in_turn"].homes == (0, 1, 0, 1)
     assert max(shares["cost"].loads_s) <= max(shares["in_turn"].loads_s)
@@ -159,12 +159,12 @@ def test_files_are_tried_before_any_work(
         {"warmup": -1},
     ],
 )
-def test_numbers_that_cannot_be_are_refused(numbers: dict[str, Any]) -> None:
+def test_invalid_numbers_are_refused(numbers: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         measure_sensor_workers("grid4x4", RIG, **numbers)
 
 
-def test_a_rig_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_rig_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no rig or file 'nothing'"):
         find_settings("rig", "nothing")
     (tmp_path / "list.yaml").write_text("wheels: 20\n")

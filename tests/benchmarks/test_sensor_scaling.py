@@ -133,6 +133,6 @@ def test_runs_that_cannot_be_compared_are_refused(runs: dict[int, list[Series]])
         [Measured(1, 0.0, 0.0, 0.0)],
     ],
 )
-def test_what_cannot_be_is_refused(measured: list[Measured]) -> None:
+def test_invalid_arguments_are_refused(measured: list[Measured]) -> None:
     with pytest.raises(ConfigError):
         scaling_table(measured)

@@ -42,7 +42,7 @@ def test_the_phases_are_the_tick(make: Callable[[int], Simulation]) -> None:
         assert not {"suggest", "loads", "vehicles"} & row["calls"].keys()
 
 
-def test_what_zones_hold_is_counted(make: Callable[[int], Simulation]) -> None:
+def test_vehicles_and_ghosts_of_zones_are_counted(make: Callable[[int], Simulation]) -> None:
     one, four = measure_sharding(make, [4], after_s=20, repeats=2).rows
     alone = {"ghosts": 0.0, "imbalance": 1.0, "largest_share": 1.0, "ratio": 1.0}
     alone_too = {"migrations": 0.0, "migration_us": None}
@@ -58,7 +58,7 @@ def test_what_zones_hold_is_counted(make: Callable[[int], Simulation]) -> None:
     assert four["migration_us"] is not None
 
 
-def test_agents_are_driven_and_their_deciding_is_no_phase() -> None:
+def test_agents_are_driven_and_their_policy_is_no_phase() -> None:
     make = world_maker("ring", agents=3, background=2, seconds=60)
     (found,) = measure_sharding(make, [1], after_s=1, repeats=1).rows
     assert found["vehicles"] == 5.0
@@ -124,7 +124,7 @@ def test_the_command_shows_and_writes(
     assert [row["zones"] for row in json.loads(path.read_text())["rows"]] == [1, 4]
 
 
-def test_the_command_says_that_worlds_differ(
+def test_the_command_reports_worlds_that_differ(
     capsys: pytest.CaptureFixture[str], demand: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Simulation, "state_hash", lambda self: hex(id(self)))
@@ -144,7 +144,7 @@ def test_the_command_says_that_worlds_differ(
         (("-d", "none.rou.xml", "--agents", "2"), "omit --agents and --background"),
     ],
 )
-def test_the_command_refuses(
+def test_the_command_refuses_invalid_options(
     capsys: pytest.CaptureFixture[str], words: tuple[str, ...], said: str
 ) -> None:
     assert _run("ring", *words) == 2

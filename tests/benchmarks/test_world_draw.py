@@ -53,7 +53,7 @@ def test_every_feature_is_drawn_and_can_be_left_out() -> None:
 
 
 @pytest.mark.parametrize("without", [("rightward",), tuple(KINDS), tuple(SIGNALS)])
-def test_what_cannot_be_left_out_is_refused(without: tuple[str, ...]) -> None:
+def test_features_that_cannot_be_left_out_are_refused(without: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match="--without"):
         draw_all(without)
 

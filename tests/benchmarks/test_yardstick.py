@@ -49,7 +49,7 @@ def test_the_table_has_room_for_all_columns_on_a_narrow_terminal(
     assert own == ["bologna_buslanes", "Krauss", "100", "1234", *["0.00"] * 5, "0"]
 
 
-def test_what_touches_on_shared_ground_is_counted_apart(tmp_path: Path) -> None:
+def test_contacts_on_shared_ground_are_counted_separately(tmp_path: Path) -> None:
     options = ("--grid", "--grid.number=3", "--grid.length=80", "--default.spreadtype=center")
     network = read_network(netgenerate(tmp_path / "bidi.net.xml", *options))
     ground = yardstick.SharedGround(network)
@@ -71,7 +71,7 @@ def test_what_touches_on_shared_ground_is_counted_apart(tmp_path: Path) -> None:
     assert ground.holds(rows[0], rows, 0.1)
 
 
-def test_a_bound_that_is_broken_is_told() -> None:
+def test_a_broken_bound_is_reported() -> None:
     one = yardstick.Drive(trips=2000)
     one.counts["off_road"] = 1
     assert one.holds, "0.05 % are allowed"

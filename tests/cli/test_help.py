@@ -36,7 +36,7 @@ def test_help_ends_with_examples_that_are_understood(words: str) -> None:
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_options_say_what_their_value_is(words: str) -> None:
+def test_help_describes_the_value_of_each_option(words: str) -> None:
     command = COMMANDS[words]
     context = command.make_context(words, [], resilient_parsing=True)
     for parameter in command.params:

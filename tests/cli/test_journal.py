@@ -24,7 +24,9 @@ def words(capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
-def test_it_counts_and_names_the_owners(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_counts_events_and_names_the_owners(
+    written: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("journal", str(written)) == 0
     said = words(capsys)
     for part in (
@@ -39,7 +41,7 @@ def test_it_counts_and_names_the_owners(written: Path, capsys: pytest.CaptureFix
     assert "note" not in said
 
 
-def test_it_prints_the_owners_of_a_tick(
+def test_the_command_prints_the_owners_of_a_tick(
     written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "owners.json"
@@ -48,7 +50,9 @@ def test_it_prints_the_owners_of_a_tick(
     assert json.loads(out.read_text()) == {"tick": 4, "owners": [[7, 1, 1, 0], [8, 1, 0, 2]]}
 
 
-def test_what_was_left_out_is_named(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dropped_incomplete_line_is_named(
+    written: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     written.write_bytes(written.read_bytes()[:-5])
     assert run("journal", str(written)) == 0
     said = words(capsys)

@@ -96,7 +96,9 @@ def test_a_followers_fault_ends_that_follower(
     assert "built-in driver" in capsys.readouterr().err
 
 
-def test_the_run_may_end_with_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_followers_fault_can_end_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert led(tmp_path / "s", FAULTS["dying"], "--on-lost", "end") == 2
     assert "error" in capsys.readouterr().err
 

@@ -136,7 +136,7 @@ def test_a_refused_evaluation_leaves_no_folder(
     assert not list(tmp_path.iterdir())
 
 
-def test_verify_says_for_each_number_of_zones_that_it_is_equal(
+def test_verify_reports_equality_for_each_number_of_zones(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "found.json"
@@ -178,7 +178,7 @@ def test_verify_fails_and_names_the_first_difference_of_each(
     assert f"{difference['values'][0]} undivided, {difference['values'][1]} divided" in said
 
 
-def test_verify_determinism_says_equal_and_gives_the_hash(
+def test_verify_determinism_reports_equality_and_the_hash(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "found.json"
@@ -262,9 +262,9 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("bench", "workers"), "cavmarl bench workers was moved"),
         (("bench", "traffic", "--worlds=3"), "run `python -m benchmarks traffic_worlds"),
         (("bench", "traffic", "some.net.xml"), "Missing option '--demand'"),
-        (("demo", "--minutes", "0"), "--minutes must be above 0"),
+        (("demo", "--decisions", "0"), "--decisions must be from 1"),
         (("demo", "--seconds", "-3"), "--seconds above 0"),
-        (("demo", "--minutes", "nan"), "--minutes must be above 0"),
+        (("demo", "--seconds", "nan"), "--seconds above 0"),
         (("demo", "--seed", "-1"), "seed = -1: must be"),
         (("demo", "--out", "/dev/null/demo"), "/dev/null/demo: cannot be written"),
         (("list", "--nonsense"), "No such option"),
@@ -342,13 +342,13 @@ def test_a_window_without_a_display_is_refused(
     assert "use --video FILE" in refusal(capsys, "view", "ring", "--seconds", "0.1")
 
 
-def test_a_window_opens_where_sdl_is_told_how(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_opens_with_the_video_driver_of_sdl(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert run("view", "merge", "--seconds", "0.1", *QUICK) == 0
 
 
-def test_a_folder_without_a_driver_says_what_is_missing(
+def test_the_error_for_a_folder_without_a_driver_names_the_missing_file(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     said = refusal(capsys, "evaluate", "merge", "--policy", str(tmp_path), *QUICK)
@@ -379,7 +379,7 @@ def test_view_films_a_drive(tmp_path: Path) -> None:
     assert json.loads(stats.read_text())["traffic"]["departed"] >= 1
 
 
-def test_bench_compares_and_says_whether_it_held(
+def test_bench_compares_and_reports_whether_bounds_hold(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     pytest.importorskip("highway_env")
@@ -390,7 +390,7 @@ def test_bench_compares_and_says_whether_it_held(
     assert json.loads(path.read_text())["ratio"] > 0.0
 
 
-def test_train_says_what_programs_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_lists_its_programs(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("train") == 0
     shown = capsys.readouterr().out
     assert set(programs()) == {path.stem for path in (ROOT / "train").glob("*.py")}

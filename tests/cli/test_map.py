@@ -107,7 +107,7 @@ def test_a_network_has_a_networks_name(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("command", ["build", "check"])
-def test_what_is_no_map_is_told_what_is_one(tmp_path: Path, command: str) -> None:
+def test_the_error_for_a_file_that_is_no_map_names_map_files(tmp_path: Path, command: str) -> None:
     path = tmp_path / "README.md"
     path.write_text("# A text\n")
     error = runner.invoke(app, [command, str(path)]).exception

@@ -31,9 +31,7 @@ def test_a_plan_is_printed_kept_and_made_again(
     assert "the recomputed plan differs" in capsys.readouterr().err
 
 
-def test_a_plan_that_cannot_be_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_an_impossible_plan_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     few = ("plan", "ring", "--zones", "2", "--snapshot", "idle", *QUICK)
     assert "3 workers for 2 shards" in refusal(capsys, *few, "--workers", "3")
     assert "--workers 0" in refusal(capsys, *few, "--workers", "0")
@@ -45,7 +43,9 @@ def test_a_plan_that_cannot_be_is_refused(
     assert "no schema" in refusal(capsys, "plan", "ring", "--snapshot", str(path))
 
 
-def test_nobody_admissible_says_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_the_error_without_admissible_workers_is_printed(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     path = tmp_path / "plan.json"
     words = ("plan", "ring", "--zones", "2", "--workers", "2", *QUICK, "--snapshot")
     assert run(*words, "idle", "--json", str(path)) == 0
@@ -60,7 +60,7 @@ def test_nobody_admissible_says_so(capsys: pytest.CaptureFixture[str], tmp_path:
     assert "has 2 workers, but --workers is 3" in refusal(capsys, *three, str(path))
 
 
-def test_zones_can_be_cut_by_what_was_measured(
+def test_zones_can_be_cut_by_measured_costs(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "zones.json"

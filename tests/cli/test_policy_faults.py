@@ -44,7 +44,7 @@ def test_a_fault_of_a_policy_shows_the_lines_of_the_policy(
     _see_the_one_line(capsys.readouterr().err)
 
 
-def test_one_that_is_no_common_exception_does_too(
+def test_an_uncommon_exception_of_a_policy_shows_its_lines(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     script = policy_that(tmp_path, "raise BaseException('ZeroDivisionError')")

@@ -29,7 +29,7 @@ def test_the_list_names_all_with_their_parameters(
         assert {"name", "default", "range", "what"} == set(about["parameters"][0])
 
 
-def test_a_run_says_what_became_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_prints_its_outcome(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pygame")
     words = ["scenario", "run", "pedestrian_crossing", "--param", "occluded=true"]
     kept, seen = tmp_path / "run.json", tmp_path / "closest.png"
@@ -56,7 +56,9 @@ def test_a_run_in_which_actors_touch_one_another_has_failed(
     assert (found["verdict"], found["verdicts"]) == ("actors collided", ["passed"])
 
 
-def test_a_sweep_says_who_passes_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sweep_prints_which_drivers_pass_on_each_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     kept = tmp_path / "sweep.json"
     words = ["scenario", "sweep", "road_closure", "--map", "grid4x4", "--map", "ring"]
     assert code(*words, "--seeds", "2", "--json", str(kept)) == 0
@@ -89,6 +91,8 @@ def test_a_run_is_played_to_several_agents(capsys: pytest.CaptureFixture[str]) -
         (["pedestrian_crossing", "--picture", "crossing.jpg"], "must end in .png"),
     ],
 )
-def test_wrong_use_is_said(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_use_is_reported(
+    words: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert code("scenario", "run", *words) == 2
     assert says in " ".join(capsys.readouterr().err.split())

@@ -35,7 +35,9 @@ def test_without_a_check_the_checks_are_named(
     assert f"verify {words[1]}: the name of a check must come first: {CHECKS}" in said
 
 
-def test_the_command_of_another_name(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_former_command_name_is_refused_with_its_replacement(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     said = refusal(capsys, "verify-determinism", "merge")
     assert "use cavmarl verify determinism" in said
 
@@ -77,7 +79,7 @@ def test_each_check_has_the_options_that_apply(
         (("nowhere", "--faults", "simulated"), "nowhere"),
     ],
 )
-def test_what_cannot_be_is_refused(
+def test_invalid_arguments_are_refused(
     words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert message in refusal(capsys, "verify", "nodes", *words)

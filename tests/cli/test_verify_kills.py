@@ -15,7 +15,7 @@ from tests.cli.test_main import refusal, run
 SMALL = ("ring", "--agents", "3", "--background", "4", "--worlds", "2")
 
 
-def test_workers_are_killed_and_nobody_can_tell(
+def test_killed_workers_change_no_result(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "kills.json"
@@ -28,7 +28,7 @@ def test_workers_are_killed_and_nobody_can_tell(
     assert all(0.0 <= kill["replaced_ms"] <= kill["recovered_ms"] for kill in found["kills"])
 
 
-def test_a_successor_that_forgets_is_found_out(
+def test_a_successor_without_the_state_is_detected(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     replace = WorkerProcesses.replace
@@ -45,7 +45,7 @@ def test_a_successor_that_forgets_is_found_out(
     assert "different after step" in capsys.readouterr().out
 
 
-def test_results_that_differ_are_found_out_where_states_do_not(
+def test_different_results_of_equal_states_are_detected(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     answers = iter([True, True, False])
@@ -94,7 +94,7 @@ def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str])
         ),
     ],
 )
-def test_what_cannot_be_is_refused(
+def test_invalid_arguments_are_refused(
     words: tuple[str, ...], told: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = refusal(capsys, *words)

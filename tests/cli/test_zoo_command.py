@@ -25,7 +25,7 @@ def test_the_list_has_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "merge_ippo" in capsys.readouterr().out
 
 
-def test_a_difference_tells_both_hashes_and_both_processors(
+def test_a_difference_names_both_hashes_and_both_processors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     entry = Path(shutil.copytree(agent_entries()["merge_ippo"], tmp_path / "merge_ippo"))

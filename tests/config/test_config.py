@@ -81,12 +81,14 @@ def test_a_file_that_is_read_again_is_read_as_it_stands(tmp_path: Path) -> None:
         ("terms: {weights: {crash: 1}}", r"terms\.weights = 'crash': no such term.*collision"),
     ],
 )
-def test_an_unknown_key_is_told_the_nearest(tmp_path: Path, text: str, expected: str) -> None:
+def test_the_error_for_an_unknown_key_names_the_nearest_key(
+    tmp_path: Path, text: str, expected: str
+) -> None:
     assert re.search(expected, refusal(tmp_path, MINIMAL + text))
 
 
 @pytest.mark.parametrize("key", ["range", "range_km", "range_mm"])
-def test_a_wrong_unit_is_told_the_right_one(tmp_path: Path, key: str) -> None:
+def test_the_error_for_a_wrong_unit_names_the_right_unit(tmp_path: Path, key: str) -> None:
     message = refusal(tmp_path, MINIMAL + f"sensors: {{lidar: {{{key}: 60}}}}")
     assert f"sensors.lidar.{key}: unknown key; use range_m" in message
 
@@ -145,7 +147,9 @@ def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None
         ("sensors: {lidar_observation: {maximum_range_m: 0}}", r"maximum_range_m = 0\.0: must be"),
     ],
 )
-def test_a_value_out_of_range_is_told_the_range(tmp_path: Path, text: str, expected: str) -> None:
+def test_the_error_for_a_value_out_of_range_names_the_range(
+    tmp_path: Path, text: str, expected: str
+) -> None:
     assert re.search(expected, refusal(tmp_path, MINIMAL + text))
 
 
@@ -157,7 +161,7 @@ def test_a_value_out_of_range_is_told_the_range(tmp_path: Path, text: str, expec
         ("horizon_s: 0.05", r"horizon_s = 0\.05: must be a number from 0\.1"),
     ],
 )
-def test_an_impossible_combination_is_told_the_cure(
+def test_the_error_for_an_impossible_combination_names_a_fix(
     tmp_path: Path, text: str, expected: str
 ) -> None:
     assert re.search(expected, refusal(tmp_path, MINIMAL + text))
@@ -205,7 +209,9 @@ def test_an_impossible_combination_is_told_the_cure(
         ),
     ],
 )
-def test_a_sensor_that_cannot_be_is_told_why(tmp_path: Path, text: str, expected: str) -> None:
+def test_the_error_for_an_invalid_sensor_gives_the_reason(
+    tmp_path: Path, text: str, expected: str
+) -> None:
     text = text if text.startswith("{") else f"{{{text}}}"
     assert re.search(expected, refusal(tmp_path, f"{MINIMAL}sensors: {text}"))
 
@@ -215,7 +221,7 @@ def test_a_missing_key_is_named(tmp_path: Path) -> None:
     assert "map.source = '': must name a map" in refusal(tmp_path, "name: a\nmap: {source: ''}")
 
 
-def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
+def test_all_errors_of_a_file_are_reported_at_once(tmp_path: Path) -> None:
     message = refusal(tmp_path, MINIMAL + "horizon_s: soon\npopulation: {agents: many, cars: 3}")
     assert len(message.splitlines()) == 3
 
@@ -250,13 +256,13 @@ NESTED_BOMB = "a: &a [x]\n" + "".join(
     ],
     ids=lambda value: repr(value[:24]),
 )
-def test_a_file_that_is_no_plain_yaml_is_refused(
+def test_a_file_that_is_not_plain_yaml_is_refused(
     tmp_path: Path, text: str | bytes, expected: str
 ) -> None:
     assert re.search(expected, refusal(tmp_path, text))
 
 
-def test_a_file_that_cannot_be_read_says_why(tmp_path: Path) -> None:
+def test_the_error_for_an_unreadable_file_gives_the_reason(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"absent\.yaml: No such file"):
         read_yaml(tmp_path / "absent.yaml")
 

@@ -91,7 +91,7 @@ def test_drivers_with_one_form_have_a_common_one() -> None:
     assert common_form(forms) == form_of_driver("cities_ippo")
 
 
-def test_drivers_with_different_forms_are_told_the_keys() -> None:
+def test_the_error_for_different_forms_names_the_keys() -> None:
     with pytest.raises(PolicyError) as caught:
         common_form(forms_in(["cities_residual", "merge_ippo"]))
     said = str(caught.value)
@@ -110,7 +110,7 @@ def test_scripts_bring_no_sensors(name: str) -> None:
         form_of_driver(name)
 
 
-def test_an_unknown_driver_is_told_the_nearest() -> None:
+def test_the_error_for_an_unknown_driver_names_the_nearest() -> None:
     with pytest.raises(PolicyError, match="'cities_residul'; did you mean cities_residual"):
         with_sensors_of({}, "cities_residul")
 
@@ -196,7 +196,7 @@ def test_a_spec_keeps_the_sensors_as_overrides() -> None:
     assert WorldSpec(**json.loads(json.dumps(asdict(spec)))).env == "ring"
 
 
-def test_a_world_gets_the_sensors_of_the_drivers_and_says_so(
+def test_a_world_gets_the_sensors_of_the_drivers_and_reports_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     spec = WorldSpec.of("ring", agents=2)

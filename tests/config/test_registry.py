@@ -74,19 +74,19 @@ def test_a_bare_map_file_gets_a_default_environment(here: Path, suffix: str) -> 
     assert resolve_map(config, base_dir) == path
 
 
-def test_an_unknown_name_is_told_the_nearest_and_all(here: Path) -> None:
+def test_the_error_for_an_unknown_name_names_the_nearest_and_all(here: Path) -> None:
     with pytest.raises(UnknownEnvironmentError, match=r"'twon'; did you mean town\?") as told:
         load_config("twon")
     assert str(told.value).split("Environments: ")[1].split(", ") == sorted(entries())
 
 
-def test_a_file_that_is_no_map_is_told_which_are(here: Path) -> None:
+def test_the_error_for_a_file_that_is_no_map_names_map_files(here: Path) -> None:
     (here / "city.png").touch()
     with pytest.raises(UnknownEnvironmentError, match=r"city\.png: not a map file.*\.net\.xml"):
         load_config("city.png")
 
 
-def test_a_folder_that_is_no_entry_is_told_what_it_lacks(here: Path) -> None:
+def test_the_error_for_a_folder_without_an_entry_names_the_missing_file(here: Path) -> None:
     (here / "empty").mkdir()
     with pytest.raises(UnknownEnvironmentError, match=r"empty: a folder without env\.yaml"):
         load_config("empty")
@@ -160,13 +160,13 @@ def test_a_map_that_is_not_in_the_wheel_is_named(source: str) -> None:
         resolve_map(config, base_dir)
 
 
-def test_without_the_wheel_its_maps_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_the_maps_wheel_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(module: str) -> None:
         raise ModuleNotFoundError(name=module)
 
     town = load_config("town")  # pydantic imports in the same way
     monkeypatch.setattr("cavmarl.core.errors.importlib.import_module", absent)
-    with pytest.raises(MissingExtraError, match=r"pip install '\.\[sumo\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install .*\[sumo\]'"):
         resolve_map(*town)
 
 

@@ -28,7 +28,7 @@ def _drafts(folder: Path) -> set[Path]:
     return set(folder.glob(".build-*"))
 
 
-def test_drafts_of_killed_processes_go_with_the_next_one_and_those_of_living_ones_stay(
+def test_the_next_draft_removes_drafts_of_killed_processes_only(
     tmp_path: Path,
 ) -> None:
     dead, living = (
@@ -85,7 +85,7 @@ def test_drafts_begun_at_once_do_not_remove_each_other(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 6 * 40
 
 
-def test_a_folder_that_is_taken_for_a_dead_ones_before_its_lock_is_made_anew(
+def test_a_draft_that_is_removed_before_its_lock_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make, made = atomic_file.tempfile.mkdtemp, []
@@ -132,7 +132,7 @@ def test_a_write_that_fails_leaves_the_older_file_and_no_draft(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_all_of_the_package_makes_its_drafts_here() -> None:
+def test_all_drafts_of_the_package_use_this_module() -> None:
     package = Path(atomic_file.__file__).parents[1]
     beside = re.compile(r"(TemporaryDirectory|NamedTemporaryFile|mkdtemp|mkstemp)\([^)]*dir=")
     found = [path for path in package.rglob("*.py") if beside.search(path.read_text("utf-8"))]

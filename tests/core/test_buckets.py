@@ -41,7 +41,7 @@ def test_lists_equal_twin_whatever_was_in_them_before(case: tuple[int, list[list
         assert (lists.bounds[:, 1] - lists.bounds[:, 0]).sum() == len(keys)
 
 
-def test_what_is_forgotten_is_empty() -> None:
+def test_forgotten_lists_are_empty() -> None:
     lists = make_lists(100)
     for k in (3, 3, 64, 99):
         add_one(lists, k)

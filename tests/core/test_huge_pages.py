@@ -15,7 +15,7 @@ RECORD = np.dtype([("x", np.float64), ("on", np.bool_)], align=True)
 
 
 @pytest.mark.parametrize("size", [1, LEAST // 8 - 1, LEAST // 8, PAGE // 8, 3 * PAGE // 8 + 5])
-def test_they_are_zeros_that_share_no_byte(size: int) -> None:
+def test_huge_arrays_are_zero_and_share_no_byte(size: int) -> None:
     """Whatever their size, what is written in one is not read in another."""
     first, second = huge_zeros(size), huge_zeros((size, 1), dtype=np.int64)
     assert first.shape == (size,)
@@ -26,7 +26,7 @@ def test_they_are_zeros_that_share_no_byte(size: int) -> None:
     assert not np.shares_memory(first, second)
 
 
-def test_records_lie_as_they_must() -> None:
+def test_records_in_huge_pages_are_aligned() -> None:
     """Large arrays start on a cache line, and their records are aligned."""
     for size in (7000, 7001, 300_000):
         array = huge_zeros(size, dtype=RECORD)
@@ -46,7 +46,7 @@ def test_a_copy_has_every_byte_and_may_be_written_as_before() -> None:
 
 
 @pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="there are no huge pages")
-def test_what_lies_in_huge_pages_is_not_copied() -> None:
+def test_arrays_in_huge_pages_are_not_copied() -> None:
     """A map that is changed in one table shares the others."""
     array = huge_zeros(2 * LEAST // 8)
     assert huge_copy(array) is array
@@ -54,7 +54,7 @@ def test_what_lies_in_huge_pages_is_not_copied() -> None:
     assert huge_copy(part) is part
 
 
-def test_memory_goes_with_its_arrays() -> None:
+def test_memory_is_freed_with_its_arrays() -> None:
     """Nothing but the arrays holds their pages."""
     array = huge_zeros(4 * PAGE // 8)
     memory = array
@@ -68,7 +68,7 @@ def test_memory_goes_with_its_arrays() -> None:
     assert gone() is None
 
 
-def test_a_system_without_them_has_arrays_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arrays_work_without_huge_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     """NumPy's own."""
     monkeypatch.delattr(mmap, "MADV_HUGEPAGE")
     assert huge_zeros(PAGE).base is None
@@ -82,7 +82,7 @@ def _mapping(memory: object) -> mmap.mmap:
 
 
 @pytest.mark.parametrize("own", ["", "glibc.malloc.hugetlb=0"])
-def test_a_heap_in_huge_pages_unless_the_user_says_otherwise(
+def test_the_heap_is_in_huge_pages_unless_the_user_sets_otherwise(
     monkeypatch: pytest.MonkeyPatch, own: str
 ) -> None:
     monkeypatch.setenv("GLIBC_TUNABLES", own)

@@ -73,7 +73,7 @@ def total_of(values: NDArray[np.float64]) -> float:
     return total
 
 
-def test_bundles_tuples_and_nothing_arrive_as_they_are() -> None:
+def test_kernels_receive_bundles_tuples_and_none_unchanged() -> None:
     grid = np.arange(12, dtype=np.float32).reshape(3, 4)
     for view in (grid, grid.T, grid[::2], np.asfortranarray(grid), grid[:1], grid[:0]):
         nested = Nested(Pair(np.arange(3), 0.25), (2.0, 7), None, view)
@@ -87,7 +87,7 @@ def test_bundles_tuples_and_nothing_arrive_as_they_are() -> None:
     [0, -1, 2**62, -(2**63), 2**63 + 5, 1.5, -0.0, float("inf"), True, False, np.int32(-7),
      np.uint8(200), np.uint64(2**64 - 1), np.float32(0.1), np.float64(0.1), np.bool_(True)],
 )  # fmt: skip
-def test_numbers_come_back(number: Any) -> None:
+def test_kernels_return_numbers(number: Any) -> None:
     found = same_number(number)
     assert found == number
     assert repr(float(found)) == repr(float(number))
@@ -95,7 +95,7 @@ def test_numbers_come_back(number: Any) -> None:
         assert type(found) is type(number.item() if isinstance(number, np.generic) else number)
 
 
-def test_a_record_is_read_where_it_lies() -> None:
+def test_a_record_is_read_in_place() -> None:
     records = np.zeros(3, dtype=[("x", np.float64), ("at", np.int64)])
     records["x"], records["at"] = [0.5, 1.5, 2.5], [10, 20, 30]
     assert [read_record(record) for record in records] == [10.5, 21.5, 32.5]
@@ -110,8 +110,8 @@ def test_arguments_may_be_named_and_left_out() -> None:
 
 
 @compiled_only
-def test_what_a_kernel_cannot_take_is_a_type_error() -> None:
-    with pytest.raises(TypeError, match=r"is a builtins\.str: pass NumPy arrays"):
+def test_unsupported_arguments_are_type_errors() -> None:
+    with pytest.raises(TypeError, match=r"is a builtins\.str; pass NumPy arrays"):
         same_number("word")
     with pytest.raises(TypeError, match=r"is a builtins\.list"):
         same_number([1])
@@ -198,7 +198,7 @@ ARGUMENTS = [
 ]
 
 
-def test_arguments_have_one_type_exactly_if_numba_says_so() -> None:
+def test_arguments_have_the_same_type_exactly_if_numba_agrees() -> None:
     for one in ARGUMENTS:
         for other in ARGUMENTS:
             is_same = _typeof(one) == _typeof(other)

@@ -136,7 +136,9 @@ def test_a_library_for_another_interpreter_or_of_another_format_is_refused(copie
 
 
 @compiled_only
-def test_a_processor_without_avx2_is_told(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_processor_without_avx2_names_the_feature(
+    built: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     opened = ctypes.CDLL(str(built / LIBRARY_FILE))
     flags = Path("/proc/cpuinfo").read_text()
     assert (library.missing_features(opened, "x86-64-v3") == []) == (" avx2 " in flags)

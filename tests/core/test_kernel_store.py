@@ -67,7 +67,9 @@ def test_a_change_moves_the_kernels_that_call_what_has_changed_and_no_others(
 
 
 @pytest.mark.parametrize("changed", sources.COMPILER_FILES)
-def test_the_compiler_concerns_all(monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
+def test_a_change_of_the_compiler_affects_all_kernels(
+    monkeypatch: pytest.MonkeyPatch, changed: str
+) -> None:
     before, after = _digests(monkeypatch), _digests(monkeypatch, changed)
     assert all(before[name] != after[name] for name in SOURCES)
 
@@ -218,7 +220,9 @@ def test_a_folder_that_cannot_be_written_is_named_once(tmp_path: Path, how: str)
     assert not list(PACKAGE.rglob("*.kernel")), "nothing beside the sources"
 
 
-def test_where_the_cache_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_folder_follows_the_environment_variables(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for name in ("CAVMARL_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     assert cache_dir() == Path.home() / ".cache" / "cavmarl"

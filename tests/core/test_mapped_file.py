@@ -32,13 +32,13 @@ def test_an_array_is_a_view_of_the_file_and_not_copied(tmp_path: Path) -> None:
     assert (array.reshape(-1) == NUMBERS[2:]).all()
 
 
-def test_other_arrays_are_of_no_file() -> None:
+def test_other_arrays_belong_to_no_file() -> None:
     assert file_of(NUMBERS) is None
     assert file_of(huge_copy(NUMBERS)) is None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_what_is_let_go_takes_no_memory(tmp_path: Path) -> None:
+def test_released_files_take_no_memory(tmp_path: Path) -> None:
     path = tmp_path / "numbers"
     write_whole(path, NUMBERS.tobytes())
     file = mapped(path)
@@ -50,7 +50,7 @@ def test_what_is_let_go_takes_no_memory(tmp_path: Path) -> None:
     assert _resident_kib(path) == 0
 
 
-def test_no_file_and_an_empty_one(tmp_path: Path) -> None:
+def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         mapped(tmp_path / "none")
     (tmp_path / "empty").touch()

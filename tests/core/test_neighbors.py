@@ -83,13 +83,13 @@ def test_equal_distances_are_ordered_by_id_and_other_levels_left_out() -> None:
     assert nearest(rows, 0, 9.0, 2) == [(81.0, 2), (81.0, 3)]
 
 
-def test_a_stranger_asks_for_a_place() -> None:
+def test_searches_need_no_vehicle_at_the_place() -> None:
     rows = vehicles([(1.0, 0.0, 0.0)])
     out_row, out_squared = np.zeros(4, np.int32), np.zeros(4)
     assert k_nearest(grid_of(rows), -1, 0.0, 0.0, 0.0, 5.0, 4, out_row, out_squared) == 1
 
 
-def test_no_place_on_earth_breaks_the_grid() -> None:
+def test_the_grid_works_at_all_coordinates() -> None:
     rows = vehicles([(np.nan, 0.0, 0.0), (1e100, -1e100, 0.0), (0.0, np.nan, 0.0), (1.0, 1.0, 0.0)])
     assert nearest(rows, 3, 50.0, 4) == []
 

@@ -27,7 +27,7 @@ def total(records: NDArray[np.void], places: NDArray[np.int64], ahead: int) -> f
 
 @pytest.mark.parametrize("ahead", [0, 1, -1, 10**12, -(10**12)])
 @pytest.mark.parametrize("stride", [1, 3])
-def test_it_changes_nothing(ahead: int, stride: int) -> None:
+def test_prefetching_changes_no_result(ahead: int, stride: int) -> None:
     records = np.zeros(60, dtype=RECORD)
     records["a"] = np.arange(60)
     view = records[::stride]
@@ -41,7 +41,7 @@ def test_an_array_without_records_has_places_too() -> None:
     assert total(np.zeros(0, dtype=RECORD), np.zeros(0, dtype=np.int64), 5) == 0.0
 
 
-def test_the_processor_is_told() -> None:
+def test_the_compiled_code_has_prefetch_instructions() -> None:
     if IS_PLAIN:
         pytest.skip("without the compiler there is no such instruction")
     njit: Any = numba.njit

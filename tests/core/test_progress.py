@@ -21,7 +21,7 @@ def test_a_bar_names_the_stage_and_the_time_left() -> None:
     assert "left" in shown
 
 
-def test_a_stage_that_is_none_is_an_error() -> None:
+def test_an_unknown_stage_is_an_error() -> None:
     with in_stages(Console(file=io.StringIO()), ["reading"]) as told:
         with pytest.raises(ValueError, match="writing"):
             told("writing")

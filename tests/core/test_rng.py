@@ -28,7 +28,7 @@ wraps_around = pytest.mark.filterwarnings("ignore:overflow encountered in scalar
          "d16cfe09 94fdcceb 5001e420 24126ea1"),
     ],
 )  # fmt: skip
-def test_known_answers(counter: str, key: str, answer: str) -> None:
+def test_philox_gives_the_published_numbers(counter: str, key: str, answer: str) -> None:
     words = [np.uint64(int(word, 16)) for word in (counter + " " + key).split()]
     block = rng.philox4x32(*words)
     assert " ".join(f"{int(word):08x}" for word in block) == answer

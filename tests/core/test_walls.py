@@ -38,5 +38,5 @@ def test_ends_and_corners_of_cells(
     assert is_cut(make_walls(segments, 2.0), *ends) == expected
 
 
-def test_no_walls_cut_nothing() -> None:
+def test_without_walls_no_line_is_cut() -> None:
     assert not is_cut(make_walls(np.zeros((0, 4))), 0.0, 0.0, 5.0, 5.0)

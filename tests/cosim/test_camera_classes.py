@@ -19,7 +19,7 @@ from cavmarl.cosim.stack.stack import CAMERA_RIG, sensor_of
 from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Obstacle
 
 
-def test_a_pedestrian_and_a_van_are_told_apart() -> None:
+def test_a_pedestrian_and_a_van_are_distinguished() -> None:
     """None is taken for another: a pixel's class is exact, and as wide as 0.2 m at 16 m.
 
     Echoes are 2 cm off, so most pixels of a group are its object's; what lies between a pedestrian
@@ -64,7 +64,7 @@ def test_a_pedestrian_and_a_van_are_told_apart() -> None:
     assert kinds.get("vehicle", 0) >= 3, kinds
 
 
-def test_a_stack_without_a_camera_says_what_it_lacks() -> None:
+def test_a_stack_without_a_camera_is_refused() -> None:
     with pytest.raises(ConfigError, match="no semantic_camera among the sensors"):
         LidarCamera([], None)  # type: ignore[arg-type]
 

@@ -18,7 +18,7 @@ from cavmarl.policies.loading import load_policy
 RIG: dict[str, Any] = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG}
 
 
-def test_it_drives_among_others_and_hits_nobody() -> None:
+def test_the_stack_drives_in_traffic_without_a_collision() -> None:
     env = cavmarl.parallel_env("grid4x4", agents=2, background=10, overrides=RIG)
     observations, _ = env.reset(seed=0)
     policy = load_policy("reference", env)

@@ -95,9 +95,7 @@ def test_one_follower_can_drive_several(address: Path, start: Start) -> None:
         assert hashes(world, 6) == reference(6, dict.fromkeys(["car_0", "car_2"]))
 
 
-def test_who_joins_a_running_world_changes_nothing_of_the_others(
-    address: Path, start: Start
-) -> None:
+def test_a_follower_that_joins_does_not_affect_other_followers(address: Path, start: Start) -> None:
     env = make_env()
     with FollowedWorld(env, address) as world:
         world.reset(seed=1)
@@ -166,7 +164,7 @@ def test_a_slow_follower_holds_the_world_and_misses_no_frame(address: Path, star
     assert frames == [0, 1, 2, 3, 4]
 
 
-def test_a_silent_follower_is_let_go_and_the_world_goes_on(address: Path) -> None:
+def test_a_silent_follower_is_dropped_and_the_world_continues(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address, timeout_s=0.2) as world:
         silent = seated(world, ["car_0"], "silent")
@@ -180,7 +178,7 @@ def test_a_silent_follower_is_let_go_and_the_world_goes_on(address: Path) -> Non
         silent.close()
 
 
-def test_others_are_heard_when_one_is_silent(address: Path, start: Start) -> None:
+def test_a_silent_follower_does_not_block_others(address: Path, start: Start) -> None:
     with FollowedWorld(make_env(), address, timeout_s=0.3) as world:
         with seated(world, ["car_0"], "silent"):
             start(lambda: drive(address, ["car_1"]))
@@ -336,7 +334,7 @@ def test_answers_to_other_frames(address: Path) -> None:
         line.close()
 
 
-def test_nobody_comes(address: Path) -> None:
+def test_missing_followers_are_reported_after_the_timeout(address: Path) -> None:
     with (
         FollowedWorld(make_env(), address) as world,
         pytest.raises(FollowerLostError, match="0 of 1 followers"),
@@ -344,14 +342,14 @@ def test_nobody_comes(address: Path) -> None:
         world.wait_for(1, 0.05)
 
 
-def test_nobody_is_there(address: Path) -> None:
+def test_a_follower_without_a_world_is_refused(address: Path) -> None:
     with pytest.raises(FollowerLostError, match="start it first"):
         Follower(address)
     with pytest.raises(ConfigError, match="at most 100 bytes"):
         Follower("x" * 200)
 
 
-def test_impossible_worlds(address: Path) -> None:
+def test_invalid_worlds_with_followers_are_refused(address: Path) -> None:
     with pytest.raises(ConfigError, match="timeout_s"):
         FollowedWorld(make_env(), address, timeout_s=0.0)
     address.write_text("somebody's file")

@@ -55,7 +55,7 @@ def test_killed_workers_are_replaced(
     assert found == reference(STEPS, {"car_1": None})
 
 
-def test_killed_followers_are_let_go(address: Path) -> None:
+def test_killed_followers_are_dropped(address: Path) -> None:
     env = make_env(zones=2, workers=2)
     with (
         closing(env),

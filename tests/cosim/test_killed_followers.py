@@ -22,7 +22,7 @@ drive(Path(sys.argv[1]), [sys.argv[2]])
 STEPS = 12
 
 
-def test_killed_at_random_ticks(address: Path) -> None:
+def test_followers_are_killed_at_random_ticks(address: Path) -> None:
     ticks = random.Random(5)
     with FollowedWorld(make_env(), address) as world:
         for _ in range(3):
@@ -52,7 +52,7 @@ def test_killed_at_random_ticks(address: Path) -> None:
             assert found[death + 1 :] != driven[death + 1 :] or death == STEPS - 1
 
 
-def test_stopped_and_replaced(address: Path) -> None:
+def test_stopped_followers_are_replaced(address: Path) -> None:
     with FollowedWorld(make_env(), address, timeout_s=0.3) as world:
         with spawn(DRIVER, address, "car_0") as first, spawn(DRIVER, address, "car_1") as other:
             try:

@@ -60,7 +60,7 @@ def test_scans_take_a_bias_of_gnss_away(world: Any, cloud: Path) -> None:
     assert matching.bias == pytest.approx(np.mean(drive.fixes_m, axis=0), abs=3.0 * 0.1)
 
 
-def test_what_is_missing_is_said(world: Any, cloud: Path, tmp_path: Path) -> None:
+def test_missing_inputs_are_named(world: Any, cloud: Path, tmp_path: Path) -> None:
     hd_map = HdMap(world.network)
     sensors = [sensor_of(v.name, v.settings) for v in welcome_to(world, ["car_0"], 0).sensors]
 

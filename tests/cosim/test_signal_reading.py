@@ -37,7 +37,7 @@ def looks(workers: int = 0, **more: Any) -> list[tuple[Any, Any, cavmarl.CavEnv]
         env.close()
 
 
-def test_what_is_heard_is_what_signals_show() -> None:
+def test_received_signal_states_equal_the_signals() -> None:
     found = looks()
     stage = SpatSignals(HdMap(found[0][2].network))
     seen = set()

@@ -144,7 +144,7 @@ def test_a_heading_the_wrong_way_is_noticed() -> None:
     assert max(off[200:]) < 1.2
 
 
-def test_a_pose_that_is_told_is_taken(grid: HdMap) -> None:
+def test_a_given_pose_is_used(grid: HdMap) -> None:
     env = cavmarl.parallel_env("grid4x4", agents=1, background=0, overrides={"rig": RIG})
     sensors = [sensor_of(v.name, v.settings) for v in welcome_to(env, [], 0).sensors]
     stack = Stack(vehicle_of(grid, sensors, TICK_S))
@@ -195,7 +195,7 @@ def test_a_red_signal_is_a_place_to_stop(grid: HdMap) -> None:
     assert red.accel_mps2 < green.accel_mps2 - 1.0
 
 
-def test_a_gap_is_kept_from_what_is_on_the_way_and_from_nothing_else(grid: HdMap) -> None:
+def test_the_stack_keeps_a_gap_to_objects_on_its_path_only(grid: HdMap) -> None:
     lane = lane_of(grid, 60.0)
     _, goal = goal_behind(grid, lane)
     mission = Mission(goal, "passenger", 5.0, 2.0)
@@ -218,7 +218,7 @@ def test_a_gap_is_kept_from_what_is_on_the_way_and_from_nothing_else(grid: HdMap
     assert plan(-15.0, 0.0, 0.0).reason != "gap"
 
 
-def test_who_has_the_right_of_way_goes_first(grid: HdMap) -> None:
+def test_vehicles_with_the_right_of_way_go_first(grid: HdMap) -> None:
     network = grid.network
     for row in network.links:
         conflicts = network.conflicts[row["first_conflict"] :][: row["num_conflicts"]]
@@ -289,6 +289,6 @@ def test_stages_are_chosen_by_name() -> None:
     assert StackConfig(perception="blind").planning == "lane_route"
 
 
-def test_a_stack_without_gnss_says_what_it_lacks(grid: HdMap) -> None:
+def test_a_stack_without_gnss_is_refused(grid: HdMap) -> None:
     with pytest.raises(ConfigError, match="there is no gnss among the sensors"):
         Stack(vehicle_of(grid, [], TICK_S))

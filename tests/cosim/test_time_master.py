@@ -61,7 +61,7 @@ def test_a_second_master_is_refused_until_the_first_has_gone() -> None:
         first.step({})
 
 
-def test_nobody_else_steps_or_resets_a_mastered_environment() -> None:
+def test_only_the_master_steps_or_resets_its_environment() -> None:
     env = make()
     master = TimeMaster(env)
     with pytest.raises(ClockError, match=r"TimeMaster\.reset"):
@@ -119,7 +119,7 @@ def test_an_obeyed_tick_is_noticed_before_the_next_one() -> None:
     assert master.world_ticks.tolist() == [14]
 
 
-def test_whoever_goes_round_the_master_is_noticed_and_refused() -> None:
+def test_steps_without_the_master_are_detected_and_refused() -> None:
     env = make()
     master = TimeMaster(env)
     master.reset(seed=0)

@@ -172,19 +172,19 @@ def test_a_vehicle_goes_from_an_own_zone_to_one_of_another_simulator() -> None:
     assert near == len(carla.actors) - 1  # its ghosts are those that stay
 
 
-def test_what_zones_share_beside_their_vehicles_is_refused() -> None:
+def test_features_that_share_more_than_vehicles_are_refused() -> None:
     world = load_world("ring", zones=2, overrides={"clock.control_latency_ticks": 2})
     with pytest.raises(ConfigError, match="control_latency_ticks"):
         own_backend(world)
 
 
-def test_backends_are_one_a_zone() -> None:
+def test_each_zone_needs_one_backend() -> None:
     world = world_of("ring", 2)
     with pytest.raises(ConfigError, match="one for each of the 2 zones"):
         BackendWorld(world.partition, [own_backend(world)])
 
 
-def test_what_is_no_snapshot_is_refused() -> None:
+def test_an_invalid_snapshot_is_refused() -> None:
     backend = own_backend(world_of("ring", 2))
     before = backend.snapshot()
     for data in (b"", b"no snapshot", before[:-40], own_backend(world_of("grid4x4", 2)).snapshot()):

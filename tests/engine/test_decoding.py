@@ -24,7 +24,7 @@ def slowly(actions: NDArray[Any]) -> NDArray[Any]:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_pairs(dtype: type) -> None:
+def test_pairs_are_decoded(dtype: type) -> None:
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, 2)).astype(dtype)
     actions[~MASK] = np.nan  # nobody reads it
     config = ActionConfig(kind="continuous")
@@ -35,7 +35,7 @@ def test_pairs(dtype: type) -> None:
     assert found.controls[~MASK].tolist() == [[0.0, 0.0]] * 2
 
 
-def test_choices() -> None:
+def test_choices_are_copied() -> None:
     actions = np.random.default_rng(0).integers(0, 5, (2, 3))
     actions[~MASK] = 99
     config = ActionConfig(kind="discrete")

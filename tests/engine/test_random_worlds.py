@@ -111,11 +111,11 @@ def check(seed: int, steps: int, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_nobody_can_tell(seed: int, tmp_path: Path) -> None:
+def test_random_worlds_give_equal_results_divided_or_not(seed: int, tmp_path: Path) -> None:
     check(seed, 120, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12, 400))
-def test_nobody_can_tell_in_many_worlds(seed: int, tmp_path: Path) -> None:
+def test_many_random_worlds_give_equal_results_divided_or_not(seed: int, tmp_path: Path) -> None:
     check(seed, 400, tmp_path)

@@ -47,7 +47,7 @@ def test_no_vehicle_is_lost(env: str, mode: str) -> None:
                 assert here + np.count_nonzero(waiting["agent"] < 0) == background
 
 
-def test_those_for_whom_there_is_no_room_wait_and_enter_later() -> None:
+def test_departures_without_room_wait_and_enter_later() -> None:
     simulation = make_traffic("merge", background=120)
     start(simulation, seed=0)
     first = set(simulation.departures.queue[0, : simulation.departures.num_queue[0]]["id"].tolist())
@@ -64,12 +64,31 @@ def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
         start(simulation, seed=0)
 
 
+@pytest.mark.parametrize(
+    ("agents", "background", "words"),
+    [
+        (
+            100,
+            20,
+            r"is 20, the default.*--background N\) to 0 or less, and use fewer",
+        ),
+        (20, 60, r"the background is 60\).*--background N\) to \d+ or less$"),
+        (100, 0, r"--agents N\) to fewer$"),
+    ],
+)
+def test_a_population_without_room_names_the_keys_to_change(
+    agents: int, background: int, words: str
+) -> None:
+    with pytest.raises(CapacityError, match=words):
+        make_simulation("ring22", mode="closed", agents=agents, background=background)
+
+
 @pytest.mark.parametrize("env", FREE_FLOW)
 @pytest.mark.parametrize(
     ("seed", "worlds", "length"),
     [(0, 3, 3.0), (1, 3, 3.0), pytest.param(2, 12, 12.0, marks=pytest.mark.slow)],
 )
-def test_drivers_neither_touch_nor_stand_for_ever(
+def test_drivers_do_not_collide_or_stand_forever(
     env: str, seed: int, worlds: int, length: float
 ) -> None:
     simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=worlds)
@@ -87,7 +106,7 @@ def test_drivers_neither_touch_nor_stand_for_ever(
 
 
 @pytest.mark.parametrize("env", FREE_FLOW)
-def test_speed_limits_hold_for_every_driver_in_his_own_measure(env: str) -> None:
+def test_drivers_keep_the_limit_times_their_speed_factor(env: str) -> None:
     simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=2)
     start(simulation, seed=7)
     lanes = simulation.network.lanes
@@ -107,7 +126,7 @@ def test_speed_limits_hold_for_every_driver_in_his_own_measure(env: str) -> None
 
 
 @pytest.mark.parametrize("env", ["grid4x4", "town"])
-def test_nobody_drives_through_red(env: str) -> None:
+def test_no_driver_passes_a_red_signal(env: str) -> None:
     simulation = make_traffic(env, background=60, num_worlds=2, overrides=PER_TICK)
     start(simulation, seed=2)
     roads, steps = simulation.network.arrays, simulation.travel.steps
@@ -150,7 +169,9 @@ OVERPASS = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 @pytest.mark.parametrize(("z", "collide"), [(0.0, True), (7.0, False)])
-def test_a_bridge_is_no_crossing(tmp_path: Path, z: float, collide: bool) -> None:
+def test_vehicles_on_a_bridge_and_below_do_not_interact(
+    tmp_path: Path, z: float, collide: bool
+) -> None:
     roads = tmp_path / "overpass.net.xml"
     roads.write_text(OVERPASS.format(z=z), encoding="utf-8")
     simulation = make_traffic(roads, background=24)

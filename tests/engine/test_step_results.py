@@ -80,7 +80,7 @@ def test_report_is_that_of_one_array_after_the_other(seed: int, network: RoadNet
 
 @pytest.mark.parametrize("in_next_step", [False, True])
 @pytest.mark.parametrize("seed", range(10))
-def test_what_those_saw_last_who_have_ended(
+def test_last_observations_of_ended_agents_are_kept(
     seed: int, in_next_step: bool, network: RoadNetwork
 ) -> None:
     rng = np.random.default_rng(seed)

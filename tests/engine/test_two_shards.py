@@ -112,7 +112,9 @@ def returns_of(*parts: Worlds) -> Returns:
     ("env", "mode", "agents", "background"),
     [("merge", "open", 8, 16), ("grid4x4", "respawn", 10, 40), ("ring", "closed", 6, 10)],
 )
-def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) -> None:
+def test_agents_of_two_shards_get_the_same_results(
+    env: str, mode: str, agents: int, background: int
+) -> None:
     whole = make_simulation(
         env, mode=mode, agents=agents, background=background, num_worlds=2, overrides=SENSORS
     )
@@ -147,7 +149,7 @@ def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) 
     assert both > STEPS // 2, "hardly ever vehicles in both shards"
 
 
-def test_signals_are_the_same(tmp_path: Path) -> None:
+def test_signals_of_two_shards_are_the_same(tmp_path: Path) -> None:
     clock = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
     whole = make_traffic(actuated_grid(tmp_path), background=30, num_worlds=2, overrides=clock)
     halves = Halves(whole)

@@ -57,7 +57,7 @@ def test_a_frame_holds_what_the_world_holds_and_stays() -> None:
     np.testing.assert_array_equal(frame.vehicles, kept)
 
 
-def test_events_tell_how_agents_end() -> None:
+def test_events_name_the_causes_of_ended_agents() -> None:
     world = parallel_env("ring")
     world.reset(seed=1)
     (before,) = world.world_frames()
@@ -122,7 +122,7 @@ def test_events_between_two_frames() -> None:
     ]
 
 
-def test_frames_that_cannot_be_had() -> None:
+def test_unavailable_frames_are_refused() -> None:
     world = parallel_env("ring")
     with pytest.raises(EpisodeError, match="reset"):
         world.world_frames()

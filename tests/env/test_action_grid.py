@@ -55,7 +55,7 @@ def test_a_suggestion_is_the_nearest_pair() -> None:
 
 
 @pytest.mark.parametrize("wrong", [-1, 35])
-def test_a_choice_that_is_none_is_refused(wrong: int) -> None:
+def test_an_invalid_choice_is_refused(wrong: int) -> None:
     decoder = ActionDecoder(GRID, 1, ["car_0", "car_1"])
     with pytest.raises(ActionError, match=rf"car_1: the action is {wrong}, must be from 0 to 34"):
         decoder.from_array(np.array([[0, wrong]]), np.ones((1, 2), dtype=np.bool_))

@@ -48,7 +48,7 @@ def test_one_world_of_nodes_is_drawn() -> None:
     assert picture.std() > 0.0
 
 
-def test_bad_input() -> None:
+def test_bad_input_is_refused() -> None:
     sumo = {
         "traffic.source": "sumo-traffic",
         "traffic.demand": ["a.rou.xml"],

@@ -186,7 +186,7 @@ def interrupted(commands: Any) -> None:
     raise KeyboardInterrupt
 
 
-def test_what_cannot_be_put_there_is_refused_with_its_cure() -> None:
+def test_invalid_insertions_are_refused_with_a_fix() -> None:
     with closing(parallel_env("grid4x4")) as env:
         env.reset(seed=0)
         with pytest.raises(ConfigError, match=r"set population\.insertions"):
@@ -219,7 +219,7 @@ def test_what_cannot_be_put_there_is_refused_with_its_cure() -> None:
         parallel_env("cities", overrides={"population.insertions": 3})
 
 
-def test_saved_states_have_what_waits() -> None:
+def test_saved_states_include_waiting_insertions() -> None:
     def finished(step: int, saved: bytes | None) -> tuple[str, bytes | None]:
         with closing(make_vec("grid4x4", background=20, overrides=ROOM)) as vec:
             vec.reset(seed=1)

@@ -275,7 +275,7 @@ def test_a_sensor_can_be_switched_off_and_leaves_the_others_alone(key: str, sens
         np.testing.assert_array_equal(rest[agent], expected)
 
 
-def test_the_state_tells_where_every_vehicle_is() -> None:
+def test_the_global_state_has_the_position_of_every_vehicle() -> None:
     env = make("grid4x4", "respawn")
     env.reset()
     for _ in range(50):
@@ -387,7 +387,7 @@ def test_meta_actions_step_through_the_target_speeds() -> None:
 
 @pytest.mark.parametrize("env_name", ["ring", "merge", "grid4x4", "town"])
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_what_is_suggested_is_allowed_and_leads_to_the_goal(env_name: str, kind: str) -> None:
+def test_suggested_actions_are_valid_and_lead_to_the_goal(env_name: str, kind: str) -> None:
     env = make(env_name, background=0, max_cycles=2500, overrides={"action.kind": kind})
     env.reset()
     fate = dict.fromkeys(env.agents, "cut")
@@ -439,6 +439,6 @@ def test_tools_that_look_change_nothing() -> None:
     env.traffic_stats()
     assert env.state_hash() == before
     assert env.step_s == env.config.clock.ctrl_dt_s
-    env.close()
     env.step(env.suggest_actions())
     assert env.state_hash() != before
+    env.close()

@@ -88,7 +88,7 @@ def test_numpy_numbers_are_numbers() -> None:
 
 
 @pytest.mark.parametrize("env", [None, 3, ["ring"]])
-def test_what_is_no_name_is_refused(env: object) -> None:
+def test_invalid_names_are_refused(env: object) -> None:
     with pytest.raises(cavmarl.UnknownEnvironmentError, match="must be the name"):
         cavmarl.parallel_env(env)
 

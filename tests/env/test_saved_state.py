@@ -46,7 +46,7 @@ def drive(vec: CavVectorEnv, steps: range) -> list[bytes]:
     ],
 )
 @pytest.mark.filterwarnings("ignore:workers = ")
-def test_worlds_go_on_bit_for_bit(mode: str, arguments: dict[str, Any]) -> None:
+def test_loaded_worlds_continue_bit_for_bit(mode: str, arguments: dict[str, Any]) -> None:
     before, middle, after = range(HORIZON + 4), range(20, 30), range(30, 50)
     whole = make(mode)
     whole.reset(seed=3)
@@ -65,7 +65,7 @@ def test_worlds_go_on_bit_for_bit(mode: str, arguments: dict[str, Any]) -> None:
     assert drive(whole, after) == expected[1]
 
 
-def test_what_cannot_be_saved_or_loaded_is_refused() -> None:
+def test_invalid_saves_and_loads_are_refused() -> None:
     vec = make()
     with pytest.raises(EpisodeError, match=r"save_state\(\) before reset"):
         vec.save_state()

@@ -28,7 +28,7 @@ def test_fewer_steps_than_the_environment_was_made_for(mode: str) -> None:
     assert env.max_cycles == 7
 
 
-def test_the_sign_of_zero_is_no_action_of_its_own() -> None:
+def test_negative_zero_equals_zero_in_actions() -> None:
     hashes = set()
     for zero in (0.0, -0.0):
         env = parallel_env("ring", agents=2, background=0)

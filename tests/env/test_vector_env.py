@@ -261,7 +261,7 @@ def test_without_autoreset_a_world_that_is_over_waits_for_a_reset() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_mask_says_who_acts(mode: str) -> None:
+def test_the_mask_marks_acting_agents(mode: str) -> None:
     vec = make(3, mode)
     observations, infos = vec.reset(seed=1)
     rng = np.random.default_rng(0)

@@ -58,7 +58,7 @@ def drive(env: cavmarl.CavEnv, first: int, steps: int) -> list[Any]:
 
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("name", WORLDS)
-def test_a_copy_goes_on_as_the_first_one(name: str, how: str) -> None:
+def test_a_copy_continues_like_the_original(name: str, how: str) -> None:
     env = cavmarl.parallel_env(**WORLDS[name])
     env.reset(seed=3)
     drive(env, 0, 15)
@@ -71,7 +71,7 @@ def test_a_copy_goes_on_as_the_first_one(name: str, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", COPIES)
-def test_what_one_does_is_nothing_to_the_other(how: str) -> None:
+def test_a_copy_is_independent_of_the_original(how: str) -> None:
     env = cavmarl.parallel_env("ring")
     env.reset(seed=1)
     other = COPIES[how](env)
@@ -111,7 +111,7 @@ def test_a_batch_of_worlds(how: str, copied: bool) -> None:
 
 
 @pytest.mark.parametrize("how", COPIES)
-def test_agents_in_turn(how: str) -> None:
+def test_a_copy_of_an_aec_environment_continues(how: str) -> None:
     turns = cavmarl.env("ring", agents=2)
     turns.reset(seed=4)
     turns.step(np.zeros(2))
@@ -124,7 +124,7 @@ def test_agents_in_turn(how: str) -> None:
     assert seen[5:] == seen[:5]
 
 
-def test_one_vehicle() -> None:
+def test_a_copy_of_a_single_vehicle_environment_continues() -> None:
     one = gymnasium.make("cavmarl/merge-v6")
     one.reset(seed=4)
     one.step(np.zeros(2, np.float32))

@@ -22,7 +22,7 @@ def ttc(one: NDArray[np.void], other: NDArray[np.void]) -> float:
     return least_ttc_s(one, other)
 
 
-def test_times_that_one_can_reckon() -> None:
+def test_times_to_collision_of_simple_cases() -> None:
     assert ttc(body(0, 0, 0, 10), body(25, 0, 0, 0)) == pytest.approx(2.0)  # behind a queue
     assert ttc(body(0, 0, 0, 10), body(45, 0, math.pi, 10)) == pytest.approx(2.0)  # head on
     assert ttc(body(0, 0, 0, 10), body(25, 0, 0, 10)) == math.inf  # as fast

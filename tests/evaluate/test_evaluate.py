@@ -90,7 +90,7 @@ def test_the_built_in_driver_arrives_where_chance_does_not(by_chance: Evaluation
 
 
 @pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
-def test_every_population_can_be_judged(mode: str) -> None:
+def test_every_population_mode_can_be_evaluated(mode: str) -> None:
     report = evaluate(
         "merge", "idm", overrides={"population.mode": mode}, **{**SMALL, "max_cycles": 600}
     )
@@ -207,7 +207,7 @@ def test_a_seed_is_a_whole_number(seed: Any) -> None:
         evaluate("merge", "idm", episodes=1, seed=seed)
 
 
-def test_progress_is_told_after_every_step() -> None:
+def test_progress_is_reported_after_every_step() -> None:
     told: list[tuple[str, int, int]] = []
     settings = {**SMALL, "max_cycles": 7}
     evaluate("ring", "idm", progress=lambda *words: told.append(words), **settings)

@@ -213,7 +213,7 @@ def test_each_cause_has_its_share_of_the_worst() -> None:
         (["arrived"], "slow"),
     ],
 )
-def test_causes(marks: list[str], cause: str) -> None:
+def test_failed_trips_have_the_right_cause(marks: list[str], cause: str) -> None:
     trip = np.zeros(1, dtype=TRIP)
     for mark in marks:
         trip[mark] = True

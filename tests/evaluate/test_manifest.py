@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from cavmarl.core.errors import ManifestError
+from cavmarl.env.vector import make_vec
 from cavmarl.evaluate import evaluate, load_report
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE, hash_of_file, read_closed
 from tests.support.forked_processes import ForkedProcess
@@ -31,7 +32,7 @@ def manifest(env: str = "merge", **changed: Any) -> dict[str, Any]:
     return dict(evaluate(env, "random_actions", **{**SMALL, **changed}).manifest)
 
 
-def test_it_says_what_a_result_depends_on() -> None:
+def test_a_manifest_has_everything_that_a_result_depends_on() -> None:
     first, again = manifest(), manifest()
     varying = ("started", "ended", "results_sha256")
     assert {k: v for k, v in first.items() if k not in varying} == {
@@ -48,7 +49,7 @@ def test_it_says_what_a_result_depends_on() -> None:
     assert manifest(seed=3)["seeds"] == [3]
 
 
-def test_demand_is_told_by_its_content(tmp_path: Path) -> None:
+def test_demand_is_identified_by_its_content(tmp_path: Path) -> None:
     found = []
     for period in (5, 5, 4):
         path = tmp_path / f"{len(found)}.rou.xml"
@@ -60,6 +61,32 @@ def test_demand_is_told_by_its_content(tmp_path: Path) -> None:
         found.append(world["demand_content_sha256"])
     assert found[0] == found[1] != found[2]
     assert manifest()["world"]["demand_content_sha256"] is None
+
+
+PERSON = (
+    "<routes><person id='p' depart='0'/><route id='r' edges='main_in weave main_out'/>"
+    "<flow id='f' route='r' begin='25200' end='25260' period='5'/></routes>"
+)
+
+
+def test_tolerated_demand_is_told_once_and_stated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "x.rou.xml"
+    path.write_text(PERSON)
+    demand = {"traffic.demand": [str(path)]}
+    said = [
+        f"       1 <person> is not read (first: {path}, line 1)",
+        "       1 the demand begins at 25200 s, as no vehicle departs in the 1 s from 0 s "
+        f"(first: {path}, line 1)",
+    ]
+    assert manifest(background=0, overrides=demand)["world"]["demand_tolerated"] == said
+    text = "\n".join(["merge: tolerated in the demand:", *said])
+    assert caplog.messages == [text]
+    caplog.clear()
+    make_vec("merge", num_envs=2, background=0, max_cycles=5, overrides=demand).close()
+    assert caplog.messages == [text]
+    assert manifest()["world"]["demand_tolerated"] == []
 
 
 def test_hardware_and_versions_are_never_empty() -> None:
@@ -74,7 +101,7 @@ def test_hardware_and_versions_are_never_empty() -> None:
     assert found["command"]
 
 
-def test_a_closed_one_knows_its_results(folder: Path) -> None:
+def test_a_closed_manifest_lists_its_results(folder: Path) -> None:
     document = read_closed(folder)
     assert document["status"] == "closed"
     assert document["ended"] >= document["started"]
@@ -90,13 +117,13 @@ def test_results_without_one_are_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"schema": 1}'])
-def test_a_broken_one_is_refused(folder: Path, text: str) -> None:
+def test_a_broken_manifest_is_refused(folder: Path, text: str) -> None:
     (folder / MANIFEST_FILE).write_text(text)
     with pytest.raises(ManifestError, match=r"manifest\.json"):
         load_report(folder)
 
 
-def test_one_of_another_version_is_refused(folder: Path) -> None:
+def test_a_manifest_of_another_version_is_refused(folder: Path) -> None:
     document = json.loads((folder / MANIFEST_FILE).read_text())
     (folder / MANIFEST_FILE).write_text(json.dumps({**document, "schema": 99}))
     with pytest.raises(ManifestError, match="schema 99"):
@@ -121,7 +148,7 @@ def test_a_folder_is_used_once(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("repeats", [1, 2])
-def test_who_is_killed_leaves_an_open_one(tmp_path: Path, repeats: int) -> None:
+def test_a_killed_run_leaves_an_open_manifest(tmp_path: Path, repeats: int) -> None:
     out = tmp_path / "killed"
     code = (
         "import sys; from pathlib import Path; from cavmarl.evaluate import evaluate\n"

@@ -122,17 +122,17 @@ def test_its_pictures_have_a_size_and_text(told: dict[str, Any]) -> None:
     assert told["texts"] > 40
 
 
-def test_it_fits_the_screen(told: dict[str, Any]) -> None:
+def test_the_page_fits_the_screen(told: dict[str, Any]) -> None:
     assert told["wide"] <= 1280
 
 
-def test_it_can_be_photographed(page: Path, browse: Browse, tmp_path: Path) -> None:
+def test_screenshots_of_the_page_can_be_taken(page: Path, browse: Browse, tmp_path: Path) -> None:
     shot = tmp_path / "page.png"
     browse(page, f"--screenshot={shot}")
     assert shot.stat().st_size > 50_000
 
 
-def test_it_shows_the_figures_and_the_manifest(folder: Path, page: Path) -> None:
+def test_the_page_shows_the_figures_and_the_manifest(folder: Path, page: Path) -> None:
     text, report = page.read_text(encoding="utf-8"), load_report(folder)
     success = report["built in"]["success"].mean
     assert success is not None
@@ -160,7 +160,7 @@ def test_its_ids_are_unique(page: Path) -> None:
     assert not {name for name in doubled if "_" in name}
 
 
-def test_one_run_says_that_there_is_no_interval(tmp_path: Path) -> None:
+def test_the_page_of_one_run_states_that_there_is_no_interval(tmp_path: Path) -> None:
     evaluate("merge", "idm", out=tmp_path / "one", **SMALL)
     write_page(tmp_path / "one", tmp_path / "one.html")
     assert "no interval between runs" in (tmp_path / "one.html").read_text(encoding="utf-8")

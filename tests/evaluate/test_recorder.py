@@ -109,14 +109,14 @@ def test_trips_of_less_than_a_metre_do_not_share_in_how_even_delays_are() -> Non
     assert uneven > 0.1
 
 
-def test_a_meeting_after_ten_seconds_is_none() -> None:
+def test_an_encroachment_after_ten_seconds_does_not_count() -> None:
     worlds = Worlds()
     worlds.recorder.least_pet_s[:, 0] = 9.9, 10.1
     worlds.add(done=(True, True))
     np.testing.assert_array_equal(worlds.trips["least_pet_s"], [9.9, np.nan])
 
 
-def test_who_has_touched_another_or_left_the_road_does_not_arrive_any_more() -> None:
+def test_collided_and_off_road_vehicles_do_not_arrive() -> None:
     worlds = Worlds()
     worlds.add(collision=(1.0, 0.0), off_road=(0.0, 1.0))
     worlds.add(done=(True, True), arrival=(1.0, 1.0))

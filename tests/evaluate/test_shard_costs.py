@@ -46,7 +46,7 @@ def test_every_zone_takes_some_time(simulation: Simulation) -> None:
     assert len(found.places) > 24
 
 
-def test_what_drivers_would_do_is_no_cost(simulation: Simulation) -> None:
+def test_suggested_actions_are_not_part_of_the_cost(simulation: Simulation) -> None:
     clock = simulation.zones.measure_costs()
     simulation.suggest(np.zeros((*simulation.outputs.present.shape, 2)))
     assert not clock.take_s().any()

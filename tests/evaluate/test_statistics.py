@@ -48,7 +48,7 @@ def test_fewer_than_two_runs_have_no_interval(runs: int) -> None:
     assert mean_interval(np.ones(runs)) is None
 
 
-def test_the_spread_within_a_run_is_no_interval() -> None:
+def test_the_spread_within_a_run_gives_no_interval() -> None:
     found = within_run(np.array([1.0, 2.0, np.nan, 6.0]), share=False)
     assert (found.n, found.mean, found.wilson95) == (3, 3.0, None)
     assert found.sd == pytest.approx(math.sqrt(7.0))
@@ -82,7 +82,7 @@ def test_runs_without_any_hit_or_miss_still_leave_room(
     assert run_share_interval(np.full(1, share), 30) is None
 
 
-def test_runs_that_happen_to_agree_say_no_more_than_their_trips() -> None:
+def test_equal_runs_have_the_interval_of_their_trips() -> None:
     found, trips = run_share_interval(np.full(2, 0.3), 20), share_interval(6, 20)
     assert found == trips
     # Of 100 trips: runs that nearly agree must not make their 30 % certain to a percent.
@@ -122,7 +122,7 @@ def test_an_interval_of_evenness_stays_within_its_bounds() -> None:
     assert (found.low, found.high) == pytest.approx((plain.low, plain.high), abs=1e-3)
 
 
-def test_one_value_in_all_runs_is_no_interval() -> None:
+def test_equal_values_in_all_runs_give_no_interval() -> None:
     for value in (1.0, 0.25, 0.7):
         assert mean_interval(np.array([value, value, value * (1.0 + 1e-15)])) is None
         assert bounded_interval(np.full(3, value), 0.25) is None

@@ -67,7 +67,7 @@ def inside(network: RoadNetwork, link: int) -> int:
     return int(np.flatnonzero(network.lanes["internal"] & (network.lanes["link"] == link))[0])
 
 
-def test_what_the_simulator_counts_is_handed_on(network: RoadNetwork) -> None:
+def test_counts_of_the_simulator_are_passed_on(network: RoadNetwork) -> None:
     figures = measure(network, []).figures
     assert (figures.departed, figures.waiting, figures.arrived) == (3, 2, 1)
     assert (figures.mean_delay_s, figures.teleports) == (4.5, 7)
@@ -105,9 +105,7 @@ def test_a_pair_counts_when_it_begins_to_touch(network: RoadNetwork, link: int) 
     assert measure(network, samples).figures.contacts == 2
 
 
-def test_a_lock_lasts_while_somebody_waits_and_nobody_passes(
-    network: RoadNetwork, link: int
-) -> None:
+def test_a_lock_lasts_while_vehicles_wait_and_none_passes(network: RoadNetwork, link: int) -> None:
     lane = int(network.links["from_lane"][link])
     into, way = inside(network, link), rows(car(network, 0, lane))
     junction = network.junction_ids[network.edges["to_junction"][network.lanes["edge"][lane]]]
@@ -116,7 +114,7 @@ def test_a_lock_lasts_while_somebody_waits_and_nobody_passes(
     assert (run.figures.longest_lock_s, run.figures.locked_junction) == (5.0, junction)
 
 
-def test_who_stands_inside_locks_and_who_vanishes_there_passes(
+def test_a_vehicle_inside_a_junction_locks_it_until_it_vanishes(
     network: RoadNetwork, link: int
 ) -> None:
     stuck = rows(car(network, 0, inside(network, link)))
@@ -137,7 +135,7 @@ def test_time_at_red_neither_counts_nor_ends_a_lock(network: RoadNetwork, link: 
 
 
 @pytest.mark.parametrize(("to_end_m", "speed"), [(STOP_LINE_M + 0.1, 0.0), (1.0, 0.2)])
-def test_who_is_not_at_the_stop_line_or_moves_does_not_wait(
+def test_moving_vehicles_and_vehicles_off_the_line_do_not_wait(
     network: RoadNetwork, link: int, to_end_m: float, speed: float
 ) -> None:
     way = rows(car(network, 0, int(network.links["from_lane"][link]), to_end_m, speed))

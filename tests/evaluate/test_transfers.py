@@ -80,9 +80,7 @@ def test_zones_change_nothing_else(folder: Path) -> None:
     assert [divided[name] for name in alike] == [whole["idm"][name] for name in alike]
 
 
-def test_each_episode_tells_how_unevenly_vehicles_are_shared_out(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_each_episode_has_the_imbalance_of_its_zones(folder: Path, tmp_path: Path) -> None:
     rows = read_table(folder / EPISODES_FILE, EPISODE)["idm"]
     assert len(rows) == 6
     assert ((rows["zone_imbalance"] > 1.0) & (rows["zone_imbalance"] < 2.0)).all()
@@ -129,6 +127,6 @@ def test_each_run_has_journals_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "run.0.jsonl").unlink()
     (tmp_path / "run.1.jsonl").unlink()
     out = tmp_path / "out"
-    with pytest.raises(JournalError, match=r"run\.run-1\.0\.jsonl: exists; take it away"):
+    with pytest.raises(JournalError, match=r"run\.run-1\.0\.jsonl: exists; move it away"):
         evaluate("grid4x4", "idm", out=out, **few)
     assert not (out / "manifest.json").exists(), "it is refused before the first run"

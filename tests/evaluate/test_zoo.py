@@ -41,7 +41,7 @@ def test_each_entry_is_what_its_result_says(found) -> None:  # type: ignore[no-u
     assert not again.differing
 
 
-def test_what_was_changed_by_a_byte_is_refused(entry: Path) -> None:
+def test_files_with_a_changed_byte_are_refused(entry: Path) -> None:
     weights = entry / "model.safetensors"
     whole = bytearray(weights.read_bytes())
     whole[-1] ^= 1
@@ -66,7 +66,7 @@ def test_another_world_is_not_compared(entry: Path) -> None:
         verify_entry(entry)
 
 
-def test_a_difference_is_found(entry: Path) -> None:
+def test_a_difference_is_reported_with_its_step(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["job"] |= {"episodes": 1, "seed": 3}
@@ -85,7 +85,7 @@ def test_a_result_is_recorded_again(entry: Path) -> None:
     assert sorted(found.name for found in entry.iterdir()) == FILES
 
 
-def test_a_result_that_cannot_be_recorded_stays(entry: Path) -> None:
+def test_a_result_stays_if_recording_it_again_fails(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["job"]["overrides"] = {"sensors.neighbors.range_m": 30.0}
@@ -97,7 +97,7 @@ def test_a_result_that_cannot_be_recorded_stays(entry: Path) -> None:
     assert sorted(found.name for found in entry.iterdir()) == FILES
 
 
-def test_what_is_no_entry(entry: Path, tmp_path: Path) -> None:
+def test_unknown_entries_are_refused(entry: Path, tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match="is a script"):
         verify_entry("idm")
     shutil.rmtree(entry / "result")

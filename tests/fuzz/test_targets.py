@@ -17,14 +17,14 @@ SLOW_MUTATIONS = 15
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_seeds_are_taken(name: str) -> None:
+def test_seed_files_are_accepted(name: str) -> None:
     target = TARGETS[name]
     for content in target.seeds():
         assert target.accepts(content), target.parse(content)
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_mutations_are_taken_or_refused_on_purpose(name: str) -> None:
+def test_mutated_files_are_accepted_or_refused_with_a_typed_error(name: str) -> None:
     target, rng = TARGETS[name], random.Random(0)
     seeds = target.seeds()
     number = SLOW_MUTATIONS if target.slow else MUTATIONS
@@ -37,7 +37,7 @@ def test_mutations_are_taken_or_refused_on_purpose(name: str) -> None:
 
 @pytest.mark.parametrize("content", [b"[" * 100_000, b'{"seed": ' + b"9" * 5000 + b"}", b"\xff"])
 @pytest.mark.parametrize("name", TARGETS)
-def test_what_stumbles_parsers_is_refused(name: str, content: bytes) -> None:
+def test_hostile_files_are_refused(name: str, content: bytes) -> None:
     TARGETS[name].accepts(content)
 
 

@@ -16,7 +16,7 @@ def test_each_row_is_recorded() -> None:
 
 
 @pytest.mark.parametrize(("name", "way"), CASES, ids=lambda word: word or "undivided")
-def test_a_world_does_what_it_did(name: str, way: str, tmp_path: Path) -> None:
+def test_a_world_gives_the_recorded_results(name: str, way: str, tmp_path: Path) -> None:
     if name in ("town", "sumo-traffic"):
         pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     write_inputs(str(tmp_path))

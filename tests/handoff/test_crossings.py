@@ -76,7 +76,7 @@ def strips(tmp_path: Path, xs: Sequence[float], ys: Sequence[float] = ()) -> Pat
     return cut_at(tmp_path / "zones.json", (-10.0, -10.0, 210.0, 410.0), xs, ys)
 
 
-def test_a_hundred_cross_a_border_in_the_same_tick(platoon: Build, tmp_path: Path) -> None:
+def test_a_hundred_vehicles_cross_a_border_in_the_same_tick(platoon: Build, tmp_path: Path) -> None:
     whole, divided = both(platoon, strips(tmp_path, [80.0]), 2)
     before: dict[int, int] = {}
     crossed = []
@@ -87,7 +87,7 @@ def test_a_hundred_cross_a_border_in_the_same_tick(platoon: Build, tmp_path: Pat
     assert divided.zones.loads().owned[:, 0].tolist() == [0, MANY]
 
 
-def test_a_hundred_cross_in_both_directions_in_the_same_tick(tmp_path: Path) -> None:
+def test_a_hundred_vehicles_cross_in_both_directions_in_the_same_tick(tmp_path: Path) -> None:
     ways = [((0.0, 4.0 * k), (160.0, 4.0 * k)) for k in range(MANY)]
     roads = [(b, a) if k % 2 else (a, b) for k, (a, b) in enumerate(ways)]
     net = write_roads(tmp_path / "rows.net.xml", roads, SPEED_MPS)
@@ -144,7 +144,7 @@ def test_corners_where_four_zones_meet(tmp_path: Path) -> None:
     assert len(ways) == len(roads)
 
 
-def test_who_arrives_on_the_border_leaves_once(platoon: Build, tmp_path: Path) -> None:
+def test_a_vehicle_that_arrives_on_the_border_leaves_once(platoon: Build, tmp_path: Path) -> None:
     # Behind the border, within the hysteresis, the road ends: the old zone's cars arrive there.
     whole, divided = both(platoon, strips(tmp_path, [199.0]), 2)
     for _ in together(whole, divided, 200):

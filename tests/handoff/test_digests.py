@@ -31,7 +31,7 @@ def test_the_digest_is_that_of_its_plain_twin(
     assert (int(upper) << 64) + int(lower) == expected
 
 
-def test_sums_carry() -> None:
+def test_sums_of_digests_carry_between_words() -> None:
     word = next(w for w in range(1000) if naive.mixed(w) > 1 << 63)
     words = np.full((4, 1), word, dtype=np.uint64)
     all_bits, one = np.array([(1 << 64) - 1], np.uint64), np.array([1], np.uint64)

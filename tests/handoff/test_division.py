@@ -148,7 +148,7 @@ def test_what_is_changed_in_all_next_rows_goes_back_to_their_shards() -> None:
     for shard in simulation.shards:
         np.copyto(shard.worlds.next_rows, shard.worlds.rows)
     before = [[part.copy() for part in owned(simulation, world)] for world in range(2)]
-    with simulation.division.everybody_next() as everybody:
+    with simulation.division.all_next_rows() as everybody:
         for world in range(2):
             num = everybody.num_owned[world]
             assert num == len(simulation.vehicles(world))
@@ -161,7 +161,7 @@ def test_what_is_changed_in_all_next_rows_goes_back_to_their_shards() -> None:
             assert (after == part).all()
 
 
-def test_a_reset_of_one_world_leaves_the_others_as_they_are() -> None:
+def test_a_reset_of_one_world_does_not_change_other_worlds() -> None:
     simulation = divided()
     for _ in range(20):
         drive(simulation)

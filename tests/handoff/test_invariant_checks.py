@@ -158,7 +158,7 @@ def started(seed: int) -> tuple[Looks, np.random.Generator, NDArray[np.void]]:
 
 @pytest.mark.parametrize("stay", [0.0, 0.8, 1.0], ids=["rows change", "few do", "rows stay"])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_run_is_looked_at_as_by_the_plain_twin(seed: int, stay: float) -> None:
+def test_the_check_of_a_run_equals_its_plain_twin(seed: int, stay: float) -> None:
     looks, rng, rows = started(seed)
     kinds: Counter[str] = Counter()
     for tick in range(11, 70):
@@ -183,7 +183,7 @@ def test_a_vehicle_that_is_nowhere_is_found(name: str) -> None:
     assert looks.found["vehicle"] == lost["id"]
 
 
-def test_sums_tell_that_all_is_well() -> None:
+def test_sums_of_a_correct_state_are_equal() -> None:
     looks, rng, rows = started(7)
     assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11)
     assert (looks.tallies["due"] == looks.tallies["seen"]).all()
@@ -235,7 +235,7 @@ def test_a_ghost_that_is_not_its_owners_row_changes_the_sum(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["hit", "events", "episode_return", "epoch"])
-def test_what_a_ghost_need_not_know_does_not(name: str) -> None:
+def test_fields_that_ghosts_do_not_need_may_differ(name: str) -> None:
     looks, rng, rows = started(9)
     zones = dealt(moved(rng, rows, 1.0))
     zones[1].ghosts[name][0] += 1

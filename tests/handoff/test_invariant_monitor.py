@@ -161,7 +161,7 @@ VIOLATIONS = {
 
 
 @pytest.mark.parametrize("meddle", VIOLATIONS, ids=lambda meddle: meddle.__name__)
-def test_the_monitor_finds(
+def test_the_monitor_finds_each_violation(
     meddle: Callable[[Meddling], None], simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world = Meddling(simulation, monkeypatch)
@@ -177,7 +177,7 @@ def narrow(monkeypatch: pytest.MonkeyPatch) -> Meddling:
     return Meddling(found, monkeypatch)
 
 
-def test_a_ghost_that_is_there_twice(narrow: Meddling) -> None:
+def test_a_duplicated_ghost_is_detected(narrow: Meddling) -> None:
     def meddle() -> None:
         rows, owned, num = narrow.zone(1)
         rows[num] = rows[owned]
@@ -188,7 +188,7 @@ def test_a_ghost_that_is_there_twice(narrow: Meddling) -> None:
     )
 
 
-def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
+def test_a_needless_ghost_is_detected(narrow: Meddling) -> None:
     def meddle() -> None:
         rows, _, num = narrow.zone(1)
         others, owned, _ = narrow.zone(2)
@@ -202,7 +202,7 @@ def test_a_ghost_that_is_of_no_use(narrow: Meddling) -> None:
     )
 
 
-def test_a_ghost_of_nobody(narrow: Meddling) -> None:
+def test_a_ghost_of_a_missing_vehicle_is_detected(narrow: Meddling) -> None:
     def meddle() -> None:
         rows, _, num = narrow.zone(1)
         rows[num]["id"] = 7_777
@@ -211,7 +211,7 @@ def test_a_ghost_of_nobody(narrow: Meddling) -> None:
     narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which does not exist")
 
 
-def test_an_arrival_of_somebody_who_is_there(
+def test_a_recorded_arrival_of_a_present_vehicle_is_detected(
     narrow: Meddling, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All sums hold: it is said to arrive, deep in a zone where nobody else sees it."""
@@ -234,7 +234,7 @@ def test_an_arrival_of_somebody_who_is_there(
     narrow.caught(meddle, r"one owner: vehicle \d+ is owned by zones \[1, 2\]")
 
 
-def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unrecorded_arrival_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = watched()
     coordination: Any = coordination_of(simulation)
     coordinator = coordination.coordinators[0]

@@ -55,7 +55,7 @@ def written(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_appended_comes_back(tmp_path: Path) -> None:
+def test_appended_records_are_read_back(tmp_path: Path) -> None:
     log = eventful().log
     with Journal(tmp_path / "run.journal") as journal:
         journal.append(log[:1])
@@ -108,12 +108,12 @@ def test_a_journal_goes_on_behind_what_is_there(tmp_path: Path) -> None:
     assert list(JournalReader(path)) == log
 
 
-def test_a_fork_does_not_write_its_mothers_journal(tmp_path: Path) -> None:
+def test_a_fork_does_not_write_its_parents_journal(tmp_path: Path) -> None:
     log, path = eventful().log, tmp_path / "run.journal"
     with Journal(path) as journal:
         journal.append(log[:3])
         said = said_in_fork(lambda: journal.append(log[3:]), journal.close)
-        assert f"the lines of {path} are those of process" in said
+        assert f"the lines of {path} belong to process" in said
         journal.append(log[3:])
     assert list(JournalReader(path)) == log
 
@@ -195,7 +195,7 @@ def test_damage_is_refused_with_file_and_line(written: Path) -> None:
         assert written.read_bytes() == b"".join(damaged)
 
 
-def test_paths_that_cannot_be_are_refused_with_a_cure(tmp_path: Path, written: Path) -> None:
+def test_invalid_paths_are_refused_with_a_fix(tmp_path: Path, written: Path) -> None:
     for path in (tmp_path / "none" / "run.journal", written / "run.journal"):
         where = re.escape(f"{path}: the journal cannot be written")
         with pytest.raises(JournalError, match=f"{where}.*choose another path"):

@@ -16,7 +16,7 @@ from cavmarl.handoff.coordinator.journal_summary import owners_at
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.ownership.log_records import replay as replay_records
 from cavmarl.ownership.messages import Begin
-from cavmarl.zones.kernels.ownership_changes import LATE
+from cavmarl.zones.kernels.ownership_changes import UNREAD_LIMIT
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.cli.test_main import run as command
@@ -72,7 +72,7 @@ def just_before_the_end_of(edge: str, path: Path) -> Path:
     return path
 
 
-def test_who_leaves_in_the_tick_of_its_change_is_told_from_others(tmp_path: Path) -> None:
+def test_vehicles_that_leave_in_the_tick_of_their_change_are_marked(tmp_path: Path) -> None:
     """The trip ends in 3.5 m, and a tick takes the car up to 2.8 m."""
     demand = tmp_path / "grid.rou.xml"
     demand.write_text(
@@ -96,7 +96,7 @@ def test_who_leaves_in_the_tick_of_its_change_is_told_from_others(tmp_path: Path
     assert [row.release_depth_m is None for row in log.rows] == gone
 
 
-def test_whoever_turns_away_from_a_border_is_forgotten() -> None:
+def test_a_vehicle_that_turns_away_from_a_border_is_forgotten() -> None:
     run = record("grid4x4", {**BUSY, "zones.approach_ticks": 30}, 2 * STEPS)
     simulation = replay(run, ZONES).simulation
     assert simulation.transfers[0].counts["aborted"] > 0
@@ -115,15 +115,15 @@ def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
             vec.step(vec.suggest_actions())
         most = max(most, int(book.num_changes[0]))
     assert most > 3 * divided.simulation.capacity
-    assert LATE - 1 + divided.simulation.capacity <= book.changes.shape[1]
+    assert UNREAD_LIMIT - 1 + divided.simulation.capacity <= book.changes.shape[1]
     assert whole.state_hash() == divided.state_hash()
 
 
-def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late(
+def test_the_table_is_updated_on_request_or_after_many_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     late = 16  # so many changes are soon there
-    monkeypatch.setattr(direct, "LATE", late)
+    monkeypatch.setattr(direct, "UNREAD_LIMIT", late)
     vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
     vec.reset(seed=1)
     simulation = vec.simulation
@@ -144,7 +144,7 @@ def test_the_table_is_brought_up_to_date_when_somebody_asks_or_it_is_late(
     assert on_record == dict(simulation.division.owners(0))
 
 
-def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> None:
+def test_a_change_from_a_zone_that_is_not_the_recorded_owner_is_detected() -> None:
     vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
     vec.reset(seed=1)
     (coordinator,) = vec.simulation.coordinators
@@ -160,7 +160,7 @@ def test_a_change_from_somebody_who_is_not_the_owner_on_record_is_noticed() -> N
         _ = coordinator.directory
 
 
-def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
+def test_a_lost_vehicle_is_detected(busy: Recorded) -> None:
     vec = make_vec("grid4x4", zones=4, overrides=BUSY)
     vec.reset(seed=1)
     lost = vec.simulation.shards[1].worlds.num_owned
@@ -170,7 +170,7 @@ def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
             vec.step(vec.suggest_actions())
 
 
-def test_the_journal_tells_actions_apart(tmp_path: Path) -> None:
+def test_the_journal_distinguishes_actions(tmp_path: Path) -> None:
     told = []
     for name, throttle in (("one", 0.0), ("again", 0.0), ("other", 0.5)):
         path = tmp_path / f"{name}.jsonl"

@@ -35,7 +35,7 @@ def worlds(env: str, zones: int, mode: str = "respawn", **overrides: Any) -> Sim
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
 @pytest.mark.parametrize(("env", "mode"), [("grid4x4", "respawn"), ("merge", "open")])
-def test_a_world_that_is_cut_anew_is_the_undivided_one(env: str, mode: str, zones: int) -> None:
+def test_a_repartitioned_world_equals_the_undivided_one(env: str, mode: str, zones: int) -> None:
     whole, repartitioned = worlds(env, 1, mode), worlds(env, zones, mode, **OFTEN)
     for _ in range(80):
         drive(whole)
@@ -52,7 +52,7 @@ def test_a_world_that_is_cut_anew_is_the_undivided_one(env: str, mode: str, zone
     )
 
 
-def test_who_enters_in_the_last_tick_before_the_cut_goes_to_its_new_zone() -> None:
+def test_a_vehicle_that_enters_just_before_repartitioning_gets_its_new_zone() -> None:
     repartitioned = worlds("merge", 4, "open", **OFTEN)
     entered = 0
     for _ in range(120):
@@ -67,7 +67,7 @@ def test_who_enters_in_the_last_tick_before_the_cut_goes_to_its_new_zone() -> No
     assert entered > 0
 
 
-def test_the_journal_of_a_world_that_is_cut_anew_tells_of_each_move(tmp_path: Path) -> None:
+def test_the_journal_of_a_repartitioned_world_has_each_change_of_owner(tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
     repartitioned = make_simulation(
         "rush", mode="closed", agents=20, background=0,
@@ -80,7 +80,7 @@ def test_the_journal_of_a_world_that_is_cut_anew_tells_of_each_move(tmp_path: Pa
     assert sum(len(line.get("switches", ())) for line in lines) == repartitioned.migrations > 20
 
 
-def test_zones_that_are_even_stay() -> None:
+def test_balanced_zones_do_not_change() -> None:
     calm = worlds(
         "grid4x4", 2, **{"zones.repartition_steps": 3, "zones.repartition_tolerance": 0.9}
     )
@@ -91,7 +91,7 @@ def test_zones_that_are_even_stay() -> None:
     assert calm.partition is before
 
 
-def test_worlds_of_workers_are_cut_anew_too() -> None:
+def test_worlds_of_workers_are_repartitioned_too() -> None:
     overrides = {"zones.repartition_steps": 3, "zones.repartition_tolerance": 0.0}
     alone, shared = (
         make_vec("grid4x4", num_envs=2, zones=4, workers=workers, overrides=overrides)
@@ -116,7 +116,9 @@ def test_worlds_of_workers_are_cut_anew_too() -> None:
         ({"zones.repartition_tolerance": float("nan")}, "zones.repartition_tolerance"),
     ],
 )
-def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: str) -> None:
+def test_worlds_that_cannot_be_repartitioned_are_refused(
+    overrides: dict[str, Any], words: str
+) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec("grid4x4", zones=2, overrides=overrides)
 

@@ -84,7 +84,7 @@ def test_the_clock_accounts_for_all_time() -> None:
     assert all(collector.times.spent_s[phase] > 0.0 for phase in PPO.PHASES[:3])
 
 
-def test_seats_of_opponents_teach_nothing_and_drive_as_they_do() -> None:
+def test_seats_of_opponents_are_not_trained_and_drive_as_their_policy() -> None:
     vec = make_worlds("SameStep")
     size = vec.single_observation_space.shape[0]
     config = NetworkConfig("merge", size, vec.config.sensors, vec.config.action, (8,))
@@ -98,7 +98,7 @@ def test_seats_of_opponents_teach_nothing_and_drive_as_they_do() -> None:
     assert batch.acted[:, ~theirs].float().mean() > 0.5
 
 
-def test_nothing_is_expected_after_a_red_light() -> None:
+def test_no_return_is_expected_after_a_red_light() -> None:
     found = {}
     for end_at_red in (False, True):
         vec = make_vec("grid4x4", num_envs=4, seed=0)

@@ -29,6 +29,11 @@ class Few:
         check_at_least(self, {"steps": 1})
 
 
+@dataclass(frozen=True)
+class WithPlugins:
+    plugins: Annotated[str, "modules"] = ""
+
+
 def test_options_shadow_a_file_and_a_file_the_defaults(tmp_path: Path) -> None:
     file = tmp_path / "few.yaml"
     file.write_text("steps: 7\nrate: 0.25\n")
@@ -47,6 +52,11 @@ def test_a_wrong_file_is_refused(tmp_path: Path, text: str, said: str) -> None:
         parse_settings(Few, ["--config", str(file)], "")
 
 
+def test_modules_to_import_can_be_repeated() -> None:
+    words = ["--import", "my_terms", "--import", "my_package.sensors"]
+    assert parse_settings(WithPlugins, words, "").plugins == "my_terms,my_package.sensors"
+
+
 def test_the_first_line_of_the_text_is_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         parse_settings(Few, ["--help"], "Learns little.\n\nMore.")
@@ -61,7 +71,7 @@ def test_a_run_lies_where_its_name_says() -> None:
     assert run_folder("runs", "", "maps/town.net.xml", "ippo", 3) == Path("runs/town_ippo_3")
 
 
-def test_wrong_use_is_said_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_use_is_reported_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     def train() -> Path:
         raise ConfigError("no such world")
 

@@ -46,7 +46,9 @@ def named(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)
-def test_it_decides_and_judges_as_the_driver_does(form: dict[str, int], tmp_path: Path) -> None:
+def test_a_warm_start_has_the_actions_and_values_of_the_driver(
+    form: dict[str, int], tmp_path: Path
+) -> None:
     its, ours = made(FEWER, form, 1), made(MORE, form, 2)
     driver, run = network(its), network(ours)
     save_network(tmp_path, driver, its)

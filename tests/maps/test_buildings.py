@@ -151,7 +151,7 @@ def test_buildings_of_another_place_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "shape", ["0,0 9e9,0 9e9,8", " ".join(f"{k},{k % 2}" for k in range(4001))]
 )
-def test_what_is_no_building_by_its_size_is_refused(tmp_path: Path, shape: str) -> None:
+def test_buildings_of_impossible_size_are_refused(tmp_path: Path, shape: str) -> None:
     network = read_network(Path("envs/merge/map/map.net.xml"))
     path = written(tmp_path, POLYGONS.replace("0,0 10,0 10,8 0,8 0,0", shape), "a.poly.xml")
     with pytest.raises(MapError, match=r"poly hall is .* remove it"):

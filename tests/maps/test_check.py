@@ -129,7 +129,7 @@ def test_a_map_without_connections_cannot_be_driven(check: Callable[..., MapRepo
     report = check(("<connection ", "<param key='' value='' "))
     assert not report.drivable
     assert report.problems == (
-        "no edge leads to another: the map has no connections (build it again)",
+        "no edge leads to another edge: the map has no connections: build it again",
     )
 
 

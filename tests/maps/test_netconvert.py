@@ -133,8 +133,14 @@ def test_a_box_elsewhere_is_refused(town: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (TOWN.replace("KIND", "footway"), "No edges loaded"),
-        ('<osm version="0.6"/>', "No nodes loaded"),
+        (TOWN.replace("KIND", "footway"), "no road for cars: .*are: 2 footway; export an area"),
+        (
+            TOWN.replace('<way id="6">', '<way id="6"><!--')
+            .replace("</osm>", "--></way></osm>")
+            .replace("KIND", "primary"),
+            "no two roads for cars meet",
+        ),
+        ('<osm version="0.6"/>', "no way has a highway tag"),
         (TOWN.replace("48.001", "nan").replace("KIND", "residential"), "town.osm: "),
         ("<html/>", "not the root of a map"),
         (TOWN[:200], "line 4: broken XML"),
@@ -264,7 +270,7 @@ def _end_in_netconvert(tmp_path: Path, call: str, how: signal.Signals) -> int:
     slow.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 600\n")
     slow.chmod(0o755)
     source = tmp_path / "a.osm"
-    source.write_text("<osm/>")
+    source.write_text(TOWN.replace("KIND", "residential"))
     program = (
         "from types import SimpleNamespace; from cavmarl.maps import netconvert_process; "
         f"netconvert_process.require = lambda *_: SimpleNamespace(SUMO_HOME={str(tmp_path)!r}); "

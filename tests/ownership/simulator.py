@@ -322,7 +322,7 @@ class Simulator:
         """Whether offers of the tick are answered, or have been sent as often as allowed."""
         tick = self.directory.table.planned.record.tick
         return all(
-            not host.endpoint.offers.owed
+            not host.endpoint.offers.unanswered
             or host.endpoint.tick != tick
             or host.endpoint.offers.attempts >= self.limits.attempts
             for host in self.hosts.values()

@@ -43,7 +43,7 @@ def test_r08_the_source_goes_on_for_d_ticks_and_then_the_hand_off_is_forced() ->
     assert step.enter[0].state == version(7, 3)
 
 
-def test_r28_who_comes_back_before_the_switch_has_not_waited() -> None:
+def test_r28_a_vehicle_that_returns_before_the_switch_was_not_deferred() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)])
     bench.tick(movers=[(7, 1)])
@@ -87,7 +87,7 @@ def test_r36_a_change_to_a_zone_that_is_no_neighbour_is_refused() -> None:
     in_a_row = tuple(map(frozenset, ({0, 1}, {0, 1, 2}, {1, 2})))
     for may_teleport in (False, True):
         bench = Bench(zones=3)
-        bench.directory.know(Neighbours(in_a_row, may_teleport))
+        bench.directory.set_neighbours(Neighbours(in_a_row, may_teleport))
         bench.tick(births=[(7, 0), (8, 1)], offers=[(7, 2), (8, 2)])
         if may_teleport:
             bench.begin([(7, 2), (8, 2)])
@@ -105,5 +105,5 @@ def test_r36_a_change_to_a_zone_that_is_no_neighbour_is_refused() -> None:
         for entry in before:
             checker.take(entry)
         wrong = Begin(0, begun.item.tick, (Switch(7, 0, 2, 1, False),))
-        with pytest.raises(ProtocolError, match="v7 goes to no neighbour"):
+        with pytest.raises(ProtocolError, match="2 is no neighbour of 0"):
             checker.take(TraceEntry(LOG, wrong))

@@ -56,7 +56,7 @@ MESSAGES: tuple[Message, ...] = (
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
-def test_what_is_sent_arrives(message: Message) -> None:
+def test_decoded_messages_equal_encoded_ones(message: Message) -> None:
     assert decode(encode(message), RUN) == message
 
 

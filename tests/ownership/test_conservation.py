@@ -77,16 +77,16 @@ def drive(handoffs: int) -> None:
     assert sum(traffic.network.faults.values()) > handoffs / 200
 
 
-def test_a_hundred_thousand_hand_offs_lose_nobody() -> None:
+def test_a_hundred_thousand_hand_offs_lose_no_vehicle() -> None:
     drive(100_000)
 
 
 @pytest.mark.slow
-def test_a_million_hand_offs_lose_nobody() -> None:
+def test_a_million_hand_offs_lose_no_vehicle() -> None:
     drive(1_000_000)
 
 
-def test_nothing_grows_with_the_ticks() -> None:
+def test_memory_does_not_grow_with_the_ticks() -> None:
     traffic = Traffic()
     sizes = []
     for tick in range(90):

@@ -46,11 +46,11 @@ def test_a_file_of_the_core_prints_opens_and_hashes_nothing(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["trace_check", "trace"])
-def test_the_judge_uses_none_of_the_code_that_it_judges(name: str) -> None:
+def test_the_checker_uses_no_code_that_it_checks(name: str) -> None:
     (path,) = (path for path in FILES if path.stem == name)
     judged = {"directory", "endpoint", "table", "planning", "decisions", "readiness", "replicas"}
     assert not {f"cavmarl.ownership.{module}" for module in judged} & imports(path)
 
 
-def test_there_are_files() -> None:
+def test_the_list_of_files_is_not_empty() -> None:
     assert len(FILES) > 15

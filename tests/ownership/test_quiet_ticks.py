@@ -67,7 +67,7 @@ class Both:
             assert zone.tally == self.directory.table.tallies[number]
 
 
-def test_nothing_is_said_and_the_same_is_known() -> None:
+def test_quiet_ticks_need_no_messages_and_give_the_same_table() -> None:
     told, quiet = Both(), Both()
     for _ in range(3):
         told.tell([])
@@ -81,7 +81,7 @@ def test_nothing_is_said_and_the_same_is_known() -> None:
     assert quiet.known() == told.known()
 
 
-def test_a_zone_may_have_something_to_say_after_all() -> None:
+def test_a_zone_can_break_a_quiet_tick() -> None:
     told, quiet = Both(), Both()
     told.deliver(told.directory.begin(()).messages)
     told.deliver((told.zones[0].complete(0, [Removed(2, 1)]), told.zones[1].complete(0)))
@@ -99,7 +99,7 @@ def test_a_zone_may_have_something_to_say_after_all() -> None:
     assert quiet.known() == told.known()
 
 
-def test_what_is_acknowledged_in_a_quiet_tick_counts() -> None:
+def test_acknowledgements_in_a_quiet_tick_count() -> None:
     both = Both()
     both.leave_alone()
     both.deliver(both.zones[0].offer([Approach(1, 1, STATE)]))

@@ -30,7 +30,7 @@ def log() -> str:
     return simulator.log
 
 
-def test_a_line_says_what_it_is(log: str) -> None:
+def test_a_line_has_its_schema_sequence_and_kind(log: str) -> None:
     for sequence, line in enumerate(log.splitlines()):
         content = json.loads(line)
         assert (content["schema"], content["sequence"]) == (SCHEMA, sequence)

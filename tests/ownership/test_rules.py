@@ -148,7 +148,7 @@ def test_r10_a_row_that_left_is_kept_until_its_switch_is_committed() -> None:
     assert bench.endpoints[0].row_state(7) is State.NONE
 
 
-def test_r11_every_living_host_has_said_done() -> None:
+def test_r11_a_commit_needs_the_done_of_every_living_host() -> None:
     bench = Bench()
     first, second = bench.begin()
     (done,) = bench.give(first)
@@ -178,7 +178,7 @@ def test_r12_the_ledger_is_exact_or_the_tick_is_not_committed() -> None:
         bench.commit()
 
 
-def test_r13_what_is_stored_is_what_was_told() -> None:
+def test_r13_stored_rows_equal_the_reported_rows() -> None:
     bench = Bench()
     for step in bench.begin(births=[(7, 0)]):
         bench.give(bench.give(step)[0])
@@ -272,7 +272,7 @@ def test_r20_a_repeated_step_is_answered_from_memory() -> None:
     assert bench.endpoints[0].tick == 1
 
 
-def test_r21_what_a_fenced_process_says_counts_for_nothing() -> None:
+def test_r21_messages_of_a_fenced_process_are_dropped() -> None:
     bench = approached(Bench())
     step = bench.begin(movers=[(7, 1)])[1]
     (late,) = bench.give(step)

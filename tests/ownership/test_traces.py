@@ -113,7 +113,7 @@ TOLD = {
 
 
 @pytest.mark.parametrize("name", [*TICKS, *TOLD])
-def test_the_story_is_told_as_on_file(name: str) -> None:
+def test_the_text_of_a_trace_equals_its_file(name: str) -> None:
     zones, ticks = TICKS.get(name, (2, []))
     bench = Bench(zones)
     for number, tick in enumerate(ticks):
@@ -126,7 +126,7 @@ def test_the_story_is_told_as_on_file(name: str) -> None:
     assert bench.trace.text() == path.read_text(encoding="utf-8")
 
 
-def test_every_file_has_its_story() -> None:
+def test_every_trace_file_has_a_scenario() -> None:
     assert sorted(path.stem for path in TRACES.glob("*.txt")) == sorted([*TICKS, *TOLD])
 
 
@@ -172,7 +172,7 @@ def without(
     return [entry for k, entry in enumerate(entries) if k not in gone]
 
 
-def test_the_judge_accepts_a_correct_run(entries: tuple[TraceEntry, ...]) -> None:
+def test_the_checker_accepts_a_correct_run(entries: tuple[TraceEntry, ...]) -> None:
     judge(list(entries))
 
 
@@ -185,7 +185,7 @@ def test_the_judge_accepts_a_correct_run(entries: tuple[TraceEntry, ...]) -> Non
         ({"target": 9}, "without an ACK"),
     ],
 )
-def test_the_judge_refuses_another_switch(
+def test_the_checker_refuses_another_switch(
     entries: tuple[TraceEntry, ...], change: dict[str, object], why: str
 ) -> None:
     with pytest.raises(ProtocolError, match=why):
@@ -195,23 +195,23 @@ def test_the_judge_refuses_another_switch(
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
-        (Prepare, "which that host never held so"),
+        (Prepare, "acknowledges an unknown state"),
         (Ack, "without an ACK"),
-        (Done, "has not said DONE"),
+        (Done, "has sent no DONE"),
         (Begin, "was sent before it was logged"),
         (Commit, "a tick is decided twice"),
         (Host, "has the zones"),
-        (Reset, "has not said DONE"),
+        (Reset, "has sent no DONE"),
     ],
 )
-def test_the_judge_misses_what_is_left_out(
+def test_the_checker_detects_missing_entries(
     entries: tuple[TraceEntry, ...], kind: type, why: str
 ) -> None:
     with pytest.raises(ProtocolError, match=why):
         judge(without(entries, kind, lambda entry: True))
 
 
-def test_the_judge_refuses_a_switch_without_its_ack(entries: tuple[TraceEntry, ...]) -> None:
+def test_the_checker_refuses_a_switch_without_its_ack(entries: tuple[TraceEntry, ...]) -> None:
     _, begin, switch = first_switch(entries)
     lost = without(
         entries,
@@ -227,7 +227,7 @@ def test_the_judge_refuses_a_switch_without_its_ack(entries: tuple[TraceEntry, .
         judge(lost)
 
 
-def test_the_judge_refuses_a_step_before_its_record(entries: tuple[TraceEntry, ...]) -> None:
+def test_the_checker_refuses_a_step_before_its_record(entries: tuple[TraceEntry, ...]) -> None:
     k, begin, _ = first_switch(entries)
     (after, *_) = places(entries, Step, lambda entry: entry.item.tick == begin.tick)
     swapped = list(entries)
@@ -236,7 +236,9 @@ def test_the_judge_refuses_a_step_before_its_record(entries: tuple[TraceEntry, .
         judge(swapped)
 
 
-def test_the_judge_refuses_a_done_without_its_confirmation(entries: tuple[TraceEntry, ...]) -> None:
+def test_the_checker_refuses_a_done_without_its_confirmation(
+    entries: tuple[TraceEntry, ...],
+) -> None:
     lied = [
         TraceEntry(to, replace(item, confirmed=()))
         if isinstance(item, Done)
@@ -247,7 +249,7 @@ def test_the_judge_refuses_a_done_without_its_confirmation(entries: tuple[TraceE
         judge(lied)
 
 
-def test_the_judge_refuses_a_wrong_ledger(entries: tuple[TraceEntry, ...]) -> None:
+def test_the_checker_refuses_a_wrong_ledger(entries: tuple[TraceEntry, ...]) -> None:
     k = places(entries, Commit, lambda entry: True)[3]
     commit = entries[k].item
     assert isinstance(commit, Commit)
@@ -259,19 +261,19 @@ def test_the_judge_refuses_a_wrong_ledger(entries: tuple[TraceEntry, ...]) -> No
         judge([*entries[:k], TraceEntry(LOG, lie), *entries[k + 1 :]])
 
 
-def test_the_judge_refuses_a_stale_acknowledgement() -> None:
+def test_the_checker_refuses_a_stale_acknowledgement() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     acks = [entry for entry in bench.trace.entries if isinstance(entry.item, Ack)]
     ack = acks[0].item
     assert isinstance(ack, Ack)
     bench.trace.delivered(COORDINATOR, replace(ack, tick=2))
-    with pytest.raises(ProtocolError, match="never held so"):
+    with pytest.raises(ProtocolError, match="acknowledges an unknown state"):
         bench.judge()
 
 
 @pytest.mark.parametrize("seed", [1, 3, 4])
-def test_the_judge_accepts_campaigns_and_refuses_them_when_a_record_is_gone(seed: int) -> None:
+def test_the_checker_accepts_campaigns_unless_a_record_is_missing(seed: int) -> None:
     simulator = campaign(seed, "corner")
     simulator.run(15)
     entries = tuple(simulator.trace.entries)

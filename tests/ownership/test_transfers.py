@@ -33,7 +33,7 @@ def test_a_prepared_transfer_has_its_row() -> None:
     assert log.counts == {"switched": 1, "acknowledged": 2, "deferred": 0}
 
 
-def test_a_forced_transfer_tells_how_long_it_waited() -> None:
+def test_a_forced_transfer_has_its_deferral() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)])
     for _ in range(2):
@@ -127,7 +127,7 @@ def test_the_summary_counts_and_ranks() -> None:
     assert found.release_depth_m == (52.0, 97.0, 102.0)
 
 
-def test_the_summary_of_nothing_has_no_figures() -> None:
+def test_the_summary_without_transfers_has_no_figures() -> None:
     found = TransferSummary.of([], {})
     assert (found.transfers, found.failure_rate) == (0, None)
     assert found.latency_ticks == (None, None, None)

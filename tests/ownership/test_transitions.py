@@ -21,7 +21,7 @@ BEGINNINGS = {
 }
 
 
-def test_what_is_not_listed_does_not_happen() -> None:
+def test_transitions_outside_of_the_table_raise() -> None:
     for party, state, event in product(Party, State, Event):
         if (party, state, event) in TABLE:
             assert after(party, state, event) is TABLE[party, state, event]

@@ -101,15 +101,15 @@ def test_an_interrupted_repartitioning_changes_nothing(
     for vec in vecs:
         vec.reset(seed=2)
     worlds = over_nodes(vecs[1])
-    know, interrupted = worlds.pool.coordinator.know, []
+    set_neighbours, interrupted = worlds.pool.coordinator.set_neighbours, []
 
     def interrupt(neighbours: Any) -> None:
         if not interrupted:
             interrupted.append(step)
             raise KeyboardInterrupt
-        know(neighbours)
+        set_neighbours(neighbours)
 
-    monkeypatch.setattr(worlds.pool.coordinator, "know", interrupt)
+    monkeypatch.setattr(worlds.pool.coordinator, "set_neighbours", interrupt)
     for step in range(10):
         actions = vecs[0].suggest_actions()
         vecs[0].step(actions)

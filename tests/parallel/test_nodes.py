@@ -128,7 +128,7 @@ def test_a_bad_refusal_is_refused(found: bytes) -> None:
 
 def test_a_fork_neither_steps_nor_ends_the_nodes(make: Make) -> None:
     vec, whole = make(zones=4, nodes=2, env="grid4x4", **WANTED), make(env="grid4x4", **WANTED)
-    assert "the nodes are those of process" in said_in_fork(lambda: drive(vec), vec.close)
+    assert "the nodes belong to process" in said_in_fork(lambda: drive(vec), vec.close)
     assert same(drive(vec), drive(whole))
     assert over_nodes(vec).pool.recoveries == 0
 

@@ -48,7 +48,7 @@ def test_a_restarted_log_leaves_returned_words_alone() -> None:
 
 
 def test_more_ticks_than_were_logged_are_refused() -> None:
-    with pytest.raises(SumoError, match=r"of 4 ticks of a SUMO 3 are on record.*reset"):
+    with pytest.raises(SumoError, match=r"the log of a SUMO process has 3 of 4 ticks.*reset"):
         log_of(3).ticks(4)
 
 

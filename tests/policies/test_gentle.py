@@ -29,6 +29,6 @@ def test_an_episode_in_which_the_agent_crashes_has_no_mean_speed() -> None:
     assert "mean" not in row
 
 
-def test_where_it_cannot_drive_it_says_so() -> None:
+def test_the_gentle_driver_refuses_unsupported_worlds() -> None:
     with pytest.raises(PolicyError, match="gentle needs"):
         load_policy("gentle", cavmarl.make_vec("ring"))

@@ -143,7 +143,7 @@ def test_only_our_environments_are_taken(wrong: Any) -> None:
         load_policy("idm", wrong)
 
 
-def test_an_unknown_name_is_told_the_nearest_and_all() -> None:
+def test_the_error_for_an_unknown_name_names_the_nearest_and_all() -> None:
     with pytest.raises(PolicyError, match=r"'idn'; did you mean idm\? Drivers: .*random_actions"):
         load_policy("idn", small_vec())
 

@@ -181,8 +181,9 @@ def test_the_tests_that_write_blocks_are_found() -> None:
 
 
 @pytest.mark.slow
-def test_a_table_recorded_again_is_what_its_card_says(tmp_path: Path) -> None:
-    (table,) = tables_named(["agents/exit_ippo/README.md"])
+@pytest.mark.parametrize("page", ["agents/exit_ippo/README.md", "README.md"])
+def test_a_table_recorded_again_is_what_its_page_says(page: str, tmp_path: Path) -> None:
+    (table,) = tables_named([page])
     tell = partial(print, flush=True)
     text = table.write(Results(finish_all(table.jobs, 2, tell, tmp_path)))
     assert text == read_block(ROOT / table.page, table.block)

@@ -126,7 +126,7 @@ def test_parts_before_a_damaged_one_can_be_read_as_its_error_says(good: Path, ba
     assert 0 < read(bad) < read(good)
 
 
-def test_what_is_not_committed_does_not_count(good: Path, bad: Path) -> None:
+def test_uncommitted_parts_are_ignored(good: Path, bad: Path) -> None:
     shutil.copy(bad / "world-0/vehicles/000000.parquet", bad / "world-0/vehicles/000003.parquet")
     (bad / "world-0/frames/.000003.parquet.77").write_bytes(b"half")
     assert read(bad) == read(good)
@@ -173,7 +173,7 @@ def test_worlds_of_workers_with_a_journal_are_recorded(tmp_path: Path) -> None:
     assert (tmp_path / "journal.jsonl").stat().st_size > 0
 
 
-def test_a_full_disk_is_told_at_the_next_step(
+def test_a_full_disk_is_reported_in_the_next_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path, content: bytes) -> None:

@@ -126,7 +126,7 @@ def test_messages_are_all_that_were_sent(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_there_is_not_is_refused(
+def test_unavailable_extras_are_refused(
     tmp_path: Path, include: tuple[str, ...], more: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words):

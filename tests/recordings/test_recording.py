@@ -50,7 +50,7 @@ def test_a_fork_adds_nothing_to_a_recording(tmp_path: Path) -> None:
     with closing(env):
         drive(env, 3)
         said = said_in_fork(lambda: env.step(env.suggest_actions()), env.close)
-        assert f"the frames of {path} are those of process" in said
+        assert f"the frames of {path} belong to process" in said
         assert not Recording.open(path).is_whole
         env.step(env.suggest_actions())
     recording = Recording.open(path)

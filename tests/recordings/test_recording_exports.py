@@ -155,7 +155,7 @@ def test_the_command_refuses_what_is_not_there(
     assert not (tmp_path / "x.csv").exists()
 
 
-def test_view_records(tmp_path: Path) -> None:
+def test_the_view_command_records(tmp_path: Path) -> None:
     words = ["view", "ring", "--seconds", "1", "--video", str(tmp_path / "a.mp4")]
     with pytest.raises(SystemExit) as ended:
         main([*words, "--record", str(tmp_path / "run")])

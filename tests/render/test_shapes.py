@@ -82,7 +82,7 @@ def test_camera_shows_all_of_its_bounds_unstretched() -> None:
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.0, "0:00.0"), (83.25, "1:23.2"), (59.98, "1:00.0")]
 )
-def test_clock(seconds: float, text: str) -> None:
+def test_the_clock_is_drawn(seconds: float, text: str) -> None:
     assert clock_text(seconds) == text
 
 

@@ -48,7 +48,7 @@ def test_file_is_finished_when_the_block_fails(tmp_path: Path) -> None:
     assert len(read(path)[1]) == 1
 
 
-def test_no_frames_no_file(tmp_path: Path) -> None:
+def test_without_frames_no_file_is_written(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "drive.mp4", fps=10.0):
         pass
     assert not list(tmp_path.iterdir())

@@ -17,6 +17,8 @@ from cavmarl.core.records.codes import (
     EVENT_RED_LIGHT,
     EVENT_WRONG_WAY,
 )
+from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
+from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.rewards.kernels.terms import NUM_TERMS, TTC_HORIZON_S, write_terms
 from tests.naive.terms import ttc_risk
 from tests.support.builders import crowds, vehicles
@@ -25,12 +27,14 @@ from tests.support.traffic import network
 STEP_S = 0.1
 
 
-def terms(rows: NDArray[np.void], i: int = 0) -> dict[str, float]:
+def terms(rows: NDArray[np.void], i: int = 0, max_speed: float = MAX_SPEED_MPS) -> dict[str, float]:
     """The terms of row i by name; all drive on lane 0 of the ring."""
+    kind = generated_types().copy()
+    kind["max_speed"] = max_speed
     grid = make_grid((-100.0, -100.0, 100.0, 100.0), 25.0, len(rows))
     fill_grid(rows, len(rows), grid)
     out = np.full(NUM_TERMS, np.nan, np.float32)
-    write_terms(network("ring").arrays, rows, i, grid, STEP_S, out)
+    write_terms(network("ring").arrays, rows, i, kind[0], grid, STEP_S, out)
     return dict(zip(TERMS, out.tolist(), strict=True))
 
 
@@ -67,7 +71,7 @@ def test_progress_is_the_way_towards_the_goal() -> None:
         (math.inf, math.inf, 10.0, 0.0),
     ],
 )
-def test_another_plan_is_no_jump(
+def test_progress_does_not_jump_when_the_plan_changes(
     before: float, after: float, speed: float, progress: float
 ) -> None:
     found = terms(one(speed=speed, step_to_go=before, to_go=after))["progress"]
@@ -80,6 +84,11 @@ def test_speed_and_delay_are_measured_at_the_limit() -> None:
     assert slow["delay"] == pytest.approx(0.5 * STEP_S)
     assert right["delay"] == fast["delay"] == 0.0
     assert terms(one(speed=0.0))["delay"] == pytest.approx(STEP_S)
+
+
+def test_a_slow_type_is_not_late_at_its_maximum_speed() -> None:
+    assert terms(one(speed=4.0), max_speed=4.0)["delay"] == 0.0
+    assert terms(one(speed=3.0), max_speed=4.0)["delay"] == pytest.approx(0.25 * STEP_S)
 
 
 def test_comfort_is_the_mean_jerk() -> None:
@@ -97,7 +106,7 @@ def test_comfort_is_the_mean_jerk() -> None:
         (EVENT_ARRIVED, "arrival"),
     ],
 )
-def test_events_are_ones(bit: int, name: str) -> None:
+def test_event_terms_are_one_in_their_step(bit: int, name: str) -> None:
     flags = ("collision", "off_road", "wrong_way", "red_light", "arrival")
     found = terms(one(events=bit))
     assert [flag for flag in flags if found[flag] == 1.0] == [name]

@@ -114,7 +114,7 @@ def test_rows_of_a_map_point_to_rows_of_the_same_map() -> None:
         assert apart >= 1000.0
 
 
-def test_what_is_wrong_with_several_maps_is_said_at_once(tmp_path: Path) -> None:
+def test_errors_of_several_maps_are_reported_at_once(tmp_path: Path) -> None:
     broken = tmp_path / "broken.net.xml"
     broken.write_text("<net>")
     sources = [MAPS[0], str(broken), "map/nowhere.net.xml"]

@@ -115,7 +115,7 @@ def test_crossing_paths_share_the_middle_and_merging_paths_the_end(crossing: Cro
         assert mirrored[f"foe_{end}"] == cross[end]
 
 
-def test_a_bridge_is_no_conflict(crossing: Crossing) -> None:
+def test_paths_over_and_under_a_bridge_do_not_conflict(crossing: Crossing) -> None:
     network = read_network(crossing(('shape="0,-5 0,-5 0,5"', 'shape="0,-5,6 0,5,6"')))
     assert network.conflicts["foe"].tolist() == [2, 0]
 
@@ -228,7 +228,7 @@ BROKEN = {
         "'e_0', which ends elsewhere",
     ),
     "bits": ('foes="110"', 'foes="1x0"', "request.*foes"),
-    "too few bits": ('foes="110"', 'foes="1"', "'c' has 3 requests"),
+    "too few bits": ('foes="110"', 'foes="1"', "'c' has more links than its 3 requests"),
     "unclosed": ("</net>", "", "line .*broken XML"),
     "not a net": ("<net ", "<map ", "broken XML|not the root"),
     "nothing to drive": (

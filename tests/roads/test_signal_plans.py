@@ -158,7 +158,49 @@ def test_a_timetable_switches_programs(
     assert states(network, [0, 3, 39, 40, 45, 60, 99]) == expected
 
 
+def test_states_beyond_the_links_have_no_effect(
+    crossing: Callable[..., Path], additional: Callable[..., Path]
+) -> None:
+    """SUMO warns of unused states."""
+    longer = additional("", ('state="Grr"', 'state="GrrGG"'), ('state="rGG"', 'state="rGGrr"'))
+    network = with_programs(read_network(crossing()), [longer])
+    assert states(network, [0, 5, 10]) == ["Grr", "rGG", "Grr"]
+
+
+def test_a_program_may_have_fewer_states_than_another_if_they_suffice(
+    crossing: Callable[..., Path], additional: Callable[..., Path]
+) -> None:
+    longer = (('state="Grr"', 'state="Grrr"'), ('state="yrr"', 'state="yrrr"'),
+              ('state="rGg"', 'state="rGgr"'))  # fmt: skip
+    network = with_programs(read_network(crossing(*longer)), [additional()])
+    assert states(network, [0, 5, 10]) == ["Grr", "rGG", "Grr"]
+    shorter = additional("", ('state="Grr"', 'state="Gr"'), ('state="rGG"', 'state="rG"'))
+    with pytest.raises(MapError, match="program 'night' with 2 states for 3 links"):
+        with_programs(read_network(crossing()), [shorter])
+
+
+def test_a_program_without_a_name_gets_sumos(
+    crossing: Callable[..., Path], additional: Callable[..., Path]
+) -> None:
+    unnamed = additional("", (' programID="night"', ""))
+    assert with_programs(read_network(crossing()), [unnamed]).program_ids == ("0", "<unknown>")
+
+
+def test_an_element_without_phases_changes_the_offset_of_a_program(
+    crossing: Callable[..., Path], additional: Callable[..., Path]
+) -> None:
+    plain = read_network(crossing())
+    path = additional()
+    path.write_text('<additional><tlLogic id="c" programID="0" offset="5"/></additional>')
+    network = with_programs(plain, [path])
+    assert network.program_ids == ("0",)
+    assert states(network, range(2, 90)) == states(plain, range(88))
+
+
 BROKEN = {
+    "no id": ("", (' id="c"', ""), "has no attribute 'id'"),
+    "empty id": ("", ('id="c"', 'id=""'), "has an empty id"),
+    "no type": ("", ('type="static" ', ""), "a program 'night' without type"),
     "other map": ("", ('id="c"', 'id="z"'), "line 3: .*no signal 'z'.*another map"),
     "letters": ("", ('state="rGG"', 'state="rG"'), "different numbers of links"),
     "name taken": ("", ('programID="night"', 'programID="0"'), "two programs '0'"),

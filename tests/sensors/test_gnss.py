@@ -97,7 +97,7 @@ def test_errors_of_an_antenna_are_other_ones_at_each_tick_and_for_each_vehicle()
         assert found[..., axis].std(axis=1).mean() == pytest.approx(2.0, rel=0.2), "over vehicles"
 
 
-def test_an_offset_that_is_no_number_is_refused(tmp_path: Path, shared_maps: Path) -> None:
+def test_an_offset_that_is_not_a_number_is_refused(tmp_path: Path, shared_maps: Path) -> None:
     text = (shared_maps / "net/mcity/mcity.net.xml").read_text(encoding="utf-8")
     broken = tmp_path / "m.net.xml"
     broken.write_text(text.replace('netOffset="0.00,0.00"', 'netOffset="0.00,east"'))

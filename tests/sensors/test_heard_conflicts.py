@@ -71,7 +71,7 @@ def hidden_from(rows: NDArray[np.void], me: np.void) -> list[int]:
     return [int(row["id"]) for row in rows if blocked(me["x"], me["y"], float(row["x"]), row["y"])]
 
 
-def test_who_is_seen_or_heard_of_counts_and_is_where_the_message_says() -> None:
+def test_seen_and_heard_vehicles_count_at_their_reported_position() -> None:
     vec = made({"v2x.channel.loss": 0.3})
     simulation = vec.worlds.simulation
     heard = old = 0
@@ -110,7 +110,7 @@ def test_without_a_message_those_in_sight_alone_are_known() -> None:
     sight.close()
 
 
-def test_what_a_hidden_vehicle_does_changes_nothing_until_it_says_so() -> None:
+def test_a_hidden_vehicle_has_no_effect_until_its_message_arrives() -> None:
     vec = made()
     for _ in driven(vec, 60):
         pass

@@ -56,7 +56,7 @@ def expected(rows: NDArray[np.void], me: np.void) -> list[tuple[float, float]]:
     return seen[:COUNT]
 
 
-def test_those_behind_a_house_are_not_seen_and_all_others_are() -> None:
+def test_vehicles_behind_a_house_are_hidden() -> None:
     hidden = 0
     for k, (observations, vec) in enumerate(seen_from(False, 60)):
         if k % 15:

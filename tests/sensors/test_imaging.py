@@ -90,7 +90,7 @@ def test_a_wall_at_ten_metres_reads_ten_metres(before_a_wall: CavVectorEnv) -> N
     assert set(middle[first + 1 :].tolist()) <= {ROAD, LANE_LINE}
 
 
-def test_bodies_look_the_same_to_those_who_begin_at_different_sides() -> None:
+def test_bodies_look_the_same_from_any_first_side() -> None:
     fan = lidar_fan(LidarRigConfig(rate_hz=5, rays=5, fov_deg=90.0))
     angles = np.degrees(np.arctan2(fan.rays[:, 0, 1], fan.rays[:, 0, 0]))
     assert angles == pytest.approx([-45.0, -22.5, 0.0, 22.5, 45.0])
@@ -122,7 +122,7 @@ def test_every_class_of_vehicles_has_a_semantic_class() -> None:
         ({"type": "radar", "range_m": 1e9}, r"rig\.wrong\.range_m"),
     ],
 )
-def test_what_cannot_be_seen_is_refused(sensor: dict[str, Any], words: str) -> None:
+def test_invalid_camera_settings_are_refused(sensor: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec("merge", overrides={"rig": {"wrong": {"rate_hz": 5, **sensor}}})
 

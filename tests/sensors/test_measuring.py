@@ -112,7 +112,7 @@ def test_a_circle_is_felt_as_speed_squared_over_radius() -> None:
     assert ahead[3:] == pytest.approx(rates)
 
 
-def test_who_stands_feels_gravity_alone_along_tilted_axes() -> None:
+def test_the_imu_of_a_standing_vehicle_measures_gravity_only() -> None:
     imu = {"type": "imu", "rate_hz": 20, "pitch_deg": 30.0}
     vec = _make(rig={"imu": imu})
     vec.reset(seed=0)

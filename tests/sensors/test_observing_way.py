@@ -149,7 +149,7 @@ def test_the_plan_of_another_changes_nothing() -> None:
     assert observed_conflicts("merge", rows, 0, phase) == before
 
 
-def test_an_indicated_way_is_told_over_one_junction_and_no_further() -> None:
+def test_an_indicated_route_is_observed_over_one_junction_only() -> None:
     """Of two cars that come to a junction, one changes its mind; of another, the one after."""
     roads, ways = network("grid4x4"), plans("grid4x4")
     phase = np.zeros(len(roads.arrays.signals), np.int32)
@@ -242,12 +242,12 @@ def test_a_saved_state_keeps_the_history() -> None:
 
 
 @pytest.mark.parametrize("wrong", [(5.0, 5.0), (9.0, 4.0), (0.1,), (400.0,), (math.nan,)])
-def test_distances_that_cannot_be_are_refused(wrong: tuple[float, ...]) -> None:
+def test_invalid_distances_are_refused(wrong: tuple[float, ...]) -> None:
     with pytest.raises(cavmarl.ConfigError, match=r"sensors\.way\.distances_m"):
         WayConfig(distances_m=wrong)
 
 
-def test_what_is_not_seen_is_off_where_only_messages_are_told() -> None:
+def test_sensors_without_sight_omit_visible_vehicles() -> None:
     config = SensorsConfig(
         way=WayConfig(distances_m=(5.0,), lines=2),
         conflicts=ConflictsConfig(count=3),

@@ -130,7 +130,7 @@ def test_a_turning_vehicle_moves_its_sensors(
     )
 
 
-def test_what_is_hidden_gives_no_echo() -> None:
+def test_hidden_bodies_give_no_echo() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (10.0, 0.0, 0.5 * math.pi), (30.0, 0.0, 0.0)], length=12.0)
     assert echoes(rows, mount((0.0, 0.0, 0.5)))["id"].tolist() == [1]
     assert echoes(rows[[0, 2]], mount((0.0, 0.0, 0.5)))["id"].tolist() == [2]

@@ -64,7 +64,7 @@ def test_sensors_have_numbers_of_their_own_whatever_else_is_mounted() -> None:
     assert stream_of("a") != stream_of("b")
 
 
-def test_so_many_samples_are_lost() -> None:
+def test_the_share_of_lost_samples_is_the_configured_one() -> None:
     settings = {
         "rig": {"a": {**CLEAN, "rate_hz": 100, "dropout": 0.25}},
         "clock.ctrl_dt_s": 0.5, "population.mode": "respawn",

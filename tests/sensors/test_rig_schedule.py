@@ -97,7 +97,7 @@ def test_a_minute_has_as_many_samples_as_the_rate_says(
         ({"type": "lidar", "rate_hz": 5, "range_km": 9}, "use range_m"),
     ],
 )
-def test_what_cannot_be_is_refused(settings: dict[str, Any], words: str) -> None:
+def test_invalid_arguments_are_refused(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         load_config("merge", overrides={"rig": {"a": settings}})
 

@@ -14,7 +14,7 @@ shares = st.lists(st.integers(0, 2), min_size=0, max_size=8)
 
 
 @given(shares, st.integers(0, 4))
-def test_who_is_sensed_for_comes_first_and_nobody_is_lost(share: list[int], others: int) -> None:
+def test_agents_that_sense_come_first_and_no_row_is_lost(share: list[int], others: int) -> None:
     agents = len(share)
     published = np.zeros((1, agents + others + 2), dtype=VEHICLE)
     rows = np.zeros_like(published)

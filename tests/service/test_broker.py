@@ -48,7 +48,7 @@ def test_a_node_that_misses_its_beats_is_down_and_comes_back_with_the_next(fleet
     assert fleet.kinds()[-4:-2] == ["node.down", "node.up"]
 
 
-def test_nodes_tell_how_far_their_jobs_are(fleet: Fleet) -> None:
+def test_nodes_report_the_progress_of_their_jobs(fleet: Fleet) -> None:
     fleet.join("a")
     job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
     service = SimpleNamespace(broker=fleet.broker)
@@ -60,7 +60,7 @@ def test_nodes_tell_how_far_their_jobs_are(fleet: Fleet) -> None:
         fleet.beat_of("a", jobs={job.id: [30]})
 
 
-def test_a_node_that_is_watched_is_told_all_scores(fleet: Fleet) -> None:
+def test_all_scores_of_a_watched_node_are_sent(fleet: Fleet) -> None:
     fleet.join("a", "b")
     fleet.register("c")
     session = fleet.open()
@@ -173,7 +173,7 @@ def test_a_session_moves_when_its_node_is_drained_gone_or_out_of_reach(fleet: Fl
     assert fleet.broker.live["b"].hosted == set()
 
 
-def test_a_process_that_was_superseded_is_told_so(fleet: Fleet) -> None:
+def test_a_superseded_process_is_notified(fleet: Fleet) -> None:
     assert fleet.register("a") == 1
     old = fleet.beat_of("a")
     assert fleet.register("a") == 2
@@ -200,13 +200,13 @@ def test_a_node_belongs_to_the_identity_that_has_registered_it(fleet: Fleet) -> 
 
 
 @pytest.mark.parametrize("wrong", [{"cpu": 85.0}, {"cpu": "0.5"}, {"ram": float("nan")}, {"x": 1}])
-def test_a_load_that_is_no_share_is_refused(fleet: Fleet, wrong: dict[str, object]) -> None:
+def test_a_load_outside_of_0_to_1_is_refused(fleet: Fleet, wrong: dict[str, object]) -> None:
     fleet.join("a")
     with pytest.raises(ValidationError):
         fleet.beat_of("a", **wrong)
 
 
-def test_a_clock_that_is_off_is_told_once(fleet: Fleet) -> None:
+def test_a_wrong_clock_is_reported_once(fleet: Fleet) -> None:
     fleet.join("a")
     for skew_s in (9.0, 9.0, 0.0):
         beat = fleet.beat_of("a", sent_s=fleet.now_s + skew_s)
@@ -233,7 +233,7 @@ def test_a_job_waits_for_a_node_and_is_run_again_when_that_is_lost(fleet: Fleet)
     assert (job.state, fleet.beat("b")["jobs"]) == ("done", [])
 
 
-def test_what_no_one_asks_for_ends_and_is_forgotten(fleet: Fleet) -> None:
+def test_unused_sessions_end_and_are_forgotten(fleet: Fleet) -> None:
     fleet.join("a")
     session = fleet.open()
     fleet.broker.save(session, 3, b"state")
@@ -310,7 +310,7 @@ def test_a_job_that_a_node_had_waits_on_when_that_is_lost(fleet: Fleet) -> None:
     assert (job.state, job.placements) == ("queued", 1)
 
 
-def test_a_wall_clock_that_is_set_is_told_once(fleet: Fleet) -> None:
+def test_a_jump_of_the_wall_clock_is_reported_once(fleet: Fleet) -> None:
     fleet.log.wall_s = lambda: fleet.now_s - 3600.0
     fleet.broker.sweep()
     fleet.broker.sweep()

@@ -98,12 +98,12 @@ def test_a_store_of_another_version_is_left_alone(tmp_path: Path) -> None:
         ("/proc/none/store.sqlite", "cannot be opened"),
     ],
 )
-def test_a_store_that_cannot_be_is_refused(where: str, words: str) -> None:
+def test_an_invalid_place_of_a_store_is_refused(where: str, words: str) -> None:
     with pytest.raises(ServiceError, match=words):
         EventStore(where)
 
 
-def test_a_file_that_is_no_store_is_refused(tmp_path: Path) -> None:
+def test_a_file_without_a_store_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     path.write_bytes(b"no database, but long enough to be read as one" * 100)
     with pytest.raises(ServiceError, match="cannot be opened"):

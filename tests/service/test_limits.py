@@ -105,7 +105,7 @@ def test_an_identity_has_so_many_configurations_at_most(tmp_path: Path) -> None:
     fleet.close()
 
 
-def test_what_a_node_tells_wrongly_is_on_record_once(
+def test_invalid_reports_of_a_node_are_recorded_once(
     service: RunningService, tokens: dict[str, Any]
 ) -> None:
     node = {"name": "odd", "address": "127.0.0.1", "client_port": 1, "simulator_port": 1}

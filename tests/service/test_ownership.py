@@ -72,7 +72,7 @@ def test_members_are_replaced_and_called_to_their_leader_s_door(fleet: Fleet) ->
     assert all(not live.zones_of for live in fleet.broker.live.values())
 
 
-def test_one_node_may_have_all_parts_where_there_is_no_other(fleet: Fleet) -> None:
+def test_a_single_node_may_have_all_parts(fleet: Fleet) -> None:
     fleet.join("a", slots=3)
     session = fleet.open(zone_nodes=4)
     assert session.members == ["a", "a"]  # one slot is its own
@@ -97,7 +97,7 @@ def test_a_request_that_is_repeated_is_carried_out_once(fleet: Fleet) -> None:
         fleet.open(key="k-1")
 
 
-def test_a_world_tells_each_transfer_once_and_what_is_prepared() -> None:
+def test_a_world_reports_each_transfer_once_and_prepared_ones() -> None:
     document = {"environment": "grid4x4", "num_envs": 1, "seed": 0, "overrides": {}}
     document |= {"zones": 4, "agents": 4, "background": 40, "max_cycles": None}
     world = SessionWorld(document, None, 0, {})

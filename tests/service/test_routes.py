@@ -160,6 +160,13 @@ def test_the_page_has_the_routes_and_the_problems() -> None:
         ),
         (
             "/configurations",
+            {"environment": "merge", "overrides": {"plugins": ["antigravity"]}},
+            422,
+            "refused",
+            "name modules, which are code",
+        ),
+        (
+            "/configurations",
             {"environment": "merge", "overrides": {"zones.journal": "log"}},
             422, "refused", "zones.journal",
         ),
@@ -348,16 +355,14 @@ def test_a_client_s_page_of_events_is_full_of_its_own(service: RunningService) -
         assert (found["kind"], found["subject"]) == ("configuration.added", "quiet")
 
 
-def test_a_parameter_that_there_is_not_is_refused(
-    service: RunningService, secrets: dict[str, str]
-) -> None:
+def test_an_unknown_parameter_is_refused(service: RunningService, secrets: dict[str, str]) -> None:
     viewer = token_of(service, secrets["viewer"]).json()
     answer = ask(service, viewer, "GET", "/events?afer=3")
     assert problem_of(answer) == "bad-body"
     assert "after, limit, subject" in answer.json()["detail"]
 
 
-def test_a_wrong_method_is_told_all_that_there_are(service: RunningService) -> None:
+def test_the_error_for_a_wrong_method_lists_allowed_methods(service: RunningService) -> None:
     answer = httpx.put(f"{service.url}/v1/nodes/a")
     assert (answer.status_code, answer.headers["allow"]) == (405, "DELETE")
     assert httpx.put(f"{service.url}/v1/nodes").headers["allow"] == "GET, POST"

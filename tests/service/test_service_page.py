@@ -88,7 +88,7 @@ def test_the_tests_that_the_page_names_exist() -> None:
         assert f"def {test}(" in text, test
 
 
-def test_the_containers_run_commands_that_there_are() -> None:
+def test_the_containers_run_existing_commands() -> None:
     compose = yaml.safe_load((CONTAINERS / "compose.yaml").read_text(encoding="utf-8"))
     assert set(compose["services"]) == {"service", "node-a", "node-b"}
     for name, service in compose["services"].items():

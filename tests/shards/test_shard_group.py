@@ -62,7 +62,7 @@ def all_rows(simulation: Simulation) -> bytes:
     ],
     ids=["alone", "in twos"],
 )
-def test_all_together_do_what_parts_of_them_do(part: Parting) -> None:
+def test_a_group_of_all_shards_equals_its_parts(part: Parting) -> None:
     together, apart = divided(), divided()
     use_executor(apart, Groups(part(apart.shards)))
     for step in range(STEPS):
@@ -91,7 +91,7 @@ def test_a_shard_is_stepped_alone() -> None:
     assert [other.sides[0].tobytes() + other.sides[1].tobytes() for other in others] == before
 
 
-def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
+def test_rows_that_other_zones_may_see_are_listed_during_advance() -> None:
     simulation = divided()
     division = simulation.division
     for _ in range(STEPS):

@@ -131,7 +131,9 @@ def trace(simulation: Simulation, steps: int = 60) -> list[bytes]:
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_who_is_carried_every_tick_goes_on_bit_for_bit(hilly: tuple[Path, Path], kind: str) -> None:
+def test_vehicles_that_are_packed_every_tick_continue_bit_for_bit(
+    hilly: tuple[Path, Path], kind: str
+) -> None:
     expected = trace(rough_world(hilly, **{"action.kind": kind}))
     carried = rough_world(hilly, **{"action.kind": kind})
     carrier = Carrier(carried)
@@ -147,7 +149,9 @@ def test_who_is_carried_every_tick_goes_on_bit_for_bit(hilly: tuple[Path, Path],
 
 
 @pytest.mark.parametrize("lost", ["pending", "observations"])
-def test_what_lies_apart_is_missed(hilly: tuple[Path, Path], lost: str) -> None:
+def test_a_change_of_arrays_outside_of_the_record_changes_the_run(
+    hilly: tuple[Path, Path], lost: str
+) -> None:
     whole, spoiled = rough_world(hilly), rough_world(hilly)
     assert trace(whole, 4) == trace(spoiled, 4)
     arrays = {**spoiled.worlds._asdict(), **spoiled.outputs._asdict()}
@@ -168,7 +172,7 @@ def test_a_state_is_under_four_kilobytes(entry: str) -> None:
     assert min(sizes) < 450
 
 
-def test_readings_of_sensors_stay_behind() -> None:
+def test_sensor_readings_are_not_transferred() -> None:
     def size(stack: int) -> int:
         sensors = {"sensors.lidar.rays": 360, "sensors.stack": stack}
         simulation = make_simulation(
@@ -224,7 +228,7 @@ def unpacked(state: bytes, vehicle: int, tick: int) -> np.void:
 
 
 @pytest.mark.parametrize("agent", [-1, 0, 2])
-def test_every_field_arrives_and_nobody_else_is_touched(agent: int) -> None:
+def test_every_field_arrives_and_other_rows_do_not_change(agent: int) -> None:
     codec, rows, commands, frames = filled(VEHICLE, agent)
     state = codec.pack(rows, 1, 2, TICK)
     sent = rows[1, 2].copy()
@@ -325,7 +329,7 @@ def test_another_record_or_environment_is_refused() -> None:
         TransferCodec(padded, commands, frames)
 
 
-def test_what_is_refused_changes_nothing() -> None:
+def test_a_refused_state_changes_nothing() -> None:
     state, vehicle = a_state()
     codec, rows, commands, frames = arrays()
     for wrong in (state[:-1], patched(state, "transfer", 7), patched(state, "agent", 9)):
@@ -400,7 +404,7 @@ def test_every_field_belongs_to_one_group() -> None:
     assert sorted(sum(GROUPS.values(), ())) == sorted(VEHICLE.names or ())
 
 
-def test_the_page_says_what_stands_in_a_state() -> None:
+def test_the_page_describes_the_content_of_a_state() -> None:
     apart = {
         "control and route": "commands that wait for `clock.control_latency_ticks`",
         "agent logic": "the frames that the next observation repeats (`sensors.stack`)",

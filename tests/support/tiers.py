@@ -8,7 +8,6 @@ it.
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 import time
@@ -19,12 +18,12 @@ from typing import Any
 
 import pytest
 
-__all__ = ["ALONE_FILES", "ProcessWatch", "is_needed", "mark", "skip_if_late"]
+__all__ = ["ALONE_FILES", "ProcessWatch", "TimeLimit", "is_needed", "mark"]
 
 _OF_PROCESSES = re.compile(
     r"^import (subprocess|multiprocessing|libsumo)\b"
     r"|^from tests\.support\.(sumo_worlds|netgenerate|junction_scenes|toy_job) import"
-    r"|^from tests\.support\.(dead_ends|local_actors|service) import"
+    r"|^from tests\.support\.(dead_ends|local_actors|map_sources|service) import"
     r"|^from tests\.support\.chromium import"
     r"|importorskip\(\"(libsumo|ray)\""
     r"|\bworkers=(?!0\b)|\bbackend=\"(?!local)|\bnodes=",
@@ -40,7 +39,7 @@ RAY_FILES = (
     "tests/parallel/test_ray_worlds.py",
 )
 
-_IN_RAY = "test_in_an_actor_of_ray"  # begins the name of a test that starts a cluster
+_IN_RAY = "test_worlds_run_in_a_ray_actor"  # begins the name of a test that starts a cluster
 
 # They measure time, memory or cores, or count on being let run at once.
 ALONE_FILES: tuple[str, ...] = (
@@ -105,11 +104,28 @@ def _has_twin(path: Path) -> bool:
     return "\nfrom tests.naive" in path.read_text(encoding="utf-8")
 
 
-def skip_if_late() -> None:
-    """Skip a test once the time of `make quick` is over."""
-    until_s = float(os.environ.get("CAVMARL_QUICK_UNTIL_S", "inf"))
-    if time.time() > until_s:
-        pytest.skip("the time of `make quick` is over: left to `make test`")
+class TimeLimit:
+    """A plugin for `make quick` that skips tests after a time, but never those of the first file.
+
+    The time begins with the first test of a process, so reading the tests does not count.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+        self._end_s = 0.0  # of `time.monotonic`; 0: no test has begun
+        self._first_file = Path()
+
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        """Note the first file."""
+        if session.items:
+            self._first_file = session.items[0].path
+
+    def pytest_runtest_setup(self, item: pytest.Item) -> None:
+        """Skip the test if it is too late for it."""
+        now = time.monotonic()
+        self._end_s = self._end_s or now + self._limit_s
+        if now > self._end_s and item.path != self._first_file:
+            pytest.skip("the time of `make quick` is over: run `make test`")
 
 
 class ProcessWatch:

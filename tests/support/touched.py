@@ -1,7 +1,7 @@
-"""`make quick`: the unit tests of what a change touches, those nearest to it first.
+"""`make quick`: the unit tests that a change affects, the closest first.
 
-A test file is touched where it imports a module that has changed, or one that imports such a
-module, and so on. What changed is asked of git: the working tree against where it left `main`.
+A test file is affected if it imports a changed module, directly or over other modules. Changes are
+those of the working tree since its branch left `main`, according to git.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ import ast
 import os
 import subprocess
 import sys
-import time
 from collections import deque
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
 import grimp
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-LIMIT_S = 50.0  # and the tests that are running then come to their end
+LIMIT_S = 50.0  # from the first test on; after that, no other test begins
 
 # Folders of Python files beside the package, whose imports are read off their text.
 BESIDE = ("tests", "benchmarks", "fuzz", "docs")
@@ -36,14 +36,14 @@ ALWAYS = ("tests/test_tidy.py",)
 
 
 def changed_files() -> set[str]:
-    """Paths that differ from where this branch left `main`, those that git does not know too."""
+    """Return the paths that differ from where this branch left `main`, including new files."""
     base = _git("merge-base", "HEAD", "main") or ["HEAD"]
     new = _git("ls-files", "--others", "--exclude-standard")
     return {*_git("diff", "--name-only", base[0]), *new}
 
 
 def touched_tests(changed: Iterable[str]) -> list[str]:
-    """Test files that the changed files bear on, the nearest first."""
+    """Return the test files that the changed files affect, the closest first."""
     files = {
         path.relative_to(ROOT).as_posix()
         for folder in BESIDE
@@ -65,7 +65,7 @@ def touched_tests(changed: Iterable[str]) -> list[str]:
 
 
 def _importers(files: set[str]) -> dict[str, set[str]]:
-    """Per module, the files that import it themselves."""
+    """Return for each module the files that import it directly."""
     graph = grimp.build_graph("cavmarl")
     found: dict[str, set[str]] = {}
     for module in graph.modules:
@@ -81,7 +81,7 @@ def _importers(files: set[str]) -> dict[str, set[str]]:
 
 
 def _imports(path: str) -> set[str]:
-    """Modules that a file beside the package imports; of `from a import b`, both a and a.b."""
+    """Return the modules that a file imports; for `from a import b`, both a and a.b."""
     found = set()
     for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -113,16 +113,34 @@ def _git(*words: str) -> list[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.split("\n")[:-1]
 
 
+class RunCount:
+    """A plugin that counts the tests that ran to their end."""
+
+    def __init__(self) -> None:
+        self.tests = 0
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Count a test, unless it was skipped."""
+        self.tests += report.when == "call" and not report.skipped
+
+
 def main() -> int:
-    """Run them, two at a time; what there is no time for is skipped, and says so."""
+    """Run the affected tests in two processes; skip and report those that there is no time for."""
     tests = touched_tests(changed_files())
-    print(f"{len(tests)} test files are touched")
+    print(f"{len(tests)} test files are affected")
+    return run(tests, "not slow and not integration and not alone")
+
+
+def run(tests: list[str], tier: str) -> int:
+    """Run the tests of a tier in these files; return an exit code that is 0 only if one ran."""
+    os.environ["CAVMARL_QUICK_S"] = str(LIMIT_S)
     order = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
-    command = [sys.executable, "-m", "pytest", "-q", *order]
-    command += ["-m", "not slow and not integration and not alone", *tests]
-    until_s = {"CAVMARL_QUICK_UNTIL_S": str(time.time() + LIMIT_S)}
-    code = subprocess.run(command, cwd=ROOT, env=os.environ | until_s).returncode
-    return 0 if code == 5 else code  # 5: no unit test among them
+    count = RunCount()
+    code = int(pytest.main(["-q", *order, "-m", tier, *tests], plugins=[count]))
+    if count.tests == 0:
+        print("no test ran: run `make test`", file=sys.stderr)
+        return code or 1
+    return code
 
 
 if __name__ == "__main__":

@@ -92,7 +92,7 @@ def test_one_a_tick_tries_on_each_lane() -> None:
     assert departures.tries[0, :4].tolist() == [MAIN[0], -1, MAIN[1], -1]
 
 
-def test_who_enters_is_owned_in_one_zone_and_a_ghost_near_it() -> None:
+def test_an_entered_vehicle_has_one_owner_and_is_a_ghost_nearby() -> None:
     # Four zones around (10, 20), halo 5 m; three vehicles: in a corner, near a border, far off.
     partition = four()
     halo = zone_halo(partition, 5.0)

@@ -14,6 +14,7 @@ import pytest
 from cavmarl.core.records.codes import COUNT_DEPARTED
 from cavmarl.engine.simulation import Simulation
 from tests.engine.test_row_order import shuffle_rows
+from tests.support import demand_worlds
 from tests.support.demand_worlds import TINY, real, tiny
 from tests.support.driving import drive, start
 
@@ -88,7 +89,7 @@ def test_a_reset_with_the_seed_repeats_the_episode_and_without_it_goes_on(make: 
     assert second[-1] != first[-1]
 
 
-def test_nobody_is_lost(make: Make) -> None:
+def test_no_vehicle_is_lost_or_duplicated(make: Make) -> None:
     simulation = make()
     start(simulation, seed=3)
     departures = simulation.departures
@@ -141,7 +142,7 @@ def test_two_processes_agree(tmp_path: Path) -> None:
     assert int(said[0][2]) > 5
 
 
-def test_the_hash_covers_who_waits_and_how_many_orders_were_called(tmp_path: Path) -> None:
+def test_the_hash_covers_waiting_vehicles_and_called_orders(tmp_path: Path) -> None:
     simulation = tiny("merge", tmp_path)
     start(simulation, seed=1)
     departures = simulation.departures
@@ -163,3 +164,21 @@ def test_the_hash_covers_who_waits_and_how_many_orders_were_called(tmp_path: Pat
         assert simulation.state_hash() != before, field
         simulation.vehicles()[field][0] = value
     assert simulation.state_hash() == before
+
+
+@pytest.mark.parametrize("model", ["Krauss", "IDM"])
+def test_a_slow_type_alone_on_its_way_has_no_delay(tmp_path: Path, model: str) -> None:
+    """SUMO's timeLoss of this vehicle is 0, too."""
+    path = tmp_path / "slow.rou.xml"
+    path.write_text(
+        f'<routes><vType id="slow" maxSpeed="4" sigma="0" speedDev="0" carFollowModel="{model}"/>'
+        '<vehicle id="s" type="slow" depart="0" departLane="0" departSpeed="max">'
+        '<route edges="weave main_out"/></vehicle></routes>',
+        encoding="utf-8",
+    )
+    simulation = demand_worlds.make("merge", [path], overrides={"clock.sim_dt_s": 0.1})
+    start(simulation, seed=0)
+    while simulation.traffic_stats().arrived == 0:
+        drive(simulation)
+        assert simulation.vehicles()["speed"].max(initial=0.0) <= 4.0 + 1e-9
+    assert simulation.traffic_stats().mean_delay_s == pytest.approx(0.0, abs=1.0)

@@ -76,7 +76,7 @@ def test_the_first_vehicles_are_the_same_in_all_densities(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [0, 77])
 @pytest.mark.parametrize("vehicles", DENSITIES)
-def test_who_starts_in_one_zone_shows_as_imbalance(vehicles: int, seed: int) -> None:
+def test_vehicles_that_start_in_one_zone_cause_imbalance(vehicles: int, seed: int) -> None:
     simulation = world(vehicles, seed)
     owned = simulation.zones.loads().owned[:, 0].tolist()
     assert sum(owned) == vehicles

@@ -285,7 +285,7 @@ def test_a_steered_car_that_sticks_out_from_the_lane_beside_is_a_leader(
     assert (near == -1.0) == minds
 
 
-def test_before_the_end_of_a_lane_nobody_enters_fast() -> None:
+def test_before_the_end_of_a_lane_no_vehicle_enters_fast() -> None:
     slow = speed_at(ROADS.arrays, KIND, MAIN[0], LENGTH - 6.5, 20.0)
     assert slow == pytest.approx(np.sqrt(2.0 * 2.0 * 2.0))
     assert speed_at(ROADS.arrays, KIND, MAIN[0], 10.0, 20.0) == 20.0
@@ -317,7 +317,9 @@ def test_only_a_line_where_it_may_have_to_stop_makes_a_departure_slow() -> None:
     ("behind_m", "pace", "brakes"),
     [(5.5, 0.0, True), (60.0, 15.0, False), (15.0, 25.0, True), (15.0, 0.0, False)],
 )
-def test_who_follows_must_not_brake_hard(behind_m: float, pace: float, brakes: bool) -> None:
+def test_a_follower_need_not_brake_hard_for_a_departure(
+    behind_m: float, pace: float, brakes: bool
+) -> None:
     cars, room = traffic((MAIN[0], 100.0 - behind_m, pace))
     found = follower_brakes(
         ROADS.arrays, TRAVEL, cars, departure(), KIND, MAIN[0], 100.0, 10.0, room
@@ -325,7 +327,7 @@ def test_who_follows_must_not_brake_hard(behind_m: float, pace: float, brakes: b
     assert found == brakes
 
 
-def test_all_who_come_are_asked_not_only_the_nearest() -> None:
+def test_all_followers_are_checked_not_only_the_nearest() -> None:
     """A vehicle that stands nearer, on another way into the lane, hides no fast one behind it."""
     roads, ways = network("grid4x4"), travel("grid4x4")
     lane = next(

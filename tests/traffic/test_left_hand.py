@@ -62,7 +62,7 @@ def test_the_cache_keeps_the_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert made.content_hash == restored.content_hash
 
 
-def test_a_side_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_an_invalid_side_is_refused(tmp_path: Path) -> None:
     path = netgenerate(tmp_path / "left.net.xml", *NETS["grid"])
     path.write_text(path.read_text().replace('lefthand="true"', 'lefthand="both"'))
     with pytest.raises(MapError, match="lefthand='both'"):

@@ -101,7 +101,7 @@ def came_by(network: RoadNetwork, seen: np.void) -> int:
     return int(found[0]) if len(found) else -1
 
 
-def test_others_are_all_whom_sumo_does_not_move(network: RoadNetwork) -> None:
+def test_others_are_all_vehicles_that_sumo_does_not_move(network: RoadNetwork) -> None:
     zoned = make_zone_state(3, 2, 10)
     for zone in range(3):
         for n in range(zone + 2):

@@ -99,7 +99,7 @@ def test_a_closed_edge_is_driven_around_as_in_sumo(net: Path, tmp_path: Path) ->
         ('<routeProbReroute id="far"/><routeProbReroute id="near" probability="3"/>', "", 8, 30),
     ],
 )
-def test_rerouters_send_whom_they_name_where_they_say(
+def test_rerouters_send_their_vehicles_to_their_goals(
     net: Path, tmp_path: Path, inside: str, attrs: str, least: int, most: int
 ) -> None:
     types = cars() + '<vType id="truck" vClass="truck"/>'
@@ -111,7 +111,9 @@ def test_rerouters_send_whom_they_name_where_they_say(
     assert found["out"] == 150 - (found["long1"] if ends else 0)
 
 
-def test_who_has_a_stop_or_an_edge_to_pass_keeps_its_way(net: Path, tmp_path: Path) -> None:
+def test_vehicles_with_a_stop_or_an_edge_to_pass_keep_their_route(
+    net: Path, tmp_path: Path
+) -> None:
     simulation = two_ways(
         net,
         tmp_path,

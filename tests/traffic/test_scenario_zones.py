@@ -68,7 +68,9 @@ def test_a_border_through_the_place_changes_nothing(name: str, tmp_path: Path) -
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(("count", "agents"), [(2, 1), (9, 3)])
-def test_nor_do_workers(name: str, count: int, agents: int, tmp_path: Path) -> None:
+def test_workers_change_nothing_in_scenarios(
+    name: str, count: int, agents: int, tmp_path: Path
+) -> None:
     place = ROOMY.get(name, "")
     whole = make_scenario(name, density="low", agents=agents, place=place)
     expected = hashes(whole, steps=60)
@@ -90,7 +92,7 @@ def test_nor_do_workers(name: str, count: int, agents: int, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nor_do_several_agents(name: str, tmp_path: Path) -> None:
+def test_several_agents_are_independent_of_zones(name: str, tmp_path: Path) -> None:
     place = ROOMY.get(name, "")
     whole = make_scenario(name, density="low", agents=3, place=place)
     expected = hashes(whole, steps=50)
@@ -100,7 +102,7 @@ def test_nor_do_several_agents(name: str, tmp_path: Path) -> None:
     assert hashes(vec, steps=50) == expected
 
 
-def test_who_turns_on_a_border_does_not_flap_between_owners(tmp_path: Path) -> None:
+def test_a_vehicle_that_turns_on_a_border_does_not_alternate_its_owner(tmp_path: Path) -> None:
     """The car goes to and fro where four zones meet: hysteresis keeps it with one of them."""
     whole = make_scenario("failed_u_turn")
     steady, restless = (

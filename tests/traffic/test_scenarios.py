@@ -71,7 +71,7 @@ def test_the_library_is_what_lies_in_its_folder() -> None:
 @pytest.mark.parametrize(
     "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
 )
-def test_the_reference_driver_passes_and_who_never_yields_does_not(
+def test_the_reference_driver_passes_and_a_driver_that_never_yields_fails(
     name: str, params: Mapping[str, bool | float], seed: int
 ) -> None:
     found = played(name, "idm", seed, params=params)
@@ -87,7 +87,7 @@ def test_the_reference_driver_passes_and_who_never_yields_does_not(
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_so_it_is_in_a_town(name: str, seed: int) -> None:
+def test_scenarios_separate_drivers_in_a_town(name: str, seed: int) -> None:
     assert played(name, "idm", seed, env="town").verdict == "passed"
     assert played(name, "never_yield", seed, env="town").verdict == "collided"
 
@@ -96,7 +96,7 @@ def test_so_it_is_in_a_town(name: str, seed: int) -> None:
 @pytest.mark.parametrize(("name", "params"), VARIANTS)
 @pytest.mark.parametrize("density", ["low", "high"])
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_so_it_is_among_other_traffic(
+def test_scenarios_separate_drivers_in_traffic(
     name: str, params: Mapping[str, bool | float], density: str, seed: int
 ) -> None:
     found = played(name, "idm", seed, density=density, params=params)
@@ -107,7 +107,7 @@ def test_so_it_is_among_other_traffic(
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "params"), VARIANTS)
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
-def test_so_it_is_on_a_real_map(
+def test_scenarios_separate_drivers_on_a_real_map(
     name: str, params: Mapping[str, bool | float], seed: int, shared_maps: Path
 ) -> None:
     env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
@@ -115,7 +115,7 @@ def test_so_it_is_on_a_real_map(
     assert played(name, "never_yield", seed, env=env, params=params).verdict == "collided"
 
 
-def test_between_two_lanes_of_a_bent_road_nobody_is_off_it(shared_maps: Path) -> None:
+def test_between_two_lanes_of_a_bend_no_vehicle_is_off_the_road(shared_maps: Path) -> None:
     """The lanes at this place leave a seam of millimetres, on which the driver once was."""
     env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
     assert played("intersection_blockage", "idm", env=env, place="85_1").verdict == "passed"
@@ -143,7 +143,7 @@ def test_a_closure_delays_as_long_as_it_lasts() -> None:
     assert long.delay_s > short.delay_s + 30.0
 
 
-def test_all_lanes_of_a_closed_road_are() -> None:
+def test_all_lanes_of_a_closed_road_are_closed() -> None:
     with made("road_closure") as vec:
         scene, lanes = vec.simulation.scene, vec.network.lanes
         assert scene is not None
@@ -176,7 +176,7 @@ def test_signals_that_fail_are_dark_from_then_on() -> None:
     assert shown[-1] == {"o", "O"}
 
 
-def test_the_seed_draws_the_place_and_its_name_says_it_again() -> None:
+def test_the_seed_draws_the_place_and_its_name_repeats_it() -> None:
     places = {seed: played("pedestrian_crossing", "never_yield", seed).place for seed in range(4)}
     assert len(set(places.values())) > 1
     again = played("pedestrian_crossing", "never_yield", 0, place=places[3])
@@ -196,7 +196,7 @@ BROKEN: tuple[tuple[dict[str, Any], type[CavmarlError], str], ...] = (
 
 
 @pytest.mark.parametrize(("given", "error", "says"), BROKEN)
-def test_what_cannot_be_is_refused(
+def test_invalid_arguments_are_refused(
     given: dict[str, Any], error: type[CavmarlError], says: str
 ) -> None:
     with pytest.raises(error, match=says):
@@ -240,7 +240,7 @@ def test_agents_of_a_parallel_env_play_it_too() -> None:
         env.step(env.suggest_actions())
 
 
-def test_a_scene_has_room_for_so_many_agents() -> None:
+def test_a_scene_limits_the_number_of_agents() -> None:
     with pytest.raises(ConfigError, match=r"population\.agents = 400: .* set at most \d+"):
         make_scenario("merge_conflict", agents=400)
     with pytest.raises(ConfigError, match=r"population\.agents = 0: must be 1 or more"):
@@ -249,7 +249,7 @@ def test_a_scene_has_room_for_so_many_agents() -> None:
         make_vec("grid4x4", overrides={"scenario.place": "left1A1_0"})
 
 
-def test_who_never_yields_steers() -> None:
+def test_the_driver_that_never_yields_steers() -> None:
     discrete = {"action.kind": "discrete"}
     with made("pedestrian_crossing", overrides=discrete) as vec, pytest.raises(PolicyError):
         load_policy("never_yield", vec)
@@ -276,7 +276,7 @@ def stage(streets, place, parameters):
 '''
 
 
-def test_anybody_can_add_one_in_a_file(tmp_path: Path) -> None:
+def test_a_file_can_add_a_scenario(tmp_path: Path) -> None:
     path = tmp_path / "nobody.py"
     path.write_text(OWN, encoding="utf-8")
     found = played(str(path), "never_yield", params={"speed_mps": 10.0})

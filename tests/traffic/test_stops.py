@@ -110,7 +110,7 @@ def test_a_stop_that_was_missed_is_left_out(world: World) -> None:
     assert simulation.traffic_stats().arrived == 1
 
 
-def test_others_pass_who_stands_on_the_other_lane(world: World) -> None:
+def test_vehicles_pass_a_vehicle_that_stands_on_another_lane(world: World) -> None:
     simulation = world(
         car('<stop lane="main_in_0" endPos="200" duration="60"/>')
         + '<flow id="f" type="c" from="main_in" to="main_out" begin="5" end="60" period="4"'
@@ -123,7 +123,7 @@ def test_others_pass_who_stands_on_the_other_lane(world: World) -> None:
     assert 0 in simulation.vehicles()["id"], "the first one has stood all the time"
 
 
-def test_who_cannot_change_lanes_for_long_goes_on_another_way(world: World) -> None:
+def test_a_vehicle_that_cannot_change_lanes_takes_another_route(world: World) -> None:
     simulation = world(
         '<vType id="c" sigma="0" speedDev="0"/>'
         '<trip id="v" type="c" depart="0" from="A1B1" to="D3right3"/>',

@@ -228,7 +228,9 @@ def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
         ({"workers.balance_steps": 8}, "workers.balance_steps"),
     ],
 )
-def test_what_cannot_be_is_refused(tmp_path: Path, wanted: dict[str, object], words: str) -> None:
+def test_invalid_arguments_are_refused(
+    tmp_path: Path, wanted: dict[str, object], words: str
+) -> None:
     both = settings(tiny_file(tmp_path), "sumo-traffic") | wanted
     with pytest.raises(ConfigError, match=words):
         load_world("grid4x4", overrides=both)
@@ -318,7 +320,7 @@ def test_a_sumo_of_a_worker_that_dies_runs_again_with_the_next_step(
         vec.close()
 
 
-def test_a_worker_dies_whose_sumo_was_told_too_much_to_keep(tmp_path: Path) -> None:
+def test_a_worker_dies_whose_sumo_log_exceeds_its_limit(tmp_path: Path) -> None:
     both = settings(tiny_file(tmp_path), "sumo-traffic") | {"sumo.replay_mib": 0}
     vec = make_vec("grid4x4", num_envs=2, agents=3, background=0, workers=2, overrides=both)
     try:

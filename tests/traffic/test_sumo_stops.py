@@ -78,7 +78,7 @@ def test_the_table_is_what_the_reader_of_demand_finds(tmp_path: Path) -> None:
     assert found["bus"]["until"].tolist() == [25.0, -1.0]
 
 
-def test_vehicles_stand_where_and_as_long_as_they_are_told(tmp_path: Path) -> None:
+def test_vehicles_stop_at_their_stops_for_the_given_time(tmp_path: Path) -> None:
     with coupled("merge", write_stops(tmp_path), "sumo-demand") as simulation:
         network = simulation.network
         found = stands(simulation, 110)

@@ -89,7 +89,7 @@ def test_ways_are_as_fast_as_the_fastest_and_lead_to_the_goal(
     assert roads.lanes[lane]["edge"] == goal
 
 
-def test_a_way_that_does_not_fit_its_slot_is_none() -> None:
+def test_a_route_that_does_not_fit_its_slot_is_dropped() -> None:
     roads = network("grid4x4")
     goal = roads.edge_ids.index("D3right3")
     lane = int(roads.edges[roads.edge_ids.index("left0A0")]["first_lane"])
@@ -147,7 +147,7 @@ def test_vehicles_ask_by_rising_id_if_it_is_their_time_or_a_rerouter_stands_ther
         (0.0, 2.0, 0, 1, False),  # its front is over the line
     ],
 )
-def test_who_has_room_may_turn_off(
+def test_a_vehicle_needs_room_to_leave_its_route(
     speed: float, back: float, changes: int, link: int, fits: bool
 ) -> None:
     roads = network("grid4x4")

@@ -142,7 +142,7 @@ def test_zones_over_workers_change_nothing_that_is_learnt(ippo: ModuleType, here
     assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "split")
 
 
-def test_a_central_critic_is_no_part_of_what_drives(ippo: ModuleType, here: Path) -> None:
+def test_a_central_critic_is_not_part_of_the_driver(ippo: ModuleType, here: Path) -> None:
     words = [*TINY, "--mappo", "--total-agent-steps", "20", "--name", "run"]
     assert ippo.main(words) == 0
     network, config = load_network(here / "runs" / "run")
@@ -198,7 +198,7 @@ def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None
         (["--env", "merg"], "did you mean merge"),
         (["--num-envs", "0"], "--num-envs 0: must be at least 1"),
         (["--learning-rate", "nan"], "--learning-rate nan: must be above 0"),
-        (["--mappo", "--shared"], "--shared: not with --mappo"),
+        (["--mappo", "--shared"], "--shared: leave out --mappo"),
         (["--keep", "0"], "--keep 0.0: must be above 0"),
         (["--gamma", "1.5"], "--gamma 1.5: must be from 0 to 1"),
         (["--agents", "-1"], "--agents -1: must be at least 0"),

@@ -96,7 +96,7 @@ def test_without_messages_it_drives_as_idm(road: Path) -> None:
     assert (deaf.spread == idm.spread).all()
 
 
-def test_what_it_needs_is_told() -> None:
+def test_missing_requirements_are_named() -> None:
     with pytest.raises(PolicyError, match=r"cacc needs .* overrides=.*v2x\.enabled"):
         load_policy("cacc", make_vec("ring"))
     discrete = make_vec("ring", overrides=HEARS | {"action.kind": "discrete"})

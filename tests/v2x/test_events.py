@@ -38,7 +38,7 @@ def run(workers: int, zones: int = 1, steps: int = 6) -> np.ndarray[Any, Any]:
     return np.array(seen)
 
 
-def test_what_one_declares_all_others_are_told() -> None:
+def test_declared_events_reach_all_other_agents() -> None:
     seen = run(workers=0)
     assert (seen[:2] == 0.0).all()
     assert seen[2:, [0, 2, 3], PRESENT].all()
@@ -46,7 +46,7 @@ def test_what_one_declares_all_others_are_told() -> None:
     assert not seen[:, 1].any()  # whoever tells it knows
 
 
-def test_workers_and_zones_are_told_the_same() -> None:
+def test_workers_and_zones_receive_the_same_events() -> None:
     whole = run(workers=0)
     assert (run(workers=2, zones=2) == whole).all()
     assert (run(workers=1) == whole).all()
@@ -66,7 +66,7 @@ def test_it_is_sent_once_a_step_and_kept_for_its_validity() -> None:
     assert known == [1, 1, 0, 0]  # said in tick 1, kept up to tick 9; a step has four ticks
 
 
-def test_a_roadside_unit_tells_and_is_told() -> None:
+def test_a_roadside_unit_sends_and_receives_events() -> None:
     env = make_vec("grid4x4", agents=2, overrides=TOLD)
     env.reset(seed=3)
     bus = env.simulation.messages

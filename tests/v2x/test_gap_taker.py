@@ -40,7 +40,7 @@ def test_messages_halve_its_collisions_at_no_more_delay() -> None:
     assert delay_s < deaf_delay_s
 
 
-def test_nothing_hangs_on_how_worlds_are_divided() -> None:
+def test_results_do_not_depend_on_the_division() -> None:
     whole = driven(0.3, seed=3, worlds=2)
     assert driven(0.3, seed=3, worlds=2, **{"zones.count": 2}) == whole
 
@@ -54,7 +54,7 @@ def test_nothing_hangs_on_how_worlds_are_divided() -> None:
         {"action.kind": "discrete"},
     ],
 )
-def test_it_says_what_it_needs(settings: dict[str, Any]) -> None:
+def test_missing_requirements_are_named(settings: dict[str, Any]) -> None:
     env = cavmarl.make_vec("blind_junction", overrides=settings)
     with pytest.raises(PolicyError, match=r"sensors\.conflicts\.heard"):
         load_policy("gap_taker", env)

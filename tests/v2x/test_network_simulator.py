@@ -112,7 +112,7 @@ def test_the_order_of_an_answer_does_not_matter() -> None:
         ((1, 0, 2), "by an unknown receiver"),
     ],
 )
-def test_answers_that_cannot_be_are_refused(reception: tuple[int, int, int], words: str) -> None:
+def test_invalid_answers_are_refused(reception: tuple[int, int, int], words: str) -> None:
     world = Standing(2, **EXTERNAL)
 
     class Liar:
@@ -125,7 +125,7 @@ def test_answers_that_cannot_be_are_refused(reception: tuple[int, int, int], wor
         world.tick()
 
 
-def test_what_is_no_array_is_refused_and_so_is_a_missing_simulator() -> None:
+def test_invalid_arrays_and_a_missing_simulator_are_refused() -> None:
     world = Standing(2, **EXTERNAL)
     world.put(PLACES)
     with pytest.raises(ConfigError, match="connect a network simulator"):

@@ -48,7 +48,7 @@ def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
     assert known(silent) == {}
 
 
-def test_lidar_does_not_meet_it_while_messages_tell_of_it() -> None:
+def test_a_vehicle_hidden_from_lidar_is_known_from_messages() -> None:
     world = Standing(1, rays=64)
     simulation = world.simulation
     rows = world.worlds.rows[0, : world.worlds.num_owned[0]]
@@ -76,7 +76,7 @@ def test_lidar_does_not_meet_it_while_messages_tell_of_it() -> None:
     assert known(world)[2] == (2, KIND_CAM)
 
 
-def test_a_car_without_radio_is_told_of_by_those_who_see_it() -> None:
+def test_a_car_without_radio_is_reported_by_vehicles_that_see_it() -> None:
     # Only the agent and the roadside unit are equipped; a wall hides the car from the agent.
     settings: dict[str, Any] = {
         "equipped": 0.0, "perception__rate_hz": 10.0, "roadside__signals": ["all"],

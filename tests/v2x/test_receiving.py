@@ -112,7 +112,7 @@ def test_inboxes_hold_what_the_definitions_say(name: str, seen: bool) -> None:
     assert statistics.mean_latency_s == pytest.approx(0.1 * world.config.v2x.channel.latency_ticks)
 
 
-def test_chances_are_met() -> None:
+def test_receptions_have_the_configured_probability() -> None:
     # 300 receptions at each distance: within four standard deviations.
     world = Standing(1, channel__path_loss_exponent=2.75, channel__loss=0.1, equipped=1.0)
     distances = np.array([20.0, 90.0, 120.0, 140.0, 220.0])

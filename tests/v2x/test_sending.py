@@ -46,7 +46,7 @@ def test_stations_take_turns_by_id() -> None:
         assert (sent(world, KIND_CAM)["tick"] == tick).all()
 
 
-def test_a_cam_says_what_the_vehicle_does() -> None:
+def test_a_cam_has_the_state_of_its_vehicle() -> None:
     world = Standing(1)
     rows = world.put(SPREAD, speed=7.0, accel=-1.5, yaw_rate=0.1, heading=0.3, length=4.2)
     world.tick()
@@ -91,7 +91,7 @@ def test_only_equipped_vehicles_send_and_agents_do() -> None:
     assert sent(silent, KIND_CAM)["sender"].tolist() == [0, 1, 2, 3]
 
 
-def test_events_are_told_by_the_worst_cause() -> None:
+def test_events_are_sent_with_the_worst_cause() -> None:
     world = Standing(1)
     rows = world.put(SPREAD, hit=-1)
     rows["accel"][3] = -4.5
@@ -111,7 +111,7 @@ def test_events_are_told_by_the_worst_cause() -> None:
 
 
 @pytest.mark.parametrize("units", [False, True], ids=["vehicles", "roadside"])
-def test_what_is_seen_is_told(units: bool) -> None:
+def test_seen_vehicles_are_reported(units: bool) -> None:
     settings: dict[str, Any] = {"perception__rate_hz": 10.0, "perception__objects": 5}
     if units:
         settings = {
@@ -140,7 +140,7 @@ def test_what_is_seen_is_told(units: bool) -> None:
     assert sum(map(len, told.values())) > 10
 
 
-def test_roadside_units_tell_the_phase_that_is_on() -> None:
+def test_roadside_units_send_the_active_phase() -> None:
     world = Standing(1, cam__rate_hz=0.0, roadside__signals=["all"], roadside__rate_hz=10.0)
     network = world.simulation.network
     world.put(SPREAD)

@@ -45,13 +45,13 @@ from cavmarl.engine.world_setup import load_world
         ({"observation.mode": "messages"}, r"observation\.mode.*set sensors\.messages\.objects"),
     ],
 )
-def test_what_cannot_be_is_refused(settings: dict[str, Any], words: str) -> None:
+def test_invalid_arguments_are_refused(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         parallel_env("grid4x4", overrides={"v2x.enabled": True} | settings)
 
 
 @pytest.mark.parametrize("name", ["objects", "events", "signal"])
-def test_messages_that_nobody_sends_cannot_be_observed(name: str) -> None:
+def test_messages_that_no_station_sends_cannot_be_observed(name: str) -> None:
     value = True if name == "signal" else 1
     with pytest.raises(ConfigError, match=rf"sensors\.messages\.{name} = .*set v2x\.enabled"):
         load_world("grid4x4", overrides={f"sensors.messages.{name}": value})

@@ -39,7 +39,7 @@ def test_the_bytes_are_those_on_record() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_encoded_is_decoded(kind: int) -> None:
+def test_decoded_messages_equal_encoded_ones(kind: int) -> None:
     header, records = decode(example(kind, 3))
     assert (header["kind"], header["count"], header["sender"]) == (kind, 3, 7)
     assert (header["x"], header["y"], header["tick"]) == (1.5, -2.5, 41)

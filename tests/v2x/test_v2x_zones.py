@@ -31,7 +31,7 @@ LOSSY = {
 
 @pytest.mark.parametrize("channel", [{}, LOSSY], ids=["ideal", "lossy"])
 @pytest.mark.parametrize("stack", [1, 3])
-def test_what_agents_are_told_does_not_depend_on_zones(channel: dict[str, Any], stack: int) -> None:
+def test_received_messages_do_not_depend_on_zones(channel: dict[str, Any], stack: int) -> None:
     settings = FAST | OBSERVED | channel | {"sensors.stack": stack, "population.background": 60}
     found = verify_zones("grid4x4", (2, 4, 9), steps=30, overrides=settings)
     for result in found.results:
@@ -59,7 +59,7 @@ def test_inboxes_are_the_same_byte_for_byte() -> None:
         assert everything_said(zones) == whole
 
 
-def test_worker_processes_say_the_same() -> None:
+def test_worker_processes_send_the_same_messages() -> None:
     overrides = FAST | OBSERVED | LOSSY | {"population.mode": "respawn"}
 
     def seen(**split: int) -> list[bytes]:

@@ -60,11 +60,11 @@ def exchanged(one: socket.socket, other: socket.socket) -> list[bytes]:
 
 
 @pytest.mark.parametrize(("fault", "wanted"), [(NetworkFault.DELAY, 0), (NetworkFault.DAMAGE, 1)])
-def test_what_comes_is_late_or_damaged(
+def test_bytes_are_delayed_or_damaged(
     ends: tuple[FaultyNetwork, socket.socket, socket.socket], fault: NetworkFault, wanted: int
 ) -> None:
     network, one, other = ends
-    network.strike(fault)
+    network.inject(fault)
     first = exchanged(one, other)
     bits = sum(
         (mine ^ theirs).bit_count()
@@ -82,14 +82,14 @@ def test_one_direction_is_silent_for_good(
     network, one, other = ends
     for end in (one, other):
         end.settimeout(0.2)
-    network.strike(NetworkFault.SILENCE)
+    network.inject(NetworkFault.SILENCE)
     assert sorted(exchanged(one, other)) == [b"", b"word"]
     assert sorted(exchanged(one, other)) == [b"", b"word"]
 
 
 def test_a_cut_ends_both_ends(ends: tuple[FaultyNetwork, socket.socket, socket.socket]) -> None:
     network, one, other = ends
-    network.strike(NetworkFault.CUT)
+    network.inject(NetworkFault.CUT)
     assert one.recv(100) == other.recv(100) == b""
 
 
@@ -116,7 +116,7 @@ def test_pieces_are_late_side_by_side() -> None:
     assert latency_s <= took_s < num * latency_s
 
 
-def test_nothing_stays_behind() -> None:
+def test_no_threads_or_sockets_remain() -> None:
     before = set(threading.enumerate())
     network = FaultyNetwork(seed=0)
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -131,7 +131,7 @@ def test_nothing_stays_behind() -> None:
 
 
 @pytest.mark.parametrize("fault", [NetworkFault.DAMAGE, NetworkFault.SILENCE, STOP])
-def test_worlds_go_through_it(fault: str) -> None:
+def test_worlds_run_through_the_faulty_network(fault: str) -> None:
     found = verify_node_faults("merge", [3], faults=[fault], seeds=1, zones=3, steps=25, **SMALL)
     (line,) = found.lines
     assert found.holds
@@ -151,7 +151,7 @@ def test_processes_are_killed_one_after_the_other() -> None:
 
 
 @pytest.mark.slow
-def test_the_command(tmp_path: Path) -> None:
+def test_the_command_prints_and_writes_its_result(tmp_path: Path) -> None:
     words = ("verify", "nodes", "merge", "--nodes", "2", "--faults", "campaign")
     amount = ("--mix", "kill,damage", "--seeds", "2", "--process-runs", "1")
     path = tmp_path / "found.json"
@@ -173,6 +173,6 @@ def test_the_command(tmp_path: Path) -> None:
         ([2], {"faults": ["flood"]}, "must be among delay"),
     ],
 )
-def test_bad_input(nodes: list[int], keys: dict[str, Any], words: str) -> None:
+def test_bad_input_is_refused(nodes: list[int], keys: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         verify_node_faults("merge", nodes, **keys)

@@ -19,7 +19,7 @@ def test_nodes_change_nothing_while_some_are_killed() -> None:
     assert found.to_dict()["holds"] is True
 
 
-def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_difference_is_reported_with_its_step(monkeypatch: pytest.MonkeyPatch) -> None:
     hashed = CavVectorEnv.state_hash
 
     def wrong(vec: CavVectorEnv, world: int = 0) -> str:
@@ -40,12 +40,12 @@ def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"nodes": (3,), "zones": 2}, "needs 1 to 2 nodes"),
     ],
 )
-def test_bad_input(arguments: dict[str, object], words: str) -> None:
+def test_bad_input_is_refused(arguments: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         verify_nodes("grid4x4", **arguments)  # type: ignore[arg-type]
 
 
-def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_and_writes_its_result(capsys: pytest.CaptureFixture[str]) -> None:
     words = ("--nodes", "2", "--steps", "5", "--zones", "2")  # none of them is for kills
     assert run("verify", "nodes", "grid4x4", *words) == 0
     assert "equal" in capsys.readouterr().out

@@ -77,7 +77,7 @@ def exchange(
     return heard, machine.now_s
 
 
-def test_what_happens_is_a_function_of_the_seed(world: World) -> None:
+def test_the_order_of_events_is_a_function_of_the_seed(world: World) -> None:
     heard, took_s = exchange(world, 3)
     assert (heard, took_s) == exchange(world, 3)
     assert 0.0 < took_s < 0.05
@@ -101,8 +101,8 @@ def test_bytes_that_are_held_arrive_in_the_order_in_which_they_were_sent(world: 
     for data in sent:
         machine.now_s += 0.0004 / 3.0
         sender.send([data])
-    machine.wait(machine.caller, lambda: len(receiver.come) == len(sent), None)
-    assert list(receiver.come) == sent
+    machine.wait(machine.caller, lambda: len(receiver.received) == len(sent), None)
+    assert list(receiver.received) == sent
 
 
 def test_a_connection_without_answers_ends(world: World) -> None:
@@ -200,14 +200,14 @@ def test_a_node_that_is_given_up_without_need(monkeypatch: pytest.MonkeyPatch) -
     assert "nodes were lost to faults that must be tolerated" in line.wrong[0]
 
 
-def test_nodes_that_do_not_heed_an_order_to_go_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nodes_that_ignore_a_rollback_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: they wait for ever for a node that only the caller misses."""
     monkeypatch.setattr(Links, "check_recovery", lambda self: None)
     assert one_line("partition", seeds=3).wrong
 
 
 @pytest.mark.slow
-def test_frames_that_are_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_without_a_checksum_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: a frame that is damaged, or comes twice, is taken for another one.
 
     What it says is checked, too, so that most of them are refused for that.
@@ -216,14 +216,14 @@ def test_frames_that_are_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert one_line("damage", seeds=12).wrong or one_line("duplicate", seeds=40).wrong
 
 
-def test_frames_that_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_without_a_sequence_number_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: a frame comes twice. Missing ones are found by what frames say."""
     checksum = "cavmarl.parallel.nodes.link.xxh3_64_intdigest"
     monkeypatch.setattr(checksum, lambda data, seed=0: xxh3_64_intdigest(data))
     assert one_line("duplicate", seeds=8).wrong
 
 
-def test_a_state_that_is_not_gone_back_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_rollback_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: nodes go on from what they have, and do steps twice."""
 
     def present(data: Bytes, like: list[Any]) -> list[Any]:
@@ -295,7 +295,7 @@ def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("stream", [RowStream, AgentStream])
-def test_a_node_that_says_what_cannot_be_is_lost(
+def test_a_node_with_an_impossible_report_is_lost(
     monkeypatch: pytest.MonkeyPatch, stream: type[RowStream] | type[AgentStream]
 ) -> None:
     """A whole frame, of which the words cannot be: a connection ends, and no node fails."""
@@ -325,7 +325,7 @@ def test_a_node_that_says_what_cannot_be_is_lost(
 
 
 @pytest.mark.slow
-def test_many_runs(tmp_path: Path) -> None:
+def test_many_runs_of_each_mix_hold(tmp_path: Path) -> None:
     words = (
         "verify",
         "nodes",
@@ -350,6 +350,6 @@ def test_many_runs(tmp_path: Path) -> None:
         ([2], {"mixes": ["flood"]}, "must be among none, delay"),
     ],
 )
-def test_bad_input(nodes: list[int], keys: dict[str, Any], words: str) -> None:
+def test_bad_input_is_refused(nodes: list[int], keys: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         verify_simulated_nodes("merge", nodes, **keys)

@@ -131,7 +131,7 @@ def test_ten_thousand_vehicles_are_at_most_100_kb() -> None:
     assert len(shown.frame) + len(shown.roster[-1].message) <= 100_000
 
 
-def test_ghosts_and_hand_overs_are_told() -> None:
+def test_messages_include_ghosts_and_transfers() -> None:
     frame = frame_with([1, 2, 3, 4], 5)
     frame.vehicles["transfer"][1] = 1
     frame.vehicles["target_zone"][1] = 3

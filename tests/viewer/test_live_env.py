@@ -108,7 +108,7 @@ def test_a_page_that_may_pauses_the_program(vec: CavVectorEnv) -> None:
         assert done.wait(10.0)
 
 
-def test_no_such_world_is_told(vec: CavVectorEnv) -> None:
+def test_an_unknown_world_is_refused(vec: CavVectorEnv) -> None:
     with cavmarl.show(vec, port=0) as shown:
         for world in (3, -1, True, "0", None):
             with connect(shown.address.replace("http", "ws") + "live") as client:
@@ -155,7 +155,7 @@ def test_an_evaluation_is_watched_and_stays_the_same(monkeypatch: pytest.MonkeyP
         evaluate("ring", "idm", episodes=1, repeats=2, watcher=watcher, **keys)
 
 
-def test_the_load_of_workers_is_told_with_their_zones() -> None:
+def test_messages_include_the_load_of_workers_and_their_zones() -> None:
     vec = make_vec("grid4x4", num_envs=1, zones=2, workers=2, agents=1, background=2)
     try:
         vec.reset(seed=0)

@@ -114,7 +114,7 @@ def test_a_page_goes_to_any_moment(path: Path, loop: asyncio.AbstractEventLoop) 
         assert turns(heard, lambda found: True) == (shown, True)
 
 
-def test_a_vehicle_is_told_as_it_was(path: Path, loop: asyncio.AbstractEventLoop) -> None:
+def test_a_vehicle_is_shown_as_recorded(path: Path, loop: asyncio.AbstractEventLoop) -> None:
     heard = Heard(path, loop, world=0)
     frame: WorldFrame = Recording(path).at(10, 0, 0)
     row = frame.vehicles[0]
@@ -124,7 +124,7 @@ def test_a_vehicle_is_told_as_it_was(path: Path, loop: asyncio.AbstractEventLoop
     assert not heard.told_of(10**6, frame.tick)["here"]
 
 
-def test_an_agent_is_told_with_what_it_observed(
+def test_an_agent_is_shown_with_its_observation(
     path: Path, loop: asyncio.AbstractEventLoop
 ) -> None:
     heard, recording = Heard(path, loop, world=1), Recording(path)

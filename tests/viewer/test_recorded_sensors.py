@@ -61,7 +61,7 @@ def test_shapes_of_a_replay_are_those_of_the_live_page(tmp_path: Path) -> None:
         (("observations",), "recording has no samples of sensors; --record-also samples records"),
     ],
 )
-def test_what_was_not_recorded_is_said(tmp_path: Path, include: tuple[str, ...], note: str) -> None:
+def test_unrecorded_data_are_reported(tmp_path: Path, include: tuple[str, ...], note: str) -> None:
     tick, vehicle, told = recorded(tmp_path / "run", *include)[-1]
     found = RecordedSensors(Recording.open(tmp_path / "run"), 0, 0).of(tick, vehicle, sensors=True)
     assert note in found["note"]
@@ -69,7 +69,7 @@ def test_what_was_not_recorded_is_said(tmp_path: Path, include: tuple[str, ...],
     assert found["shapes"] == kept
 
 
-def test_settings_of_another_version_are_said(tmp_path: Path) -> None:
+def test_settings_of_another_version_are_reported(tmp_path: Path) -> None:
     tick, vehicle, _ = recorded(tmp_path / "run", "observations")[-1]
     recording = Recording.open(tmp_path / "run")
     recording.manifest["world"]["config"]["sensors"]["sonar"] = {"rays": 4}

@@ -99,7 +99,7 @@ def test_occupied_cells_hold_the_vehicles(told: Any) -> None:
     assert nearest.max() < 5.0  # half the diagonal of a cell
 
 
-def test_pictures_are_small_enough_and_all_kinds_are_told(told: Any) -> None:
+def test_pictures_of_all_kinds_are_small_enough(told: Any) -> None:
     shapes = shapes_of(told)
     assert shapes["front"]["width"] * shapes["front"]["height"] <= 64_000
     for name in ("front", "depth", "above"):
@@ -123,7 +123,7 @@ def test_the_way_leads_from_the_vehicle_to_its_goal(told: Any) -> None:
     assert length_m == pytest.approx(row["to_go"], abs=10.0)
 
 
-def test_one_world_of_several_is_told() -> None:
+def test_details_are_those_of_the_chosen_world() -> None:
     vec = make_vec("merge", num_envs=2, agents=2, background=4)
     vec.reset(seed=0)
     for _ in range(5):

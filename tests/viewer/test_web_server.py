@@ -64,7 +64,7 @@ def ended_with(client: ClientConnection) -> tuple[int | None, str]:
         return client.close_code, client.close_reason or ""
 
 
-def test_a_page_is_told_the_world_the_map_and_frames(serve: Serve) -> None:
+def test_a_page_gets_the_world_the_map_and_frames(serve: Serve) -> None:
     served = serve()
     with welcome(served.server) as client:
         hello = first_of(client, "hello")
@@ -287,7 +287,7 @@ def test_a_watcher_that_reads_nothing_is_dropped_and_the_world_goes_on(serve: Se
         turns_until(served, lambda: served.audience.wishes.watchers == 0)
 
 
-def test_a_world_that_nobody_watches_publishes_nothing(serve: Serve) -> None:
+def test_a_world_without_watchers_publishes_nothing(serve: Serve) -> None:
     served = serve(drives=False)
     served.run.clock.pace = 0.0
     for _ in range(30):

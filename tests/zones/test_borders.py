@@ -30,12 +30,12 @@ BORDERS = Borders(2.0, 1.0, MAX_SPEED_MPS)
     st.sampled_from([0.1, 0.5]),
     st.booleans(),
 )
-def test_who_has_crossed_or_soon_will_is_told_of(
+def test_vehicles_that_have_crossed_or_soon_will_are_found(
     data: st.DataObject,
     partition: ZonePartition,
     hysteresis_m: float,
     ahead_s: float,
-    everybody: bool,
+    check_all: bool,
 ) -> None:
     draw = np.random.default_rng(data.draw(st.integers(0, 1000)))
     parts = []
@@ -51,10 +51,10 @@ def test_who_has_crossed_or_soon_will_is_told_of(
     reach_m = MAX_SPEED_MPS * ahead_s  # as far as anybody can drive by then
     borders = Borders(hysteresis_m, ahead_s, MAX_SPEED_MPS)
     zoned = exchanged(partition, reach_m, parts, borders=borders)
-    if everybody:
+    if check_all:
         zoned.num_border[:] = 0
     out = np.zeros(2 * zoned.rows.shape[-1] * partition.count, dtype=NEAR)
-    found = find_near(partition.arrays, borders, zoned, SIDE, 0, everybody, out)
+    found = find_near(partition.arrays, borders, zoned, SIDE, 0, check_all, out)
     for zone, rows in enumerate(parts):
         told = [
             (int(e["row"]), int(e["target"]), bool(e["crossed"]))
@@ -93,7 +93,7 @@ def _margins(
     return margins
 
 
-def test_who_drives_over_a_corner_is_told_to_both_zones() -> None:
+def test_a_vehicle_near_a_corner_is_found_for_both_zones() -> None:
     partition = four()
     row = vehicles([(13.0, 12.0, math.pi / 2)], speed=10.0)  # of zone 0, 3 m to the east of it
     none = row[:0]
@@ -105,7 +105,7 @@ def test_who_drives_over_a_corner_is_told_to_both_zones() -> None:
     assert out["crossed"].tolist() == [True, False]
 
 
-def test_rows_that_are_not_there_any_more_are_not_looked_at() -> None:
+def test_removed_rows_are_ignored() -> None:
     partition = four()
     rows = vehicles([(13.0, 12.0, 0.0), (13.0, 12.0, 0.0)])
     none = rows[:0]
@@ -132,7 +132,9 @@ def ids(zoned: ZoneState, zone: int, first: int, last: int) -> set[int]:
 
 @pytest.mark.parametrize("hint", [0, 1, 2, 4, 99])
 @pytest.mark.parametrize("vehicle", [10, 11, 12])
-def test_who_is_passed_on_is_a_ghost_here_and_owned_there(vehicle: int, hint: int) -> None:
+def test_a_handed_over_vehicle_is_owned_by_the_target_and_a_ghost_at_the_source(
+    vehicle: int, hint: int
+) -> None:
     zoned = two_zones()
     assert pass_on(vehicle, 0, hint, 1, 5, zoned, SIDE, 0) == 2
     assert zoned.num_owned[:, 0].tolist() == [2, 3]
@@ -145,7 +147,7 @@ def test_who_is_passed_on_is_a_ghost_here_and_owned_there(vehicle: int, hint: in
 
 
 @pytest.mark.parametrize(("vehicle", "why"), [(20, -1), (99, -1), (13, -2)])
-def test_nobody_is_passed_on_who_is_not_owned_or_has_no_ghost(vehicle: int, why: int) -> None:
+def test_a_vehicle_without_owner_or_ghost_is_not_handed_over(vehicle: int, why: int) -> None:
     zoned = two_zones()
     zoned.rows["id"][SIDE, 0, 0, 1] = 13  # whom the other zone has not seen
     before = zoned.rows.copy()

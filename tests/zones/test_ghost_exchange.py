@@ -15,7 +15,7 @@ from cavmarl.traffic.departure_queue import make_departure_queue
 from cavmarl.traffic.kernels.leaving import drop_ghosts, leave
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, gather, note_gathered, take_own
-from cavmarl.zones.kernels.ownership_changes import AT_ONCE, make_book
+from cavmarl.zones.kernels.ownership_changes import BATCH_SIZE, make_book
 from cavmarl.zones.kernels.zone_lookup import Halo
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -146,7 +146,7 @@ def test_zones_that_gather_have_what_those_have_that_exchange(
 def test_more_ghosts_than_are_found_at_once_are_those_that_zones_gather() -> None:
     rng, rects = np.random.default_rng(3), four().reaching
     middle = np.array([rects[0, 2], rects[0, 3]])
-    xy = middle + rng.uniform(-9.0, 9.0, (6 * AT_ONCE, 2))
+    xy = middle + rng.uniform(-9.0, 9.0, (6 * BATCH_SIZE, 2))
     rows = vehicles([(x, y, 0.0) for x, y in xy.tolist()], id=np.arange(len(xy)))
     owners = np.array([naive.owners(rects, x, y)[0] for x, y in xy.tolist()])
     parts = [rows[owners == zone] for zone in range(4)]
@@ -160,7 +160,7 @@ def test_more_ghosts_than_are_found_at_once_are_those_that_zones_gather() -> Non
         assert noted[0] == noted[1]
     for name in ("rows", "num_rows", "num_near"):
         assert getattr(sent, name).tobytes() == getattr(gathered, name).tobytes(), name
-    assert (sent.num_rows - sent.num_owned).sum() > 4 * AT_ONCE, "some zone sends them twice"
+    assert (sent.num_rows - sent.num_owned).sum() > 4 * BATCH_SIZE, "some zone sends them twice"
 
 
 def note_outer(zoned: ZoneState, halo: Halo, parts: list[NDArray[np.void]]) -> None:
@@ -217,7 +217,7 @@ def test_other_worlds_keep_their_ghosts() -> None:
 
 
 @given(st.data(), partitions(3), st.sampled_from([0.0, 7.5, 30.0]))
-def test_rows_that_are_noted_are_enough(
+def test_listed_rows_suffice_for_the_exchange(
     data: st.DataObject, partition: ZonePartition, halo_m: float
 ) -> None:
     parts = spread(data, partition)
@@ -232,7 +232,7 @@ def test_rows_that_are_noted_are_enough(
     assert partition.count == 1 or (zoned.num_outer == -1).all(), "rows may change from here on"
 
 
-def test_others_than_those_that_are_noted_are_not_looked_at() -> None:
+def test_unlisted_rows_are_not_read() -> None:
     zoned = zoned_of([cars(3)] * 4)
     zoned.num_outer[:] = 0
     halo, book = zone_halo(four(), 50.0), make_book(1, 12)
@@ -264,7 +264,7 @@ def test_background_vehicles_leave_when_they_have_arrived() -> None:
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=9))
-def test_who_leaves_is_no_longer_noted_and_the_others_are_where_they_are(
+def test_a_leaving_vehicle_is_unlisted_and_other_rows_stay_listed(
     fates: list[tuple[bool, bool]],
 ) -> None:
     rows = cars(len(fates))
@@ -297,7 +297,7 @@ def test_agents_leave_when_their_trip_has_ended_and_they_have_acted() -> None:
     assert set(ids(worlds.rows[0, : worlds.num_rows[0]])) == {102, 103}
 
 
-def test_ghosts_of_those_who_left_are_dropped_once() -> None:
+def test_ghosts_of_vehicles_that_left_are_dropped_once() -> None:
     worlds, departures = world(cars(6), owned=2)
     departures.passing[0, :3]["id"] = [105, 102, 999]
     departures.num_passing[0] = 3

@@ -36,9 +36,9 @@ def world(
     return exchanged(PARTITION, 60.0, parts, borders=BORDERS, book=book), book
 
 
-def call(zoned: ZoneState, book: BorderRecords, everybody: bool = False, newborn: int = 0) -> int:
+def call(zoned: ZoneState, book: BorderRecords, check_all: bool = False, newborn: int = 0) -> int:
     arguments = (PARTITION.arrays, BORDERS, zoned, SIDE, 0)
-    return int(hand_over(*arguments, everybody, newborn, book))
+    return int(hand_over(*arguments, check_all, newborn, book))
 
 
 def next_tick(zoned: ZoneState, book: BorderRecords) -> None:
@@ -60,7 +60,7 @@ def coming(book: BorderRecords) -> list[tuple[int, int]]:
     return [(int(entry["vehicle"]), int(entry["target"])) for entry in entries]
 
 
-def test_whoever_has_crossed_changes_by_rising_ids() -> None:
+def test_crossed_vehicles_change_owners_by_rising_ids() -> None:
     zoned, book = world((13.0, 5.0, 0.0), (5.0, 13.0, 0.0), (14.0, 5.0, 0.0), ids=[30, 20, 10])
     assert book.num_crossed[0] == 3
     assert call(zoned, book) == 3
@@ -78,7 +78,7 @@ def test_whoever_has_crossed_changes_by_rising_ids() -> None:
     assert book.num_crossed[0] == 0
 
 
-def test_who_has_just_come_is_found_where_another_has_left() -> None:
+def test_a_vehicle_in_the_row_of_a_left_vehicle_is_found() -> None:
     coming_in = vehicles([(13.0, 5.0, 0.0)], id=np.array([10]))
     leaving = vehicles([(7.0, 5.0, math.pi), (15.0, 5.0, 0.0)], id=np.array([20, 30]))
     book = make_book(1, 16)
@@ -111,7 +111,7 @@ def test_an_approach_is_remembered_until_the_change() -> None:
     assert book.aborted[0] == 0
 
 
-def test_whoever_turns_away_is_counted_once() -> None:
+def test_a_vehicle_that_turns_away_is_counted_once() -> None:
     zoned, book = world((9.5, 5.0, 0.0), ids=[3], speed=20.0)
     zoned.rows[SIDE, 0, 0]["heading"][0] = math.pi
     for _ in range(3):
@@ -125,24 +125,24 @@ def test_looking_again_at_the_same_tick_counts_nothing_twice() -> None:
     next_tick(zoned, book)
     zoned.num_owned[0, 0] = 1  # the other one has left
     for _ in range(3):
-        assert call(zoned, book, everybody=True) == 0
+        assert call(zoned, book, check_all=True) == 0
         assert coming(book) == [(3, 1)]
         assert book.owned[0] == 1
     next_tick(zoned, book)
     assert (book.acknowledged[0], book.aborted[0]) == (2 + 1, 1)
 
 
-def test_whoever_has_just_entered_stays_for_a_tick() -> None:
+def test_a_newly_entered_vehicle_keeps_its_owner_for_a_tick() -> None:
     zoned, book = world((13.0, 5.0, 0.0), (14.0, 5.0, 0.0), ids=[3, 4])
     book.newborn[0, 0] = 3
-    assert call(zoned, book, everybody=True, newborn=1) == 1
+    assert call(zoned, book, check_all=True, newborn=1) == 1
     assert changes(book)["vehicle"].tolist() == [4]
     next_tick(zoned, book)
     assert call(zoned, book) == 1
     assert changes(book)["vehicle"].tolist() == [4, 3]
 
 
-def test_whoever_left_in_the_tick_of_its_change_has_no_place_any_more() -> None:
+def test_a_vehicle_that_left_in_the_tick_of_its_change_has_no_release_depth() -> None:
     zoned, book = world((13.0, 5.0, 0.0), ids=[3])
     assert call(zoned, book) == 1
     zoned.num_owned[1, 0] = 0
@@ -150,7 +150,7 @@ def test_whoever_left_in_the_tick_of_its_change_has_no_place_any_more() -> None:
     assert math.isnan(changes(book)["release_depth_m"][0])
 
 
-def test_nobody_enters_a_zone_that_has_not_seen_it() -> None:
+def test_a_vehicle_without_a_ghost_cannot_enter_a_zone() -> None:
     zoned, book = world((13.0, 5.0, 0.0), ids=[3])
     zoned.num_rows[1, 0] = 0
     assert call(zoned, book) == NOT_SEEN

@@ -62,7 +62,7 @@ def widest_junction_m(roads: RoadNetwork) -> float:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_reach_covers_view_junction_and_those_who_come_to_it(name: str) -> None:
+def test_reach_covers_view_junction_and_approaching_vehicles(name: str) -> None:
     roads = network(name)
     reach_m = driving_reach_m(roads, travel(name))
     rest_m = reach_m - VIEW_M - APPROACH_M - 2.0 * LENGTH_M - ASIDE_M
@@ -125,7 +125,7 @@ def test_the_longest_move_counts_kinks() -> None:
 
 
 @pytest.mark.parametrize("internal", [(), ("--no-internal-links",)])
-def test_nobody_moves_further(internal: tuple[str, ...], tmp_path: Path) -> None:
+def test_no_vehicle_exceeds_the_longest_move(internal: tuple[str, ...], tmp_path: Path) -> None:
     path = netgenerate(
         tmp_path / "x.net.xml",
         "--grid", "--grid.number", "3", "--grid.length", "80", "-L", "3", *internal,
@@ -149,7 +149,9 @@ def test_nobody_moves_further(internal: tuple[str, ...], tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("internal", [(), ("--no-internal-links",)])
-def test_nobody_is_further_off_its_lane(internal: tuple[str, ...], tmp_path: Path) -> None:
+def test_no_vehicle_exceeds_the_distance_off_its_lane(
+    internal: tuple[str, ...], tmp_path: Path
+) -> None:
     """A body whose bumpers are on both sides of a jump has its centre between them."""
     path = netgenerate(
         tmp_path / "x.net.xml",
@@ -170,7 +172,7 @@ def test_nobody_is_further_off_its_lane(internal: tuple[str, ...], tmp_path: Pat
     assert furthest_m <= off_lane_m(roads, travel("merge"))
 
 
-def test_zones_see_who_is_off_a_lane_that_matters(tmp_path: Path) -> None:
+def test_zones_see_vehicles_beside_a_lane_that_matters(tmp_path: Path) -> None:
     """As far as anybody asks about lanes, and as far as bodies are off them."""
     path = netgenerate(
         tmp_path / "x.net.xml",
@@ -203,5 +205,5 @@ def test_zones_see_who_is_off_a_lane_that_matters(tmp_path: Path) -> None:
         assert asked[zone].tolist() == looks.tolist()
 
 
-def test_where_nobody_jumps_agents_are_furthest_off_their_lanes() -> None:
+def test_without_jumps_agents_are_farthest_off_their_lanes() -> None:
     assert off_lane_m(network("grid4x4"), travel("grid4x4")) == LOST_M

@@ -48,7 +48,7 @@ def ghosts(world: DrivenWorld) -> int:
     return int(world.simulation.zones.loads().ghosts.sum())
 
 
-def test_a_named_halo_is_seen_whole_and_nobody_can_tell(blocks: Path) -> None:
+def test_a_configured_halo_is_seen_whole_and_changes_no_result(blocks: Path) -> None:
     """More ghosts, the same world."""
     narrow = driven(blocks)
     whole = driven(blocks, **{"zones.halo_m": narrow.simulation.zones.loads().halo_m})
@@ -56,7 +56,7 @@ def test_a_named_halo_is_seen_whole_and_nobody_can_tell(blocks: Path) -> None:
     assert narrow.simulation.state_hash() == whole.simulation.state_hash()
 
 
-def test_who_may_have_reached_a_line_is_nearer_than_half_a_body_and_what_is_kept_clear(
+def test_vehicles_at_a_line_are_within_half_a_body_and_the_clearance(
     blocks: Path,
 ) -> None:
     simulation = driven(blocks).simulation
@@ -65,13 +65,13 @@ def test_who_may_have_reached_a_line_is_nearer_than_half_a_body_and_what_is_kept
     assert half_m + kept_m < simulation.division.halo.line_m < half_m + kept_m + 5.0
 
 
-def test_the_monitor_asks_for_those_who_are_seen(blocks: Path) -> None:
+def test_the_monitor_expects_ghosts_of_seen_vehicles(blocks: Path) -> None:
     """It would name a ghost too few as well as one too many."""
     assert ghosts(driven(blocks, **{"zones.check_invariants": True})) > 0
 
 
 @pytest.mark.parametrize("fields", [("head",), ("line", "merge")])
-def test_a_look_less_makes_another_world(
+def test_a_smaller_visible_part_changes_results(
     blocks: Path, fields: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Leaders ahead, and foes of the right of way: who is not seen is driven into."""

@@ -176,7 +176,7 @@ def test_drivers_look_ahead_and_less_far_back(line: RoadNetwork) -> None:
     assert (np.array([before["line"], own["line"], beyond["line"]]) == np.inf).all()
 
 
-def test_who_follows_over_a_border_is_seen(line: RoadNetwork) -> None:
+def test_a_follower_across_a_border_is_seen(line: RoadNetwork) -> None:
     """The end of a lane before the zone is near, so who comes on it may be a follower."""
     before, own, beyond = looks_of(line, (450.0, -10.0, 460.0, 10.0))
     assert before["tail"] == np.inf
@@ -185,7 +185,7 @@ def test_who_follows_over_a_border_is_seen(line: RoadNetwork) -> None:
     assert beyond["head"] == -np.inf
 
 
-def test_a_place_without_roads_asks_about_nobody(line: RoadNetwork) -> None:
+def test_a_zone_without_roads_sees_no_vehicles(line: RoadNetwork) -> None:
     looks = looks_of(line, (0.0, 50.0, 1200.0, 90.0))
     assert (looks["head"] == -np.inf).all()
     assert (looks["tail"] == np.inf).all()
@@ -193,7 +193,7 @@ def test_a_place_without_roads_asks_about_nobody(line: RoadNetwork) -> None:
 
 
 @pytest.mark.parametrize("part", [(0.0, 0.0, 0.4, 1.0), (0.5, 0.5, 0.6, 0.6)])
-def test_nobody_is_asked_about_further_away_than_the_farthest(
+def test_no_visible_vehicle_is_beyond_the_farthest_distance(
     part: tuple[float, float, float, float],
 ) -> None:
     """Beside places that lie close together on all lanes."""
@@ -218,6 +218,6 @@ def test_nobody_is_asked_about_further_away_than_the_farthest(
     assert VIEW_M < found
 
 
-def test_where_nobody_is_asked_about_the_farthest_is_no_distance(line: RoadNetwork) -> None:
+def test_without_visible_vehicles_the_farthest_distance_is_zero(line: RoadNetwork) -> None:
     rect = (0.0, 50.0, 1200.0, 90.0)
     assert farthest_m(line.arrays, np.array([rect]), 0, looks_of(line, rect)) == 0.0

@@ -106,7 +106,7 @@ def expected_of(
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_who_is_asked_about_is_seen_and_nobody_else(seed: int, zones: int) -> None:
+def test_exactly_the_vehicles_that_matter_are_seen(seed: int, zones: int) -> None:
     rng, roads = np.random.default_rng(seed), network("grid4x4")
     partition = cut_map(roads, "grid", zones)
     halo, looks = asked_at_random(rng, roads, partition)

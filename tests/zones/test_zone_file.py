@@ -21,7 +21,7 @@ Change = Callable[[dict[str, Any]], object]
 @settings(
     deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_what_is_written_is_read(tmp_path: Path, partition: ZonePartition) -> None:
+def test_a_written_zone_file_is_read_back(tmp_path: Path, partition: ZonePartition) -> None:
     path = tmp_path / "zones.json"
     write_zones(path, partition)
     again = read_zones(path)
@@ -98,7 +98,7 @@ def test_numbers_are_finite(tmp_path: Path, number: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", "zones: 3", '{"zones": 1, "zones": 2}', "\0"])
-def test_what_is_no_zone_file_is_refused(tmp_path: Path, text: str) -> None:
+def test_an_invalid_zone_file_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "bad.json"
     path.write_text(text)
     with pytest.raises(ConfigError, match=r"bad\.json"):
@@ -107,7 +107,7 @@ def test_what_is_no_zone_file_is_refused(tmp_path: Path, text: str) -> None:
         read_zones(tmp_path / "none.json")
 
 
-def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
+def test_an_unwritable_zone_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be written"):
         write_zones(tmp_path / "no" / "folder.json", four())
 

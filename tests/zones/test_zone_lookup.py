@@ -99,7 +99,7 @@ def test_zones_are_skipped_diagonal_and_narrow() -> None:
 
 
 @given(st.data(), partitions(), st.sampled_from([0.0, 3.0, 25.0]), st.sampled_from([0, 2]))
-def test_whoever_is_within_reach_of_a_shard_s_vehicle_is_a_ghost_there(
+def test_every_vehicle_within_reach_of_a_zones_vehicle_is_a_ghost(
     data: st.DataObject, partition: ZonePartition, reach_m: float, deferred: int
 ) -> None:
     halo_m = needed_overlap_m(reach_m, 2.0, Limits(deferral=deferred), 50.0, 0.1) + 1e-6

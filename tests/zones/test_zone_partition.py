@@ -25,7 +25,7 @@ def test_one_zone_has_everything() -> None:
     assert one.neighbors == ((),)
 
 
-def test_no_places_have_no_zones() -> None:
+def test_the_zones_of_no_positions_are_empty() -> None:
     assert four().zones_of(np.empty((0, 2))).tolist() == []
 
 
@@ -74,7 +74,7 @@ def test_arrays_cannot_be_written() -> None:
         ((3, 3, np.inf), r"zone 3: .* must be finite"),
     ],
 )
-def test_what_is_no_division_is_refused(change: tuple[int, int, float], words: str) -> None:
+def test_an_invalid_division_is_refused(change: tuple[int, int, float], words: str) -> None:
     zone, side, value = change
     rects = four().rects.copy()
     rects[zone, side] = value

@@ -18,6 +18,7 @@ from cavmarl.cli.output import (
     number,
 )
 from cavmarl.core.errors import ConfigError, require
+from cavmarl.core.xml_root import is_sumo_config
 
 _ROWS = {
     "departed": "departed",
@@ -36,17 +37,20 @@ _ROWS = {
 def traffic(
     map_name: Annotated[
         str,
-        typer.Argument(metavar="MAP", help="Map file, or the name or folder of an environment."),
+        typer.Argument(
+            metavar="MAP", help="Map file, .sumocfg, or the name or folder of an environment."
+        ),
     ],
     demand: Annotated[
-        list[Path],
+        list[Path] | None,
         about(
-            "Demand: a .rou.xml, .add.xml or .sumocfg file. Repeat it for more.",
+            "Demand: a .rou.xml, .add.xml or .sumocfg file. Repeat it for more. [default: MAP, if "
+            "it is a .sumocfg]",
             "--demand",
             "-d",
             metavar="FILE",
         ),
-    ],
+    ] = None,
     seconds: Annotated[
         int, about("Simulated seconds, from the beginning of the demand.", metavar="S")
     ] = 900,
@@ -78,6 +82,7 @@ def traffic(
             "--plot and --speed: --plot draws flow and density, which --speed does not measure; "
             "use only one of the two"
         )
+    demand = demand or ([Path(map_name)] if is_sumo_config(Path(map_name)) else [])
     if speed:
         return _speed(map_name, demand, dt, seed, after, repeats, say)
     return _comparison(map_name, demand, seconds, dt, seed, teleports, plot, say)

@@ -29,7 +29,7 @@ Env = Annotated[
     str | None,
     typer.Argument(
         metavar="[ENV]",
-        help="Environment: its name, its folder, or a map file.",
+        help="Environment: its name, its folder, a map file or a .sumocfg.",
         show_default="with --faults: a busy grid4x4",
     ),
 ]

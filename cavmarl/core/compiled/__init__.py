@@ -42,8 +42,8 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile as `kernel` does, but always inline the function into its callers.
 
-    For functions that are called for every vehicle: a call would pass each array of a bundle as
-    seven numbers.
+    This is for functions that are called for every vehicle, because a call would pass each array of
+    a bundle as seven numbers.
     """
     return _make(function, is_inlined=True)
 
@@ -51,7 +51,7 @@ def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
 def inlined_function(function: Callable[P, R]) -> Callable[P, R]:
     """Inline the function into kernels as `inlined_kernel` does, but leave it plain in Python.
 
-    For small functions of numbers that must return the same bits in Python and in kernels.
+    This is for small functions of numbers that must return the same bits in Python and in kernels.
     """
     if IS_PLAIN:
         return function

@@ -226,7 +226,7 @@ def _make_type(argument: Any, key: Any) -> ArgumentType:
         kind, text = _NUMBERS[python]
         return kind(key, text)
     raise TypeError(
-        f"an argument of a kernel is a {python.__module__}.{python.__qualname__}: pass NumPy "
+        f"an argument of a kernel is a {python.__module__}.{python.__qualname__}; pass NumPy "
         "arrays, numbers, None, or tuples of these"
     )
 

@@ -110,7 +110,7 @@ def _is_same(one: Any, other: Any) -> bool:
 
 
 class CallSequence:
-    """Bound calls in order; some run only if the result of an earlier call is true."""
+    """Bound calls in order. Some calls run only if the result of an earlier call is true."""
 
     def __init__(self) -> None:
         self._rows: list[list[int]] = []

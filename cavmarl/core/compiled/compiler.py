@@ -9,8 +9,9 @@ array, including negative ones, is an `IndexError`; `make bounds` runs the tests
 The cache has only the machine code of a kernel, not its LLVM code, which would stay in memory.
 Three changes shorten the first compilation (decision 002):
 
-- A kernel that is called by another kernel is compiled as a part of it: it is not callable from
-  Python, not cached, and optimised once, together with its caller. Numba does all of this for each.
+- A kernel that is called by another kernel is compiled as a part of its caller: it is not callable
+  from Python, not cached, and optimised once, together with its caller. Numba makes each kernel
+  callable, caches it and optimises it.
 - A bundle of arrays is passed as one address and read in place. Numba passes each array as seven
   numbers, and rebuilds the bundle in the called function.
 - Without reference counts, no code is generated for the end of a variable's life.

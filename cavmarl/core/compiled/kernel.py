@@ -144,8 +144,8 @@ def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
     The first call determines the types. A later call stores only the arguments, and items of
     bundles, that are other objects than in the previous call; for that, a call keeps its arguments
     alive until the next one. An argument of another type is a TypeError. Without `checks`, types
-    are not compared: for loops in which one process waits for another, and for frames, whose few
-    callers ensure the types.
+    are not compared. This is for loops in which one process waits for another process, and for
+    frames, whose few callers ensure the types.
 
     With `NUMBA_DISABLE_JIT=1`, this is the kernel itself.
     """
@@ -158,8 +158,8 @@ def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
 def unchecked(kernel: Callable[P, R]) -> Callable[P, R]:
     """Return a kernel for callers whose arguments always have the types of the first call.
 
-    Types are not compared, and no reference to the arguments is kept: for small kernels that all
-    callers of a process share.
+    Types are not compared, and no reference to the arguments is kept. This is for small kernels
+    that all callers of a process share.
     """
     if not isinstance(kernel, Kernel):
         return kernel

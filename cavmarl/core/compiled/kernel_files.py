@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cavmarl.core.atomic_file import write_whole
-from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.cache_folder import cache_dir, report_unwritable
 from cavmarl.core.compiled.arguments import accepts
 from cavmarl.core.compiled.sources import module_digest
 
@@ -110,7 +110,7 @@ class KernelFile:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(self._path, pack(kernel))
         except OSError as error:
-            tell_unwritable(error)
+            report_unwritable(error)
 
 
 def _digest_of(*parts: str) -> str:
@@ -136,11 +136,11 @@ def unpack(content: bytes) -> CompiledKernel | None:
 
 @cache
 def _machine() -> tuple[str, ...]:
-    """Return what the machine code depends on besides the sources: compiler and processor."""
+    """Return the compiler, the processor and the settings that determine machine code."""
     from llvmlite import binding
 
     processor = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
-    features = os.environ.get("NUMBA_CPU_FEATURES")  # empty: by the processor's name
+    features = os.environ.get("NUMBA_CPU_FEATURES")  # empty: the processor's name decides
     if features is None:
         features = binding.get_host_cpu_features().flatten()
     settings = [f"{name}={os.environ.get(name, '')}" for name in ("NUMBA_BOUNDSCHECK", "NUMBA_OPT")]
@@ -149,7 +149,7 @@ def _machine() -> tuple[str, ...]:
 
 @cache
 def machine_digest() -> str:
-    """Return a digest of what the code depends on besides the sources."""
+    """Return a digest of the compiler, the processor and the settings of kernels."""
     return _digest_of(*_machine())
 
 

@@ -1,4 +1,4 @@
-"""The library of compiled kernels in a wheel, and the check whether this machine can use it.
+"""The library of compiled kernels in a wheel, and a check whether this machine can use it.
 
 `prebuilt/kernels.so` defines an entry point for each kernel and list of argument types.
 `prebuilt/kernels.json` lists them with the sources and the processor that they were built for.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled.arguments import type_of
 
-# A folder for the kernel calls of the package's Python code.
+# Environment variable with the folder in which the package's calls of kernels are recorded.
 CALLS_SETTING = "CAVMARL_KERNEL_CALLS"
 _PACKAGE = "cavmarl."
 _COMPILED = __name__.rpartition(".")[0]

@@ -1,8 +1,7 @@
-"""Lists by lane or by link. Most are empty, so only lists in use are cleared and laid out.
+"""Lists by lane or by link. Most lists are empty, so only lists in use are cleared and laid out.
 
 List k is `[start[k], end[k])` of some array of records; an empty list has start = end. Lists are
-built in three steps: `forget` the previous lists, `add` each item, `lay_out`. Then each `end`
-    equals
+built in three steps: `forget` the previous lists, `add` each item, `lay_out`. Then each `end` is
 its list's start, and the caller increments it for each item that it stores.
 """
 

@@ -21,8 +21,8 @@ from cavmarl.core.math.float_bits import bits_to_float, float_to_bits
 
 _NAN = math.nan
 _INFINITY = math.inf
-# Adding and subtracting this rounds a number below 2**51 to an integer. In between, the lowest bits
-# of the sum are those of the integer.
+# Adding and subtracting this rounds a number below 2**51 to an integer. After the addition, the
+# lowest bits of the sum are the bits of the integer.
 _ROUNDER = 6755399441055744.0  # 1.5 * 2**52
 
 # pi / 2 in three parts (Cody and Waite: "Software Manual for the Elementary Functions", 1980). The
@@ -343,7 +343,7 @@ def log1p(value: float) -> float:
     if value == _INFINITY or abs(value) < 1e-17:
         return value
     whole = 1.0 + value
-    # The rounding error of the sum; its larger term comes first.
+    # The rounding error of the sum, computed from its larger term first.
     lost = value - (whole - 1.0) if value < 1.0 else 1.0 - (whole - value)
     return _log_of_sum(whole, lost, 0)
 

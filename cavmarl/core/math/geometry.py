@@ -100,14 +100,14 @@ def _left_of(point: np.void, x: float, y: float) -> float:
 def _project_between(
     points: NDArray[np.void], first: int, num: int, start: int, stop: int, x: float, y: float
 ) -> tuple[float, float, float, float]:
-    """Return what `project` does, but search the segments [start, stop) only."""
+    """Return the result of `project` for the segments [start, stop) only."""
     nearest, squared = _nearest_segment(points, start, stop, x, y)
     point = points[nearest]
     along = (x - point["x"]) * point["cos"] + (y - point["y"]) * point["sin"]
     length = points[nearest + 1]["s"] - point["s"]
     d = _left_of(point, x, y)
     if along < 0.0 and nearest > first:
-        # Nearest to a corner: one segment of a sharp bend is not enough to find its outer side.
+        # The nearest point is a corner. In a sharp bend, the side depends on both segments.
         side = d + _left_of(points[nearest - 1], x, y)
         along = 0.0
         d = math.copysign(math.sqrt(squared), side)
@@ -128,7 +128,7 @@ def project(
 ) -> tuple[float, float, float, float]:  # s and d in metres, cos and sin of the direction there
     """Return the lane coordinates of a point: those of the nearest point of the polyline.
 
-    Of several nearest points, the one with the smallest `s` counts. If it is an end of the
+    Of several nearest points, the point with the smallest `s` counts. If it is an end of the
     polyline, `s` and `d` are relative to the end segment's line, so `s` may be outside of [0,
     length].
     """
@@ -162,8 +162,8 @@ def boxes_overlap(
     sin1: float,  # sin of the heading
     half_length1: float,  # along its heading, m
     half_width1: float,  # across its heading, m
-    x2: float,  # as above, for the second box
-    y2: float,  # as above
+    x2: float,  # centre of the second box, m
+    y2: float,  # centre of the second box, m
     cos2: float,  # as above
     sin2: float,  # as above
     half_length2: float,  # as above
@@ -217,9 +217,9 @@ def time_to_collision_s(
 ) -> float:
     """Return the time in s until two oriented rectangles touch; inf: never, 0: now.
 
-    Hayward's time to collision ("Near miss determination through use of a scale of danger", Highway
-    Research Record 384, 1972) for bodies with constant velocities that do not turn: they overlap
-    while their projections do on each of the four separating axes of `boxes_overlap`.
+    This is Hayward's time to collision ("Near miss determination through use of a scale of danger",
+    Highway Research Record 384, 1972) for bodies with constant velocities that do not turn: they
+    overlap while their projections do on each of the four separating axes of `boxes_overlap`.
     """
     cos = abs(cos1 * cos2 + sin1 * sin2)
     sin = abs(cos1 * sin2 - sin1 * cos2)

@@ -1,8 +1,8 @@
 """A grid with the vehicles of one world in square cells, and searches for the nearest of them.
 
 `fill_grid` sorts the vehicles into cells once per tick. It copies the data that neighbours read
-into `bodies`: compact records with sine and cosine of the heading computed once. Within a cell they
-are in row order; readers must not depend on this and break ties by id.
+into `bodies`: compact records with sine and cosine of the heading computed once. Within a cell,
+bodies are in row order; readers must not depend on this order, and break ties by id.
 
 The border cells extend to infinity: they contain everything outside of the grid's area. If worlds
 drive on one of several maps, the area floats: it begins where their vehicles are.
@@ -59,7 +59,7 @@ class Grid(NamedTuple):
     """Square cells over a map and the bodies in them; rebuilt in each tick."""
 
     corner: NDArray[np.float64]  # (2,) m, corner of cell (0, 0)
-    floating: bool  # whether `aim` moves it
+    floating: bool  # whether `move_area` moves the area
     cells_per_m: float
     num_x: int
     num_y: int
@@ -70,7 +70,7 @@ class Grid(NamedTuple):
     cell: NDArray[np.int32]  # (capacity,) the cell of each row
     largest: NDArray[np.float64]  # (1,) the largest radius of all bodies, m
     newest: NDArray[np.int32]  # (num_x * num_y,) the VEHICLE row last put into each cell, or -1
-    spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; only `contacts` uses these two
+    spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; only `contacts` uses this and newest
 
 
 def make_grid(
@@ -132,7 +132,7 @@ def cell_rows(grid: Grid, y: float, distance_m: float) -> tuple[int, int]:
 
 
 @kernel
-def aim(grid: Grid, rows: NDArray[np.void], num: int) -> None:
+def move_area(grid: Grid, rows: NDArray[np.void], num: int) -> None:
     """Move the area of a floating grid to where VEHICLE rows[:num] begin."""
     if not grid.floating or num == 0:
         return
@@ -176,7 +176,7 @@ def fill_grid(
     start = grid.start
     cell = grid.cell
     start[:] = 0
-    aim(grid, rows, num)
+    move_area(grid, rows, num)
     for i in range(num):
         c = cell_at(grid, rows[i]["x"], rows[i]["y"])
         cell[i] = c

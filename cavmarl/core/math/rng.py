@@ -9,9 +9,9 @@ generator gives a vehicle the same numbers in every shard, and after every resta
              word 2    vehicle, bits 32-47, below tick, bits 32-47
              word 3    stream + draw index
 
-A caller that needs several numbers of one stream in one tick uses `STREAM_X`, `STREAM_X + 1`, …:
-the streams below are `DRAWS_PER_STREAM` apart. Every use of random numbers has its own stream in
-this list.
+A caller that needs several numbers of one stream in one tick uses `STREAM_X`, `STREAM_X + 1`, …,
+because the streams below are `DRAWS_PER_STREAM` apart. Every use of random numbers has its own
+stream in this list.
 
 Words are stored as uint64, in which the product of two 32-bit numbers cannot overflow. All operands
 are uint64: Numba converts a mix with int64 to float64.

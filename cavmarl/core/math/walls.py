@@ -84,7 +84,7 @@ def _clamped(number: float, most: int) -> int:
 def is_cut(walls: Walls, x: float, y: float, to_x: float, to_y: float) -> bool:
     """Return whether a wall meets the straight line between two points in m.
 
-    A wall along the line does not: it is the side of a house along which the line of sight runs.
+    A wall along the line does not count, because the line of sight runs along the side of a house.
     """
     if walls.start.size == 1:
         return False

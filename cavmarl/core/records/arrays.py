@@ -71,7 +71,7 @@ class TripTables(NamedTuple):
     begin_s: float  # time of the demand at tick 0
     view_m: float  # how far any driver looks for vehicles along the road, at most VIEW_M
     see_m: float  # distance before a stop line from which drivers check it
-    num_fixed: int  # steps from this one on are written while the world runs
+    num_fixed: int  # the world writes steps from this index on while it runs
     scripts: Scripts
     trip_horizon: float = 0.0  # limit of agents' trips, in multiples of free time; 0: no limit
     tick_s: float = 0.1
@@ -102,14 +102,14 @@ class Worlds(NamedTuple):
     num_rows: NDArray[np.int64]  # (W,) rows [num_owned, num_rows) are ghosts
     ticks: NDArray[np.int64]  # (W,) since reset
     keys: NDArray[np.uint64]  # (W,) the root of all random numbers of the episode
-    signal_phase: NDArray[np.int32]  # (W, num_signals) PHASE row that is on
+    signal_phase: NDArray[np.int32]  # (W, num_signals) active PHASE row
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
     detected_s: NDArray[np.float64]  # (W, D) time when a body was last over each detector
     num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
     pending: NDArray[
         np.float64
     ]  # (W, A, D + 1, 2) agents' commands of the last D ticks of latency, by tick modulo D + 1
-    num_near: NDArray[np.int64]  # (W,) only ghosts before this row can touch owned vehicles
+    num_near: NDArray[np.int64]  # (W,) ghosts from this row on cannot touch owned vehicles
     num_touching: NDArray[np.int64]  # (W,) owned vehicles that touched another before this tick
     num_contacts: NDArray[np.int64]  # (W,) vehicles that began to touch another, since the reset
     step: NDArray[
@@ -135,7 +135,7 @@ class ZoneState(NamedTuple):
     step_at: NDArray[np.int64]  # (k, W, C)
     outer: NDArray[np.void]  # OUTER (k, W, C)
     num_outer: NDArray[np.int64]  # (k, W)
-    border: NDArray[np.int32]  # (k, W, C) owned rows that are noted at a border, ascending
+    border: NDArray[np.int32]  # (k, W, C) owned rows at a border, ascending
     num_border: NDArray[np.int64]  # (k, W)
     spare: NDArray[np.void]  # VEHICLE (1,)
 
@@ -157,7 +157,7 @@ class DepartureQueue(NamedTuple):
     places: NDArray[np.int64]  # (W, C + D) positions in the queue of vehicles that may enter
     tries: NDArray[np.int32]  # (W, C + D) LANE on which each queued vehicle tries to enter, or -1
     ranks: NDArray[np.int64]  # (W, C + D, E) how crowded each lane of its edge is, at most E
-    last_s: NDArray[np.float64]  # (W, C + D, E) position on them for a vehicle that enters last, m
+    last_s: NDArray[np.float64]  # (W, C + D, E) position behind the last vehicle of these lanes, m
     lane_taken: NDArray[np.bool_]  # (L,) whether a vehicle tries to enter there in this tick
     spare: NDArray[np.void]  # VEHICLE (1,) scratch
 
@@ -175,7 +175,7 @@ class Demand(NamedTuple):
     agent_trips: TripTable
     start_trips: TripTable  # of background vehicles at the reset, in proportion to lane length
     enter_trips: TripTable  # of background vehicles that enter later
-    # (M,) whether these enter at the start of their lane (a road into the map)
+    # (M,) whether background vehicles enter at the start of their lane (a road into the map)
     enter_at_start: NDArray[np.bool_]
     num_agents: int  # agents in the world at the same time
     num_ids: int  # agents of an episode
@@ -185,15 +185,17 @@ class Demand(NamedTuple):
     seats: bool  # whether an agent's new vehicle keeps the agent's id
     speed_factor_spread: float
     blank: NDArray[np.void]  # VEHICLE (1,) initial value of a new record
-    agent_types: NDArray[np.int32]  # VTYPE rows that agents have in turn, by their number
+    agent_types: NDArray[np.int32]  # VTYPE rows, which agents use in turn by their number
 
 
 class Scratch(NamedTuple):
     """Working memory of a tick; between calls, only the lists to clear have a meaning."""
 
     lanes: Lists  # by lane, lists of entries
-    lane_start: NDArray[np.int32]  # entries of lane l: [lane_start[l], lane_end[l]); at L: of all.
-    lane_end: NDArray[np.int32]  # Both are views of `lanes.bounds`: one access to memory
+    # entries of lane l: [lane_start[l], lane_end[l]); at index L, the entries of all lanes. Both
+    # arrays are views of `lanes.bounds`, so one access to memory reads both
+    lane_start: NDArray[np.int32]
+    lane_end: NDArray[np.int32]
     entries: NDArray[np.void]  # ENTRY (2 C + Scripts.room,) by (lane, s, id), with side lanes
     links: Lists  # by link, lists of approach
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
@@ -238,15 +240,14 @@ class Sensors(NamedTuple):
     near_squared: NDArray[np.float64]
     echoes: NDArray[np.void]  # ECHO (lidar_rays,) scratch
     history_at: int
-    history: int  # numbers of the frame before that are kept in the next one
+    history: int  # numbers of a frame that the next frame repeats
 
 
 class Outputs(NamedTuple):
     """Outputs for the agents at the end of a step, by agent index; zeros for absent agents.
 
     T is the number of terms, D the length of a flat observation. Earlier observations are only
-    stored
-    here: the frames of a stack move up within `observations`.
+    stored here: the frames of a stack move up within `observations`.
     """
 
     observations: NDArray[np.float32]  # (W, A, D) the stacked frames, oldest first
@@ -254,7 +255,7 @@ class Outputs(NamedTuple):
     rewards: NDArray[np.float32]  # (W, A)
     terminated: NDArray[np.bool_]  # (W, A) the vehicle ended in this step
     present: NDArray[np.bool_]  # (W, A) the agent had a vehicle at the end of the step
-    acted: NDArray[np.bool_]  # (W, A) and had it during the whole step
+    acted: NDArray[np.bool_]  # (W, A) the agent had a vehicle during the whole step
     events: NDArray[np.int32]  # (W, A) EVENT_* bits of the step
     vehicle_ids: NDArray[np.int64]  # (W, A) -1 where absent
     places: NDArray[np.float64]  # (W, A, 2) x and y of the vehicle, m; outdated if absent

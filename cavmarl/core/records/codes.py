@@ -9,7 +9,7 @@ DRIVER_SCRIPTED = 2  # moves by its script: pedestrians, vehicles of scenarios
 
 # VTYPE["vclass"] of pedestrians; the classes of vehicles are positions in network.VEHICLE_CLASSES
 CLASS_PEDESTRIAN = 9
-DRIVER_SUMO = 3  # moved by SUMO, mirrored here
+DRIVER_SUMO = 3  # moved by SUMO, copied to the rows
 
 # VTYPE["model"]: the car-following models, a file each in driving/kernels/models
 MODEL_KRAUSS = 0
@@ -20,7 +20,7 @@ MODEL_ACC = 2
 INSERT_NONE = 0
 INSERT_VEHICLE = 1
 INSERT_BARRIER = 2  # stands until its lane is opened, or until the end of the episode
-INSERT_OPEN = 3  # a lane; its barrier drives on, or is cancelled
+INSERT_OPEN = 3  # opens a lane; its barrier drives on, or is cancelled
 
 # DEPARTURE["lane_code"]: the lane of its edge on which a vehicle enters
 LANE_GIVEN = 0
@@ -52,7 +52,7 @@ UNTIL_ABSOLUTE = 0
 UNTIL_FLOW = 1
 UNTIL_DEPARTURE = 2
 
-# VEHICLE["hold"]: why a driver stands or will stop
+# VEHICLE["hold"]: the reason why a driver stands or will stop
 HOLD_NONE = 0
 HOLD_SIGNAL = 1  # red or yellow
 HOLD_YIELD = 2  # gives way
@@ -65,7 +65,7 @@ EVENT_WRONG_WAY = 4
 EVENT_RED_LIGHT = 8
 EVENT_ARRIVED = 16
 EVENT_OUT_OF_TIME = 32  # its trip has exceeded its time limit
-EVENTS_OF_FATE = EVENT_COLLIDED | EVENT_OFF_ROAD | EVENT_ARRIVED  # each has priority over that
+EVENTS_OF_FATE = EVENT_COLLIDED | EVENT_OFF_ROAD | EVENT_ARRIVED  # these precede OUT_OF_TIME
 EVENTS_THAT_END = EVENTS_OF_FATE | EVENT_OUT_OF_TIME
 
 # VEHICLE["transfer"]
@@ -94,11 +94,15 @@ ACTION_SLOWER = 4
 COUNT_DEPARTED = 0  # vehicles that have entered
 COUNT_ARRIVED = 1  # vehicles that reached their goal
 COUNT_REMOVED = 2  # agents removed after a collision or off the road
-COUNT_REROUTED = 3  # vehicles that left their route for another one
+COUNT_REROUTED = 3  # vehicles that left their route for another route
 NUM_COUNTS = 4
 
 # DepartureQueue.sums, over vehicles that arrived
 SUM_DISTANCE_M = 0
 SUM_TIME_S = 1
-SUM_DELAY_S = 2  # time in excess of the route's duration at the speed of limit and driver
+SUM_DELAY_S = 2  # time in excess of the route's duration at the speed of limit, driver and type
 NUM_SUMS = 3
+
+# First bits of LANE["permissions"] that bar vehicle classes from changes to the left and right.
+NO_CHANGE_LEFT = 12
+NO_CHANGE_RIGHT = 22

@@ -16,11 +16,11 @@ SIZE_BODIES_M = (
 )  # assumed minimum length of a vehicle of each class
 STEERED = 3  # class of a steered car, in SWEEP rows about the area that it sweeps
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position inside a junction still waits there
-MERGES_M = 300.0  # before its line, a vehicle is watched by those that turn into its lane
-SWEPT_BEYOND_M = 9.0  # how far beyond a junction others may still watch a vehicle's rear
+MERGES_M = 300.0  # within this distance of a line, vehicles that turn into the lane watch a vehicle
+SWEPT_BEYOND_M = 9.0  # how far beyond a junction other drivers may watch a vehicle's rear
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still overlap
-LOST_M = 10.0  # from its lane: an agent's vehicle that is further off counts as gone
-OFF_LANES_M = 1.5  # from the middle of the nearest lane
+LOST_M = 10.0  # an agent's vehicle that is farther from its lane counts as gone
+OFF_LANES_M = 1.5  # a scripted vehicle farther from the middle of its lane is off the lanes
 
 
 @inlined_kernel
@@ -35,6 +35,6 @@ def is_lost(row: np.void) -> bool:
 
 @inlined_kernel
 def is_off_lanes(row: np.void) -> bool:
-    """Return whether a row's lane is only the nearest lane, or the last one that it was on."""
+    """Return whether a scripted vehicle is off its lane, which is its nearest or its last lane."""
     off: bool = row["driver"] == DRIVER_SCRIPTED and abs(row["d"]) > OFF_LANES_M
     return off or is_lost(row)

@@ -40,7 +40,7 @@ class FollowedWorld:
 
     Args:
         env: the world, in this process or run by workers; it has a master until `close`.
-        address: path of a Unix socket, or a port of this machine, 0: any free port.
+        address: path of a Unix socket, or a port of this machine; 0 picks a free port.
         secret: required from followers; necessary for a port, which all users can connect to.
         timeout_s: maximum time that a step waits for its followers, by the wall clock.
         own_ticks: handling of a follower's own ticks; see `TimeMaster`.
@@ -51,8 +51,8 @@ class FollowedWorld:
         trace: records the phases of each step.
 
     Attributes:
-        master: the master of the time.
-        address: where followers connect.
+        master: the time master.
+        address: path or port to which followers connect.
 
     Raises:
         ConfigError: the address cannot be opened, a port has no secret, or a trace is given for a
@@ -143,8 +143,8 @@ class FollowedWorld:
             EpisodeError: the episode is over.
             FollowerLostError: a follower has not answered in time, or has ended; it is dropped. The
                 world has advanced by one step, and the next call continues from there.
-            FollowerError: as before, but the follower's messages are invalid, or its controls
-                cannot be carried out.
+            FollowerError: a follower's messages are invalid, or its controls cannot be carried out;
+                the consequences are those of a FollowerLostError.
             ClockError: another caller has advanced the world.
         """
         if self.is_over:

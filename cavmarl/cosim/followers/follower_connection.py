@@ -194,7 +194,10 @@ class FollowerConnection:
 
     @contextmanager
     def _peer_errors(self, what: str, within_s: float | None) -> Iterator[None]:
-        """Raise errors of the connection as errors of the other end, which had to do `what`."""
+        """Raise errors of the connection as errors of the other end.
+
+        `what`: what the other end had to do, as a participle for the message.
+        """
         try:
             yield
         except TimeoutError as error:
@@ -208,7 +211,7 @@ class FollowerConnection:
         self._socket.until_s = None if within_s is None else time.monotonic() + within_s
 
     def too_late(self, what: str, within_s: float | None) -> FollowerLostError:
-        """Return the error of a peer that has not done `what` in time."""
+        """Return the error of a peer that is late; `what` is a participle, such as "answered"."""
         span = "in time" if within_s is None else f"within {within_s:.3g} s"
         return FollowerLostError(
             f"{self.name} has not {what} {span}; it is dead, stopped or too slow{self._cure}",

@@ -100,7 +100,7 @@ class Welcome:
     action: StrictStr  # `continuous`, `discrete` or `grid`
     acceleration_mps2: StrictFloat  # acceleration for the first control at 1
     steering_rad: StrictFloat  # steering angle for the second control at 1
-    # of every vehicle; none: snapshots contain the `observation` of the environment
+    # sensors of every vehicle; empty: snapshots contain the `observation` of the environment
     sensors: list[SensorView]
 
 
@@ -109,8 +109,8 @@ class Welcome:
 class ArrayView:
     """One array of a snapshot; its bytes are in the frame's data, in the order of the list."""
 
-    # its vehicle; empty: the whole map, as for `signals`: (1, links) the SIGNAL_* code that each
-    # link's signal shows (255: no signal)
+    # agent of the vehicle; empty: the array is about the whole map, such as `signals`: (1, links)
+    # the SIGNAL_* code of each link's signal (255: no signal)
     vehicle: StrictStr
     name: StrictStr
     dtype: StrictStr  # NumPy's notation, little-endian
@@ -124,10 +124,10 @@ class ArrayView:
 class VehicleView:
     """A vehicle of the follower that is in the world."""
 
-    vehicle_id: StrictInt  # a new id: the agent drives a new vehicle
+    vehicle_id: StrictInt  # changes if the agent gets a new vehicle
     vclass: StrictStr  # SUMO's class
-    length_m: StrictFloat  # of its body
-    width_m: StrictFloat  # of its body
+    length_m: StrictFloat  # length of its body
+    width_m: StrictFloat  # width of its body
     goal_edge: StrictStr  # destination, an edge of the map
     goal_m: list[StrictFloat]  # end of the destination edge: x and y on the map
 

@@ -6,8 +6,8 @@ code.
 
     head    magic, version, kind, order, bytes of the payload, bytes of the data,
             checksum of the data, checksum of the head and the payload
-    payload nothing if there is nothing to say
-    data    arrays one behind the other, as they lie in memory (little-endian)
+    payload may be empty
+    data    the arrays one after another, as in memory (little-endian)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cavmarl.core.errors import MessageError
 
 Array = NDArray[Any]
 
-MAX_PIECES = 512  # buffers in one call of the system
+MAX_PIECES = 512  # maximum number of buffers in one system call
 
 _HEAD = struct.Struct("<4sHHQIQI")
 _SUM = struct.Struct("<I")
@@ -34,26 +34,26 @@ HEAD_BYTES = _HEAD.size + _SUM.size
 
 
 class Dialect(NamedTuple):
-    """What both ends of a connection agree on."""
+    """The parameters of a protocol, which are equal at both ends of a connection."""
 
-    magic: bytes  # four bytes that every frame begins with
-    version: int  # of everything that is said
-    kinds: type[IntEnum]  # of frames
-    max_payload: int  # bytes of the longest payload
-    max_data: int  # bytes of the most data
-    write: Callable[[Any], bytes]  # a payload's bytes
-    read: Callable[[bytes], Any]  # the payload again; a ValueError says that it is none
-    cure: str  # what to do about another version
+    magic: bytes  # the first four bytes of every frame
+    version: int  # version of the protocol
+    kinds: type[IntEnum]  # kinds of frames
+    max_payload: int  # maximum size of a payload in bytes
+    max_data: int  # maximum size of the data in bytes
+    write: Callable[[Any], bytes]  # encodes a payload
+    read: Callable[[bytes], Any]  # decodes a payload; raises ValueError if it is invalid
+    cure: str  # advice if the other end has another version
 
 
 class Frame(NamedTuple):
-    """What stands before a frame's data."""
+    """A received frame without its data."""
 
-    kind: IntEnum  # what it says
-    order: int  # which order it belongs to
-    payload: Any  # as the dialect reads it; None: nothing
-    size: int  # bytes of data
-    checksum: int  # of them
+    kind: IntEnum  # kind of the frame
+    order: int  # number of the order that the frame belongs to
+    payload: Any  # as decoded by the dialect; None: empty
+    size: int  # size of the data in bytes
+    checksum: int  # checksum of the data
 
 
 class FramedSocket:
@@ -62,7 +62,7 @@ class FramedSocket:
     def __init__(
         self,
         connection: socket.socket,  # a stream socket, which this object owns and closes
-        dialect: Dialect,  # that both ends use
+        dialect: Dialect,  # the same at both ends
     ) -> None:
         if connection.family != socket.AF_UNIX:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -76,7 +76,7 @@ class FramedSocket:
     def send(
         self, kind: IntEnum, order: int, payload: Any = None, arrays: Sequence[Array] = ()
     ) -> None:
-        """Send one frame. Raises OSError: the other end is gone, or does not read."""
+        """Send one frame. Raises OSError: the connection is lost, or the peer does not read."""
         dialect = self._dialect
         text = b"" if payload is None else dialect.write(payload)
         data = [array.data.cast("B") for array in arrays if array.nbytes]
@@ -87,46 +87,48 @@ class FramedSocket:
         self._send_all([memoryview(start), *data])
 
     def receive(self) -> Frame:
-        """What stands before the next frame's data, which then has to be taken or skipped.
+        """Return the next frame without its data, which must then be taken or skipped.
 
         Raises:
-            EOFError: the other end has ended.
-            OSError: it is gone, or sends nothing.
+            EOFError: the other end has closed the connection.
+            OSError: the connection is lost, or nothing arrives in time.
+            MessageError: the frame is damaged, or is not one of the dialect.
         """
         dialect = self._dialect
         raw = self._read(HEAD_BYTES)
         head = bytes(raw[: _HEAD.size])
-        kind, order, payload_size, size, checksum = _understood(head, dialect)
+        kind, order, payload_size, size, checksum = _parse_head(head, dialect)
         text = bytes(self._read(payload_size))
         if _SUM.unpack(raw[_HEAD.size :])[0] != zlib.crc32(text, zlib.crc32(head)):
-            raise MessageError("the head of a frame is not what was sent")
-        self._frame = _frame(dialect, kind, order, text, size, checksum)
+            raise MessageError("the head of a frame does not match its checksum")
+        self._frame = _parse_frame(dialect, kind, order, text, size, checksum)
         return self._frame
 
     def take(
         self,
         arrays: Sequence[Array],  # contiguous; they are filled one after the other
     ) -> None:
-        """Read the data of the frame that was received.
+        """Read the data of the received frame into arrays.
 
         Raises:
-            EOFError: the other end has ended.
-            OSError: it is gone, or sends no more.
+            EOFError: the other end has closed the connection.
+            OSError: the connection is lost, or the data do not arrive in time.
+            MessageError: the data are damaged, or do not have the size of the arrays.
         """
         frame = self._frame
         assert frame is not None
         pieces = [array.data.cast("B") for array in arrays if array.nbytes]
         room = sum(len(piece) for piece in pieces)
         if room != frame.size:
-            raise MessageError(f"{frame.size} bytes of data: {room} were to come")
+            raise MessageError(f"a frame has {frame.size} bytes of data; {room} are expected")
         for piece in pieces:
             self._fill(piece)
         if frame.checksum != _checksum(pieces):
-            raise MessageError("the data of a frame are not what was sent")
+            raise MessageError("the data of a frame do not match their checksum")
         self._frame = None
 
     def skip(self) -> None:
-        """Read the data of the frame that was received, and forget them."""
+        """Read the data of the received frame, and discard them."""
         assert self._frame is not None
         self.take([np.empty(self._frame.size, dtype=np.uint8)])
 
@@ -155,34 +157,36 @@ class FramedSocket:
 
 
 def bytes_before_data(head: bytes, dialect: Dialect) -> int:
-    """How long a frame's head and payload are together, by its first HEAD_BYTES.
+    """Return the size of a frame's head and payload in bytes, given its first HEAD_BYTES.
 
-    Raises MessageError: no frame of the dialect begins so.
+    Raises MessageError: these bytes do not begin a frame of the dialect.
     """
-    return HEAD_BYTES + _understood(head[: _HEAD.size], dialect)[2]
+    return HEAD_BYTES + _parse_head(head[: _HEAD.size], dialect)[2]
 
 
-def _understood(head: bytes, dialect: Dialect) -> tuple[int, int, int, int, int]:
-    """Kind, order, bytes of the payload, bytes and checksum of the data."""
+def _parse_head(head: bytes, dialect: Dialect) -> tuple[int, int, int, int, int]:
+    """Return kind, order, size of the payload, size and checksum of the data."""
     magic, version, kind, order, payload_size, size, checksum = _HEAD.unpack(head)
     if magic != dialect.magic:
-        raise MessageError(f"{head[:4]!r} begins no frame")
+        raise MessageError(f"{head[:4]!r} does not begin a frame")
     if version != dialect.version:
         raise MessageError(
-            f"a frame of version {version}, this is {dialect.version}: {dialect.cure}"
+            f"a frame has version {version}, this end has {dialect.version}: {dialect.cure}"
         )
     if payload_size > dialect.max_payload or size > dialect.max_data:
-        raise MessageError(f"a frame of {payload_size} + {size} bytes is none")
+        raise MessageError(f"a frame of {payload_size} + {size} bytes is too large")
     return kind, order, payload_size, size, checksum
 
 
-def _frame(dialect: Dialect, kind: int, order: int, text: bytes, size: int, checksum: int) -> Frame:
-    """The same, understood."""
+def _parse_frame(
+    dialect: Dialect, kind: int, order: int, text: bytes, size: int, checksum: int
+) -> Frame:
+    """Return a frame from its numbers and the bytes of its payload."""
     try:
         payload = dialect.read(text) if text else None
         return Frame(dialect.kinds(kind), order, payload, size, checksum)
     except ValueError as error:
-        raise MessageError(f"a frame that says nothing: {error}") from error
+        raise MessageError(f"a frame has an invalid kind or payload: {error}") from error
 
 
 def _checksum(pieces: Sequence[memoryview]) -> int:

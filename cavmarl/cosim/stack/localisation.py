@@ -251,8 +251,8 @@ class GnssInertial:
     ) -> bool:
         """Update the state by one number; return whether it was accepted.
 
-        `row`: its derivatives by the first numbers of the state. `surprise`: the number less its
-        expected value. `gate`: squared deviations beyond which it is rejected.
+        `row`: derivatives of the number by the first numbers of the state. `surprise`: the number
+        minus its expected value. `gate`: squared deviations beyond which it is rejected.
         """
         row = np.concatenate([row, np.zeros(_SIZE - len(row))])
         spread = float(row @ self._spread @ row) + deviation**2

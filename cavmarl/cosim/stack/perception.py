@@ -19,10 +19,10 @@ from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
 from cavmarl.cosim.stack.stack_types import EgoPose, Obstacle, Readings, StackSensor
 
 _GAP_M = 0.8
-_ROAD_M = 2.5  # from the centre of a lane
-_BESIDE_ROAD_M = 6.0  # the same for pedestrians: they may step onto the road
+_ROAD_M = 2.5  # maximum distance of an echo from the centre of a lane
+_BESIDE_ROAD_M = 6.0  # the same for pedestrians, who may step onto the road
 _RANGE_MARGIN_M = 0.05
-_MATCH_M = 3.0  # between an object and its predicted position
+_MATCH_M = 3.0  # maximum distance between an object and its predicted position
 _SAME_M = 0.5  # the same for an object that keeps the kind of an earlier detection: 0.1 s before
 _ALPHA, _BETA = 0.5, 0.2
 _FORGET_S = 0.5

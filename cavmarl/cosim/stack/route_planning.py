@@ -1,9 +1,9 @@
 """Planning over the lane graph: the way to the goal, and the acceleration along it.
 
-The way is that of `roads.routing.make_plans`, without traffic. The acceleration along it is the
-minimum of what the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) gives behind every
-obstacle on the way, and behind a standing obstacle at each line where a signal or a vehicle with
-the right of way requires a stop.
+The way is that of `roads.routing.make_plans`, without traffic. The acceleration is the minimum of
+the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) over all obstacles on the way. A
+line where a signal or a vehicle with the right of way requires a stop counts as a standing
+obstacle.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from cavmarl.roads.routing import make_plans
 
 _AHEAD_M = 70.0
 _MATCH_M = 5.0
-_HEADING_COST_M = 3.0  # cost of a radian, compared with metres beside a lane
+_HEADING_COST_M = 3.0  # a radian of heading counts like this lateral distance from a lane
 _EXPECTED_M = 1.5  # preference for a lane on the previous way
 _ACCEL, _DECEL, _HEADWAY_S, _GAP_M = 1.5, 2.5, 1.4, 2.0
 _HARDEST = 6.0
@@ -86,7 +86,7 @@ class LaneRoute:
         return Trajectory(points, max(hardest.accel, -_HARDEST), hardest.reason, lanes)
 
     def _here(self, pose: EgoPose, plan: NDArray[np.void]) -> OnLane | None:
-        """Return the vehicle's lane, among those that lead to the goal."""
+        """Return the nearby lane that fits the vehicle best and leads to the goal, or None."""
         best, least = None, math.inf
         for place in self._map.near(pose.x_m, pose.y_m, _MATCH_M):
             apart = abs(wrap(pose.heading_rad - place.heading_rad))

@@ -45,15 +45,15 @@ _WEAKEST = 1e-3  # share of the best axis's information below which an axis is i
 # Minimum deviation along the best axis: errors of scans are correlated, and noise of normals looks
 # like information along the other axes.
 _LEAST_M = 0.1
-_BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # of fixes, and its change per second
+_BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # deviation of the fixes' bias, and its drift per second
 _SURE_M = 0.5  # standard deviation of the position below which a scan is tried only there
 _SIGMAS, _STEPS = 2.5, 6  # else: radius of the search in deviations, steps to each side
 _TRIED, _TRY_EVERY = 150, 5  # echoes used per try, and scans between tries
 _FIRST_TRIED = 3  # best places that are then matched fully
 _FAR_COST = 0.05  # penalty at the edge of the tried area, as a share of fitting echoes
 _LOST_SCANS = 20  # consecutive scans without a fit after which the position is unknown
-_ASIDE_M, _WORSE = 0.5, 3.0  # a match must be worse by _WORSE when shifted sideways, or it slides
-_TURN_M = 10.0  # metres that count like a radian
+_ASIDE_M, _WORSE = 0.5, 3.0  # a fit slides unless a shift by _ASIDE_M makes it worse by _WORSE
+_TURN_M = 10.0  # distance that counts like a radian of heading
 
 
 class ScanMatching(GnssInertial):
@@ -179,7 +179,7 @@ class ScanMatching(GnssInertial):
         information = slopes.T @ slopes / (_CORRELATED * _DEVIATION_M**2)
         strength, axes = np.linalg.eigh(information)
         for share, axis in zip(strength.tolist(), axes.T, strict=True):
-            if share < _WEAKEST * strength[-1] or share < 1.0:  # 1: a deviation of a metre
+            if share < _WEAKEST * strength[-1] or share < 1.0:  # 1.0: a standard deviation of 1 m
                 continue
             off = seen - self._get()[:3]
             off[2] = wrap(float(off[2]))

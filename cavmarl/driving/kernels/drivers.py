@@ -73,7 +73,7 @@ from cavmarl.driving.kernels.lanes.lane_ends import (
     misses_last_change,
 )
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M, last_on
-from cavmarl.driving.kernels.lanes.route_following import next_step, next_step_from
+from cavmarl.driving.kernels.lanes.route_following import free_speed, next_step, next_step_from
 from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE, has_to_stay_aside
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import before_line, no_constraint, response, wish
@@ -234,8 +234,7 @@ def _road_ahead(
         constraint = behind_entry(kind, speed, gap, leader)
         if constraint == 0.0:
             return constraint, 0.0, HOLD_NONE, -1
-    limit = min(here["speed_mps"], kind["desired_max_speed"])
-    allowed = min(limit * row["speed_factor"], kind["max_speed"])
+    allowed = free_speed(here, kind, row["speed_factor"])
     if steered:
         allowed = min(allowed, bend_speed(roads, lane, lane, -row["s"]))
     constraint = no_constraint(kind)

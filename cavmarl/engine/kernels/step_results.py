@@ -1,6 +1,6 @@
 """The results of a step, except observations, in one pass over the agents.
 
-A step writes about ten small arrays. With NumPy this takes about thirty calls, and each waits for
+A step writes about ten small arrays. With NumPy this takes about thirty calls. Each call waits for
 memory, because the kernels before it have filled the caches with vehicles.
 """
 

@@ -1,10 +1,8 @@
 """The manifest of an evaluation: how results are made, written before the results.
 
 `open_manifest` writes the manifest before the first step. `close_manifest` completes it with the
-hashes
-of all results. If the process dies in between, the manifest stays open. Every report is read
-through
-`read_closed`, which refuses results without a closed manifest that lists them.
+hashes of all results. If the process dies in between, the manifest stays open. Every report is read
+through `read_closed`, which refuses results without a closed manifest that lists them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The manifest of a training run, which lies beside the driver's checkpoint.
 
 It is written before the first update and closed after the last one with the hashes of the results.
-If
-the run dies, the manifest stays open.
+If the run dies, the manifest stays open.
 """
 
 from __future__ import annotations
@@ -37,8 +36,7 @@ def begin_training(
     """Write the manifest of a training run, replacing that of an earlier run there.
 
     `plans` say which worker hosts which shards; `cavmarl plan --again FOLDER/manifest.json`
-    recomputes
-    them. `seed` is one of the settings.
+    recomputes them. `seed` is one of the settings.
     """
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
     open_manifest(

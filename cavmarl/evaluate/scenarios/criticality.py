@@ -54,13 +54,11 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
     """Return the post-encroachment time of two bodies, in s.
 
     It is the shortest time between one body's leaving a place and the other body's presence there
-    (Allen,
-    Shin, Cooper: "Analysis of traffic conflicts and collisions", Transportation Research Record
-    667, 1978).
-    The arguments are TRACE (n,) and (m,), and the place is the ground that a body covers. The value
-    is inf if no place was covered by both bodies, and 0 if both were there at the same time. As
-    bodies are known at discrete moments, it is too long by at most twice the time between two of
-    them.
+    (Allen, Shin, Cooper: "Analysis of traffic conflicts and collisions", Transportation Research
+    Record 667, 1978). The arguments are TRACE (n,) and (m,), and the place is the ground that a
+    body covers. The value is inf if no place was covered by both bodies, and 0 if both were there
+    at the same time. As bodies are known at discrete moments, it is too long by at most twice the
+    time between two of them.
     """
     reach = 0.5 * (hypot_all(one["length"], one["width"]).max(initial=0.0)
                    + hypot_all(other["length"], other["width"]).max(initial=0.0))  # fmt: skip

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from pygame import Surface
 
 SIZE = (1280, 720)
-HALF_M = (64.0, 36.0)  # shown around the centre of the scene
+HALF_M = (64.0, 36.0)  # half width and half height of the picture
 
 
 class ScenarioCamera:
     """A camera on the first world of `make_scenario`, for use in a `with` block.
 
     `picture` shows the moment in which an agent was closest to a moving actor, `video` the whole
-    run. None: neither is written.
+    run. If a path is None, that file is not written.
     """
 
     def __init__(self, vec: CavVectorEnv, picture: Path | None, video: Path | None) -> None:

@@ -50,36 +50,36 @@ VERDICTS = {
 class ScenarioRun:
     """The result of one run."""
 
-    scenario: str  # its name
+    scenario: str  # name of the scenario
     environment: str  # environment whose map was used
-    place: str  # where
-    driver: str  # of the agents
-    seed: int  # of place and traffic
+    place: str  # place on the map
+    driver: str  # driver of the agents
+    seed: int  # seed of the place and of the traffic
     zones: int  # number of zones of the world
-    agents: int  # how many
-    background: int  # vehicles other than agents and actors
-    # `passed` (all through, and none hurt), or what became of the worst of the agents: `collided`,
-    # `off road`, or `stuck`; `actors collided`, with one another and not with an agent: the scene
-    # was not what it should be
+    agents: int  # number of agents
+    background: int  # number of vehicles other than agents and actors
+    # `passed`: all agents reached their goals without a collision; `collided`, `off road` or
+    # `stuck`: the worst verdict of an agent; `actors collided`: two actors touched each other, and
+    # no agent collided, so the scene was not as intended
     verdict: str
-    verdicts: tuple[str, ...]  # verdict of each agent, that in the conflict first
+    verdicts: tuple[str, ...]  # verdict of each agent, the agent in the conflict first
     clash: str  # the first contact of two actors, with its time; empty: none
-    # least time to collision of an agent with an actor, 0 after a collision with one; None: they
-    # were never about to
+    # least time to collision of an agent with an actor, 0 after a collision; None: they were never
+    # on a collision course
     min_ttc_s: float | None
     pet_s: (
         float | None
     )  # least post-encroachment time of an agent and an actor; None: no common place
     collisions: int  # contacts of vehicles and actors, agents included
     red_lights: int  # steps in which an agent entered a junction at red
-    delay_s: float  # of the first agent, compared with its initial speed
+    delay_s: float  # delay of the first agent, compared with its initial speed
     longest_wait_s: float  # longest wait of another vehicle at the end of the run
     time_s: float  # duration of the run
-    state_hash: str  # of the world at the end
+    state_hash: str  # hash of the world at the end
 
     @property
     def passed(self) -> bool:
-        """Whether all agents reached their goals and caused no collision."""
+        """True if all agents reached their goals and caused no collision."""
         return self.verdict == "passed"
 
 

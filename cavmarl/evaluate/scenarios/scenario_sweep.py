@@ -20,7 +20,7 @@ from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario,
 class SweepRow(NamedTuple):
     """One scenario on one map."""
 
-    scenario: str  # its name
+    scenario: str  # name of the scenario
     environment: str  # name, folder or map file
     # runs of the driver that must pass; empty if the map has no place
     passing: list[ScenarioRun]
@@ -28,7 +28,7 @@ class SweepRow(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether one driver passed all runs and the other none."""
+        """True if one driver passed all runs and the other driver none."""
         return all(run.passed for run in self.passing) and not any(
             run.passed for run in self.failing
         )

@@ -15,12 +15,9 @@ class JunctionLocks:
     """The duration of locks of each junction, from samples once per second.
 
     A vehicle *waits* at a junction if it stands inside it, or at the stop line of a lane with a
-    link into the
-    junction that has no red signal. A lock is the time with a waiting vehicle since a vehicle last
-    entered or
-    left the junction. It also ends when no vehicle waits there, unless all are held only by red. So
-    time at
-    red neither counts nor ends a lock.
+    link into the junction that has no red signal. A lock counts the seconds with a waiting vehicle
+    since a vehicle last entered or left the junction. It also ends when no vehicle stands there.
+    Seconds in which all vehicles that stand there have a red signal neither count nor end a lock.
     """
 
     def __init__(self, network: RoadNetwork) -> None:

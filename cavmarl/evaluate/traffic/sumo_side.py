@@ -1,8 +1,7 @@
 """A run of a demand in SUMO, measured like the run in cavmarl.
 
 libsumo supports one simulation per process, and a second start silently replaces the first.
-Therefore
-every run has its own process.
+Therefore every run has its own process.
 """
 
 from __future__ import annotations
@@ -36,15 +35,15 @@ class SumoJob:
     """One run."""
 
     map_file: Path  # a SUMO network
-    demand: SumoInput  # what drives on it
+    demand: SumoInput  # vehicles and flows
     seconds: int  # duration from `demand.begin_s`
     dt_s: float  # step length
     seed: int  # seed of SUMO's random numbers
-    # whether SUMO may put vehicles elsewhere that stand for too long (300 s unless the demand's
-    # configuration says otherwise)
+    # whether SUMO may teleport vehicles that stand for too long (300 s, or as configured in the
+    # demand)
     teleports: bool = True
-    # vehicles and flows that ours drives, too: others, and persons, are taken out when they enter;
-    # None: all stay
+    # vehicles and flows that cavmarl drives, too; SUMO removes all others, and persons, when they
+    # enter. None: nothing is removed
     shared: frozenset[str] | None = None
 
     def is_shared(self, vehicle: str) -> bool:
@@ -55,7 +54,7 @@ class SumoJob:
 
 
 def run_seeds(job: SumoJob, more_seeds: Sequence[int]) -> tuple[TrafficRun, list[TrafficRun]]:
-    """Run the job and further seeds, each in its own process; contacts of the others are 0."""
+    """Run the job, then further seeds without counting contacts, in one new process."""
     with sumo_process(job) as process:
         run = process.submit(_measure, job, True).result()
         others = (replace(job, seed=seed) for seed in more_seeds)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +25,15 @@ class TrafficComparison:
     """Result of the comparison."""
 
     map_name: str  # the map's name
-    seconds: int  # how long both ran
+    seconds: int  # duration of both runs
     dt_s: float  # step length of both
-    seed: int  # of both
+    seed: int  # seed of both
     ours: TrafficRun  # our run
     sumo: TrafficRun  # SUMO's
-    edge_ids: tuple[str, ...]  # of the map, by the rows that `edge_minutes` name
+    edge_ids: tuple[str, ...]  # ids of the map's edges, by EDGE row
     # parts of the demand that were left out or approximated, with counts
     tolerated: tuple[str, ...] = ()
-    sumo_others: tuple[TrafficFigures, ...] = ()  # SUMO's with further seeds, contacts not counted
+    sumo_others: tuple[TrafficFigures, ...] = ()  # SUMO with further seeds, without contacts
 
     def ratio(self, figure: str) -> float | None:
         """Return our value over SUMO's; None if SUMO's is zero or a value is missing."""
@@ -74,7 +74,7 @@ def compare_traffic(
     """Run and measure both simulators; SUMO gets only the demand that cavmarl supports.
 
     Args:
-        map_name: name or folder of an environment, or a map file.
+        map_name: name or folder of an environment, a map file or a .sumocfg.
         demand: route files and additional files, or one `.sumocfg`.
         seconds: duration from the beginning of the demand.
         dt_s: step length; a second is a whole number of steps.
@@ -101,15 +101,15 @@ def compare_traffic(
     world = make_world(path, demand, seconds, seed, dt_s)
     progress("SUMO's run")
     shared = frozenset(world.demand.element_ids) if isinstance(world.demand, DemandFile) else None
+    if isinstance(world.demand, DemandFile):
+        given = replace(given, begin_s=world.demand.begin_ms / 1000.0)
     job = SumoJob(path, given, seconds, dt_s, seed, teleports, shared)
     sumo, others = run_seeds(job, range(seed + 1, seed + sumo_seeds))
     progress("our run")
     ours = run_native(world, seconds)
     finished(world)
     name = path.name.removesuffix(".gz").removesuffix(".net.xml")
-    tolerated = world.demand.report.lines() if isinstance(world.demand, DemandFile) else []
+    tolerated = () if world.demand is None else world.demand.tolerated
     edges = tuple(world.network.edge_ids)
     figures = tuple(other.figures for other in others)
-    return TrafficComparison(
-        name, seconds, dt_s, seed, ours, sumo, edges, tuple(tolerated), figures
-    )
+    return TrafficComparison(name, seconds, dt_s, seed, ours, sumo, edges, tolerated, figures)

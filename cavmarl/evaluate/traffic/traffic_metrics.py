@@ -41,7 +41,7 @@ class TrafficCounts:
     departed: int  # vehicles that have entered
     waiting: int  # vehicles whose departure time has passed but that have not entered
     arrived: int  # vehicles that reached the end of their trip
-    # mean over arrived vehicles of the time above that of the same route at the desired speed;
+    # mean over arrived vehicles: trip time minus the time of the same route at the desired speed;
     # None if no vehicle arrived
     mean_delay_s: float | None
     teleports: int = 0  # vehicles that were teleported because they waited too long
@@ -162,10 +162,8 @@ class TrafficMeter:
         """Return flow and density of lanes by Edie's definitions.
 
         In an area of road and time, density is the time that vehicles spend in it, and flow the
-        distance that
-        they cover in it, each divided by the area (Edie: "Discussion of traffic stream measurements
-        and
-        definitions", 1963).
+        distance that they cover in it, each divided by the area (Edie: "Discussion of traffic
+        stream measurements and definitions", 1963).
         """
         edges = self._network.edges
         lane_km = edges["length_m"] * edges["num_lanes"] / 1000.0

@@ -37,7 +37,7 @@ class Watcher(Protocol):
 
 
 class Coordinator(ABC):
-    """Decides ownership, tick by tick: `begin`, then the zones compute, then `end`."""
+    """Decides ownership, tick by tick: `begin`, then the zones advance, then `end`."""
 
     def __init__(self, directory: Directory, journal: Journal | None) -> None:
         self._directory = directory
@@ -45,8 +45,8 @@ class Coordinator(ABC):
         self.switched = 0  # number of changes of owner
         self._watchers: tuple[Watcher, ...] = ()
         self._births: list[Birth] = []
-        self._gone: list[Removed] = []  # between two ticks
-        self._removed: list[Removed] = []  # in the tick
+        self._gone: list[Removed] = []  # vehicles that left between two ticks
+        self._removed: list[Removed] = []  # vehicles that left in the present tick
 
     @property
     def directory(self) -> Directory:
@@ -59,7 +59,7 @@ class Coordinator(ABC):
     @property
     @abstractmethod
     def is_open(self) -> bool:
-        """Whether a tick has begun and is not committed."""
+        """True if a tick has begun and is not committed."""
 
     def watch(self, watcher: Watcher) -> None:
         """Send all further records also to this watcher."""
@@ -88,7 +88,7 @@ class Coordinator(ABC):
     @abstractmethod
     def begin(
         self,
-        everybody: bool,  # check all rows, because rows have changed since ghosts were renewed
+        check_all: bool,  # check all rows, because rows have changed since ghosts were renewed
         inputs: bytes = b"",  # digest of the actions
     ) -> None:
         """Decide the owners for the next tick, and move rows between owners.

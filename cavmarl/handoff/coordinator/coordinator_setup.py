@@ -70,8 +70,8 @@ def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
 def make_coordinators(
     settings: ZonesConfig,  # journal, checks and deadlines
     division: ZonedShards,
-    longest_move_m: float,  # of a vehicle in a tick
-    # one per world; None: chosen here, and their journals must not exist
+    longest_move_m: float,  # longest move of a vehicle in a tick
+    # run of each world; None: new runs, whose journals must not exist
     runs: Sequence[OpenRun] | None = None,
 ) -> CoordinatorSetup:
     """Make the coordinators of divided worlds.

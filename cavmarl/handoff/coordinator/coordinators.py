@@ -34,7 +34,7 @@ class OwnershipRuntime(Protocol):
     def reset(self, chosen: NDArray[np.bool_]) -> None: ...
 
     def save(self, w: int) -> SavedOwnership | None:
-        """Return the state that the next changes of owner depend on; None: not known here."""
+        """Return the state that the next changes of owner depend on; None: unknown here."""
         ...
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
@@ -61,7 +61,7 @@ class OwnershipRuntime(Protocol):
 
 
 class NoOwnershipRuntime:
-    """The replacement where one zone owns all vehicles."""
+    """The `OwnershipRuntime` where one zone owns all vehicles."""
 
     coordinators: tuple[LocalCoordinator, ...] = ()
     needs_ghosts = False
@@ -108,9 +108,9 @@ class WorldCoordinators:
         self._division = division
         self._digests = digests
         self._monitor = monitor
-        self._rows = [self._live(w) for w in range(len(self.coordinators))]
+        self._rows = [self._make_row_digest(w) for w in range(len(self.coordinators))]
         # Whether rows of a world have changed since its ghosts were renewed.
-        self._stirred = [True] * len(self.coordinators)
+        self._rows_changed = [True] * len(self.coordinators)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,), with their present vehicles."""
@@ -118,14 +118,14 @@ class WorldCoordinators:
             if chosen[w]:
                 coordinator.reset()
                 coordinator.entered(self._division.owners(w))
-                self._stirred[w] = True
+                self._rows_changed[w] = True
                 if self._monitor is not None:
                     self._monitor.begin(w, coordinator.notes()[0])
 
     def save(self, w: int) -> SavedOwnership:
         """Return the state that the next changes of owner depend on, except the zones."""
         saved = self.coordinators[w].save()
-        if not self._stirred[w]:
+        if not self._rows_changed[w]:
             return saved
         # Rows have changed since vehicles near borders were recorded, so they are searched again.
         numbers = saved.numbers._replace(is_stirred=1, crossed=0)
@@ -146,10 +146,10 @@ class WorldCoordinators:
             if saved is None:
                 coordinator.reset()
                 coordinator.entered(self._division.owners(w))
-                self._stirred[w] = True
+                self._rows_changed[w] = True
             else:
                 gone = coordinator.go_on(saved[w], self._rows_of(w))
-                self._stirred[w] = bool(saved[w].numbers.is_stirred)
+                self._rows_changed[w] = bool(saved[w].numbers.is_stirred)
             if self._monitor is not None:
                 table = coordinator.directory.table
                 self._monitor.go_on(w, table, coordinator.notes()[0], gone)
@@ -168,20 +168,20 @@ class WorldCoordinators:
         for w, coordinator in enumerate(self.coordinators):
             births, gone = coordinator.notes()
             coordinator.resume(self._division.changes.settle_newborn(w, births), gone)
-            self._stirred[w] = True
+            self._rows_changed[w] = True
 
     def begin(self, commands: Commands) -> None:
         for w, coordinator in enumerate(self.coordinators):
-            everybody, self._stirred[w] = self._stirred[w], False
+            check_all, self._rows_changed[w] = self._rows_changed[w], False
             coordinator.begin(
-                everybody, b"" if coordinator.journal is None else _digest(commands, w)
+                check_all, b"" if coordinator.journal is None else _digest(commands, w)
             )
 
     def end(self) -> None:
         """Commit the tick that all zones have computed.
 
         Raises:
-            ProtocolError: an invariant does not hold in it.
+            ProtocolError: an invariant does not hold in this tick.
         """
         for w, coordinator in enumerate(self.coordinators):
             coordinator.end(self._rows[w])
@@ -197,7 +197,7 @@ class WorldCoordinators:
             gone = departures.passing[w, : departures.num_passing[w]]
             if len(gone):
                 coordinator.left(zip(gone["id"].tolist(), gone["events"].tolist(), strict=True))
-                self._stirred[w] |= not coordinator.is_open
+                self._rows_changed[w] |= not coordinator.is_open
 
     def entered(self, departures: DepartureQueue) -> None:
         for w, coordinator in enumerate(self.coordinators):
@@ -207,7 +207,7 @@ class WorldCoordinators:
                 zones_of(self._division.zones, new, len(new), zones)
                 coordinator.entered(zip(new["id"].tolist(), zones.tolist(), strict=True))
 
-    def _live(self, w: int) -> Callable[[int], int]:
+    def _make_row_digest(self, w: int) -> Callable[[int], int]:
         digests = self._digests
         if digests is None:
             return lambda zone: 0

@@ -47,7 +47,7 @@ class SavedBorders(NamedTuple):
 
 
 class HandoffLog:
-    """Hands vehicles over to the zones in which they are, and keeps unread changes."""
+    """Hands vehicles over to the zones that contain them, and keeps unread changes."""
 
     def __init__(self, division: ZonedShards, world: int) -> None:
         self._division = division
@@ -60,7 +60,7 @@ class HandoffLog:
 
     def hand_over(
         self,
-        everybody: bool,  # check all rows, because rows have changed since ghosts were renewed
+        check_all: bool,  # check all rows, because rows have changed since ghosts were renewed
         vehicles: int,  # expected number of vehicles
         newborn: Sequence[Birth],  # entered since the last tick began; they keep their owner
     ) -> int:  # number of changes
@@ -73,12 +73,12 @@ class HandoffLog:
         """
         division, book, w = self._division, self._book, self._world
         changed = 0
-        if everybody or book.num_crossed.item(w):
+        if check_all or book.num_crossed.item(w):
             if newborn:
                 book.newborn[w, : len(newborn)] = [birth.vehicle for birth in newborn]
             changed = self._hand_over(
                 division.zones, division.borders, division.zoned, division.side,
-                w, everybody, len(newborn), book,
+                w, check_all, len(newborn), book,
             )  # fmt: skip
             if changed < 0:
                 self._refuse(changed)
@@ -86,7 +86,7 @@ class HandoffLog:
             self._note_teleports(changed)
         self._neighbours = division.neighbours
         # Vehicles that entered after the ghosts were renewed have not been checked.
-        if book.owned.item(w) != (vehicles if everybody else vehicles - len(newborn)):
+        if book.owned.item(w) != (vehicles if check_all else vehicles - len(newborn)):
             raise ProtocolError(
                 f"the zones own {division.counts(w)} vehicles, but {vehicles} are expected"
             )
@@ -155,7 +155,7 @@ class HandoffLog:
         return taken
 
     def take_counts(self) -> tuple[int, int]:
-        """Return and clear two sums over ticks: vehicles near borders, and those turned away."""
+        """Return and clear two sums over ticks: vehicles near borders, vehicles turned away."""
         acknowledged, aborted = self._book.acknowledged, self._book.aborted
         counts = acknowledged.item(self._world), aborted.item(self._world)
         acknowledged[self._world] = aborted[self._world] = 0

@@ -59,8 +59,8 @@ def _nothing() -> None:
 class OwnersOnRecord:
     """The owners according to the records of a coordinator, with a check of the records.
 
-    It receives the same records as a `Trace`. A coordinator that makes records later announces
-    changes of owner meanwhile with `foretold`.
+    This class receives the same records as a `Trace`. A coordinator that makes its records later
+    announces changes of owner with `foretold` until then.
 
     Attributes:
         entered: number of vehicles that have entered.
@@ -76,12 +76,12 @@ class OwnersOnRecord:
         self.entered = self.left = 0  # since the reset
         self._checker = TraceChecker(limits.deferral, limits.lifetime, is_direct=True)
         self._sums = np.zeros(zones, dtype=np.uint64)
-        self._current = self._sums  # including announced changes
+        self._current = self._sums  # `_sums`, including announced changes
         self.ask: Callable[[], None] = _nothing
 
     @property
     def owners(self) -> dict[int, Owner]:
-        """(zone, epoch) of each vehicle at the committed tick, by id."""
+        """The (zone, epoch) of each vehicle at the committed tick, by id."""
         self.ask()
         return self._checker.owners
 
@@ -174,7 +174,7 @@ class InvariantMonitor:
     def begin(self, w: int, births: Sequence[Birth]) -> None:
         """Check a world that has been reset. Raises ProtocolError if an invariant does not hold."""
         self._begin(w)
-        self._look(w, births, new_late=0)
+        self._check_world(w, births, new_late=0)
 
     def go_on(
         self, w: int, table: Table, births: Sequence[Birth], gone: Sequence[Departed] = ()
@@ -186,7 +186,7 @@ class InvariantMonitor:
         """
         self._records[w].go_on(table)
         self._begin(w)
-        self._look(w, births, new_late=ANY_LATE, gone=gone)
+        self._check_world(w, births, new_late=ANY_LATE, gone=gone)
 
     def _begin(self, w: int) -> None:
         self._ticks[w] = self._division.ticks(w)[0]
@@ -196,9 +196,9 @@ class InvariantMonitor:
     def end(self, w: int, births: Sequence[Birth]) -> None:
         """Check a world after a tick. Raises ProtocolError if an invariant does not hold."""
         self._ticks[w] += 1
-        self._look(w, births, new_late=1)
+        self._check_world(w, births, new_late=1)
 
-    def _look(
+    def _check_world(
         self, w: int, births: Sequence[Birth], new_late: int, gone: Sequence[Departed] = ()
     ) -> None:
         division, record = self._division, self._records[w]

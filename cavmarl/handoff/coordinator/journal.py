@@ -32,8 +32,8 @@ class JournalPlace(NamedTuple):
     """The end of a line of a journal."""
 
     lines: int  # number of lines up to here; -1: there is no journal
-    checksum: int  # of the last of these lines, a signed word; 0 before the first line
-    size: int  # of these lines in bytes
+    checksum: int  # checksum of the last of these lines, a signed word; 0 before the first line
+    size: int  # size of these lines in bytes
 
     @classmethod
     def nowhere(cls) -> JournalPlace:
@@ -53,7 +53,7 @@ class JournalReader:
 
     Attributes:
         chain: the chain at the end of the complete lines that have been read.
-        size: of these lines in bytes.
+        size: size of these lines in bytes.
         torn: a description of the incomplete last line that was dropped; empty: none.
     """
 
@@ -117,7 +117,7 @@ class Journal:
 
     def __init__(
         self,
-        path: Path,  # of the file, which must not exist unless `resume` or `anew` is set
+        path: Path,  # the file, which must not exist unless `resume` or `anew` is set
         *,
         # append to the lines of the file. All of them are read, and an incomplete last line is
         # dropped
@@ -134,7 +134,7 @@ class Journal:
         self.path = path
         self.dropped = ""
         self._chain = LogChain()
-        self._size = 0  # of the lines
+        self._size = 0  # size of the lines in bytes
         self._fsync = sync == "fsync"
         if resume and not path.is_file():
             raise JournalError(f"{path}: there is no such journal to resume; omit resume")

@@ -18,8 +18,8 @@ class JournalSummary:
 
     run: str = ""  # id of the run, in hex
     lines: int = 0
-    episodes: int = 0  # that began
-    ticks: int = 0  # that were committed
+    episodes: int = 0  # episodes that began
+    ticks: int = 0  # committed ticks
     first_tick: int = -1  # the first committed tick; a reset does not restart the numbers
     last_tick: int = -1  # the last committed tick
     births: int = 0  # vehicles that entered

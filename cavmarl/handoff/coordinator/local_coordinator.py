@@ -30,7 +30,7 @@ from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import SeenIds, world_digest
 from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Reset, Switch, ZoneLedger
 from cavmarl.ownership.transfers import Transfer, TransferLog
-from cavmarl.zones.kernels.ownership_changes import LATE
+from cavmarl.zones.kernels.ownership_changes import UNREAD_LIMIT
 
 
 class _News(NamedTuple):
@@ -188,11 +188,11 @@ class LocalCoordinator(Coordinator):
         self._new, self._news = (), {}
         return [Departed(vehicle, zone, epoch) for vehicle, _, zone, epoch in gone]
 
-    def begin(self, everybody: bool, inputs: bytes = b"") -> None:
+    def begin(self, check_all: bool, inputs: bytes = b"") -> None:
         """Hand over vehicles outside of their owner's zone; see `Coordinator.begin`."""
         births = self._births
         try:
-            changed = self._book.hand_over(everybody, self._vehicles, births)
+            changed = self._book.hand_over(check_all, self._vehicles, births)
         except ProtocolError:
             self._check(births)
             raise
@@ -222,7 +222,7 @@ class LocalCoordinator(Coordinator):
         has_news = bool(self._new or removed)
         if has_news:
             self._news[self._tick] = _News(self._new, removed)
-        is_late = self._late >= LATE or len(self._news) >= LATE
+        is_late = self._late >= UNREAD_LIMIT or len(self._news) >= UNREAD_LIMIT
         if self.journal is not None or is_late or (has_news and self._watchers):
             self.catch_up()
             self._check(self._births)
@@ -242,11 +242,11 @@ class LocalCoordinator(Coordinator):
             ticks = changes["tick"]
             for tick in sorted({*ticks.tolist(), *news}):
                 these = changes[ticks == tick]
-                self._settle(tick, these, news.get(tick, _NO_NEWS), is_told=True)
+                self._settle(tick, these, news.get(tick, _NO_NEWS), has_watchers=True)
         elif len(changes) or news:
             births = tuple(birth for tick in news.values() for birth in tick.births)
             removed = tuple(entry for tick in news.values() for entry in tick.removed)
-            self._settle(self._tick, changes, _News(births, removed), is_told=False)
+            self._settle(self._tick, changes, _News(births, removed), has_watchers=False)
         table.settle(self._tick)
         if len(changes):
             left = {entry.vehicle: tick for tick, those in news.items() for entry in those.removed}
@@ -259,17 +259,19 @@ class LocalCoordinator(Coordinator):
         acknowledged, aborted = self._book.take_counts()
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
-    def _settle(self, tick: int, changes: NDArray[np.void], news: _News, is_told: bool) -> None:
-        """Apply changes up to a tick to the table and, if `is_told`, make records for watchers."""
+    def _settle(
+        self, tick: int, changes: NDArray[np.void], news: _News, has_watchers: bool
+    ) -> None:
+        """Apply changes up to a tick to the table, and make records if `has_watchers`."""
         table = self._directory.table
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
         switches = tuple(map(Switch, *columns, repeat(False)))
-        if is_told:
+        if has_watchers:
             self._record(self._begun(tick, switches, news.births))
         if news.births:
             self._directory.check_births(news.births)
         table.settle(tick, switches, news.births, news.removed)
-        if is_told:
+        if has_watchers:
             self._record(self._committed(news.removed, _no_digest))
 
     def _begun(

@@ -37,7 +37,7 @@ class OwnershipNumbers(NamedTuple):
     seen_below: int  # all smaller ids have been in the episode
     is_stirred: int  # 1: rows have changed since ghosts were renewed
     repartition_steps_done: int  # steps begun, if zones may change
-    # see `BorderRecords`
+    # The next six are described in `BorderRecords`.
     near_tick: int
     acknowledged: int
     aborted: int
@@ -131,7 +131,7 @@ class SavedOwnership(NamedTuple):
         """Check that the state is consistent with these vehicles and zones.
 
         Raises:
-            ConfigError: it is not.
+            ConfigError: the state is not consistent.
         """
         numbers, counts, near = self.numbers, self.counts, self.near
         births, gone = self.births, self.gone
@@ -172,7 +172,7 @@ class SavedOwnership(NamedTuple):
 
 
 def without_journal(words: Words) -> Words:
-    """Return the packed state (1, n) of one world without its place in a journal, for a file."""
+    """Return one world's packed state (1, n) without its place in a journal, for a file."""
     saved = SavedOwnership.unpack(words[0])
     if saved is None:
         return words

@@ -1,6 +1,6 @@
 """Description of a violated invariant, with the tick, the zone, the vehicle and the values.
 
-It runs only after the monitor has found a violation, so it may search all vehicles.
+This code runs only after the monitor has found a violation, so it may search all vehicles.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Violations:
         """Raise ProtocolError with the first violation that is found."""
         expected = {**owners, **{birth.vehicle: (birth.zone, 0) for birth in births}}
         for words in (
-            self._doubled(),
+            self._duplicates(),
             self._finding(kind, vehicle),
             self._clocks(),
             self._owners(expected),
@@ -52,10 +52,10 @@ class Violations:
                 raise ProtocolError(f"tick {self._clock.tick} of world {self._w}: {word}")
         raise ProtocolError(
             f"tick {self._clock.tick} of world {self._w}: the sums of hashes differ, but the rows "
-            "do not: rows have changed during the check"
+            "do not, because rows have changed during the check"
         )
 
-    def _doubled(self) -> Iterator[str]:
+    def _duplicates(self) -> Iterator[str]:
         for vehicle, places in sorted(self._places.items()):
             if len(places) > 1:
                 zones = [zone for zone, _ in places]

@@ -1,8 +1,8 @@
 """Checks of the invariants of ownership in one pass over all rows of a world after a tick.
 
-Sets are compared by sums of hashes, so neither the order of rows nor that of zones matters. The
-comparison of a vehicle with its last tick needs its last row. Nearly all vehicles keep their row;
-the others are searched among the vehicles that are missing from their former rows.
+Sets are compared by sums of hashes, so the order of rows and zones does not matter. A vehicle is
+compared with its row in the last tick. Nearly all vehicles keep their row. Other vehicles are
+searched among the vehicles that are missing from their former rows.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ FINDING = np.dtype(
     [
         ("kind", np.int64),
         ("vehicle", np.int64),
-        ("entered", np.int64),  # number of vehicles that were not there at the last check
-        ("left", np.int64),  # number of vehicles that are not there at this check
+        ("entered", np.int64),  # number of vehicles that were not in the world at the last check
+        ("left", np.int64),  # number of vehicles that are not in the world at this check
     ],
     align=True,
 )
@@ -93,8 +93,8 @@ class Strays(NamedTuple):
     table: NDArray[np.void]  # LOST (a power of two,), a hash table; blank between two checks
     places: NDArray[np.int64]  # (n,) indices in the table of missing vehicles
     rows: NDArray[np.int64]  # (n, 2) zone and row of vehicles that are new in their row
-    entered: NDArray[np.int64]  # (n,) ids that were not there at the last check
-    left: NDArray[np.int64]  # (n,) ids that are not there at this check
+    entered: NDArray[np.int64]  # (n,) ids that were not in the world at the last check
+    left: NDArray[np.int64]  # (n,) ids that are not in the world at this check
 
 
 def make_kept(zones: int, capacity: int) -> Kept:
@@ -145,7 +145,7 @@ def _place(table: NDArray[np.void], vehicle: int) -> int:
 
 
 @kernel
-def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
+def _record_missing(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
     """Record the former row of a missing vehicle. Return the new number of missing vehicles."""
     place = _place(strays.table, vehicle)
     entry = strays.table[place]
@@ -158,7 +158,7 @@ def _miss(strays: Strays, vehicle: int, zone: int, row: int, num: int) -> int:
 
 
 @inlined_kernel
-def _note(found: np.void, kind: int, vehicle: int) -> None:
+def _record_finding(found: np.void, kind: int, vehicle: int) -> None:
     """Record a finding, if it is about a lower id than the present one."""
     if found["kind"] == KIND_NONE or vehicle < found["vehicle"]:
         found["kind"] = kind
@@ -166,14 +166,14 @@ def _note(found: np.void, kind: int, vehicle: int) -> None:
 
 
 @inlined_kernel
-def _judge(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
+def _check_motion(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
     """Compare a vehicle with its state at the last check."""
     dx = now["x"] - last["x"]
     dy = now["y"] - last["y"]
     if now["late"] != last["late"]:
-        _note(found, KIND_TICK, now["id"])
+        _record_finding(found, KIND_TICK, now["id"])
     elif not dx * dx + dy * dy <= limit_m * limit_m:  # true for NaN, too
-        _note(found, KIND_FAR, now["id"])
+        _record_finding(found, KIND_FAR, now["id"])
 
 
 @kernel
@@ -219,17 +219,17 @@ def watch(
             owned += owner_hash(row["id"], row["epoch"])
             last = before.rows[zone, i]
             if i < num_before and last["id"] == entry["id"]:
-                _judge(finding, last, entry, clock.limit_m)
+                _check_motion(finding, last, entry, clock.limit_m)
             else:
                 if i < num_before:
-                    missing = _miss(strays, last["id"], zone, i, missing)
+                    missing = _record_missing(strays, last["id"], zone, i, missing)
                 strays.rows[moved, 0] = zone
                 strays.rows[moved, 1] = i
                 moved += 1
             if not is_inside(inner, row["x"], row["y"]):
-                _owe_ghosts(zones, halo, zone, row, own_words, i, masks, factors, tallies)
+                _add_due_ghosts(zones, halo, zone, row, own_words, i, masks, factors, tallies)
         for i in range(num_owned, num_before):
-            missing = _miss(strays, before.rows[zone, i]["id"], zone, i, missing)
+            missing = _record_missing(strays, before.rows[zone, i]["id"], zone, i, missing)
         now.num[zone] = num_owned
         tallies[zone]["vehicles"] = num_owned
         tallies[zone]["owned"] = owned
@@ -266,12 +266,12 @@ def _match(
         stood = table[_place(table, entry["id"])]
         if stood["state"] == MISSING:
             stood["state"] = FOUND
-            _judge(finding, before.rows[stood["zone"], stood["row"]], entry, clock.limit_m)
+            _check_motion(finding, before.rows[stood["zone"], stood["row"]], entry, clock.limit_m)
         else:
             strays.entered[entered] = entry["id"]
             entered += 1
             if clock.new_late != ANY_LATE and entry["late"] != clock.new_late:
-                _note(finding, KIND_TICK, entry["id"])
+                _record_finding(finding, KIND_TICK, entry["id"])
     left = 0
     for n in range(missing):
         stood = table[strays.places[n]]
@@ -284,7 +284,7 @@ def _match(
 
 
 @inlined_kernel
-def _owe_ghosts(
+def _add_due_ghosts(
     zones: ZoneArrays,
     halo: Halo,
     zone: int,
@@ -304,7 +304,7 @@ def _owe_ghosts(
     for n in range(halo.near_start[here], halo.near_start[here + 1]):
         other = halo.near[n]
         if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
-            if sought:  # many outer rows are seen by no zone and need no digest
+            if sought:  # no other zone sees most outer rows, and these need no digest
                 digest = row_digest(words, i, masks, factors)
                 sought = False
             tallies[other]["due"] += digest

@@ -1,4 +1,4 @@
-"""Lanelet2 (.osm), written by its own package and read back for a check."""
+"""Exports Lanelet2 files (.osm), written and read back by the package lanelet2."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
     Lanelets of lanes that lead into each other share end points, so that routes are connected.
 
     Raises:
-        MapError: the map has no projection, the target cannot be written, or another number of
-            lanelets is read back.
+        MapError: the map has no projection, the target cannot be written, or the number of lanelets
+            read back differs.
         MissingExtraError: lanelet2 or pyproj is not installed.
     """
     if network.geo is None:
@@ -72,12 +72,12 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
         raise MapError(f"{target}: cannot be written as Lanelet2 ({error})") from error
     counts = {"lanelets": len(made.laneletLayer), "read back": len(back.laneletLayer)}
     if counts["lanelets"] != counts["read back"]:
-        raise MapError(f"{target}: {counts} differ: export it again")
+        raise MapError(f"{target}: numbers of lanelets differ ({counts}): export it again")
     return counts
 
 
 class _Joints:
-    """Points that lanelets share if one leads into the other."""
+    """End points, shared by lanelets that lead into each other."""
 
     def __init__(self, network: RoadNetwork) -> None:
         assert network.geo is not None

@@ -1,4 +1,4 @@
-"""OpenDRIVE from netconvert, repaired for ASAM's rules and verified by reading it back."""
+"""Exports OpenDRIVE with netconvert, repaired for ASAM's rules and verified by reading it back."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def write_opendrive(
 ) -> RoundTrip:
     """Write a SUMO network as OpenDRIVE and read it back; call `told` at the start of each stage.
 
-    The target is also written if the file read back differs; the result reports the differences.
+    If netconvert reads back something else, the target is still written, and the result reports the
+    differences.
 
     Raises:
         MapError: netconvert refuses the network or its own export, or the target cannot be written.
@@ -79,7 +80,7 @@ def _mended(draft: Path, facts: Mapping[str, str]) -> Element:
 
 
 def _mend_object(element: Element) -> None:
-    """Add the height of a crosswalk, and move its outline to the place required since 1.5."""
+    """Add the height of a crosswalk, and move its outline to its place since OpenDRIVE 1.5."""
     element.attrib.setdefault("zOffset", "0")
     outlines = element.findall("outline")
     if outlines:

@@ -1,8 +1,8 @@
 """Repairs the curves of netconvert's OpenDRIVE for the rules of ASAM's checker.
 
-netconvert writes lengths of cubic curves that are up to a decimetre off, and repeats elevations
-that do not change. It draws roads for U-turns from the wrong side, or about one point. The
-directions of lines over junctions differ from those of roads by some milliradians.
+netconvert writes lengths of cubic curves with errors up to a decimetre, and repeats elevations that
+do not change. It draws roads for U-turns from the wrong side, or about one point. The directions of
+lines over junctions differ from the directions of roads by some milliradians.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from cavmarl.maps.exports.opendrive_lanes import LANES, part_roads
 
 _SEALED_M = 1e-3  # maximum gap between lanes that lead into each other
-_SAME_RAD = 1e-4  # the outermost lane of a wide road is 20 m from the reference line
+_SAME_RAD = 1e-4  # 2 mm at the outermost lane of a wide road, 20 m from the reference line
 _PIVOT_M = 0.5  # a shorter line for a U-turn is moved to the other side of its lane
 _SAME_GRADE = 1e-6
-_PARTS = 64  # of a curve, to compute its length: some curves nearly stop and turn
+_PARTS = 64  # a curve is divided to compute its length, because some have nearly a cusp
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _U, _V = ("aU", "bU", "cU", "dU"), ("aV", "bV", "cV", "dV")
 
@@ -85,7 +85,7 @@ def _end(road: Element, at_start: bool) -> RoadEnd:
 
 
 def _seal(road: Element, roads: dict[str, Element]) -> bool:
-    """Redraw a road over a junction if its lanes do not meet those that it joins."""
+    """Redraw a road over a junction if its lanes do not meet the lanes that it joins."""
     before, after = (
         roads.get(link.get("elementId", "")) if link is not None else None
         for link in (road.find("link/predecessor"), road.find("link/successor"))
@@ -118,7 +118,7 @@ def _seal(road: Element, roads: dict[str, Element]) -> bool:
 
 
 def _taper(road: Element, roads: dict[str, Element]) -> None:
-    """Let lanes over a junction begin and end with the widths of the lanes that they join."""
+    """Change the widths of lanes over a junction to those of the lanes that they join."""
     length_m = float(road.get("length", "0"))
     for lane in road.iterfind(LANES):
         widths = []
@@ -149,7 +149,7 @@ def _width_m(road: Element | None, lane: int) -> float | None:
 
 
 def _offset_m(road: Element) -> float:
-    """Return how far to the left of the reference line lanes begin."""
+    """Return the distance to the left of the reference line at which lanes begin."""
     offset = road.find("lanes/laneOffset")
     return 0.0 if offset is None else float(offset.get("a", "0"))
 

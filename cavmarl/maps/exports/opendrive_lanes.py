@@ -1,7 +1,7 @@
 """Splits roads over junctions if their lanes are not neighbours on the roads that they join.
 
-netconvert makes one road of all lanes that lead from one road to another, side by side. If a lane
-between them leads elsewhere, or two lanes end in one, the lanes would be apart or overlap.
+netconvert writes all lanes that lead from one road to another as one road, side by side. If a lane
+between them leads elsewhere, or two lanes end in one lane, the drawn lanes have gaps or overlap.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ LANES = "lanes/laneSection/right/lane"
 
 
 def part_roads(root: Element) -> int:
-    """Give each group of neighbouring lanes a road of its own; return how many were added."""
+    """Write each group of neighbouring lanes as a separate road; return the number of new roads."""
     connections = {
         connection.get("connectingRoad", ""): (junction, connection)
         for junction in root.iter("junction")
@@ -44,7 +44,7 @@ def part_roads(root: Element) -> int:
 
 
 def _groups(road: Element) -> list[list[str]]:
-    """Return the ids of lanes, grouped by lanes that are neighbours at both ends."""
+    """Return the ids of lanes in groups of lanes that are neighbours at both ends."""
     groups: list[list[str]] = []
     before: tuple[int, int] | None = None
     for lane in road.findall(LANES):
@@ -71,7 +71,7 @@ def _copied(road: Element, connection: Element, number: str) -> tuple[Element, E
 
 
 def _keep(road: Element, connection: Element, ids: list[str]) -> None:
-    """Remove all but some lanes of a road, and number these from the inside."""
+    """Keep only the lanes with some ids on a road, and number them from the inside."""
     names = {name: str(-number) for number, name in enumerate(ids, start=1)}
     for right in road.iterfind("lanes/laneSection/right"):
         for lane in right.findall("lane"):

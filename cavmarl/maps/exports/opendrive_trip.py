@@ -1,4 +1,4 @@
-"""Compares a map with its OpenDRIVE file and with what netconvert reads from that file."""
+"""Compares a map with its OpenDRIVE file and with the network that netconvert reads from it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 
 @dataclass(frozen=True)
 class CarRoads:
-    """Roads that cars may use; netconvert leaves out some of the others."""
+    """Roads that cars may use; netconvert does not export some other roads."""
 
     edges: int
     lanes: int
@@ -30,8 +30,8 @@ class CarRoads:
 class RoundTrip:
     """A map, the file written from it, and that file as read by netconvert.
 
-    netconvert reads only one of several lanes of a road that enter the same lane of the next road,
-    and shortens roads at junctions. It may read fewer links and shorter roads than the file has.
+    If several lanes of a road enter the same lane of the next road, netconvert reads only one of
+    these links. It also shortens roads at junctions.
     """
 
     map: CarRoads
@@ -57,7 +57,7 @@ class RoundTrip:
         if not fewest <= self.read.links <= self.map.links:
             found.append(f"links {self.map.links} in the map, {self.read.links} read by netconvert")
         if self.off > MOST_OFF:
-            found.append(f"the total length of the file's roads is {self.off:.1%} off")
+            found.append(f"the total length of roads in the file differs by {self.off:.1%}")
         return found
 
     @property

@@ -1,7 +1,7 @@
-"""Point clouds from files: csv and other text, ply, pcd, las and laz.
+"""Reads point clouds from files: csv and other text, ply, pcd, las and laz.
 
-The first bytes of the file give its format; text is recognized by its suffix. Points with NaN or
-infinite coordinates are left out and counted.
+Formats are recognized by the first bytes of a file, text by its suffix. Points with NaN or infinite
+coordinates are left out and counted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Points = NDArray[np.float64]
 
 CLOUD_ENDINGS = (".csv", ".txt", ".xyz", ".ply", ".pcd", ".las", ".laz")
 MOST_POINTS = 50_000_000  # 1.2 GB after reading, several times that during a comparison
-_MOST_DIGITS = 18  # of the number of points
+_MOST_DIGITS = 18  # maximum number of digits of the number of points
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -37,11 +37,11 @@ class Cloud:
 
     name: str
     points: Points  # (n, 3) x, y, z in m
-    # number of points "read", then removed by each filter, in order
+    # number of points "read", then the number that each filter removed, in order
     counts: dict[str, int] = field(default_factory=dict)
 
     def kept(self, points: Points, filter_name: str) -> Cloud:
-        """Return the cloud with fewer points, and count those that a filter has removed."""
+        """Return the cloud with only some points, and add the filter's count of removed points."""
         removed = self.counts.get(filter_name, 0) + len(self.points) - len(points)
         return Cloud(self.name, points, self.counts | {filter_name: removed})
 
@@ -78,7 +78,7 @@ def read_cloud(path: Path) -> Cloud:
 def write_cloud(path: Path, cloud: Cloud) -> None:
     """Write points as csv or ply, in the form that `read_cloud` reads.
 
-    Raises MapError: the suffix is another one, or the file cannot be written.
+    Raises MapError: the suffix is unknown, or the file cannot be written.
     """
     if path.suffix.lower() not in (".csv", ".ply"):
         raise MapError(f"{path}: the name must end in .csv or .ply")
@@ -130,7 +130,7 @@ def _read_text(path: Path, stream: BinaryIO) -> Points:
     if head and not _is_number(words[0]):
         if not {"x", "y", "z"} <= set(words):
             raise MapError(
-                f"{path}, line {first}: the header has no columns x, y and z: name them so"
+                f"{path}, line {first}: the header has no columns x, y and z: rename the columns"
             )
         columns = tuple(words.index(axis) for axis in "xyz")
         skipped = first
@@ -165,7 +165,7 @@ def _read_ply(path: Path, stream: BinaryIO) -> Points:
     if number == 0:
         return np.zeros((0, 3))
     if len(set(names)) < len(names):
-        raise MapError(f"{path}: two values of its vertices have one name: export it again")
+        raise MapError(f"{path}: two properties of its vertices have one name: export it again")
     if not {"x", "y", "z"} <= set(names):
         raise MapError(f"{path}: its vertices have no x, y and z: export it again")
     if order == "=":
@@ -188,7 +188,7 @@ def _read_ply(path: Path, stream: BinaryIO) -> Points:
 
 
 def _ply_head(path: Path, stream: BinaryIO) -> tuple[str, int, list[tuple[str, str]]]:
-    """Return the byte order, the number of vertices, and name and type of their values."""
+    """Return the byte order, the number of vertices, and name and type of their properties."""
     order, number, element = "", -1, ""
     properties: list[tuple[str, str]] = []
     for _ in range(1000):

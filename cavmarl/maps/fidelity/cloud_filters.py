@@ -1,4 +1,4 @@
-"""Filters that thin out and crop clouds and remove outliers; each counts what it removes."""
+"""Filters that thin out and crop clouds and remove outliers; each counts the removed points."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.maps.fidelity.cloud_files import Cloud
 
 NEIGHBOURS = 8
-_SWAPPED = 0.4  # if this share more of the points is on the map with x and y swapped, they are
-_VOXEL_BITS = 20  # of a voxel's index on an axis, plus its sign
+_SWAPPED = 0.4  # x and y are swapped if swapping them puts this share more points on the map
+_VOXEL_BITS = 20  # bits of a voxel's index on an axis, without its sign
 
 
 def thin_out(cloud: Cloud, voxel_m: float, threads: int = 2) -> Cloud:
-    """Return one point, the mean, for each cube of this side; 0: no filter."""
+    """Replace the points in each cube of side `voxel_m` by their mean; 0: no filter."""
     if voxel_m == 0.0:
         return cloud
     if not 0.0 < voxel_m < np.inf:
         raise ConfigError(f"voxels of {voxel_m:g} m: give a side above 0, or 0 for no filter")
     gicp: Any = require("small_gicp", "maps")
-    # The library numbers voxels from (0, 0, 0) on and drops points too far from there.
+    # The library numbers voxels from (0, 0, 0) and drops points that are too far from there.
     middle = 0.5 * (cloud.points.min(axis=0) + cloud.points.max(axis=0))
     if np.ptp(cloud.points, axis=0).max() / voxel_m >= 2.0 * (1 << _VOXEL_BITS):
         raise ConfigError(
-            f"{cloud.name}: is {np.ptp(cloud.points, axis=0).max():.0f} m long, too much for "
-            f"voxels of {voxel_m:g} m: use larger ones, or remove stray points"
+            f"{cloud.name}: is {np.ptp(cloud.points, axis=0).max():.0f} m long, too long for "
+            f"voxels of {voxel_m:g} m: use larger voxels, or remove stray points"
         )
     thinned = gicp.voxelgrid_sampling(cloud.points - middle, voxel_m, threads)
     return cloud.kept(np.asarray(thinned.points())[:, :3] + middle, "voxel filter")
@@ -35,8 +35,9 @@ def thin_out(cloud: Cloud, voxel_m: float, threads: int = 2) -> Cloud:
 def drop_outliers(cloud: Cloud, sigmas: float, threads: int = 2) -> Cloud:
     """Remove points that are far from their neighbours; 0 sigmas: no filter.
 
-    A point is far if its mean distance to `NEIGHBOURS` others exceeds the mean over all points by
-    `sigmas` standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
+    A point is far if its mean distance to its `NEIGHBOURS` nearest points exceeds the mean over all
+    points by `sigmas` standard deviations (Rusu et al., "Towards 3D point cloud based object maps",
+    2008).
     """
     if sigmas == 0.0 or len(cloud.points) <= NEIGHBOURS:
         return cloud
@@ -60,7 +61,7 @@ def neighbour_distances(points: Any, number: int, threads: int = 2) -> Any:
 def crop(cloud: Cloud, box_m: tuple[float, float, float, float], margin_m: float) -> Cloud:
     """Return the points within a box of the plane and a margin around it.
 
-    Raises MapError: no point is inside, or many more are with x and y swapped.
+    Raises MapError: no point is inside, or many more points would be inside if x and y are swapped.
     """
     low = np.array(box_m[:2]) - margin_m
     high = np.array(box_m[2:]) + margin_m

@@ -22,7 +22,7 @@ def in_map_frame(cloud: Cloud, frame: str, network: RoadNetwork | None) -> Cloud
         network: the map; None: only frames that need no map are allowed.
 
     Raises:
-        ConfigError: there is no such frame.
+        ConfigError: the frame is unknown.
         MapError: the frame needs a map with a projection.
     """
     points = cloud.points.copy()

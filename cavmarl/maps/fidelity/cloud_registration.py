@@ -1,4 +1,4 @@
-"""Registration of a cloud with another one: trimmed ICP by small_gicp, and its reliability."""
+"""Registration of two clouds: trimmed ICP with small_gicp, and its reliability."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _NORMAL_NEIGHBOURS = 20
 _STAGES = 12
 _SETTLED_M, _SETTLED_RAD = 1e-4, 1e-6
 _ITERATIONS = 50
-_WIDEST_M = 10.0  # points farther from the other cloud never correspond to it
-# If the share of normals along a direction is smaller, the cloud can slide along it.
+_WIDEST_M = 10.0  # points farther from the other cloud have no corresponding point
+# If the share of normals along a direction is smaller, the cloud can slide in this direction.
 _HELD = 0.005
-# The kept points fit the other cloud if they are about as near to it as to their neighbours.
+# An alignment is good if the kept points are about as near to the other cloud as to each other.
 _SPACINGS, _LEAST_LIMIT_M, _MOST_LIMIT_M = 2.5, 0.1, 0.5
-_SAMPLE = 10_000  # points, for the spacing
+_SAMPLE = 10_000  # number of points from which the spacing is computed
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Alignment:
     """The rigid motion that aligns a source with a target, and its quality."""
 
     transform: Points  # (4, 4), from the source's frame to the target's
-    trimmed_rmse_m: float  # of the share of the points that is kept
+    trimmed_rmse_m: float  # over the kept share of the points
     limit_m: float  # limit of `trimmed_rmse_m`
     stages: int
-    problems: tuple[str, ...]  # why it is not reliable; empty if it is
+    problems: tuple[str, ...]  # reasons why it is not reliable; empty if it is
     before_m: Points  # (n,) distance of each point of the source to the target before the motion
     distance_m: Points  # (n,) the same after the motion
 
@@ -47,8 +47,8 @@ class Alignment:
 
     @property
     def angle_deg(self) -> float:
-        """Angle of the whole rotation, about any axis."""
-        # Uses the sine, too: near 0, the cosine alone is imprecise.
+        """Angle of the rotation about its axis."""
+        # Use the sine, too, because the cosine alone is imprecise near 0.
         turn = self.transform[:3, :3]
         skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0)))
@@ -78,7 +78,7 @@ class Target:
         gicp: Any = require("small_gicp", "maps")
         if len(points) < FEWEST_POINTS:
             raise MapError(
-                f"a cloud of {len(points)} points: must be at least {FEWEST_POINTS}: use "
+                f"a cloud has {len(points)} points; at least {FEWEST_POINTS} are needed: use "
                 "smaller voxels, or another cloud"
             )
         self.middle_m = points.mean(axis=0)
@@ -104,11 +104,11 @@ class Target:
 
 
 def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
-    """Align a source with a target by ICP with a share of the nearest pairs.
+    """Align a source with a target by ICP, using only a share of the nearest pairs.
 
-    In each stage, pairs farther than twice the distance of the `keep` nearest are left out
-    (Chetverikov et al., "The trimmed iterative closest point algorithm", 2002). Within a stage,
-    small_gicp minimises distances between surfaces (generalized ICP).
+    Each stage ignores pairs farther apart than twice the `keep` quantile of distances (Chetverikov
+    et al., "The trimmed iterative closest point algorithm", 2002). Within a stage, small_gicp
+    minimises distances between surfaces (generalized ICP).
 
     Raises:
         ConfigError: `keep` is not a valid share.
@@ -173,18 +173,18 @@ def _assess(
     limit_m = float(np.clip(_SPACINGS * spacing_m, _LEAST_LIMIT_M, _MOST_LIMIT_M))
     problems = []
     if last_m > 10.0 * _SETTLED_M:
-        problems.append(f"it still moved by {1e3 * last_m:.1f} mm in the last stage, {stages}")
+        problems.append(f"the last stage ({stages}) still moved it by {1e3 * last_m:.1f} mm")
     if rmse_m > limit_m:
         problems.append(
-            f"the nearest {keep:.0%} of the points are {rmse_m:.3f} m off, more than "
-            f"{limit_m:.3f} m: the clouds show other places, or start too far apart (--start)"
+            f"the nearest {keep:.0%} of the points have an RMSE of {rmse_m:.3f} m, more than "
+            f"{limit_m:.3f} m: the clouds show different places, or start too far apart (--start)"
         )
     normals = np.asarray(target.cloud.normals())[rows[order], :3]
     share, axes = np.linalg.eigh(normals.T @ normals / len(normals))
     if share[0] < _HELD:
         along = ", ".join(f"{value:.2f}" for value in axes[:, 0])
         problems.append(
-            f"nothing fixes it along ({along}), where it can slide: give walls (--buildings), or "
-            "a cloud that is more than a plane"
+            f"the cloud can slide along ({along}), because few surfaces face this direction: give "
+            "walls (--buildings), or a cloud that is more than a plane"
         )
     return tuple(problems), rmse_m, limit_m

@@ -39,7 +39,7 @@ class Comparison:
 
     source: Cloud  # P, filtered, in its own frame
     reference: Cloud  # Q, filtered
-    before_m: float  # mean distance P → Q as the clouds were given
+    before_m: float  # mean distance P → Q before the alignment
     alignment: Alignment | None  # None: compared without alignment
     distance_m: Points  # (n,) distance of each point of P to its nearest point of Q
     reverse_m: Points  # distance of each point of Q to its nearest point of P
@@ -127,7 +127,7 @@ def start_transform(text: str | None) -> Points:
         x, y, z, yaw_deg = map(float, text.split(","))
     except ValueError as error:
         raise ConfigError(
-            f"--start {text}: must be four numbers x,y,z,yaw in m and degrees"
+            f"--start {text}: must be four numbers x,y,z,yaw, in m and degrees"
         ) from error
     if not np.isfinite([x, y, z, yaw_deg]).all():
         raise ConfigError(f"--start {text}: must be finite")

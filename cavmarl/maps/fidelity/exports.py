@@ -1,4 +1,4 @@
-"""Exports of distances per point (csv, ply), and a page with a picture that can be rotated."""
+"""Exports of the distance of each point (csv, ply), and a page with a picture that rotates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.maps.fidelity.comparison import PAPER_TABLE, Comparison
 
 _PAGE = Path(__file__).with_name("page.html")
 _SHOWN = 60_000  # points of each cloud on the page
-_FAR_M = 1.0  # this distance and more is red
+_FAR_M = 1.0  # points at this distance or farther are red
 _VERTEX = np.dtype(
     [
         *((axis, "<f8") for axis in "xyz"),
@@ -66,7 +66,7 @@ def write_points(path: Path, comparison: Comparison) -> None:
 
 
 def write_page(path: Path, comparisons: Sequence[Comparison]) -> None:
-    """Write a page with the table, the histograms, and the clouds, which the mouse rotates."""
+    """Write a page with the table, the histograms, and clouds that can be rotated by the mouse."""
     middle = comparisons[0].reference.points.mean(axis=0)
     scenes = []
     for comparison in comparisons:

@@ -27,8 +27,8 @@ def map_surface(network: RoadNetwork, box_m: Box, spacing_m: float = 0.25) -> tu
     if not len(lanes):
         place = "x {0:.1f} … {2:.1f}, y {1:.1f} … {3:.1f}".format(*box_m)
         raise MapError(
-            f"the map '{network.name}' has no lane within {place}: give another cloud, or "
-            "the cloud's frame (--frame projected, degrees, swapped)"
+            f"the map '{network.name}' has no lane in the box of the cloud ({place}): give another "
+            "cloud, or the cloud's frame (--frame projected, degrees, swapped)"
         )
     area_m2 = float((network.lanes["length_m"][lanes] * network.lanes["width_m"][lanes]).sum())
     walls = _walls_in(network, box_m)
@@ -86,7 +86,7 @@ def _lengths(walls: NDArray[np.void]) -> Points:
 
 
 def _ground_m(network: RoadNetwork) -> tuple[Points, Points]:
-    """Return points of the plane (n, 2) and the road's heights there, on which walls stand."""
+    """Return points of roads in the plane (n, 2) and their heights, as the ground under walls."""
     points = network.points
     return np.stack([points["x"], points["y"]], axis=1), np.asarray(points["z"])
 

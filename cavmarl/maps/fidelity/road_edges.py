@@ -1,8 +1,8 @@
 """Compares the borders and heights of a map's roads with a cloud.
 
-A border is where, from the middle of the outer lane outwards, the ground first leaves the road's
-height by more than `STEP_M`: a kerb, a bank, a ditch or a wall. If a road ends without a step, no
-border is found, and nothing is counted.
+The border of a road is the first step of more than `STEP_M` from the road's height, searched from
+the middle of the outer lane outwards: a kerb, a bank, a ditch or a wall. A cross-section without a
+step is not counted.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from cavmarl.roads.network import RoadNetwork
 
 Points = NDArray[np.float64]
 
-STATION_M = 2.0  # between two cross-sections
-BEYOND_M = 3.0  # how far outside of the map's border the cloud's border is searched
+STATION_M = 2.0  # distance between two cross-sections
+BEYOND_M = 3.0  # the cloud's border is searched up to this distance outside of the map's border
 STEP_M = 0.05  # minimum change of height at a border
 _BIN_M = 0.1
-_LEVEL_M = 1.5  # points farther above or below the road are not of the road
-_FEWEST = 3  # minimum number of points of a bin, of its neighbour and of a height
+_LEVEL_M = 1.5  # points farther above or below the road do not belong to it
+_FEWEST = 3  # minimum number of points of a bin, and of a height
 _FEWEST_STATIONS = 6
-_OUTLIER = 3.0  # median deviations
+_OUTLIER = 3.0  # outliers are this many median deviations from the median
 
 
 @dataclass(frozen=True)
 class RoadFit:
-    """The differences between a cloud's roads and a map's; offsets are cloud minus map."""
+    """The differences between the roads of a cloud and of a map; offsets are cloud minus map."""
 
     stations: int  # cross-sections of the map in the cloud's box
     edge_offset_m: Points  # of cross-sections with a border in the cloud; positive: farther outside
@@ -152,7 +152,7 @@ def _section(outer_m: Points, height_m: Points) -> tuple[float | None, float | N
         inside = outer_m[order[first:end]]
         steps = np.abs(height_m[order[first:end]] - road_m) > STEP_M
         if steps.mean() > 0.5:
-            # The road ends at the first point off it, or after the last point on it.
+            # The border is the first point off the road, but not before the last point on it.
             return float(
                 inside[steps].min() if before is None else max(before, inside.min())
             ), road_m

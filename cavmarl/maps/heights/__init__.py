@@ -1,3 +1,3 @@
-"""Heights of a map: terrain models are read and draped over a network continuously."""
+"""Heights of a map: reads terrain models, and drapes networks over them without steps."""
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Drapes a flat network over a terrain model; positions in the plane do not change.
 
 On the ground, a lane has the model's height. Bridges and tunnels are straight from abutment to
-abutment. Where they cross another road, they keep `CLEARANCE_M` from it, with ramps.
+abutment. If they cross another road, ramps keep them `CLEARANCE_M` above or below it.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from cavmarl.maps.net_document import HEIGHT_DIGITS, NetDocument, shape_text
 from cavmarl.maps.osm_roads import OsmRoads
 from cavmarl.maps.projection import unproject
 
-CLEARANCE_M = 5.0  # between roads, where one crosses above the other
+CLEARANCE_M = 5.0  # vertical distance of roads that cross on two levels
 RAMP_GRADE = 0.08
-STEEP_GRADE = 0.15  # reported
-MOST_GRADE = 0.25  # an error
+STEEP_GRADE = 0.15  # steeper roads are reported
+MOST_GRADE = 0.25  # steeper roads are errors
 _LIST = 8
 
 Heights = NDArray[np.float64]
@@ -37,17 +37,17 @@ class HeightReport:
     """A report about draping a map over a terrain model."""
 
     models: tuple[str, ...]
-    cell_m: float  # of the finest model
+    cell_m: float  # cell size of the finest model
     heights_m: tuple[float, float]  # lowest and highest of all lanes
-    places: int  # at which the model was evaluated
-    filled_places: int  # in voids of the model, interpolated
-    void_cells: int  # of the models around the map
-    raised_edges: tuple[str, ...]  # partly or completely on bridges or in tunnels
-    crossings: int  # of lanes on two levels
-    ramp_places: int  # on the ground, moved from the model to keep the clearance of a crossing
-    smoothed_places: int  # moved from the model by the limit of the grade
+    places: int  # places at which the model was evaluated
+    filled_places: int  # places in voids of the model, interpolated
+    void_cells: int  # cells of the models around the map without a height
+    raised_edges: tuple[str, ...]  # edges partly or completely on bridges or in tunnels
+    crossings: int  # crossings of lanes on two levels
+    ramp_places: int  # places on the ground moved from the model for the clearance of a crossing
+    smoothed_places: int  # places moved from the model by the limit of the grade
     most_smoothed_m: float
-    max_grade: float  # of the result
+    max_grade: float  # steepest grade of the result
     steep: tuple[str, ...]  # roads above `STEEP_GRADE`, with their grades
 
     def to_dict(self) -> dict[str, Any]:
@@ -59,7 +59,7 @@ class HeightOptions:
     """Options for the heights of a build."""
 
     models: tuple[Path, ...]
-    limit_grade: float | None = None  # roads are made no steeper; None: as the model
+    limit_grade: float | None = None  # steeper roads are flattened; None: follow the model
     max_grade: float = MOST_GRADE  # steeper roads are errors
 
 
@@ -69,14 +69,14 @@ def drape(
     """Set the heights of each lane and junction of a document.
 
     Args:
-        document: a network without heights, which is changed.
+        document: a network without heights; changed in place.
         options: the models, and the treatment of steep roads.
         roads: the bridges and tunnels; None: all roads are on the ground.
         source: source of the map, for messages.
 
     Raises:
-        MapError: the map has no projection, or has heights; the model cannot be used or does not
-            cover the map; or a road is too steep.
+        MapError: the map has no projection, or already has heights; the model cannot be used or
+            does not cover the map; or a road is too steep.
         MissingExtraError: pyproj or Pillow is not installed.
     """
     if document.geo is None:
@@ -133,7 +133,7 @@ def drape(
 def raise_levels(document: NetDocument, roads: OsmRoads, source: Path) -> int:
     """Set the heights that crossings need in a network without a terrain model.
 
-    The ground is at 0. Only bridges and tunnels that cross other roads, and their ramps, leave it.
+    The ground is at 0. Only bridges and tunnels that cross roads, and their ramps, have heights.
 
     Args:
         document: a projected network without heights; changed if it has such crossings.
@@ -224,7 +224,7 @@ def _write(document: NetDocument, stations: Stations, heights: Heights) -> None:
 def _write_middles(document: NetDocument, stations: Stations, heights: Heights) -> None:
     """Set the heights of edges' centre lines to those of their first lanes.
 
-    netconvert uses the centre lines in exports.
+    netconvert uses the centre lines for exports.
     """
     node = {
         junction.get("id", ""): f"{junction.get('x')},{junction.get('y')}"

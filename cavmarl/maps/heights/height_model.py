@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MapError, require
 from cavmarl.maps.heights.tile_files import WGS84, Grid, HeightTile, read_tile
 
-_MOST_FILLED = 0.5  # of the evaluated places
+_MOST_FILLED = 0.5  # maximum share of evaluated places that are filled
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,15 @@ class Coverage:
     places: int
     # places between cells without a height, interpolated from neighbours
     filled_places: int
-    void_cells: int  # number of filled cells of the tiles
-    cells: int  # number of cells of these tiles
+    void_cells: int  # number of filled cells in the used parts of tiles
+    cells: int  # number of cells in these parts
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
 class HeightModel:
-    """Tiles of heights; where tiles overlap, the first tile with a height counts."""
+    """Tiles of heights; where tiles overlap, the first tile with a height is used."""
 
     def __init__(self, paths: Sequence[str | Path]) -> None:
         """Read the tiles; raises MapError if a file cannot be used, see `read_tile`."""
@@ -78,7 +78,7 @@ class HeightModel:
             west, south = degrees.min(axis=0)
             east, north = degrees.max(axis=0)
             swapped = any(_cells_of(tile, degrees[:, ::-1])[2].any() for tile in self.tiles)
-            hint = "; longitude and latitude look swapped in one of the two" if swapped else ""
+            hint = "; longitude and latitude look swapped in the map or model" if swapped else ""
             raise MapError(
                 f"{names}: {off.mean():.0%} of the roads are outside of the model (they reach from "
                 f"longitude {west:.4f} to {east:.4f}, latitude {south:.4f} to {north:.4f}){hint}: "

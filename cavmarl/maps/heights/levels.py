@@ -18,7 +18,7 @@ Levels = NDArray[np.int64]
 
 
 def levels_of(stations: Stations, roads: OsmRoads, geo: GeoReference, source: Path) -> Levels:
-    """Return the level (places and junctions,) of each place: 0 on the ground, above, below."""
+    """Return the level of each place and junction: 0 on the ground, > 0 above, < 0 below."""
     levels = np.zeros(stations.graph.places, np.int64)
     raised = {name for name, way in roads.ways.items() if way.level}
     for row, lane in enumerate(stations.lanes):
@@ -47,7 +47,7 @@ def _ends(roads: OsmRoads, name: str, geo: GeoReference, source: Path) -> Points
 
 
 def _between(places: Points, ends: Points) -> NDArray[np.bool_]:
-    """Return which places of a lane are between those nearest to two points."""
+    """Return which places of a lane are between the places nearest to two points."""
     near = [int(hypot_all(*(places - end).T).argmin()) for end in ends]
     chosen = np.zeros(len(places), bool)
     chosen[min(near) : max(near) + 1] = True

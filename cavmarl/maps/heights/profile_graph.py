@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Heights = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-_SHORTEST_M = 0.01  # minimum length of a link, for coincident ends
+_SHORTEST_M = 0.01  # minimum length of a link, because its ends may coincide
 _TOLERANCE = 1e-8
 
 
@@ -34,9 +34,9 @@ class ProfileGraph:
         return first.tolist(), ends[order, 1].tolist(), far[order].tolist()
 
     def capped(self, heights: Heights, caps: Heights, grade: float) -> Heights:
-        """Return the highest profile below some caps that rises from them by at most `grade`.
+        """Return the highest profile below `heights` that rises from caps by at most `grade`.
 
-        Where `heights` are lower, they do not change. `caps`: (places,) m; infinite: none.
+        `caps`: (places,) maximum heights in m; infinite: none.
         """
         first, neighbours, far = self._neighbours
         result, own = caps.tolist(), heights.tolist()
@@ -49,7 +49,7 @@ class ProfileGraph:
             for link in range(first[row], first[row + 1]):
                 beside = neighbours[link]
                 reached = height + grade * far[link]
-                # the slope ends where it meets the present heights
+                # The slope from a cap ends where it meets `heights`.
                 if reached < result[beside] and reached < own[beside]:
                     result[beside] = reached
                     heapq.heappush(heap, (reached, beside))
@@ -57,17 +57,17 @@ class ProfileGraph:
         return lowered
 
     def lifted(self, heights: Heights, floors: Heights, grade: float) -> Heights:
-        """Return the lowest profile above `heights` and some floors, with slopes of `grade`."""
+        """Return the lowest profile above `heights` that falls from floors by at most `grade`."""
         return -self.capped(-heights, -floors, grade)
 
     def limited(self, heights: Heights, grade: float) -> Heights:
-        """Return the profile nearest to `heights` with no link steeper than `grade`."""
+        """Return the profile with the least maximum change that has no link above `grade`."""
         return (self.capped(heights, heights, grade) + self.lifted(heights, heights, grade)) / 2.0
 
     def spanned(self, heights: Heights, free: NDArray[np.bool_]) -> Heights:
-        """Return heights whose `free` places are on straight lines between their other neighbours.
+        """Return heights with `free` places on straight lines between places that are not free.
 
-        Conjugate gradients on the links' lengths; free parts without an abutment do not change.
+        Solved by conjugate gradients; free parts without an abutment do not change.
         """
         touched = free[self.links].any(axis=1)
         rows, numbers = np.unique(self.links[touched], return_inverse=True)

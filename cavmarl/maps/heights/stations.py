@@ -1,4 +1,4 @@
-"""Places along all lanes of a network file, at most a metre apart, for heights."""
+"""Places along all lanes of a network file, at most a metre apart, where heights are computed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.maps.heights.profile_graph import ProfileGraph
 from cavmarl.maps.net_document import DocumentLane, NetDocument, Points
 
 STEP_M = 1.0
-_BESIDE = 40  # places before and after the proportional one that are searched on an adjacent lane
+_BESIDE = 40  # adjacent places are searched this many places before and after the proportional one
 _OFF_M = 0.01  # maximum error of written heights
 
 Rows = NDArray[np.int64]
@@ -29,7 +29,7 @@ class Stations:
     s_m: NDArray[np.float64]  # (n,) from the start of the lane
     written: NDArray[np.bool_]  # (n,) whether the place is in the file
     first: Rows  # (lanes + 1,) rows of each lane
-    graph: ProfileGraph  # of places, then junctions
+    graph: ProfileGraph  # its nodes are the places, then the junctions
     hubs_m: Points  # (junctions, 2)
     junction_ids: tuple[str, ...]
 
@@ -54,8 +54,8 @@ def stations_of(document: NetDocument) -> Stations:
             raise MapError(f"{document.path}: lane {lane.id} has no shape: build the map again")
         if shape.shape[1] > 2 and shape[:, 2].any():
             raise MapError(
-                f"{document.path}: has heights already (lane {lane.id}): leave out --dem, or give "
-                "it with the source that the map was built from"
+                f"{document.path}: has heights already (lane {lane.id}): leave out --dem, or build "
+                "the map again from its source, with --dem"
             )
         places, s_m, own = laid(shape[:, :2])
         parts.append(places)
@@ -73,7 +73,7 @@ def stations_of(document: NetDocument) -> Stations:
 
 
 def laid(shape: Points) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]:
-    """Return places on a polyline, their arc lengths, and which of them are its own points."""
+    """Return places on a polyline, their arc lengths, and which of them are points of `shape`."""
     lengths = hypot_all(*np.diff(shape, axis=0).T)
     counts = np.maximum(np.ceil(lengths / STEP_M).astype(np.int64), 1)
     segment = np.repeat(np.arange(len(counts)), counts)
@@ -91,7 +91,7 @@ def laid(shape: Points) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]
 def _links(
     document: NetDocument, lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows
 ) -> tuple[Points, tuple[str, ...], Rows]:
-    """Return junctions' positions and ids, and pairs of places between which vehicles drive."""
+    """Return positions and ids of junctions, and pairs of places between which vehicles drive."""
     row_of = {lane.id: row for row, lane in enumerate(lanes)}
     along = np.delete(np.arange(first[-1] - 1), first[1:-1] - 1)
     pairs = [np.stack([along, along + 1], axis=1)]
@@ -139,7 +139,7 @@ def _beside(lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows) -> li
 
 
 def kept_rows(s_m: NDArray[np.float64], z_m: NDArray[np.float64], own: NDArray[np.bool_]) -> Rows:
-    """Return rows of a lane to write: its own points, and others needed for exact heights."""
+    """Return the rows of a lane to write: its original points, and places needed for heights."""
     kept = set(np.flatnonzero(own).tolist())
     open_parts = list(pairwise(sorted(kept)))
     while open_parts:

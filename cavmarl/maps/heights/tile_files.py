@@ -1,7 +1,7 @@
-"""Reads terrain models: GeoTIFF via Pillow, and SRTM's HGT, as tiles of a grid.
+"""Reads terrain models as tiles of a grid: GeoTIFF with Pillow, and HGT of SRTM.
 
-netconvert's own reader is not used: its build for Python refuses HGT, assumes degrees and metres in
-every GeoTIFF, does not handle voids, and changes the network.
+netconvert's reader is not used, because its build for Python refuses HGT, assumes degrees and
+metres in every GeoTIFF, does not handle voids, and changes the network.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ WGS84 = "EPSG:4326"
 _FORMATS = "give a GeoTIFF (.tif), or an SRTM tile (.hgt, .hgt.zip, .hgt.gz)"
 _HGT = re.compile(r"([NS])(\d{2})([EW])(\d{3})", re.IGNORECASE)
 _HGT_VOID = -32768
-_LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # of ground on the earth; other values are voids
+_LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # range of heights on the earth; other values are voids
 _MOST_BYTES = 1 << 30
 _FEET = {9002: "feet", 9003: "US feet", 9005: "feet", 9006: "feet"}  # EPSG's units of length
 _USER_DEFINED = 32767
@@ -44,7 +44,7 @@ class HeightTile:
     """Heights on a grid: cell (row, column) is at x0 + column · dx, y0 + row · dy."""
 
     name: str
-    crs: str  # of x and y, an EPSG code
+    crs: str  # EPSG code of the coordinate system of x and y
     # (rows, columns) m above the model's own zero; NaN: unknown
     heights_m: Grid
     x0: float
@@ -54,7 +54,7 @@ class HeightTile:
 
     @property
     def box(self) -> tuple[float, float, float, float]:
-        """Min x, min y, max x, max y of the cells, in its own units."""
+        """Min x, min y, max x, max y of the cells, in the unit of `crs`."""
         rows, columns = self.heights_m.shape
         x = sorted((self.x0 - self.dx / 2, self.x0 + (columns - 0.5) * self.dx))
         y = sorted((self.y0 - self.dy / 2, self.y0 + (rows - 0.5) * self.dy))
@@ -101,7 +101,7 @@ def _hgt(path: Path, content: bytes) -> HeightTile:
     named = _HGT.match(path.name)
     if named is None:
         raise MapError(
-            f"{path}: the name of an SRTM tile must give its position, as N43E007.hgt: rename it"
+            f"{path}: the name of an SRTM tile must give its position, like N43E007.hgt: rename it"
         )
     side = math.isqrt(len(content) // 2)
     if side * side * 2 != len(content) or side < 2:
@@ -120,7 +120,7 @@ def _geotiff(path: Path, content: bytes) -> HeightTile:
     image_module = require("PIL.Image", "maps")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about large images: the limit of bytes applies
+            warnings.simplefilter("ignore")  # Pillow warns of large images; _MOST_BYTES limits them
             with image_module.open(io.BytesIO(content)) as image:
                 tags = dict(image.tag_v2)
                 raw = np.asarray(image)
@@ -138,14 +138,14 @@ def _geotiff(path: Path, content: bytes) -> HeightTile:
     keys = _geo_keys(tags)
     _check_metres(path, keys)
     x0, y0, dx, dy = _placed(path, tags)
-    if keys.get(_RASTER_TYPE, 1) != 2:  # the tie point is a cell's corner, not its centre
+    if keys.get(_RASTER_TYPE, 1) != 2:  # the tie point is the corner of a cell, not its centre
         x0, y0 = x0 + dx / 2, y0 + dy / 2
     void = str(tags.get(_NO_DATA, "")).strip("\0 ")
     try:
         no_data = float(void) if void else None
     except ValueError as error:
         raise MapError(
-            f"{path}: '{void}', the value of voids, is not a number: repair the file"
+            f"{path}: the value of voids, '{void}', is not a number: repair the file"
         ) from error
     return HeightTile(path.name, _crs(path, keys), _cleaned(raw, no_data), x0, y0, dx, dy)
 
@@ -160,7 +160,7 @@ def _cleaned(raw: NDArray[Any], void: float | None) -> Grid:
 
 
 def _geo_keys(tags: dict[int, Any]) -> dict[int, int]:
-    """Return the keys of GeoTIFF whose value is a number in the directory."""
+    """Return the keys of GeoTIFF whose value is a number in the key directory."""
     words = tuple(tags.get(_GEO_KEYS, ()))
     rows = [words[first : first + 4] for first in range(4, len(words) - 3, 4)]
     return {int(key): int(value) for key, place, _, value in rows if place == 0}
@@ -181,7 +181,7 @@ def _check_metres(path: Path, keys: dict[int, int]) -> None:
 
 
 def _feet_of(projected: int) -> str | None:
-    """Return the name of a projection's unit if it is feet; None: metres, or unknown."""
+    """Return the name of a projection's unit if it is a kind of foot; None: metres, or unknown."""
     if projected in (0, _USER_DEFINED):
         return None
     pyproj: Any = require("pyproj", "maps")

@@ -1,9 +1,9 @@
-"""Memory that a process shares with those that it forks, in huge pages if the system has them.
+"""Memory that a process shares with its forks, in huge pages if the system has them.
 
-The vehicles of a city take thousands of small pages. In a virtual machine, their look-up takes some
-hundredths of a tick. By default, most systems give no huge pages to shared memory
-(`shmem_enabled`), but Linux from 6.1 on merges pages on request. If it cannot, pages stay small,
-which is only slower.
+The vehicles of a city take thousands of small pages. In a virtual machine, translating their
+addresses takes a few hundredths of a tick. By default, most systems give no huge pages to shared
+memory (`shmem_enabled`), but Linux from 6.1 on merges pages on request. If Linux cannot merge them,
+the program is only slower.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.parallel.memory.shared_memory import shared_zeros
 
-HUGE_BYTES = 1 << 21  # of a huge page, on most processors
-MOST_BYTES = 1 << 28  # of an array that is allocated at once
+HUGE_BYTES = 1 << 21  # size of a huge page, on most processors
+MOST_BYTES = 1 << 28  # larger arrays get small pages
 
 _NO_ACCESS = 0  # PROT_NONE: reserves addresses only
 _AT_THIS_PLACE = 0x10  # MAP_FIXED
@@ -43,7 +43,7 @@ def huge_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float6
     An array of more than `MOST_BYTES` has small pages, each allocated when it is first written.
 
     Raises:
-        MemoryError: this process has not enough addresses or memory.
+        MemoryError: this process does not have enough address space or memory.
     """
     kind = np.dtype(dtype)
     sides = (shape,) if isinstance(shape, int) else shape

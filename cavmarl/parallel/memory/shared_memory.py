@@ -1,7 +1,7 @@
-"""Memory that processes share. It has no name, so nothing is left behind.
+"""Memory that processes share. The memory has no name, so nothing is left behind.
 
 A process knows a segment by its descriptor alone, which it gets when it starts. The system frees a
-segment when the last process that has it open or mapped ends, in whatever way.
+segment when the last process that has it open or mapped ends, whatever the cause.
 """
 
 from __future__ import annotations

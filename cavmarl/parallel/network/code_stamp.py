@@ -1,4 +1,4 @@
-"""`code_stamp`: identifies the code of a process; another code may give other results."""
+"""`code_stamp`: identifies the code of a process; different code may give different results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def code_stamp() -> str:
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
         name = source.relative_to(package).as_posix()
-        if not name.startswith("data/"):  # only a wheel has it
+        if not name.startswith("data/"):  # only wheels have this folder
             digest.update(name.encode() + b"\0" + source.read_bytes())
     sources = digest.hexdigest()[:12]
     return f"cavmarl of sources {sources}, numpy {np.__version__}"

@@ -27,7 +27,7 @@ class EncryptedSocket(ssl.SSLSocket):
     """A TLS socket that raises `BlockingIOError` like a plain non-blocking socket."""
 
     def sendmsg(self, buffers: Iterable[Any], *_: Any) -> int:  # type: ignore[override]
-        """Send the first bytes and return how many; pass the rest again, unchanged."""
+        """Send the first bytes and return how many; the next call must pass the rest unchanged."""
         pieces, size = [], 0
         for piece in buffers:
             pieces.append(piece)

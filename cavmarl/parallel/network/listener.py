@@ -52,7 +52,7 @@ class PendingConnection:
     def __init__(self, connection: socket.socket, secret: bytes) -> None:
         connection.setblocking(False)
         self.until_s = time.monotonic() + HANDSHAKE_S  # deadline, by `time.monotonic`
-        self.number = -1  # that the caller claims to have; -1: HELLO has not come
+        self.number = -1  # number that the caller claims to have; -1: HELLO has not come
         self._socket = connection
         if leaves_this_machine(connection):
             self._socket = encrypted(connection, secret, calls=False)
@@ -131,7 +131,7 @@ class Listener:
     def __init__(
         self,
         address: str,
-        secret: bytes | None = None,  # that callers have to know; None: a random one
+        secret: bytes | None = None,  # known to the callers; None: a random one
         port: int = 0,  # 0: the system chooses
     ) -> None:
         self.secret = secrets.token_bytes(SECRET) if secret is None else secret
@@ -151,7 +151,7 @@ class Listener:
             self._listener.close()
             raise
         self._callers: list[PendingConnection] = []
-        self._spare = socket.socket()  # its descriptor serves to accept and reject a caller
+        self._spare = socket.socket()  # closed when descriptors run out, to reject a caller
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
 
@@ -170,7 +170,7 @@ class Listener:
             if key.fileobj is self._listener:
                 for caller in self._welcome():
                     self._listen(caller, admitted)
-            elif key.fileobj in self._callers:  # it was not disconnected just now
+            elif key.fileobj in self._callers:  # skip callers that were just disconnected
                 self._listen(key.fileobj, admitted)
         now = time.monotonic()
         for caller in [caller for caller in self._callers if caller.until_s < now]:

@@ -4,7 +4,7 @@ A place is `mpi` and a rank. Ranks trust each other, since MPI has started all o
 secret. MPI has no failover: when it loses a rank, it ends the run.
 
 A message with the tag 0 is a notice about a connection. Every other message carries bytes; its tag
-is the number of the end of the connection at the receiving rank.
+is the number that the receiving rank has given to its end of the connection.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MPI: Literal["mpi"] = "mpi"
 CALLER = 0  # the rank of the program whose worlds the other ranks host
 NOTICE = 0  # tag of notices
 LISTENER = 0  # number by which a poll reports the listener
-LOOKS = 500  # polls before the process naps between polls
+LOOKS = 500  # polls without a nap; after that, the process naps between polls
 NAP_S = 50e-6
 END_S = 60.0  # time for the other ranks to end after the caller
 PRINTED_S = 0.3  # time for printed text to arrive before the run is aborted
@@ -46,7 +46,7 @@ _SHARED = re.compile(r"/dev/shm/mpich_shm_\w+(?= *$)", re.MULTILINE)
 
 
 class _Notice(IntEnum):
-    """Kinds of notices, each with two numbers."""
+    """Kinds of notices, and the two numbers that each kind carries."""
 
     OPEN = 0  # number for the listener; end of the opener
     ACCEPT = 1  # end of the sender; end of the opener
@@ -123,7 +123,7 @@ class MpiListener:
 
 
 class MpiPoll:
-    """A `TransportPoll`. A process cannot sleep on MPI, so it looks again and again."""
+    """A `TransportPoll`. A process cannot sleep until MPI has a message, so it polls repeatedly."""
 
     def __init__(self, receive_all: Callable[[], None]) -> None:
         self._receive_all = receive_all
@@ -210,7 +210,7 @@ class MpiTransport:
         return end
 
     def forget(self, end: MpiConnection) -> None:
-        """Close a connection, and drop what still comes for it."""
+        """Close a connection, and discard messages that still arrive for it."""
         if self._ends.pop(end.number, None) is not None and end.far and not end.has_ended:
             self._send_notice(end.rank, _Notice.CLOSE, 0, end.far)
 
@@ -344,7 +344,7 @@ def mpi_transport() -> MpiTransport:
 
 
 def _rest(look: int) -> None:
-    """Yield the core, and after many looks sleep for a moment."""
+    """Yield the core or, after `LOOKS` polls, sleep for a moment."""
     if look < LOOKS:
         os.sched_yield()
     else:

@@ -44,7 +44,7 @@ class RayActors:
         self,
         main: Main,  # what each actor runs: a function of a module that every node can import
         workers: int | None,  # actors with a CPU of their own; None: as many as there are free CPUs
-        at_most: int,  # most actors that are of use
+        at_most: int,  # largest useful number of actors
     ) -> None:
         self._main = main
         self._actors: list[Any] = []

@@ -16,7 +16,7 @@ ADDRESS = "RAY_ADDRESS"  # environment variable that Ray itself reads
 CALL_S = 5.0
 RELEASE_S = 2.0  # Ray notices the end of an actor with a delay
 _RESOURCES = ("CPU", "memory", "GPU")
-_joined = 0  # calls of `join` that have not left, if the program itself had not joined
+_joined = 0  # calls of `join` without their `leave`; 0 if the program itself has joined
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Node:
 def join() -> bool:  # whether `leave` has to be called
     """Join the cluster of this program, or start one on this machine.
 
-    A program that has called `ray.init` is a member already. Otherwise the cluster is that of
-    `RAY_ADDRESS`, or the one that `ray start` has started here, or a new one that ends with its
+    A program that has called `ray.init` is a member already. Otherwise it joins the cluster at
+    `RAY_ADDRESS`, a cluster that `ray start` has started here, or a new cluster that ends with its
     last user.
 
     Raises:

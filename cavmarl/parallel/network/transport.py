@@ -18,7 +18,7 @@ Place: TypeAlias = tuple[str, int]
 
 READS = select.POLLIN
 READS_AND_WRITES = select.POLLIN | select.POLLOUT
-MOST_PIECES = 512  # in one call of `Connection.send`
+MOST_PIECES = 512  # limit in one call of `Connection.send`
 
 
 class Connection(Protocol):
@@ -31,16 +31,16 @@ class Connection(Protocol):
 
     @property
     def keeps_bytes(self) -> bool:
-        """Whether received bytes may wait here although a poll does not report them."""
+        """True if received bytes may wait here although a poll does not report them."""
         ...
 
     @property
     def closed(self) -> bool:
-        """Whether the other end has closed, and all bytes before that have been received."""
+        """True if the other end has closed, and all bytes before that have been received."""
         ...
 
     def send(self, pieces: Sequence[Bytes]) -> int:
-        """Send the pieces as one; return how many of the first bytes were accepted.
+        """Send the pieces in order; return how many bytes were accepted, from the first on.
 
         Raises:
             OSError: the other end has gone.
@@ -87,7 +87,7 @@ class TransportPoll(Protocol):
     def unregister(self, one: Any) -> None: ...
 
     def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
-        """Return the numbers of those that can receive or send, within that time."""
+        """Wait up to `timeout_ms`; return the numbers and events of sockets that are ready."""
         ...
 
 
@@ -97,8 +97,8 @@ class Transport(Protocol):
     def open(
         self,
         place: Place,
-        secret: bytes,  # that both ends have to know
-        number: int,  # that the listener receives
+        secret: bytes,  # known to both ends
+        number: int,  # sent to the listener
         answer_s: float | None,  # time for the listener to answer; None: unlimited
     ) -> Connection:
         """Open a connection to a listener.

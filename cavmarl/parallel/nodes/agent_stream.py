@@ -75,7 +75,7 @@ class AgentStream:
     def packed(
         self,
         present: Flags,  # (W, A) agents that have sensed in this node
-        chosen: Flags,  # (W,) in these worlds
+        chosen: Flags,  # (W,) worlds whose agents are sent
         number: int,  # of this node
         own: Flags,  # (W, A) output: agents that sensed here last
         owner: NDArray[np.int32],  # (W · A,) output: node of each agent

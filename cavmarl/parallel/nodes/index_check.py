@@ -22,7 +22,7 @@ class IndexCheck:
 
     Attributes:
         of_rows: bounds of the indices in a row.
-        of_ghosts: bounds of the indices in a row, in its step and in the place of the step.
+        of_ghosts: bounds of the indices in a ghost: in its row, in its PLAN, and of its `step_at`.
     """
 
     def __init__(self, simulation: Simulation) -> None:

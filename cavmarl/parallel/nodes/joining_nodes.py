@@ -23,7 +23,7 @@ from cavmarl.parallel.worlds.world_errors import original_error
 
 log = logging.getLogger("cavmarl.nodes")
 
-LOOK_MS = 20.0  # between looks for callers, before the worlds start
+LOOK_MS = 20.0  # time between checks for callers, before the worlds start
 END_S = 1.0  # time for waiting nodes to end
 ANYONE = (1 << 32) - 1  # number of a node that accepts any number
 
@@ -34,7 +34,7 @@ class JoiningNode:
 
     asked: int  # the number that it was started with, or ANYONE
     machine: str = "a machine"
-    pid: int = 0  # on its machine
+    pid: int = 0  # process id on the machine of the node
     is_accepted: bool = False  # it runs the same code as the caller
     place: Place | None = None  # where other nodes can call, once it has loaded the world
     neighbours: Neighbours | None = None  # zones between which vehicles change, in that world
@@ -55,7 +55,7 @@ class JoiningNodes:
         listener: TransportListener,
         job: Any,  # JSON value for the nodes
         files: Sequence[WorldFile],  # of the world
-        room: Callable[[], int],  # returns how many more nodes are of use
+        room: Callable[[], int],  # returns how many more nodes can be used
         zones: int,  # of each world
         system: NodeSystem = MACHINE,
     ) -> None:
@@ -127,12 +127,12 @@ class JoiningNodes:
 
     def _receive(self, number: int, frame: NodeFrame) -> None:
         node = self._all.get(number)
-        if node is None:  # it was rejected
+        if node is None:  # the node was rejected
             return
         try:
             with reading(number):
                 self._apply(number, node, frame)
-        except LinkLostError as lost:  # it is no node
+        except LinkLostError as lost:  # the caller is not a node
             log.warning("a caller is rejected: %s", lost)
             self._forget(number)
 

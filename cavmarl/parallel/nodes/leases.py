@@ -1,4 +1,4 @@
-"""Length of the leases of nodes: the ticks of a step, whose commands are known in advance.
+"""Length of the leases of nodes: at most a step, because its commands are known in advance.
 
 A vehicle that crosses a border during a lease stays with its owner until the next lease. A vehicle
 without a record cannot be offered. For such a vehicle, a lease of no ticks comes first.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from cavmarl.config.env import EnvConfig
 
-MOST = 4  # ticks; a longer lease makes zones see further over their borders
+MOST = 4  # limit in ticks; with longer leases, zones need more ghosts beyond their borders
 
 
 def lease_ticks(config: EnvConfig) -> int:
@@ -22,5 +22,5 @@ def leases_of(ticks: int, lease: int) -> int:
 
 
 def late_ticks(config: EnvConfig) -> int:
-    """Return for how many ticks more than one a vehicle may stay with the zone it has left."""
+    """Return how many ticks longer than one a vehicle may stay with the zone that it has left."""
     return lease_ticks(config) - 1

@@ -171,7 +171,7 @@ class Link:
                 return
 
     def _split(self, filled: int, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
-        """Split the room into frames, the last of which may be incomplete."""
+        """Split the room into frames. The last frame may be incomplete."""
         room, at = self._room, 0
         while filled - at >= HEAD_BYTES:
             begin, code, which, size, summed, own = _WHOLE_HEAD.unpack_from(room, at)

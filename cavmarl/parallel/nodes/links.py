@@ -14,12 +14,13 @@ from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, reading
 
-LOST = (EOFError, OSError, MessageError)  # what ends a connection
+LOST = (EOFError, OSError, MessageError)  # errors that end a connection
 
 Urgent: TypeAlias = Callable[[int, NodeFrame], Exception | None]
 """Handles an urgent frame as soon as it has come; the first argument is its sender.
 
-An error in the handler is the fault of the sender. `pump` raises an error that it returns."""
+An error in the handler is the fault of the sender. `pump` raises an error that the
+handler returns."""
 
 
 class SilenceError(Exception):
@@ -130,14 +131,14 @@ class Links:
         return found
 
     def receive_next(self, number: int) -> NodeFrame:
-        """Receive the next frame of a sender, without a limit; errors as of `receive`."""
+        """Receive a sender's next frame, without a limit. Raises the errors of `receive`."""
         try:
             frames = self._links[number].frames
         except KeyError:
             raise LinkLostError(number) from None
         if not frames:
             self.wanted = (number,)
-            # Another node is at the same point of its tick, so polling is faster than to sleep.
+            # Another node is at the same point of its tick, so polling is faster than sleeping.
             looks = 0 if number == COORDINATOR else self._looks
             while not frames:
                 if number != COORDINATOR:
@@ -149,7 +150,7 @@ class Links:
     def check_recovery(self) -> None:
         """Raise RecoveryOrderedError if the coordinator has ordered a recovery.
 
-        Then an awaited frame may never come, since its sender may be lost unnoticed.
+        In a recovery an awaited frame may never come: the loss of its sender may be unnoticed here.
         """
         link = self._links.get(COORDINATOR)
         if link is None or not link.frames:

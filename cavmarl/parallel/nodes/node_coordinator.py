@@ -33,7 +33,7 @@ class CrossingDigests:
         return self.digests[vehicle]
 
     def state(self, vehicle: int) -> bytes:
-        """Raise ProtocolError: a node that needs a state has lost one that it acknowledged."""
+        """Raise ProtocolError: a node needs a state again that it has acknowledged."""
         raise ProtocolError(
             f"vehicle {vehicle}: its new zone does not have the state that it acknowledged"
         )
@@ -78,7 +78,7 @@ class _World:
             if (num, total) != (due[zone], sums[zone]):
                 raise ProtocolError(
                     f"world {w}, tick {self.directory.table.tick}: zone {zone} has {num} vehicles, "
-                    f"the records have {due[zone]} or other epochs; zones.journal shows the records"
+                    f"the records {due[zone]}, or epochs differ; zones.journal shows the records"
                 )
 
     def is_silent(self, births: Sequence[Birth]) -> bool:
@@ -102,7 +102,7 @@ class NodeCoordinator:
     """Decides about ownership in W worlds.
 
     Attributes:
-        worlds: what it knows of each world.
+        worlds: ownership in each world.
         switched: number of changes of owner.
         is_late: a vehicle without a record has crossed a border, so a lease of no ticks is due.
     """
@@ -126,17 +126,17 @@ class NodeCoordinator:
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Start; return the hostings of all zones, by worlds."""
-        self.know(neighbours)
+        self.set_neighbours(neighbours)
         for world in self.worlds:
             world.write(world.directory.reset())
             for zone, node in enumerate(self._node_of):
                 world.write(world.directory.host(zone, worker=node))
         return self._hostings()
 
-    def know(self, neighbours: Neighbours) -> None:
-        """Let vehicles change between these zones only, from now on."""
+    def set_neighbours(self, neighbours: Neighbours) -> None:
+        """From now on, allow changes of owner only between these pairs of zones."""
         for world in self.worlds:
-            world.directory.know(neighbours)
+            world.directory.set_neighbours(neighbours)
 
     def recover(self, node_of: Sequence[int], switched: int) -> list[list[Hosting]]:
         """Go back to a kept state, with zones on other nodes; open transfers are void.
@@ -315,7 +315,7 @@ class NodeCoordinator:
         ]
 
     def lease(self, messages: Mapping[int, bytes], ticks: int) -> None:
-        """Send the leases that `begin` returned; 0 ticks, or the ticks of a lease."""
+        """Send the leases that `begin` returned; `ticks`: their length, 0 or more."""
         for node, data in messages.items():
             self._links.send(node, FrameKind.LEASE, ticks, [data])
 

@@ -1,8 +1,8 @@
 """Repartitioning of zones that nodes host: the messages between the caller and the nodes.
 
-The first node reads the positions of all vehicles for a moment, and proposes new zones. Then all
+The first node receives the rows of all vehicles for a moment, and proposes new zones. Then all
 nodes repartition: each vehicle goes to the node of its zone, and ownership starts anew, as when
-worlds are loaded. The zones belong to the state to which the caller returns when nodes are lost.
+worlds are loaded. The zones are a part of the kept state: if nodes are lost, they are restored too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PoolState(NamedTuple):
 
     number: int
     zones: list[list[int]]  # of each node
-    switched: int  # changes of owner up to then
+    switched: int  # number of changes of owner when the state was kept
     cut: ZoneCut
 
 

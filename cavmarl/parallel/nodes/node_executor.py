@@ -32,7 +32,7 @@ class NodeExecutor(ShardGroup):
         side, next_side = self.sides
         for shard in self._foreign:
             if shard.side != side or shard.next_side != next_side:
-                shard.face(side, next_side)
+                shard.set_sides(side, next_side)
 
 
 class TimedNodeExecutor(PhaseExecutor):

@@ -1,4 +1,4 @@
-"""`NodeGroups`: worlds over nodes, each of which hosts whole worlds."""
+"""`NodeGroups`: worlds over nodes, where each node hosts whole worlds."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CHANGES = (Task.STEP, Task.RESET, Task.LOAD)  # tasks that change worlds
 
 
 class NodeGroups(CommandedWorlds):
-    """W worlds over n nodes, each of which hosts all zones of its worlds.
+    """W worlds over n nodes, where each node hosts all zones of its worlds.
 
     Each node has a coordinator and a thread of its own, so all nodes carry out a command at once.
     This process keeps the state of the worlds of each node: if a node is lost, another one resumes

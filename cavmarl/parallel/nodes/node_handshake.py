@@ -9,9 +9,9 @@ from cavmarl.parallel.network.transport import READS, Connection, Place, Transpo
 from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
 
-LOOK_MS = 50.0  # between checks that the awaited nodes still live
+LOOK_MS = 50.0  # time between checks that the awaited nodes still live
 ANSWER_S = 5.0  # time for a node to answer a call
-_MOST = 1 << 16  # nodes, and distinguished generations
+_MOST = 1 << 16  # limit of node numbers; generations are sent modulo this
 
 
 def caller_number(number: int, generation: int) -> int:

@@ -51,7 +51,7 @@ class RemoteNetwork:
         bus.connect(self)
 
     def begin(self, generation: int, is_reporter: bool) -> None:
-        """Start a new generation of nodes, one of which is the reporter."""
+        """Start a new generation of nodes. One of these nodes is the reporter."""
         self._generation, self._is_reporter = generation, is_reporter
 
     def receive(self, frame: NodeFrame) -> None:

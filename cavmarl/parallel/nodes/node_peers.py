@@ -53,7 +53,7 @@ class NodePeers:
         simulation: Simulation,
         links: Links,  # to all other nodes
         zones: Sequence[Sequence[int]],  # of each node
-        number: int,  # of this one
+        number: int,  # of this node
         first_share: int = 0,  # number of the first share, the same at all nodes
     ) -> None:
         shard = simulation.shards[0]
@@ -87,7 +87,7 @@ class NodePeers:
         self._sent = first_share
         self._is_stepping = False
         self._gate: DepartureQueue | None = None
-        self._leaving: Passing  # of the gate
+        self._leaving: Passing  # vehicles that pass `_gate`
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
         self.owner: NDArray[np.int32] = np.full(self.own.size, UNOWNED, dtype=np.int32)
@@ -96,7 +96,7 @@ class NodePeers:
         """Note that the next outputs are those of a step."""
         self._is_stepping = True
 
-    def keep_own(self, chosen: NDArray[np.bool_]) -> None:
+    def drop_foreign_rows(self, chosen: NDArray[np.bool_]) -> None:
         zoned = self._zoned
         for zone in self._foreign.tolist():
             for numbers in (zoned.num_owned, zoned.num_rows, zoned.num_near, zoned.num_through):
@@ -105,12 +105,12 @@ class NodePeers:
             zoned.num_outer[zone, chosen] = -1
         for zone in range(len(zoned.num_rows)):
             for w in np.flatnonzero(chosen).tolist():
-                num = zoned.num_rows.item(zone, w)  # the first zone had all vehicles
+                num = zoned.num_rows.item(zone, w)  # the first zone had the rows of all zones
                 for array in (*zoned.rows[:, zone, w], *(each[zone, w] for each in self._of_rows)):
                     forget(array[num:])
         self._rerouted[chosen] = 0
 
-    def take_up(self, departures: DepartureQueue, side: int) -> None:
+    def resume_from(self, departures: DepartureQueue, side: int) -> None:
         self._rerouted[:] = departures.counts[:, COUNT_REROUTED]
         self._seen_s[...] = self._detected_s
         self.own[...] = False
@@ -233,8 +233,8 @@ class NodePeers:
                 self._agents.read(data, number, self.owner)
 
     @contextmanager
-    def everybody(self, departures: DepartureQueue, side: int) -> Iterator[None]:
-        """Have the vehicles of each other node in its first zone, for a while."""
+    def all_zones(self, departures: DepartureQueue, side: int) -> Iterator[None]:
+        """Context in which the first zone of each other node has the vehicles of that node."""
         before = departures.counts[:, COUNT_REROUTED].copy()
         with self._rows_of_all(side):
             yield
@@ -242,7 +242,7 @@ class NodePeers:
 
     @contextmanager
     def whole(self, simulation: Simulation) -> Iterator[None]:
-        """Have whole worlds at each node, for a while; all nodes have to call it."""
+        """Context in which each node has the whole worlds; all nodes have to enter it together."""
         arrays = simulation.agent_arrays()
         mine = self._agents_of(simulation.division.side)
         with self._rows_of_all(simulation.division.side):

@@ -104,7 +104,7 @@ class NodePool:
         self._next_state = 1
         self._lost: list[int] = []
         self._is_torn = False
-        self._successions = 0  # in the present command
+        self._successions = 0  # losses of the only node in the present command
         self._max_retries = config.workers.max_retries
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
@@ -130,12 +130,12 @@ class NodePool:
         self._living = living_of(self.zones)
         self.reporter = 0
         self._cut = ZoneCut(self._partition, Neighbours(()))
-        # The state to which all nodes can go back, and the one that they keep next.
+        # The state to which all nodes can go back, and the state that they keep next.
         self._state = PoolState(self._next_state, self.zones, 0, self._cut)
         self._opened: PoolState | None = None
         self._next_state += 1
         self._kept: dict[int, Bytes] = {}  # replicas of the states of a single node, by numbers
-        self._keep_again_s = -math.inf  # by the clock of `_links`
+        self._keep_again_s = -math.inf  # time of the next kept state, by the clock of `_links`
         self._log: list[NodeCommand] = []  # commands since the state
         self.owner = np.full(len(runs) * self._num_ids, UNOWNED, dtype=np.int32)
         self.coordinator = NodeCoordinator(
@@ -282,7 +282,7 @@ class NodePool:
         self._log.pop()
 
     def move(self, zones: Zones) -> None:
-        """Move zones to other nodes; errors as of `run`."""
+        """Move zones to other nodes. Raises the errors of `run`."""
         before, self._homes = self._homes, zones
         self._is_torn, self._opened = True, None
         try:
@@ -292,7 +292,7 @@ class NodePool:
             raise
 
     def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
-        """Carry out a command, or none, and repeat it until no node is lost meanwhile."""
+        """Carry out a command, if any; recover and try again until no node is lost during it."""
         while True:
             try:
                 if self._is_torn:
@@ -312,11 +312,11 @@ class NodePool:
                 found.append(read(number, data))
         return found
 
-    def _replace_lost(self) -> bool:  # whether the worlds go back for that
+    def _replace_lost(self) -> bool:  # whether the worlds go back to the newest state
         """Let nodes that have joined in the meantime replace lost ones.
 
-        They get the zones of the newest state from the nodes that host them now. With SUMO this is
-        impossible, since no state has the commands to SUMO up to now.
+        The new nodes get the zones of the newest state from the nodes that host these zones now.
+        With SUMO this is impossible, since no state has all commands to SUMO so far.
         """
         if not self._is_native:
             return False
@@ -355,7 +355,7 @@ class NodePool:
             with reading(self.reporter):
                 near = read_neighbours(read_json(results[self.reporter], list), self._num_zones)
             self._cut = ZoneCut(command.cut, near)
-            self.coordinator.know(near)
+            self.coordinator.set_neighbours(near)
         return results
 
     def _begin_lease(self) -> dict[int, bytes]:
@@ -406,7 +406,7 @@ class NodePool:
         return None
 
     def _exchange(self, frame: NodeFrame) -> None:
-        """Send the receptions to all nodes; if a step is repeated, the same as before.
+        """Send the receptions to all nodes; in a repeated step, send the same receptions again.
 
         Raises:
             MessageError: there is no step.
@@ -440,7 +440,7 @@ class NodePool:
         """Remove a lost node, and start another one in its place.
 
         Raises:
-            WorkerError: the node had not begun, and too many were lost like that.
+            WorkerError: the node had not begun, and too many nodes were lost before they had begun.
         """
         is_silent = isinstance(lost, SilentNodeError)
         lost = lost if is_silent else self._watch.most_missed(lost)
@@ -477,7 +477,7 @@ class NodePool:
         self.owner[~np.isin(self.owner, self._living)] = UNOWNED  # the owner may be any node
         self.generation += 1
         self._cut = state.cut
-        self.coordinator.know(state.cut.neighbours)
+        self.coordinator.set_neighbours(state.cut.neighbours)
         hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)
         self.send_zones(hostings, moves, begins=False, kept=kept)
         self.commit()
@@ -487,7 +487,7 @@ class NodePool:
         self.recoveries += bool(moves.heirs or kept)
 
     def _moves(self) -> tuple[ZoneMoves, Bytes]:
-        """Return the new zones of the nodes, and the replica of the state if it is only here.
+        """Return the new zones of the nodes, and the state's replica if only this process has it.
 
         If the only node is lost, another one takes its place.
 
@@ -565,7 +565,7 @@ class NodePool:
         return results
 
     def close(self) -> None:
-        """End the nodes, unless this process is a fork of the one that started them."""
+        """End the nodes, unless this process is a fork of the process that started them."""
         if is_fork(self._pid):
             return
         self._links.end(END_S)

@@ -84,7 +84,7 @@ class NodeProgram:
         zones: hosted by this node.
     """
 
-    _replicas: StateReplicas  # after the first RECOVER
+    _replicas: StateReplicas  # set by the first RECOVER
 
     def __init__(self, system: NodeSystem, links: Links, address: str, secret: bytes) -> None:
         self.zones: tuple[int, ...] = ()
@@ -252,7 +252,7 @@ class NodeProgram:
                 frame = None
 
     def _report_missed(self, lost: LinkLostError) -> None:
-        """Report a node that cannot be reached to the coordinator, which may not notice."""
+        """Tell the coordinator, which may not have noticed, that a node cannot be reached."""
         if lost.peer == COORDINATOR:
             raise lost
         self._links.drop(lost.peer)
@@ -290,8 +290,8 @@ class NodeProgram:
         self._worlds.simulation.zones.set_zones(partition)
         self._host(zones, order["runs"], order["hostings"], frame.number)
         state, mine = order["state"], zones[self._number]
-        if order["begins"]:  # the SYNC after it confirms its arrival
-            self._peers.keep_own(self._worlds.simulation.everywhere)
+        if order["begins"]:  # the SYNC that follows the replica confirms its arrival
+            self._peers.drop_foreign_rows(self._worlds.simulation.everywhere)
             self._replicas.keep(state, self._living)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
@@ -435,7 +435,7 @@ class NodeProgram:
         return self._results.packed(peers.own, chosen, peers.stepped, of_step, self._is_reporter)
 
     def _do_alone(self, task: Task, payload: Any) -> None:
-        """Let the first node do a task, which has the whole worlds for that."""
+        """Let the first node do a task; it gets the whole worlds from the other nodes."""
         worlds, answer = self._worlds, list[Bytes]()
         with self._peers.whole(worlds.simulation):
             if self._is_first:
@@ -446,7 +446,7 @@ class NodeProgram:
 
     @property
     def _is_first(self) -> bool:
-        """Whether this node does the tasks of a single node."""
+        """True if this node does the tasks of a single node."""
         return self._number == self._living[0]
 
     def _answer(self, pieces: Sequence[Bytes]) -> None:

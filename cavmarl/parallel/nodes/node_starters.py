@@ -31,7 +31,7 @@ Route: TypeAlias = Callable[[Place], Place]
 
 
 def straight(place: Place) -> Place:
-    """Return the place itself: the route without a detour."""
+    """Return the place unchanged: the default `Route`."""
     return place
 
 
@@ -101,7 +101,7 @@ class LocalNodes:
 
     def trouble(self, begun: Collection[int]) -> str | None:
         stopped = {n for n in self.stopped() if self._processes[n].pid not in begun}
-        for number in stopped & self._seen_stopped:  # at two checks in a row
+        for number in stopped & self._seen_stopped:  # stopped at two checks in a row
             self._processes[number].kill()
             self._processes[number].wait()
         self._seen_stopped = stopped
@@ -178,7 +178,7 @@ class RayNodes:
             self._actors.trouble()
 
     def stopped(self) -> set[int]:
-        return set()  # Ray does not tell
+        return set()  # Ray does not report it
 
     def close(self) -> None:
         self._actors.close()

@@ -72,7 +72,7 @@ class NodeSupply:
 
     @property
     def is_here(self) -> bool:
-        """Whether this process has started the nodes on this machine."""
+        """True if this process has started the nodes on this machine."""
         return isinstance(self._starter, LocalNodes)
 
     def _room(self) -> int:

@@ -12,10 +12,10 @@ from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import Links, SilenceError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices
 
-LOOK_S = 0.5  # between checks; a process that is stopped at two checks is given up
+LOOK_S = 0.5  # time between checks; a process that is stopped at two checks is given up
 PONG_S = 1.0  # time for a living node to answer a PING
 MISSED_S = 0.1  # time to collect reports of lost connections
-VAIN = 5  # rounds in which all nodes answer a PING, but the command does not end
+VAIN = 5  # number of PINGs that all nodes answer before an unfinished command fails
 
 MOST_NODES = 1 << 32
 
@@ -76,10 +76,10 @@ class NodeWatch:
                     raise SilentNodeError(
                         number, MessageError("it does not answer offers")
                     ) from error
-        raise WorkerError(f"{silence}, {VAIN} times, though all nodes live") from silence
+        raise WorkerError(f"{silence}, {VAIN} times, although all nodes are alive") from silence
 
     def _wait(self, timeout_s: float, wait: Callable[[float], Found]) -> Found:
-        """Wait, and check now and then whether a process is stopped."""
+        """Wait, and check from time to time whether a process is stopped."""
         stopped: set[int] = set()
         left_s = timeout_s
         while left_s > LOOK_S:
@@ -119,7 +119,7 @@ class NodeWatch:
                 raise SilentNodeError(number, MessageError("others wait for it"))
 
     def most_missed(self, lost: LinkLostError) -> LinkLostError:
-        """Return the node that has ended, or else the one that most others cannot reach."""
+        """Return the node that has ended, or else the node that most nodes cannot reach."""
         links = self._links
         if not self._missed:  # the node has sent a bad frame
             return lost

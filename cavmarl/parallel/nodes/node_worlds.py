@@ -90,7 +90,7 @@ class NodeWorlds(CommandedWorlds):
         route: Route = straight,  # maps a place to the place that nodes of this machine call
         system: NodeSystem = MACHINE,
         start: Start = start_nodes,  # starts the nodes
-        share: WorldShare | None = None,  # part of more worlds; None: these are all worlds
+        share: WorldShare | None = None,  # part of the worlds of `NodeGroups`; None: all worlds
     ) -> None:
         config, count = world.config, world.partition.count
         nodes = 1 if share else backend.count or 1
@@ -172,7 +172,7 @@ class NodeWorlds(CommandedWorlds):
         self._network = network
 
     def _answer(self, data: memoryview) -> bytes:
-        """Return the answer of the network simulator; errors as of `answer_of`."""
+        """Return the answer of the network simulator. Raises the errors of `answer_of`."""
         latency = self.world.config.v2x.channel.latency_ticks
         return answer_of(self._network, read_request(data, len(self.arrays.mask), latency))
 
@@ -219,7 +219,7 @@ class NodeWorlds(CommandedWorlds):
     def set_worlds(
         self, arrays: StepArrays, runs: Sequence[WorldRun], saved: Sequence[bytes]
     ) -> None:
-        """Replace the worlds by saved ones; errors as of `NodePool.begin_anew`."""
+        """Replace the worlds by saved ones. Raises the errors of `NodePool.begin_anew`."""
         self._set_arrays(arrays)
         self.pool.begin_anew(runs)
         self.perform(Task.LOAD, saved)
@@ -271,7 +271,7 @@ class NodeWorlds(CommandedWorlds):
         return self.ask(task, payload)
 
     def ask(self, task: Task, payload: Any = None) -> Any:
-        """Return the answer of the first node, which has the whole worlds for that."""
+        """Return the answer of the first node, which gets the whole worlds for the task."""
         read = self._read_proposal if task == Task.PROPOSE else _ANSWERS[task]
         first = self._of_first(lambda data: read(json.loads(bytes(data))))
         return self._run(task, payload, first)[0]

@@ -31,7 +31,7 @@ class reading:
     """Context in which a frame of a peer is read and checked.
 
     Raises:
-        LinkLostError: the code inside has failed, except for the journal.
+        LinkLostError: the code inside has raised one of `FAULTS` other than a JournalError.
     """
 
     __slots__ = ("_peer",)

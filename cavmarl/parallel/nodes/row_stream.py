@@ -25,7 +25,7 @@ from cavmarl.zones.kernels.row_frames import (
     ID,
     MOST,
     NO_FRAME,
-    Both,
+    ExchangeState,
     Ghosts,
     Passing,
     pack_frame,
@@ -95,13 +95,15 @@ class RowStream:
         zoned: ZoneState,
         zones: NDArray[np.int64],  # of this node
         others: NDArray[np.int64],  # of the other one
-        running: NDArray[np.int64],  # (W,) see `Both`
-        rerouted: NDArray[np.int64],  # (W,) see `Both`
+        running: NDArray[np.int64],  # (W,) see `ExchangeState`
+        rerouted: NDArray[np.int64],  # (W,) see `ExchangeState`
         law: Forecast,
     ) -> None:
         rows, steps = words_of(zoned.rows), words_of(zoned.step)
         numbers = zoned.num_owned, zoned.num_rows, zoned.num_near
-        self._both = Both(rows, steps, zoned.step_at, *numbers, zones, others, running, rerouted)
+        self._both = ExchangeState(
+            rows, steps, zoned.step_at, *numbers, zones, others, running, rerouted
+        )
         self._row = rows.shape[-1]
         size = self._row + steps.shape[-1] + AFTER
         assert size < MOST

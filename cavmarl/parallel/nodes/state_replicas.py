@@ -2,8 +2,8 @@
 
 Now and then, between two steps, each node keeps its state, and sends a replica to the next living
 node. When a node is lost, the next one takes over its zones, and all nodes go back to the newest
-state that all of them have. They repeat the commands since then, which gives the same bytes. Zones
-that move to another node, such as a new one, do it in the same way.
+state that all of them have. They repeat the commands since then, which gives the same bytes. When
+zones move to another node, for example a new node, all nodes also go back to a kept state.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class StateReplicas:
         self._number = number
         self.own: dict[int, Bytes] = {}
         self.others: dict[int, dict[int, Bytes]] = {}
-        self._given: dict[int, NodeFrame] = {}  # by nodes that give zones away
+        self._given: dict[int, NodeFrame] = {}  # state of each node that gives zones away
         self._is_settled = True  # no state was kept since `settle`
 
     def begin_anew(self, worlds: LocalWorlds, logs: Sequence[ToldLog]) -> None:
-        """Keep states of other worlds; replicas of other nodes stay, as they may be of these."""
+        """Switch to other worlds; replicas stay, since their senders may have switched before."""
         self._worlds, self._logs = worlds, logs
         self.own.clear()
         self._given.clear()
@@ -139,7 +139,7 @@ class StateReplicas:
             self._links.wanted = (donor,)
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
-                check()  # it may receive the awaited frame
+                check()  # this call may receive the awaited frame
             self._links.wanted = ()
             with reading(donor):
                 given = self._read(self._given.pop(donor).data, like)

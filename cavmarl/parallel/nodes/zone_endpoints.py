@@ -237,7 +237,7 @@ class ZoneEndpoints:
         endpoints = self._endpoints[w].values()
         if self._began[w] or self._stirred[w] or self._gone[w] or self._births[w]:
             return False
-        if self._is_checked or self._division.changes.near(w, everybody=False):
+        if self._is_checked or self._division.changes.near(w, check_all=False):
             return False
         if any(endpoint.offers.open for endpoint in endpoints):
             return False
@@ -259,7 +259,7 @@ class ZoneEndpoints:
         kept: dict[int, int] = {}
         for vehicle, reason in gone.items():
             zone = next((z for z, e in self._endpoints[w].items() if vehicle in e.owned), None)
-            if zone is None:  # it was born during the lease
+            if zone is None:  # the vehicle was born during the lease
                 kept[vehicle] = reason
             else:
                 left.setdefault(zone, []).append(Removed(vehicle, reason))
@@ -275,10 +275,10 @@ class ZoneEndpoints:
             movers of the report, and whether vehicles without a record have crossed, too.
         """
         division, endpoints = self._division, self._endpoints[w]
-        everybody, self._stirred[w] = self._stirred[w] or began, False
+        check_all, self._stirred[w] = self._stirred[w] or began, False
         approaches: dict[int, list[Approach]] = {zone: [] for zone in endpoints}
         movers, is_late = [], False
-        for entry in division.changes.near(w, everybody):
+        for entry in division.changes.near(w, check_all):
             endpoint = endpoints.get(entry.source)
             if not entry.crossed or endpoint is None:
                 continue
@@ -320,7 +320,7 @@ class ZoneEndpoints:
                 self._send(w, answer)
 
     def _send(self, w: int, message: Message) -> None:
-        """Send a message to its zones, some of which may be here, and to the coordinator."""
+        """Send a message to its zones, in this process or others, and to the coordinator."""
         for destination in message.destinations():
             if destination in self._zones:
                 self._apply_own(w, destination, message)
@@ -371,7 +371,7 @@ class ZoneEndpoints:
             return
         if (w, vehicle) not in self._arrived_agents:
             others = {node for zone, node in enumerate(self._node_of) if zone not in self._zones}
-            self._links.wanted = others  # all but a silent node have sent their next share
+            self._links.wanted = others  # only a silent node has not sent its next share
             while (w, vehicle) not in self._arrived_agents:
                 self._links.check_recovery()
                 self._links.pump(None)

@@ -60,7 +60,7 @@ def moves_of(
     living: Collection[int],
     state: int,  # number of the state
 ) -> ZoneMoves:
-    """Give the zones of a lost node to the next node of the ring, and zones to their homes.
+    """Give the zones of a lost node to the next node of the ring; return zones to their homes.
 
     Raises:
         WorkerDeathError: the next node is lost, too.

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.extensions import HOW
 from cavmarl.parallel.network.mpi_transport import MPI
 
 LOCAL, PROCESSES, NODES, RAY = "local", "processes", "nodes", "ray"
@@ -43,12 +44,12 @@ class BackendName:
 
     @property
     def is_local(self) -> bool:
-        """Whether the worlds run in the process of the caller."""
+        """True if the worlds run in the process of the caller."""
         return self.kind == LOCAL
 
     @property
     def is_mpi(self) -> bool:
-        """Whether the nodes are the other ranks of an MPI run."""
+        """True if the nodes are the other ranks of an MPI run."""
         return self.address == MPI
 
     def is_split(self, num_worlds: int) -> bool:
@@ -91,15 +92,15 @@ def read_backend(
 
 
 def _read(backend: str, registered: Collection[str]) -> BackendName:
-    names = FORMS + "".join(f", '{name}'" for name in sorted(registered))
     if not isinstance(backend, str):
-        raise ConfigError(f"backend = {backend!r}: must be a string, one of {names}")
+        raise ConfigError(f"backend = {backend!r}: must be a string, one of {FORMS}")
     kind, colon, rest = backend.partition(":")
     count, at, where = rest.partition("@")
     if kind not in OWN and kind not in registered:
+        names = FORMS + "".join(f", '{name}'" for name in sorted(registered))
         raise ConfigError(
-            f"backend = {backend!r}: there is no backend {kind!r}; use one of {names}, or add one "
-            "with cavmarl.register_backend"
+            f"backend = {backend!r}: there is no backend {kind!r}; use one of {names}. If a module "
+            f"registers it with cavmarl.register_backend, {HOW}"
         )
     if kind == LOCAL and colon:
         raise ConfigError(f"backend = {backend!r}: 'local' has no number; use 'local'")

@@ -24,7 +24,7 @@ from cavmarl.parallel.worlds.world_errors import copy_error, network_error, orig
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
-MAX_AGENTS = 500  # in one request, since an answer is one message
+MAX_AGENTS = 500  # limit in one request, since an answer is one message
 
 log = logging.getLogger("cavmarl.workers")
 
@@ -158,7 +158,7 @@ class CommandedWorlds(ABC):
         return self._ask(task, number, number if more is None else [number, more])
 
     def _command(self, task: Task, payload: Any = None, commits: bool = True) -> None:
-        """`_send`, with the errors that worlds of this process would raise."""
+        """Call `_send`, but raise the errors that worlds of this process would raise."""
         try:
             self._send(task, payload, commits)
         except WorkerFailureError as failure:

@@ -22,15 +22,15 @@ Run = Callable[[Task, Any, bool], None]
 
 
 class Mover:
-    """Counts steps, makes new plans from time to time, and moves what they move."""
+    """Counts steps; from time to time, makes new plans and moves worlds or zones accordingly."""
 
     def __init__(
         self,
         placement: StepPlacement,  # the plans
         num_zones: int,  # of each world
         every: int,  # steps from one round to the next
-        # (W, zones) total processor time of each shard, which others add up; a whole world is one
-        # zone
+        # (W, zones) total processor time of each shard, which the workers update; a whole world is
+        # one zone
         spent_s: NDArray[np.float64],
     ) -> None:
         self._placement = placement
@@ -38,7 +38,7 @@ class Mover:
         self._every = every
         self._spent_s = spent_s
         self._steps = 0
-        self.moves = 0  # of shards, up to now
+        self.moves = 0  # number of moved shards so far
         self.moved_s = 0.0  # total duration of the moves
 
     def before_step(

@@ -35,7 +35,7 @@ class StepPlacement:
         world: World,
         num_worlds: int,
         workers: int,
-        is_here: bool = True,  # workers are on this machine; otherwise each watches its own
+        is_here: bool = True,  # workers are on this machine, not on machines of their own
     ) -> None:
         settings = world.config.workers
         self._rule = BalanceRule(
@@ -54,7 +54,7 @@ class StepPlacement:
 
     @property
     def in_row(self) -> bool:
-        """Whether workers have whole worlds with consecutive numbers."""
+        """True if workers have whole worlds with consecutive numbers."""
         return self._balancers[0].plan.problem.in_row
 
     @property

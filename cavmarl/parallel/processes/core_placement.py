@@ -20,7 +20,7 @@ def homes(
     cores: Sequence[int],  # where each process was seen
     usable: set[int],
 ) -> list[int]:  # different cores; empty if there are too few
-    """Choose a core for each process: where it was seen, unless an earlier process was there."""
+    """Choose each process's core: where it was seen, unless an earlier process was seen there."""
     free = sorted(usable - set(cores))
     found: list[int] = []
     for core in cores:
@@ -43,6 +43,6 @@ def keep_apart(
     usable = usable_cores()
     found = homes(cores, usable)
     for pid, home in zip(pids, found, strict=False):
-        # Its pool notices a death. Where this is forbidden, the system places the process.
+        # The pool notices a dead process. If this call is forbidden, the system places the process.
         with suppress(ProcessLookupError, PermissionError):
             os.sched_setaffinity(pid, usable - set(found) | {home})

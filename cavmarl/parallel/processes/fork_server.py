@@ -32,7 +32,7 @@ _ONE_THREAD = dict.fromkeys(
 def has_ended(pidfds: Iterable[int], limit_s: float | None) -> bool:
     """Wait until one of the processes has ended; return False after the limit (None: no limit).
 
-    It uses `poll`, since `select` accepts no descriptor above 1,023.
+    The function uses `poll`, since `select` accepts no descriptor above 1,023.
     """
     waiting = select.poll()
     for pidfd in pidfds:
@@ -54,7 +54,7 @@ class Process:
     mail: list[bytes] = field(default_factory=list)  # received messages that are not read yet
 
     def collect(self) -> None:
-        """Receive all messages that have come, and drop those that only wake."""
+        """Receive all messages that have come, and drop messages that only wake."""
         with suppress(BlockingIOError, ConnectionResetError):
             while self.receive():
                 pass
@@ -95,7 +95,7 @@ class ForkServer:
         self,
         program: str,  # module that the server runs, which calls `worker_loop.serve`
         start: Mapping[str, Any],  # JSON message for the server, with numbers of descriptors
-        descriptors: tuple[int, ...],  # that the server and its workers inherit
+        descriptors: tuple[int, ...],  # inherited by the server and its workers
     ) -> None:
         ours, theirs = _wires()
         start_message = {

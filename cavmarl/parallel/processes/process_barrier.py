@@ -28,17 +28,17 @@ from cavmarl.core.compiled.intrinsic import intrinsic
 
 Words = NDArray[np.int64]
 
-WORDS = 8  # of a line, which is one cache line
+WORDS = 8  # words of a line, which is one cache line
 NUMBER, ASLEEP = 0, 1  # words of this module; callers define the others
 
 SHORT_S = 20e-6  # a side polls for this time before it sleeps
-LONG_S = 200e-6  # it polls for this time, if the previous wait was not longer
-LONG_WORK_S = 500e-6  # after a longer wait, or more work, it does not poll for `LONG_S`
+LONG_S = 200e-6  # a side polls for this time if its previous wait was not longer
+LONG_WORK_S = 500e-6  # after a longer wait or more work, a side does not poll for `LONG_S`
 PAUSES = 4  # polls before it yields the core
 ROUNDS = 16  # yields before it reads the clock
 ALONE_S = 300e-6  # a side with a core of its own polls without yielding for this time
 AWAKE_S = 10e-3  # within a command, a side polls and yields for this time
-NAP_S = 100e-6  # after that, it sleeps for this time between polls
+NAP_S = 100e-6  # after `AWAKE_S`, a side sleeps for this time between polls
 WAKE = b"!"
 
 _PAUSE = {"x86_64": "llvm.x86.sse2.pause", "AMD64": "llvm.x86.sse2.pause"}.get(platform.machine())
@@ -204,7 +204,7 @@ _has, _set, look, _pass, present_core = (
 
 
 def load_kernels() -> None:
-    """Load the compiled loops, for this process and those that it forks."""
+    """Load the compiled loops, for this process and the processes that it forks."""
     words = np.zeros(WORDS, dtype=np.int64)
     _set(words, NUMBER, 1, words)
     _has(words, 1)
@@ -214,18 +214,18 @@ def load_kernels() -> None:
 
 
 def post(mine: Words, number: int) -> None:
-    """Set the number of this side; the other side must not sleep while it waits for it."""
+    """Set the number of this side; the other side must not sleep while it waits for the number."""
     _set(mine, NUMBER, number, mine)
 
 
 def wait_for(
     theirs: Words,  # (WORDS,) line of the other side
-    number: int,  # to wait for
+    number: int,  # the awaited number
     # whether the other side was last seen on another core. Then this side does not yield at first,
     # since another program could keep the core for milliseconds
     is_apart: bool = False,
 ) -> None:
-    """Wait until the other side reaches a number, which it does soon unless it is dead."""
+    """Wait until the other side reaches a number; only a dead side takes long."""
     if look(theirs, number, False):
         return
     now = time.perf_counter()
@@ -259,7 +259,7 @@ class WakeSignal:
             _pass()  # the other side may poll or wake up on this core
 
     def announce(self, number: int) -> int:
-        """Set the number of this side; return not 0 if the other side has to be woken."""
+        """Set the number of this side; the result is not 0 if the other side has to be woken."""
         return _set(self.mine, NUMBER, number, self.theirs)
 
     def wake_peer(self) -> None:
@@ -271,7 +271,7 @@ class WakeSignal:
 
     def watch(
         self,
-        number: int,  # to wait for
+        number: int,  # the awaited number
         last_s: float,  # duration of the previous wait
         work_s: float = 0.0,  # duration of the work since then
         is_soon: bool = False,  # the caller knows that it does not take long
@@ -294,7 +294,7 @@ class WakeSignal:
 
     def announce_sleep(self) -> None:
         """Mark this side as asleep before its next number: its wait will be long."""
-        self.mine[ASLEEP] = 1  # the other side sees it before or with that number
+        self.mine[ASLEEP] = 1  # the other side sees this word before or with that number
 
     def sleep(self, number: int) -> bool:
         """Mark this side as asleep; return False if the number is already there."""

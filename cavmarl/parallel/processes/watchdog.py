@@ -20,7 +20,7 @@ class Watchdog:
     def __init__(
         self,
         pid: int,
-        timeout_s: float,  # limit on the work, without times in which nothing checks
+        timeout_s: float,  # limit on the work; times without calls of `verdict` do not count
     ) -> None:
         self._pid = pid
         self._timeout_s = timeout_s
@@ -34,7 +34,7 @@ class Watchdog:
         try:
             state, spent = read_state(self._pid)
         except OSError:
-            return None  # it has ended, which its pool notices
+            return None  # the process has ended, which its pool notices
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
         is_still = state == "S"
@@ -67,7 +67,7 @@ def descendants(pid: int) -> list[int]:
     """Return the descendants of a process."""
     try:
         text = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
-    except OSError:  # it has ended, or the system cannot tell
+    except OSError:  # the process has ended, or the system cannot tell
         return []
     children = [int(word) for word in text.split()]
     return children + [one for child in children for one in descendants(child)]

@@ -48,7 +48,7 @@ MAX_TRACEBACK = 16_000  # characters of at most six bytes; a longer traceback lo
 
 
 class TeamFailedError(Exception):
-    """A worker cannot go on because another one of its team failed; that one reports why."""
+    """A worker cannot go on because another worker of its team failed, which reports the reason."""
 
 
 class Job:
@@ -72,8 +72,8 @@ class Job:
     def on_idle(self) -> None:
         """Do work that the pool does not wait for, after the answer to a command was sent.
 
-        The next command must not depend on this work: a successor may carry it out, which finds
-        only what was committed.
+        The next command must not depend on this work: a successor that only has the committed state
+        may carry out that command.
         """
 
     def before_fork(self) -> None:
@@ -130,7 +130,7 @@ def describe(error: BaseException) -> dict[str, str]:
 
 
 def send_to_pool(pool: socket.socket, what: Mapping[str, Any]) -> None:
-    """Send to the pool. If it is gone (Ctrl-C), the next read from its socket notices."""
+    """Send to the pool. If the pool is gone (Ctrl-C), the next read from its socket shows it."""
     with suppress(BrokenPipeError, ConnectionResetError):
         pool.send(json.dumps(what).encode())
 

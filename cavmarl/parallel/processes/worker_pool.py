@@ -1,10 +1,10 @@
 """`Pool`: worker processes that carry out commands together, and survive deaths of workers.
 
 Each worker has its state in its own memory, and writes an image of it after each command that
-changes it. A worker has two images: the committed one, and the one that it writes. When all workers
-have carried out a command, the pool commits it. If a worker dies before that, its successor resumes
-from the committed image and repeats the command. Commands are deterministic, so the result is the
-same.
+changes it. A worker has two images: the committed image, and the image that it writes. When all
+workers have carried out a command, the pool commits it. If a worker dies before that, its successor
+resumes from the committed image and repeats the command. Commands are deterministic, so the result
+is the same.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Pool:
     """m worker processes.
 
     Raises:
-        WorkerError: no process, or no memory.
+        WorkerError: a process cannot be started, or there is not enough memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 
@@ -103,7 +103,7 @@ class Pool:
         return self._command(self._all, task, payload, commits)
 
     def ask(self, worker: int, task: int, payload: Any = None) -> Any:
-        """Let one worker do a task that changes nothing; errors as of `run`."""
+        """Let one worker do a task that changes nothing. Raises the errors of `run`."""
         return self._command((worker,), task, payload, False)[0]
 
     def ping(self) -> None:
@@ -195,7 +195,7 @@ class Pool:
         self._note_done(first, pending)
 
     def _note_done(self, first: int, pending: list[int]) -> None:
-        """Note for deaths from a number on when the successors have finished."""
+        """Note the time in `deaths[first:]` whose successors have just finished."""
         for death in self.deaths[first:]:
             if death.worker not in pending and isnan(death.done_s):
                 death.done_s = time.monotonic()

@@ -163,7 +163,7 @@ class WorkerProcesses:
     def _fall_asleep(self, pending: Sequence[int]) -> bool:
         """Mark this side as asleep; return False if a worker has finished in the meantime."""
         self.drain_wakeups()
-        # One finished worker is enough: it has not woken this side, which was awake.
+        # A worker that finished while this side was awake has not woken it, so check each number.
         return all(self._signals[k].sleep(self.number(k)) for k in pending)
 
     def drain_wakeups(self) -> None:
@@ -179,7 +179,7 @@ class WorkerProcesses:
     def _none_has_finished(self, pending: Sequence[int]) -> bool:
         """Drain late wake-ups; return False if a worker has finished.
 
-        It is called after the workers got their command. If it drains a wake-up that belongs to
+        Call this after the workers got their command. If it drains a wake-up that belongs to
         this command, the number of that worker is already set.
         """
         for fd, _ in self._poll.poll(0):
@@ -193,7 +193,7 @@ class WorkerProcesses:
         """Wait up to a limit for a worker to finish or to die; return whether it did."""
         process = self.processes[k]
         if has_ended([process.pidfd], 0.0 if self.has(k) else limit_s):
-            self._statuses[k][NUMBER] = self.number(k)  # the worker, which writes it, is dead
+            self._statuses[k][NUMBER] = self.number(k)  # its writer, the worker, is dead
         process.collect()
         process.mail.clear()
         return self.has(k)
@@ -210,7 +210,7 @@ class WorkerProcesses:
             keep_apart([process.pid for process in self.processes.values()], cores)
 
     def answer(self, k: int) -> tuple[int, Any]:
-        """Return how the command of a worker ended, as its line says, and its answer."""
+        """Return how the command of a worker ended, read from its line, and its answer."""
         kind = self._statuses[k].item(ANSWER)
         if kind == SILENT:
             return kind, None
@@ -277,7 +277,7 @@ class WorkerProcesses:
             if process is dead.get(k):
                 continue
             self._dismiss(process)
-            if k in dead:  # the successor of a dead process is of no use, either
+            if k in dead:  # release also the successor of a dead process
                 process.release()
         old = {**self.processes, **dead}
         for team in {self._program.team_of(k) for k in old}:
@@ -383,7 +383,7 @@ class _OwnedResources:
         return segment
 
     def release(self) -> None:
-        """End the processes, unless this process is a fork of the one that started them."""
+        """End the processes, unless this process is a fork of the process that started them."""
         if os.getpid() != self._pid:
             return
         for process in self.processes.values():

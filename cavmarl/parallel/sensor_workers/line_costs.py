@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-PARTS = 32  # of a frame; lines of one part count as equally expensive
+PARTS = 32  # parts of a frame; lines of one part count as equally expensive
 
 
 class LineCosts:

@@ -37,7 +37,7 @@ NEW_COST = 0.5  # weight of new costs after that; the first measurements suffer 
 class SensorWorkerPlan(NamedTuple):
     """What is needed to start sensor workers."""
 
-    module: str  # their program
+    module: str  # program of the workers
     message: Mapping[str, Any]  # for the program; the descriptors of shared memory are added
     frames: Segment  # memory of the samples, closed together with the workers
     shape: SceneShape
@@ -55,7 +55,7 @@ class SensorWorkerTimes:
     busy_s: float = 0.0  # part of `wait_s` in which the busiest worker sensed
     ticks: int = 0
     sent_bytes: int = 0  # written for the workers
-    got_bytes: int = 0  # of frames written by the workers
+    got_bytes: int = 0  # size of the frames written by the workers
     messages: int = 0  # commands and answers
 
     def since(self, before: SensorWorkerTimes) -> SensorWorkerTimes:
@@ -85,12 +85,12 @@ class _Sharing:
 
     @property
     def is_settled(self) -> bool:
-        """Whether there are enough measurements to keep the shares for long."""
+        """True if there are enough measurements to keep the shares for long."""
         return self.uses >= SHARED_ANEW
 
     @property
     def is_over(self) -> bool:
-        """Whether it is time to evaluate the measurements."""
+        """True if it is time to evaluate the measurements."""
         often = self.uses % SHARED_ANEW == 0 if self.is_settled else self.uses.bit_count() == 1
         return often and self.agents > 0
 

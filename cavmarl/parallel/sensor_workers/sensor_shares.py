@@ -1,7 +1,7 @@
 """Distribution of sensing over sensor workers: round robin, or by cost.
 
-A unit is one sensor of some agents. Agents of one sensor cost about the same, so many agents form a
-unit. By cost, frames are divided as well if whole frames overload a worker: then several workers
+A unit is one sensor of some agents. Agents of one sensor cost about the same, so a unit has many
+agents. By cost, frames are divided as well if whole frames overload a worker: then several workers
 write lines of the same frames.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.assignment import workers_of
-from cavmarl.balance.initial_placement import spread
+from cavmarl.balance.initial_placement import assign_longest_first
 from cavmarl.balance.load_snapshot import idle_snapshot
 from cavmarl.balance.local_search import refine
 from cavmarl.balance.problem import Problem, ShardCost
@@ -25,7 +25,7 @@ from cavmarl.balance.shard_placement import Placement
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 
 PIECES_PER_WORKER = 4  # units of one sensor, if there are enough agents
-MIN_GAIN_S = 2e-4  # to divide frames, since two workers then look up the same surroundings
+MIN_GAIN_S = 2e-4  # smaller gains do not pay for looking up the same surroundings in two workers
 
 
 class Unit(NamedTuple):
@@ -57,7 +57,7 @@ class Shares:
 
     @property
     def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
-        """Worker and lines of each part of the sensors that are divided equally for all agents.
+        """For each sensor divided in the same way for all agents: worker and lines of each part.
 
         For other sensors, the time of a worker cannot be attributed to lines.
         """
@@ -107,7 +107,7 @@ def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int)
     problem = Problem(shards, alone, idle_snapshot(min(workers, len(units))))
     hosts, _ = workers_of(problem)
     nowhere = Placement(problem, hosts, [-1] * len(units))
-    placed = refine(spread(nowhere, [[number] for number in range(len(units))]))
+    placed = refine(assign_longest_first(nowhere, [[number] for number in range(len(units))]))
     return Shares(tuple(units), tuple(placed.homes), tuple(costs_s), workers)
 
 
@@ -134,7 +134,7 @@ def divide(shares: Shares, costs: LineCosts) -> Shares:
             home == taker and other[:3] == unit[:3]
             for other, home in zip(units, homes, strict=True)
         ):
-            break  # a worker writes a single range of lines of a frame
+            break  # the taker already writes a range of these frames, and can write only one
         before = costs.part(unit.sensor, 0, unit.end)
         within = costs.part(unit.sensor, unit.begin, unit.end)
         line = costs.line_at(unit.sensor, before - within * wanted_s / cost_s)

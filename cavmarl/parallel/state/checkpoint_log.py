@@ -1,8 +1,8 @@
 """`CheckpointLog`: an occasional image of worlds, and the commands of the steps after it.
 
-To write an image takes a tenth of a step; for ten thousand vehicles it takes half a tick that
-several workers share. A step follows from the state and the commands, so a successor may resume
-from an older image and repeat the steps after it.
+Writing an image takes a tenth of a step; for ten thousand vehicles, it takes half as long as a
+tick that several workers share. A step follows from the state and the commands, so a successor may
+resume from an older image and repeat the steps after it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class CheckpointLog:
 
     @property
     def is_full(self) -> bool:
-        """Whether there is no room for another step."""
+        """True if there is no room for another step."""
         return len(self) == STEPS
 
     def note(self, commands: Commands) -> None:

@@ -28,7 +28,7 @@ def to_bytes(arrays: Sequence[Array]) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
-    """Return the header of an array in a NumPy file. It is cached, since it is slow to make."""
+    """Return the header of an array in a NumPy file. Making a header is slow, so it is cached."""
     file, format_of = BytesIO(), np.lib.format
     descr = format_of.dtype_to_descr(dtype)
     format_of.write_array_header_1_0(file, {"descr": descr, "fortran_order": False, "shape": shape})

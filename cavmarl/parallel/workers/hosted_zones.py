@@ -23,7 +23,7 @@ class HostedZones:
         self,
         shards: Sequence[Shard],  # of all zones of the world
         zones: Sequence[int],  # hosted here, maybe none
-        # (k,) where the processor time of each zone is added up; None: not measured
+        # (k,) total processor time of each zone, updated; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self._all = shards
@@ -36,15 +36,15 @@ class HostedZones:
         self._shards = [self._all[zone] for zone in sorted(zones)]
         self._together = [ShardGroup(self._shards)] if self._shards else []
         self._alone: list[ShardGroup] = []
-        self._untimed = -1  # tick whose run prepares the timed groups
-        self._sides: tuple[int, int] | None = None  # that the shards face, if known
+        self._untimed = -1  # tick in which the timed groups were made, whose time does not count
+        self._sides: tuple[int, int] | None = None  # of the shards, if known
 
-    def face(self, side: int, next_side: int) -> None:
+    def set_sides(self, side: int, next_side: int) -> None:
         """Set the sides of the present and the next rows, as another process announced them."""
         if self._sides != (side, next_side):
             self._sides = side, next_side
             for shard in self._shards:
-                shard.face(side, next_side)
+                shard.set_sides(side, next_side)
 
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
         """Run a phase on the zones of this worker."""
@@ -61,7 +61,7 @@ class HostedZones:
         """Run a phase zone by zone; the time counts for all ticks until the next timed one."""
         if not self._alone:
             self._alone = [ShardGroup([shard]) for shard in self._shards]
-            self._untimed = self._ticks  # this tick also loads what the later ones use
+            self._untimed = self._ticks  # the first run of new groups also loads their kernels
         for shard, group in zip(self._shards, self._alone, strict=True):
             began_ns = time.thread_time_ns()
             phase.run(group, arguments)

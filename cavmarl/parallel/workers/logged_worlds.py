@@ -81,7 +81,7 @@ class LoggedWorlds(WorkerWorlds):
 
     @property
     def _is_full(self) -> bool:
-        """Whether the log has to restart with the next step."""
+        """True if the log has to restart with the next step."""
         return self._log.is_full or self._repeat_s > MAX_REPEAT_S
 
     def _restart_log(self, is_prepared: bool = False) -> None:

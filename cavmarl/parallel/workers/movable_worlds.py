@@ -1,10 +1,10 @@
 """`MovableWorlds`: worlds of a worker that may move to other workers.
 
 Worlds move between two commands. A worker that gives worlds away writes them to its outbox, which
-all workers can read (PACK). Then each worker restarts with the worlds that it has kept and with
-those that it finds in the outboxes of others (UNPACK). Both tasks give the same result if they are
-repeated, so a worker that dies meanwhile is replaced as usual. The bounds that say where the worlds
-are belong to the committed state.
+all workers can read (PACK). Then each worker restarts with the worlds that it has kept and with its
+new worlds, which it finds in the outboxes of other workers (UNPACK). Both tasks give the same
+result if they are repeated, so a worker that dies meanwhile is replaced as usual. The bounds that
+say where the worlds are belong to the committed state.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MakeWorlds = Callable[[int, int], LocalWorlds]
 
 
 class MovableWorlds(WorkerWorlds):
-    """Worlds with consecutive numbers, which may become others."""
+    """Worlds with consecutive numbers, which may be replaced by other worlds between commands."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class MovableWorlds(WorkerWorlds):
         bounds: Sequence[int],  # first world of each worker, and the number of worlds
         number: int,  # of this worker
         outboxes: Sequence[Image],  # of all workers
-        spent_s: NDArray[np.float64],  # (W,) where the processor time of each world is added up
+        spent_s: NDArray[np.float64],  # (W,) total processor time of each world, updated
     ) -> None:
         self._make = make
         self._number = number

@@ -64,7 +64,7 @@ class PooledWorlds(CommandedWorlds):
             refuse_journal(
                 config.zones,
                 "with workers.balance_steps and zones.repartition_steps: worlds move between "
-                "workers, each of which repartitions its own worlds",
+                "workers, but each worker repartitions its own worlds",
                 "leave workers.balance_steps or zones.repartition_steps 0",
             )
         _warn_of_few_cores(workers)

@@ -57,9 +57,9 @@ class Team:
         self,
         shards: Sequence[Shard],  # one per zone, in the order of zones; their arrays are shared
         zones: Sequence[Sequence[int]],  # initial zones of each worker; the first worker leads
-        # arguments of shared phases: all that a phase may be called with, with shared arrays
+        # every tuple of arguments that each shared phase may get; its arrays are shared
         known: Mapping[Phase, Sequence[tuple[Any, ...]]],
-        # (k,) where the processor time of each zone is added up; None: not measured
+        # (k,) total processor time of each zone, updated; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self.known = {phase: tuple(known.get(phase, ((),))) for phase in SHARED}
@@ -129,7 +129,7 @@ class TeamLeader(PhaseExecutor):
         rule = phase.value
         which = self._which(phase, arguments)
         if (which < 0 and not rule.is_early) or rule.is_late:
-            self.meet()
+            self.finish_phase()
         if which < 0:
             phase.run(self._all_zones, arguments)
             return
@@ -138,11 +138,11 @@ class TeamLeader(PhaseExecutor):
         self._own.run(phase, arguments)
         if rule.is_late:
             return
-        self.meet()
+        self.finish_phase()
         if phase is self._last:
             self._dismiss()
 
-    def meet(self) -> None:
+    def finish_phase(self) -> None:
         """Wait until the members have run the phase that was announced last, if any."""
         if not self._is_ahead:
             return
@@ -153,7 +153,7 @@ class TeamLeader(PhaseExecutor):
                 raise TeamFailedError
 
     def _which(self, phase: Phase, arguments: tuple[Any, ...]) -> int:
-        """Return the index of the arguments among those that members know.
+        """Return the index of the arguments in the list that members know.
 
         -1: the members do not know the arguments, or wait for no phase.
         """
@@ -228,5 +228,5 @@ class TeamMember:
 
     def _run(self, phase: Phase, call: int) -> None:
         self._leave_shared_core()
-        self._own.face(call >> 1 & 1, call & 1)
+        self._own.set_sides(call >> 1 & 1, call & 1)
         self._own.run(phase, self._known[phase][call >> 16])

@@ -35,7 +35,7 @@ class LedTeam:
         kept: WorkerWorlds,  # of one world, whose shards write shared memory
         zones: Sequence[Sequence[int]],  # initial zones of each worker, those of the leader first
         repeated: Sequence[Commands],  # commands that the steps of a checkpoint log may have
-        # (k,) where the processor time of each zone is added up; None: not measured
+        # (k,) total processor time of each zone, updated; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self._kept = kept

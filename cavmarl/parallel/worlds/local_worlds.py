@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import specialized
-from cavmarl.core.errors import ConfigError
-from cavmarl.core.extensions import extension_modules, load_extensions
+from cavmarl.core.errors import ConfigError, WorkerError
+from cavmarl.core.extensions import extension_modules, load_plugins
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_continuation
@@ -148,7 +148,7 @@ class LocalWorlds:
         )
 
     def _end(self, over: NDArray[np.bool_], some_over: bool) -> None:
-        """Keep the last observations of what has ended, and start new episodes."""
+        """Keep the last observations of ended agents and episodes, and start new episodes."""
         arrays = self.arrays
         self._keep_observations()
         if arrays.frames:
@@ -239,7 +239,7 @@ class LocalWorlds:
         return [self._steps, self._waiting, *self.simulation.save()]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Resume from what `save` returned; errors as of `Simulation.load`."""
+        """Resume from the result of `save`. Raises the errors of `Simulation.load`."""
         self._check_own(saved)
         self.simulation.load(saved[2:])
         self._steps[:], self._waiting[:] = saved[:2]
@@ -276,7 +276,7 @@ class LocalWorlds:
             )
         saved = [array.copy() for array in self.save()]
         shown = [array.copy() for array in every_array(self.arrays)]
-        modules = extension_modules(config.registered)
+        modules = extension_modules(config.registered, config.plugins)
         return _made_again, (modules, without_journals(self.world), self.in_next_step, saved, shown)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> LocalWorlds:
@@ -296,7 +296,7 @@ class LocalWorlds:
         )
 
     def connect_network(self, network: NetworkSimulator) -> None:
-        """Let a network simulator decide receptions; errors as of `Bus.connect`."""
+        """Let a network simulator decide receptions. Raises the errors of `Bus.connect`."""
         self.simulation.messages.connect(network)
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
@@ -389,7 +389,7 @@ def _made_again(
     saved: list[NDArray[Any]],
     shown: list[NDArray[Any]],
 ) -> LocalWorlds:
-    load_extensions(modules)
+    load_plugins(modules, WorkerError)
     worlds = LocalWorlds(world, len(saved[0]), in_next_step=in_next_step)
     worlds.load(saved)
     for array, before in zip(every_array(worlds.arrays), shown, strict=True):
@@ -398,7 +398,7 @@ def _made_again(
 
 
 def kept_elsewhere(config: EnvConfig) -> str:
-    """Return a key that gives the worlds state outside of their arrays; empty: there is none."""
+    """Return a configuration key whose value puts state outside of the arrays; empty: none does."""
     kept = {
         "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
         "workers.sensors": config.workers.sensors,

@@ -40,7 +40,7 @@ class StepArrays(NamedTuple):
     mask: NDArray[np.bool_]  # (W, A) agents that act next
     terms: NDArray[np.float32]  # (W, A, T)
     arrivals: NDArray[np.int64]  # (W,) since each world's reset
-    ticks: NDArray[np.int64]  # (W,) the same
+    ticks: NDArray[np.int64]  # (W,) since each world's reset
     episode_over: NDArray[np.bool_]  # (W,) worlds that were reset, or will be in the next step
     chosen: NDArray[np.bool_]  # (W,) worlds to reset
     controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next three
@@ -114,7 +114,7 @@ class SteppedWorlds(Protocol):
 
     world: World
     arrays: StepArrays  # inputs and outputs of a step
-    in_next_step: bool  # a new episode starts in the step after the one that ended the last one
+    in_next_step: bool  # a new episode starts one step after the last episode has ended
 
     @property
     def simulation(self) -> Simulation:

@@ -52,7 +52,7 @@ class WorldTask(NamedTuple):
     write: Callable[[Any], Any] = lambda found: found
 
     def perform(self, worlds: LocalWorlds, payload: Any, first: int = 0) -> Any:
-        """Do the task with worlds, the first of which has the number `first`."""
+        """Do the task with worlds, numbered from `first` on."""
         return self.write(self.method(worlds, **self.read(payload, first)))
 
 

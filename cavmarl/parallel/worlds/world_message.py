@@ -9,7 +9,7 @@ from typing import Any
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
-from cavmarl.core.extensions import extension_modules, load_extensions
+from cavmarl.core.extensions import extension_modules, load_plugins
 from cavmarl.engine.world_setup import World, make_world
 
 CHANGED = "have changed while workers started: try again"
@@ -19,7 +19,7 @@ def make_world_message(world: World, base_dir: Path, **more: Any) -> dict[str, A
     """Return the message of a world, a JSON value, with further entries."""
     return {
         "config": asdict(world.config),
-        "extensions": extension_modules(world.config.registered),
+        "extensions": extension_modules(world.config.registered, world.config.plugins),
         "base_dir": str(base_dir.resolve()),
         "fingerprint": fingerprint(world),
         **more,
@@ -39,7 +39,7 @@ def world_of(message: Mapping[str, Any], trouble: str = "") -> World:
     """
     from cavmarl.config.io import validate  # pydantic is slow to import
 
-    load_extensions(message["extensions"])
+    load_plugins(message["extensions"], WorkerError)
     config = validate(EnvConfig, message["config"], "the environment")
     world = make_world(config, Path(message["base_dir"]))
     if trouble and fingerprint(world) != message["fingerprint"]:

@@ -1,6 +1,6 @@
 """Activation functions in float32, built from IEEE additions, multiplications and divisions only.
 
-Library functions such as `tanhf` differ between processors. These do not.
+Library functions such as `tanhf` differ between processors. The functions here do not.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ HALF = np.float32(0.5)
 ONE = np.float32(1.0)
 
 # tanh(x) ≈ x · P(x²) / Q(x²): a minimax fit of the relative error, which is below 3e-8 before
-# rounding. All coefficients are positive, so no sum cancels. Beyond the end, where the quotient is
-# exactly 1, the exact value rounds to ±1.
+# rounding. All coefficients are positive, so no sum cancels. At TANH_END the quotient is exactly 1;
+# beyond it, the exact value rounds to ±1.
 TANH_END = np.float32(9.015)
 _P1 = np.float32(0.13380328)  # P0 and Q0 are 1
 _P2 = np.float32(0.0034947577)

@@ -24,6 +24,7 @@ from cavmarl.core.records.codes import (
     EVENT_RED_LIGHT,
     EVENT_WRONG_WAY,
 )
+from cavmarl.driving.kernels.lanes.route_following import free_speed
 
 NUM_TERMS = 10
 TTC_HORIZON_S = 4.0  # longer times to collision do not count
@@ -35,7 +36,8 @@ CIRCLE_MARGIN_M = 0.01  # margin around two circles that do not touch; larger th
 def _progress(row: np.void, step_s: float) -> float:
     """Return the progress towards the goal in m.
 
-    After a wrong turn the new way may be much longer; the loss is limited to that of driving back.
+    After a wrong turn the new way may be much longer, so progress and loss are limited to twice the
+    distance at the present speed (at least 1 m/s).
     """
     if row["step_to_go"] == math.inf:
         return 0.0  # before the step, no way led to the goal
@@ -44,15 +46,9 @@ def _progress(row: np.void, step_s: float) -> float:
 
 
 @kernel
-def _of_limit(roads: RoadArrays, row: np.void) -> float:
-    ratio: float = row["speed"] / roads.lanes[row["lane"]]["speed_mps"]
-    return ratio
-
-
-@kernel
 def _speed(roads: RoadArrays, row: np.void) -> float:
     """Return the speed above the lane's limit as a share of it; `delay` covers lower speeds."""
-    return max(_of_limit(roads, row) - 1.0, 0.0)
+    return float(max(row["speed"] / roads.lanes[row["lane"]]["speed_mps"] - 1.0, 0.0))
 
 
 @kernel
@@ -123,9 +119,10 @@ def _event(row: np.void, bit: int) -> float:
 
 
 @kernel
-def _delay(roads: RoadArrays, row: np.void, step_s: float) -> float:
-    """Return the time lost in s compared with driving at the limit."""
-    return step_s * max(1.0 - _of_limit(roads, row), 0.0)
+def _delay(roads: RoadArrays, kind: np.void, row: np.void, step_s: float) -> float:
+    """Return the time lost in s compared with driving at the limit, or at the type's top speed."""
+    free_mps = free_speed(roads.lanes[row["lane"]], kind, 1.0)
+    return float(step_s * max(1.0 - row["speed"] / free_mps, 0.0))
 
 
 @kernel
@@ -133,6 +130,7 @@ def write_terms(
     roads: RoadArrays,
     rows: NDArray[np.void],  # VEHICLE (C,) at the end of the step
     i: int,  # row of the agent's vehicle
+    kind: np.void,  # its VTYPE
     grid: Grid,  # filled from these rows
     step_s: float,  # duration of a step in s
     out: NDArray[np.float32],  # (NUM_TERMS,) in the order of `config.terms.TERMS`
@@ -147,4 +145,4 @@ def write_terms(
     out[6] = _event(row, EVENT_WRONG_WAY)
     out[7] = _event(row, EVENT_RED_LIGHT)
     out[8] = _event(row, EVENT_ARRIVED)
-    out[9] = _delay(roads, row, step_s)
+    out[9] = _delay(roads, kind, row, step_s)

@@ -16,7 +16,7 @@ from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
 from cavmarl.core.records import record
 
 WALL = record(
-    ("ax", np.float64),  # its ends, m
+    ("ax", np.float64),  # end points a and b, m
     ("ay", np.float64),
     ("bx", np.float64),
     ("by", np.float64),
@@ -28,13 +28,13 @@ WALL = record(
 class Backdrop(NamedTuple):
     """The static objects of a map in its frame, and the semantic classes of vehicle types.
 
-    Objects are sorted by the cells of their centres; an index has only `start`, their counts, and
-    `largest`, half of the largest extent.
+    Objects are sorted by the cells of their centres. Their indices have only `start`, and `largest`
+    as half of the largest extent. Corners of a strip: right start, left start, left end, right end.
     """
 
     semantics: NDArray[np.uint8]  # (num_types,) semantic class of each VTYPE row
-    strips: NDArray[np.float64]  # (num_strips, 4, 2) pieces of lanes: right and left start, left
-    lined: NDArray[np.float64]  # and right end; (num_strips,) 1: its sides are lane lines
+    strips: NDArray[np.float64]  # (num_strips, 4, 2) corners of pieces of lanes
+    lined: NDArray[np.float64]  # (num_strips,) 1: the sides of the strip are lane lines
     strip_index: Grid
     walls: NDArray[np.void]  # WALL (num_walls,)
     wall_index: Grid
@@ -111,7 +111,7 @@ def gather_quads(
         corners: (num_quads, 4, 2) in the frame of the map.
         values: (num_quads,) an attribute of each quad.
         index: index of the quads by their centres; `largest` is the largest half diagonal.
-        reach_m: all quads are found that have a part within this distance.
+        reach_m: all quads with a part within this distance are found.
         out_corners: (num_quads, 4, 2) in the vehicle's frame, overwritten.
         out_values: (num_quads,) attributes of the found quads, overwritten.
 

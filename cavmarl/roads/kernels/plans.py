@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
 
-LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a long lane, in travel time, s;
-LANE_CHANGE_M = 250.0  # it doubles on a lane of this length, which is hardly enough for a change
+LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a very long lane, as travel time in s
+LANE_CHANGE_M = 250.0  # the cost doubles on a lane of this length: drivers can barely change there
 LEAST_CHANGE_M = 9.0  # on shorter lanes, vehicles hardly change: a change always has its full cost
 TURNAROUND = ord("t")
 
@@ -46,6 +47,17 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
         if roads.links[link]["next_lane"] == lane and _is_allowed(roads, link):
             return True
     return False
+
+
+@inlined_kernel
+def is_barred(roads: RoadArrays, lane: int, side: int, permission: int) -> bool:
+    """Return whether a solid line bars vehicles from a lane change; side: 1 left, -1 right.
+
+    `permission`: bits of LANE["permissions"]; one that is not barred is enough.
+    """
+    barred = roads.lanes[lane]["permissions"] >> (NO_CHANGE_LEFT if side > 0 else NO_CHANGE_RIGHT)
+    every: bool = (barred & permission) == permission
+    return every
 
 
 @kernel
@@ -89,6 +101,7 @@ def _settle(
     roads: RoadArrays,
     lane: int,
     goal_edge: int,
+    permission: int,
     change_weight: float,
     cost: NDArray[np.float64],
     plan: NDArray[np.void],
@@ -108,11 +121,19 @@ def _settle(
     change = 0
     beside = -1
     sideways = change_cost(roads, lane, change_weight)
-    if row["left"] >= 0 and cost[row["left"]] + sideways < best:
+    if (
+        row["left"] >= 0
+        and cost[row["left"]] + sideways < best
+        and not is_barred(roads, lane, 1, permission)
+    ):
         best = cost[row["left"]] + sideways
         change = 1
         beside = row["left"]
-    if row["right"] >= 0 and cost[row["right"]] + sideways < best:
+    if (
+        row["right"] >= 0
+        and cost[row["right"]] + sideways < best
+        and not is_barred(roads, lane, -1, permission)
+    ):
         change = -1
         beside = row["right"]
     step["change"] = change
@@ -134,7 +155,7 @@ class _Search(NamedTuple):
 
     cost: NDArray[np.float64]  # (L,) cost of the cheapest known way, s
     heap: NDArray[np.int32]  # (L,) lanes that are reached and not settled
-    place: NDArray[np.int32]  # (L,) index of a lane in the heap; `_UNSEEN`, or `_SETTLED`
+    place: NDArray[np.int32]  # (L,) index of a lane in the heap, `_UNSEEN`, or `_SETTLED`
 
 
 _UNSEEN, _SETTLED = -1, -2
@@ -163,7 +184,7 @@ def _put_up(search: _Search, lane: int, at: int) -> None:
 
 @kernel
 def _put_down(search: _Search, lane: int, size: int) -> None:
-    """Move a lane down in a heap of some size whose first place is empty."""
+    """Insert a lane at the empty root of a heap, and move it down; `size` includes the lane."""
     at = 0
     while True:
         below = 2 * at + 1
@@ -196,7 +217,7 @@ def _offer(search: _Search, lane: int, cost: float, size: int) -> int:
 
 @kernel
 def _take_first(search: _Search, size: int) -> int:
-    """Remove the cheapest lane from a heap of some size, and settle it."""
+    """Remove the cheapest lane from a heap of `size` lanes, and mark it as settled."""
     first = search.heap[0]
     if size > 1:
         _put_down(search, search.heap[size - 1], size - 1)
@@ -233,15 +254,20 @@ def _search_plan(
         lane = _take_first(search, size)
         size -= 1
         here = search.cost[lane]
-        _settle(roads, lane, goal_edge, change_weight, search.cost, plan)
+        _settle(roads, lane, goal_edge, permission, change_weight, search.cost, plan)
         row = roads.lanes[lane]
         for k in range(row["first_into"], row["first_into"] + row["num_into"]):
             before = roads.into[k]
             other = roads.lanes[before]
             if other["permissions"] & permission and _leads_to(roads, before, lane):
                 size = _offer(search, before, here + other["length_m"] / other["speed_mps"], size)
-        for beside in (row["left"], row["right"]):
-            if beside >= 0 and roads.lanes[beside]["permissions"] & permission:
+        for side in (1, -1):
+            beside = row["left"] if side > 0 else row["right"]
+            if (
+                beside >= 0
+                and roads.lanes[beside]["permissions"] & permission
+                and not is_barred(roads, beside, -side, permission)
+            ):
                 reached = here + change_cost(roads, beside, change_weight)
                 size = _offer(search, beside, reached, size)
 
@@ -254,8 +280,8 @@ def plan_goal(
     Args:
         roads: the road arrays.
         goal_edge: EDGE row to reach.
-        change_weight: multiple of the usual cost of lane changes. If it is large, plans change
-            lanes only if there is no other way.
+        change_weight: factor on the cost of lane changes. If it is large, plans change lanes only
+            where the goal cannot be reached otherwise.
         permission: bit of LANE["permissions"] that a lane needs.
         plan: PLAN records (L,), overwritten. Lanes from which the goal cannot be reached get
             to_go = inf and next = -1.

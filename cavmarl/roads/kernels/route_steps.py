@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.roads.kernels.plans import change_cost
+from cavmarl.roads.kernels.plans import change_cost, is_barred
 
 
 @kernel
@@ -24,8 +24,8 @@ def plan_route(
     """Fill the steps of one route, edge after edge.
 
     The steps of an edge's lanes are contiguous. A vehicle's "way" on the edge is the index of the
-    first step minus the edge's first lane. Costs are as in `kernels.plans`, but only over the
-    route.
+    first step minus the edge's first lane. Costs are computed as in `kernels.plans`, but only along
+    the route.
 
     Args:
         roads: the road arrays.
@@ -61,7 +61,7 @@ def plan_route(
                 cost[way + lane] = roads.lanes[lane]["length_m"] / roads.lanes[lane]["speed_mps"]
             else:
                 _go_through(roads, lane, way, edges[n + 1], way_after, steps, cost)
-        # Changes are propagated over the lanes of an edge, from the kerb inwards and back again.
+        # Propagate lane changes over the lanes of an edge, from the kerb inwards and back again.
         for lane in range(first + 1, first + edge["num_lanes"]):
             _go_sideways(roads, lane, lane - 1, permission, way, steps, cost)
         for lane in range(first + edge["num_lanes"] - 2, first - 1, -1):
@@ -92,7 +92,7 @@ def _go_through(
     steps: NDArray[np.void],
     cost: NDArray[np.float64],
 ) -> None:
-    """Take the cheapest link from a lane to the next edge of the route, if there is one."""
+    """Write the step over the cheapest link from a lane to the route's next edge, if any."""
     row = roads.lanes[lane]
     for link in range(row["first_link"], row["first_link"] + row["num_links"]):
         target = roads.links[link]
@@ -121,10 +121,12 @@ def _go_sideways(
     steps: NDArray[np.void],
     cost: NDArray[np.float64],
 ) -> None:
-    """Change to the lane beside if that is cheaper than the present step."""
+    """Write the step to the adjacent lane if that is cheaper than the present step."""
     row = roads.lanes[lane]
     side = int(row["left"] == beside) - int(row["right"] == beside)
     if side == 0 or not row["permissions"] & permission:
+        return
+    if is_barred(roads, lane, side, permission):
         return
     reached = cost[way + beside] + change_cost(roads, lane, 1.0)
     if reached < cost[way + lane]:
@@ -148,7 +150,7 @@ def trace_edges(
 
     `plan`: PLAN (L,) of one goal. `out`: memory for EDGE rows, including the first edge.
 
-    Returns the number of edges, 0 if the plan has no way, -1 if `out` is too short.
+    Returns the number of edges; 0 if the goal cannot be reached, -1 if `out` is too short.
     """
     edge = roads.edges[first_edge]
     lane = -1
@@ -170,7 +172,7 @@ def follow_plan(
     `plan`: PLAN (L,) of one goal, with a way from that lane. `lane`: LANE row outside junctions.
     `out`: memory for EDGE rows, including that of the lane.
 
-    Returns the number of edges, -1 if `out` is too short.
+    Returns the number of edges; -1 if `out` is too short.
     """
     out[0] = roads.lanes[lane]["edge"]
     found = 1
@@ -194,7 +196,7 @@ def follow_plan(
 @kernel
 def _time_of(roads: RoadArrays, plan: NDArray[np.void], lane: int) -> float:
     """Return the time in s from the start of a lane to the end of a plan, without lane changes."""
-    total = 0.0
+    total: float = 0.0
     while True:
         step = plan[lane]
         if step["change"] > 0:

@@ -1,9 +1,9 @@
 """Signals: the present phase of fixed-time programs and of actuated programs.
 
-A fixed-time program is a function of the tick. An actuated program is SUMO's gap-based control: a
-green phase is prolonged while vehicles follow one another over its detectors, up to its maximum
-duration. Its times are whole milliseconds, like SUMO's. Its state belongs to the world: the phase,
-its beginning, the time of the next check, and when each detector was last occupied.
+The phase of a fixed-time program is a function of the tick. An actuated program is SUMO's gap-based
+control: a green phase is prolonged while vehicles follow one another over its detectors, up to its
+maximum duration. Its times are whole milliseconds, as in SUMO. Its state is part of the world: the
+phase, its beginning, the time of the next check, and when each detector was last occupied.
 
 Sources: SUMO's documentation, Simulation/Traffic Lights ("actuated"), and the behaviour of libsumo
     1.28.
@@ -24,7 +24,7 @@ from cavmarl.roads.kernels.map_choice import map_of
 # Maximum distance from a detector to the centre of a vehicle that is on it or left it in this tick.
 DETECTOR_REACH_M = 30.0
 
-SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and checks no sooner after a switch
+SECOND_MS = 1000  # SUMO prolongs phases to whole seconds; the least time from a switch to a check
 
 
 @kernel
@@ -39,7 +39,7 @@ def detect(
 ) -> None:
     """Record when vehicles were on the detectors: now, or when their rear left in this tick.
 
-    The latest time counts, so the result depends neither on the order of rows nor on their owners.
+    The latest time is kept, so the result depends neither on the order of rows nor on their owners.
 
     `lane_place`: (L,) see `RoadArrays`. `places`: PLACE (num_places,). `rows`: VEHICLE (W, C), the
     committed rows of the tick. `num_owned`: (W,) number of rows to check. `detected_s`: (W, D),
@@ -47,7 +47,7 @@ def detect(
     """
     for w in range(ticks.size):
         if ticks[w] == 0:
-            # As in SUMO, the start of the episode counts as the time of a vehicle.
+            # As in SUMO, every detector counts as occupied at the start of the episode.
             detected_s[w] = 0.0
         for i in range(num_owned[w]):
             row = rows[w, i]
@@ -72,7 +72,7 @@ def switch_signals(
     controllers: NDArray[np.void],
     signal_phase: NDArray[np.int32],
 ) -> None:
-    """Set every signal to the worlds' present ticks; repeated calls change nothing.
+    """Set every signal to its phase at the worlds' present ticks; repeated calls change nothing.
 
     Signals of maps that a world does not use show their first phase.
 
@@ -192,7 +192,7 @@ def _check(
     if phase["green"] and lasted < phase["max_ms"]:
         gap = _gap(roads, phase, detected_s, now_ms)
     if gap < math.inf:
-        # Until the last vehicle has driven from its detector to the stop line.
+        # Prolong the phase until the last vehicle has driven from its detector to the stop line.
         more = max(phase["min_ms"] - lasted, _milliseconds(detector_gap_s - gap), 1)
         if more % SECOND_MS != 0:
             more = ((more + lasted) // SECOND_MS + 1) * SECOND_MS - lasted
@@ -206,7 +206,7 @@ def _check(
 
 @kernel
 def _gap(roads: RoadArrays, phase: np.void, detected_s: NDArray[np.float64], now_ms: int) -> float:
-    """Return the time in s since a phase's detectors were occupied; inf if above their gaps."""
+    """Return the time in s since a detector of a phase was occupied; inf above its maximum gap."""
     gap = math.inf
     for k in range(phase["first_detector"], phase["first_detector"] + phase["num_detectors"]):
         detector = roads.phase_detectors[k]

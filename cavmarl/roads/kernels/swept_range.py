@@ -21,14 +21,14 @@ def swept_range(
     level_m: float,
     foes: bool,
 ) -> tuple[float, float, float, float]:
-    """Return the first and last position of each centre at which two bodies touch, or inf first.
+    """Return the first and last position of each centre at which two bodies touch; inf first: none.
 
     Args:
         mine: (n, 6) positions on a path: distance of the centre from the stop line, x, y, z, and
             cosine and sine of the body's heading.
         theirs: (m, 6) the same for the other path.
-        own: half length and half width of the body in m, the length of its path, and the start and
-            end on it of the area that a conflict protects; the last two are read if `foes`.
+        own: half length and half width of the body, length of its path, and start and end on the
+            path of the area that a conflict protects, all in m; the last two are read if `foes`.
         other: the same for the other body.
         level_m: bodies with a larger difference in height do not touch.
         foes: whether a conflict keeps the bodies apart in its area. Then a pair counts only if one

@@ -2,7 +2,7 @@
 
 netconvert joins the end of one lane to the start of another with a line. If roads overlap, the
 start may lie behind the end, or beside it. The line then runs against both roads, or folds back.
-Here, both lanes are shortened until a smooth curve joins them. The removed part of a lane is added
+This module shortens both lanes until a smooth curve joins them. The removed part of a lane is added
 to the other paths that begin or end there, so only the repaired paths change.
 """
 
@@ -16,20 +16,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
-from cavmarl.roads.polylines import SAME_POINT_M, Shape
+from cavmarl.core.math.elementary_arrays import atan2_all
+from cavmarl.roads.polylines import (
+    SAME_POINT_M,
+    Shape,
+    cut_shape,
+    shape_length,
+    smooth_curve,
+    without_repeats,
+)
 
-KINK_RAD = np.radians(60.0)  # a path cannot be driven if it has a corner sharper than this,
-ASTRAY_RAD = np.radians(90.0)  # and turns this much more than its roads do;
-BACK_RAD = np.radians(100.0)  # or if it has such a corner, and its roads
-U_TURN_RAD = np.radians(150.0)  # do not turn round themselves
-SMOOTH_RAD = np.radians(60.0)  # accepted excess turning of a new path; if no path meets it,
-WORTH_RAD = np.radians(3.0)  # a longer cut must save at least this much
-STEP_M = 0.5  # minimum cut of a lane, and its step,
-MOST_M = 12.0  # and its maximum,
-MOST_SHARE = 0.4  # or this share of the lane, as its other end may be cut, too
-CURVE_M = 1.0  # between the points of a new path
-MOST_POINTS = 24
+# A car cannot follow a path with a corner above KINK_RAD that turns ASTRAY_RAD more than its roads
+# do, or with a corner above BACK_RAD between roads that do not make a U-turn of U_TURN_RAD.
+KINK_RAD = np.radians(60.0)
+ASTRAY_RAD = np.radians(90.0)
+BACK_RAD = np.radians(100.0)
+U_TURN_RAD = np.radians(150.0)
+SMOOTH_RAD = np.radians(60.0)  # accepted excess turning of a new path
+WORTH_RAD = np.radians(3.0)  # while no path is accepted, a longer cut must save this much turning
+STEP_M = 0.5  # minimum cut of a lane, and step between two cuts
+MOST_M = 12.0  # maximum cut of a lane
+MOST_SHARE = 0.4  # maximum cut as a share of the lane, because its other end may be cut, too
 
 
 class Way(NamedTuple):
@@ -41,9 +48,9 @@ class Way(NamedTuple):
 
 
 def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
-    """Redraw paths that no car can follow; `shapes` (n, 3) of all lanes in m, changed in place.
+    """Redraw paths that no car can follow; `shapes`: (n, 3) of each lane in m, changed in place.
 
-    A lane keeps its shape if a movement without internal lanes begins or ends there.
+    An end of a lane is not cut if a movement without internal lanes begins or ends there.
     """
     fixed_ends = {way.before for way in ways if not way.inside}
     fixed_starts = {way.after for way in ways if not way.inside}
@@ -54,10 +61,14 @@ def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
         cut = _needed_cut(shapes, way, way.before in fixed_ends, way.after in fixed_starts)
         back[way.before] = max(back[way.before], cut[0])
         front[way.after] = max(front[way.after], cut[1])
-    tails = {lane: _cut(shapes[lane], _length(shapes[lane]) - m) for lane, m in back.items() if m}
+    tails = {
+        lane: cut_shape(shapes[lane], shape_length(shapes[lane]) - m)
+        for lane, m in back.items()
+        if m
+    }
     for lane, (kept, _) in tails.items():
         shapes[lane] = kept
-    heads = {lane: _cut(shapes[lane], m) for lane, m in front.items() if m}
+    heads = {lane: cut_shape(shapes[lane], m) for lane, m in front.items() if m}
     for lane, (_, kept) in heads.items():
         shapes[lane] = kept
     mended = set(broken)
@@ -74,7 +85,7 @@ def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
             mended.add(way)  # the part removed from its lanes runs backwards
     for way in ways:
         if way in mended:
-            _redraw(shapes, way)
+            redraw(shapes, way)
 
 
 def _is_broken(shapes: Sequence[Shape], way: Way) -> bool:
@@ -103,17 +114,17 @@ def _astray(corners: NDArray[np.float64]) -> float:
 def _needed_cut(
     shapes: Sequence[Shape], way: Way, fixed_end: bool, fixed_start: bool
 ) -> tuple[float, float]:
-    """Return the smallest cuts in m of both lanes with a smooth curve, or the best ones."""
+    """Return the smallest cuts of both lanes in m for a smooth curve, or else the best cuts."""
     rooms = [
-        0.0 if fixed else min(MOST_SHARE * _length(shapes[lane]), MOST_M)
+        0.0 if fixed else min(MOST_SHARE * shape_length(shapes[lane]), MOST_M)
         for lane, fixed in ((way.before, fixed_end), (way.after, fixed_start))
     ]
     steps = [np.append(np.arange(STEP_M, room, STEP_M), room).tolist() for room in rooms]
     best = (np.inf, 0.0, 0.0)
     for cuts in sorted(product(*steps), key=lambda pair: (sum(pair), max(pair))):
-        before = _cut(shapes[way.before], _length(shapes[way.before]) - cuts[0])[0]
-        after = _cut(shapes[way.after], cuts[1])[1]
-        astray = _astray(_corners(before, _curve(before, after), after))
+        before = cut_shape(shapes[way.before], shape_length(shapes[way.before]) - cuts[0])[0]
+        after = cut_shape(shapes[way.after], cuts[1])[1]
+        astray = _astray(_corners(before, smooth_curve(before, after), after))
         if astray < best[0] - WORTH_RAD:
             best = (astray, *cuts)
         if astray <= SMOOTH_RAD:
@@ -121,61 +132,15 @@ def _needed_cut(
     return best[1:]
 
 
-def _redraw(shapes: list[Shape], way: Way) -> None:
+def redraw(shapes: list[Shape], way: Way) -> None:
     """Replace the internal lanes of a way by a curve, divided in proportion to their lengths."""
-    curve = _curve(shapes[way.before], shapes[way.after])
-    lengths = [max(_length(shapes[lane]), SAME_POINT_M) for lane in way.inside]
-    whole = _length(curve)
+    curve = smooth_curve(shapes[way.before], shapes[way.after])
+    lengths = [max(shape_length(shapes[lane]), SAME_POINT_M) for lane in way.inside]
+    whole = shape_length(curve)
     for lane, length in zip(way.inside[:-1], lengths, strict=False):
-        shapes[lane], curve = _cut(curve, whole * length / sum(lengths))
+        shapes[lane], curve = cut_shape(curve, whole * length / sum(lengths))
     shapes[way.inside[-1]] = curve
 
 
-def _curve(before: Shape, after: Shape) -> Shape:
-    """Return a cubic curve from the end of one lane to the start of another, tangent to both."""
-    start, end = before[-1], after[0]
-    leaves, arrives = _direction(before[-2:]), _direction(after[:2])
-    chord = float(hypot_all(*(end - start)[:2]))
-    cos_turn = float(leaves[0] * arrives[0] + leaves[1] * arrives[1])
-    # With these handles, the curve is a circular arc if both ends lie on one.
-    handle = chord * 2.0 / (3.0 * (1.0 + np.sqrt(max(0.5 * (1.0 + cos_turn), 0.0))))
-    number = int(np.clip(np.ceil(chord / CURVE_M), 8, MOST_POINTS))
-    t = np.linspace(0.0, 1.0, number + 1)[:, None]
-    u = 1.0 - t
-    curve = (
-        u * u * u * start
-        + 3.0 * t * u * u * (start + handle * leaves)
-        + 3.0 * t * t * u * (end - handle * arrives)
-        + t * t * t * end
-    )
-    s = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(curve[:, :2], axis=0).T))])
-    curve[:, 2] = start[2] + (end[2] - start[2]) * s / max(s[-1], SAME_POINT_M)  # a constant slope
-    return _clean(curve)
-
-
-def _direction(pair: Shape) -> NDArray[np.float64]:
-    step = pair[1] - pair[0]
-    step[2] = 0.0
-    direction: NDArray[np.float64] = step / hypot_all(step[0], step[1])
-    return direction
-
-
-def _length(shape: Shape) -> float:
-    return float(hypot_all(*np.diff(shape[:, :2], axis=0).T).sum())
-
-
-def _cut(shape: Shape, at_m: float) -> tuple[Shape, Shape]:
-    """Return the parts of a polyline before and after a position in m along it."""
-    s = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(shape[:, :2], axis=0).T))])
-    point = np.array([[np.interp(at_m, s, shape[:, axis]) for axis in range(3)]])
-    near, far = s < at_m - SAME_POINT_M, s > at_m + SAME_POINT_M
-    return np.concatenate([shape[near], point]), np.concatenate([point, shape[far]])
-
-
 def _join(*parts: Shape) -> Shape:
-    return _clean(np.concatenate(parts))
-
-
-def _clean(shape: Shape) -> Shape:
-    step = hypot_all(*np.diff(shape[:, :2], axis=0).T)
-    return np.ascontiguousarray(shape[np.concatenate([[True], step > SAME_POINT_M])])
+    return without_repeats(np.concatenate(parts))

@@ -5,7 +5,7 @@ The map says *that* two links are foes (a bit of the junction's request); this m
 
 The results are CONFLICT rows, the common parts of movements from one lane, and the positions where
 cars must stop so that no vehicle on the junction touches them. Maps put the stop line at the end of
-a lane, and some paths sweep across it.
+a lane, which some paths sweep over.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.sumo_net.selection import Movement
 
 SAMPLE_M = 0.5
-# Half a car (2 m wide) on each path, and a margin for corners cut in a turn.
+# Half the width of a car (2 m) on each path, and a margin for corners cut in a turn.
 NEAR_M = 1.0 + 1.0 + 0.6
-# Half a car, with a margin.
+# Half the size of a car, with a margin.
 HALF_LENGTH_M = 2.6
 HALF_WIDTH_M = 1.1
 # Paths with a larger difference in height are a bridge and the road below it.
 CLEARANCE_M = 3.0
 # Half length of the area of foes whose paths never come close in the plane.
 TOUCH_M = 1.0
-WAITS_BACK_M = 3.0  # maximum distance that drivers wait before netconvert's position inside
+WAITS_BACK_M = 3.0  # maximum distance that drivers wait before netconvert's waiting position
 
 
 class LinkPath(NamedTuple):
@@ -59,7 +59,7 @@ class Overlap(NamedTuple):
     leave_m: float
     foe_enter_m: float
     foe_leave_m: float
-    near: bool = True  # False: the paths stay apart, and this is where they are closest
+    near: bool = True  # False: the paths stay apart; the area is where they are closest
 
 
 def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
@@ -70,13 +70,13 @@ def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
 
 
 def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
-    """Return where two foes meet, or None if one passes over the other.
+    """Return where the paths of two foes meet, or None if one path is a bridge over the other.
 
     `path`: the path of one link. `foe`: the path of the other link. `merging`: both lead into the
     same lane, so the shared area extends to the end of both.
 
-    The area is the hull of all parts with less than `NEAR_M` between the centre lines; if there are
-    none, `TOUCH_M` around the closest points.
+    The area is the hull of all parts with less than `NEAR_M` between the centre lines. If there are
+    none, it extends `TOUCH_M` around the closest points.
     """
     plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
     square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]
@@ -106,10 +106,10 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
 
 
 def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> Overlap | None:
-    """Return where cars on two paths would touch, as they are oblique in bends, or None.
+    """Return where cars on two paths would touch because cars are oblique in bends, or None.
 
     The ways are the paths with some metres of the lanes at their ends. The result has the positions
-    of an arriving front bumper and of a leaving rear bumper, as in `overlap`.
+    of an arriving front bumper and of a leaving rear bumper, like that of `overlap`.
     """
     mine, theirs = poses(path, way), poses(foe, foe_way)
     apart = mine.xyz[:, None, :] - theirs.xyz[None, :, :]
@@ -127,7 +127,7 @@ def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> 
 
 
 def poses(path: LinkPath, way: LinkPath) -> Poses:
-    """Return car poses along a path, a part of its way: a chord with both bumpers on the way."""
+    """Return car poses along a path, which is a part of the way; both bumpers are on the way."""
     front, rear = places_on(way, path.s + HALF_LENGTH_M), places_on(way, path.s - HALF_LENGTH_M)
     chord = front - rear
     return Poses(0.5 * (front + rear), atan2_all(chord[:, 1], chord[:, 0]))
@@ -200,7 +200,7 @@ def _shared_m(path: LinkPath, other: LinkPath) -> float:
     return float(path.s[parted[0]]) if parted.size else float(path.s[-1]) + FORK_BEYOND_M
 
 
-LINE_MARGIN_M = 1.0  # as in `car_following_model`: drivers stop at this distance before a line
+LINE_MARGIN_M = 1.0  # drivers stop at this distance before a line, see `car_following_model`
 STEP_M = 0.5
 MOST_M = 8.0
 BODY_M = 5.0
@@ -218,18 +218,18 @@ def stop_back(
     """Return how far before its end each lane has its stop line, in m.
 
     Args:
-        ends: (L, 4) x, y, z of each lane's end, m, and its direction there, rad.
+        ends: (L, 4) x, y, z of each lane's end in m, and the lane's direction there in rad.
         edge: (L,) EDGE row of each lane.
         from_lane: (K,) LANE row that each link leaves.
         junction: (K,) JUNCTION row of each link.
         paths: (K,) the path of each link, None if the map has none.
-        approaches: (K,) the same with the last metres before the junction, on which vehicles from
-            another road also matter.
+        approaches: (K,) the same, extended by the last metres before the junction, where vehicles
+            from another road must also be kept clear of.
         ways: (K,) the same with some metres of the lanes at both ends.
 
     Returns:
-        (L,), 0 for lanes that no path of another lane's links comes near. If `MOST_M` is not
-        enough, the lane keeps the map's line.
+        (L,), 0 if no path from another lane comes near. If `MOST_M` is not enough, the lane keeps
+        the stop line of the map.
     """
     back = np.zeros(len(ends))
     at: dict[int, list[int]] = defaultdict(list)
@@ -289,19 +289,16 @@ def conflict_rows(
 ) -> tuple[NDArray[np.void], NDArray[np.int32], list[int]]:
     """Return all conflicts of links, each link's first row with the end appended, unruled links.
 
-    Two links are foes if either names the other: some maps set the bit on one side only. A link
-        over a
-    bridge and a link below it are no foes, whatever the map says. Links from different lanes that
-    the map declares free of each other, but so close that cars would touch, are foes, too; of
-    these, the turn across the road yields. Unruled links end in the same lane as another link, and
-    the map has no rule for the two.
+    Two links are foes if the map sets the bit of either, as some maps set one of the two bits. A
+    link over a bridge and a link below it are never foes. Links from different lanes that are no
+    foes in the map, but so close that cars would touch, are foes, too; the turn across the road
+    yields. An unruled link ends in the same lane as another link, and the map has no rule for both.
 
     Args:
         movements: one per LINK row.
         paths: the path of each link; None if the map has no internal lanes.
         ways: the same with some metres of the lanes at both ends.
-        left_hand: whether the map has left-hand traffic, in which turns to the right cross the
-            road.
+        left_hand: whether the map has left-hand traffic; then turns to the right cross the road.
 
     Raises:
         MapError: a junction's request has fewer bits than the junction has links.
@@ -349,9 +346,9 @@ def fill_conflicts(
     conflicts: NDArray[np.void],
     first_conflict: NDArray[np.int32],
 ) -> None:
-    """Write the conflicts of each LINK, and where vehicles wait for them inside, into `links`.
+    """Write the conflicts of each LINK, and its waiting position in the junction, into `links`.
 
-    Also set `merges` of lanes at whose end others turn into their road without stopping first.
+    Also set `merges` of lanes at whose end vehicles turn into the road without a duty to stop.
     """
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
@@ -366,10 +363,10 @@ def fill_conflicts(
 def _wait_places(
     wait_m: NDArray[np.float64], owner: NDArray[np.intp], conflicts: NDArray[np.void]
 ) -> NDArray[np.float64]:
-    """Return where drivers wait inside, in m from the stop line, out of the way of others.
+    """Return waiting positions inside junctions, in m from the stop line, clear of other vehicles.
 
-    netconvert's positions suit its own margins. If a position is up to `WAITS_BACK_M` within the
-    area of vehicles that have priority over it, drivers wait before that area.
+    netconvert's positions suit SUMO's margins. If a position is up to `WAITS_BACK_M` within the
+    area of a conflict with priority over the waiting vehicle, drivers wait before that area.
 
     Args:
         wait_m: (K,) netconvert's positions; inf: none.
@@ -378,7 +375,7 @@ def _wait_places(
     """
     place = conflicts["enter_m"] + LINE_MARGIN_M
     back = wait_m[owner] - place
-    # Rows are sorted by link, then foe. Sorted by foe, then link, they are the opposite rows.
+    # Rows are sorted by link, then foe. Sorting by foe, then link gives the opposite rows.
     mirror = np.argsort(np.lexsort((owner, conflicts["foe"])))
     drives_on = conflicts["must_yield"] & ~conflicts["must_yield"][mirror]
     moved = drives_on & (back > 0.0) & (back <= WAITS_BACK_M)
@@ -394,8 +391,8 @@ def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:
     row = requests.get(mine.index, "")
     if foe.index >= len(row):
         raise MapError(
-            f"junction '{mine.node.getID()}' has {len(requests)} requests, but more links: build "
-            "the network again with netconvert"
+            f"junction '{mine.node.getID()}' has more links than its {len(requests)} requests: "
+            "build the network again with netconvert"
         )
     return row[-1 - foe.index] == "1"
 

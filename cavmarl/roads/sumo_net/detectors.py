@@ -1,8 +1,8 @@
 """Positions of the detectors of actuated signals, and the phases that they prolong.
 
-SUMO puts one induction loop on every lane that an actuated phase opens. The loop prolongs a phase
-only if everything that its lane leads to is open (SUMO's documentation, Simulation/Traffic Lights,
-"actuated").
+SUMO puts one induction loop on every lane with a green in an actuated phase. The loop prolongs a
+phase only if all movements from its lane have green (SUMO's documentation, Simulation/Traffic
+Lights, "actuated").
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.signal_rows import DETECTOR_GAP_S, SignalRows, param
 # SUMO's defaults of actuated programs, s.
 MAX_GAP_S = 3.0
 PASSING_TIME_S = 1.9
-# Length that a standing vehicle occupies, m.
+# Length that a stopped vehicle occupies in a queue, m.
 QUEUE_SPACING_M = 7.5
 
 NO_DETECTOR = "NO_DETECTOR"
@@ -45,10 +45,10 @@ def place_detectors(
 ) -> tuple[NDArray[np.void], NDArray[np.int32]]:
     """Return the detectors of the actuated programs in `rows.specs`, and add them to their phases.
 
-    `rows`: the detectors of each phase are written. `first_row`: row of the first detector.
+    `rows`: updated with the detectors of each phase. `first_row`: row of the first detector.
 
-    Returns DETECTOR (D,) and phase_detectors, starting with those that `rows` already has.
-    Raises MapError: a parameter is not a number, or names a detector of its own.
+    Returns DETECTOR (D,), and phase_detectors including the entries of `rows`.
+    Raises MapError: a parameter is not a number, or names a custom detector.
     """
     detectors: list[tuple[int, float, float]] = []
     for row, program in rows.specs.items():
@@ -119,13 +119,14 @@ class _Approaches:
         """Return the position of a lane's detector: (LANE, s in m).
 
         It is `detector-gap` seconds before the stop line, but no farther than the queue that the
-        shortest green clears. On short lanes it is further back, while there is only one way.
+        shortest green clears. If the lane is shorter, the detector is on the lane before it,
+        provided that only one lane leads there.
         """
         custom = self.program.params.get(self.roads.lane_ids[lane])
         if custom is not None:
             raise MapError(
-                f"{self.program.place}: lane '{self.roads.lane_ids[lane]}' has the detector "
-                f"'{custom}' of its own, which is not supported: remove this <param>"
+                f"{self.program.place}: lane '{self.roads.lane_ids[lane]}' has the custom detector "
+                f"'{custom}', which is not supported: remove this <param>"
             )
         passing = parameter(self.program, "passing-time", PASSING_TIME_S)
         if passing <= 0.0:
@@ -171,7 +172,7 @@ class _Approaches:
         ]
 
     def _counts(self, index: int, state: str, major: set[int]) -> bool:
-        """Return whether a green with a duty to yield counts as a green without."""
+        """Return whether a green with a duty to yield (`g`) counts as one without (`G`)."""
         unimportant = index in self.never_major or index in self.turnaround
         if index in self.one_lane or (unimportant and major & self.lanes_at[index]):
             return True
@@ -180,7 +181,7 @@ class _Approaches:
         )
 
     def _gives_way(self, link: np.void, state: str) -> bool:
-        """Return whether motor vehicles of another road may cross a link in this state."""
+        """Return whether motor vehicles from another road may cross a link in this state."""
         first = link["first_conflict"]
         foes = self.roads.conflicts["foe"][first : first + link["num_conflicts"]]
         for foe in self.roads.links[foes]:
@@ -194,7 +195,7 @@ class _Approaches:
         return False
 
     def _next_lanes(self, lane: int) -> list[int]:
-        """Return lanes after the junction, where another line of the same signal may be closed."""
+        """Return the lanes after the junction; they may end at another line of the same signal."""
         ahead = self.links[self.links["from_lane"] == lane]
         on = ahead[~np.isin(ahead["direction"], _TURNAROUND)]
         return [int(row) for row in on["to_lane"]]

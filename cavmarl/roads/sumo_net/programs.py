@@ -1,6 +1,6 @@
 """Signal programs in SUMO's XML: <tlLogic> with its phases, and <WAUT> timetables.
 
-Networks and additional files have the same elements; one reader serves both.
+Networks and additional files have the same elements, so one reader reads both.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-# The program that every signal has: the signal is off, and right of way applies.
+# Every signal has this program: the signal is off, and the rules of right of way apply.
 OFF = "off"
+UNNAMED = "<unknown>"  # SUMO's name of a program without programID
 
 _REQUIRED = {
-    "tlLogic": ("id", "type", "programID"),
+    "tlLogic": ("id",),
     "phase": ("duration", "state"),
     "WAUT": ("id", "startProg"),
     "wautSwitch": ("time", "to"),
@@ -45,10 +46,12 @@ class SignalProgram:
 
     signal_id: str  # with `program_id`, the program's name
     program_id: str
-    kind: str  # SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …
+    # SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …; "": not stated
+    kind: str
     offset_s: float  # delay of all phases
     place: str  # file and line, for error messages
-    phases: list[ProgramPhase] = field(default_factory=list)  # in order
+    # in order; none: the element only changes the offset of a known program
+    phases: list[ProgramPhase] = field(default_factory=list)
     params: dict[str, str] = field(default_factory=dict)  # <param> by key
 
 
@@ -56,7 +59,7 @@ class SignalProgram:
 class Timetable:
     """One <WAUT>: the times at which signals switch between programs."""
 
-    start: str  # the program at the beginning
+    start: str  # program at the beginning
     place: str  # file and line, for error messages
     # (seconds since the beginning, program), in the file's order
     switches: list[tuple[float, str]] = field(default_factory=list)
@@ -112,7 +115,10 @@ class ProgramReader:
 
     def _open_program(self, attrs: Mapping[str, str], place: str) -> None:
         offset = 0.0 if attrs.get("offset") == "begin" else _seconds(attrs, "offset", place, 0.0)
-        self._program = SignalProgram(attrs["id"], attrs["programID"], attrs["type"], offset, place)
+        program_id, kind = attrs.get("programID", UNNAMED), attrs.get("type", "")
+        if not (attrs["id"] and program_id):
+            raise MapError(f"{place} has an empty id or programID: give it a name")
+        self._program = SignalProgram(attrs["id"], program_id, kind, offset, place)
         self.programs.append(self._program)
 
 
@@ -141,7 +147,7 @@ class _AdditionalHandler(ContentHandler):
 
 def _phase(attrs: Mapping[str, str], place: str) -> ProgramPhase:
     duration = _seconds(attrs, "duration", place)
-    # As in SUMO: if only the minimum duration is given, there is no maximum.
+    # As in SUMO, there is no maximum duration if only the minimum is given.
     longest = math.inf if "minDur" in attrs else duration
     try:
         following = tuple(int(number) for number in attrs.get("next", "").split())

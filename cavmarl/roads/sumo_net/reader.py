@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +15,16 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MapError
 from cavmarl.core.math.elementary_arrays import atan2_all
 from cavmarl.core.math.geometry import project
+from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
 from cavmarl.core.records.rows import FORK_BEYOND_M, STEERED, SWEPT_BEYOND_M
-from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
+from cavmarl.roads.network import (
+    EDGE,
+    JUNCTION,
+    LANE,
+    LINK,
+    GeoReference,
+    RoadNetwork,
+)
 from cavmarl.roads.polylines import (
     Shape,
     clean_shape,
@@ -34,7 +43,15 @@ from cavmarl.roads.sumo_net.conflicts import (
     stop_back,
 )
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
-from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
+from cavmarl.roads.sumo_net.road_corners import round_corners
+from cavmarl.roads.sumo_net.selection import (
+    ALL_CLASSES,
+    Movement,
+    NetworkSelection,
+    permission_bits,
+    select,
+)
+from cavmarl.roads.sumo_net.shared_strips import Road, find_strips, move_apart
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
 from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows, unfed_beside
 from cavmarl.roads.sumo_net.xml_source import limit
@@ -42,15 +59,16 @@ from cavmarl.roads.sumo_net.xml_source import limit
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
-APPROACH_M = 12.0  # before a junction, where bodies are still oblique to waiting vehicles
-FORK_WATCHED_M = 5.0  # after a junction, where vehicles that turn off beside a rear watch it
-MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the square
-MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable for another limit
-_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
+APPROACH_M = 12.0  # before a junction, bodies are oblique to waiting vehicles up to this distance
+FORK_WATCHED_M = 5.0  # after a junction, drivers that turn off watch rears up to this distance
+MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the squared length
+MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that changes this limit
+_NAMED = 5  # maximum number of changed lanes that are named
+_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr", ".sumocfg")
 
 
 def map_name(path: Path) -> str:
-    """Return the file's name without the suffixes of map files."""
+    """Return a map file's name without its suffixes."""
     name = path.name
     for ending in _ENDINGS:
         name = name.removesuffix(ending)
@@ -76,7 +94,7 @@ def read_network(path: str | Path) -> RoadNetwork:
 
     Raises MapError: the file is broken, malicious or inconsistent, or has no drivable lane.
     """
-    # Load sumolib only if the cache does not have the network.
+    # Import sumolib only here: it is not needed for networks in the cache.
     from cavmarl.roads.sumo_net.sumo_xml import parse_net
 
     path = Path(path)
@@ -105,13 +123,14 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
 
     num_normal = sum(lane.getEdge().getFunction() == "" for lane in chosen.lanes)
     lane_ids = tuple(lane.getID() for lane in chosen.lanes)
-    shapes = _shapes(chosen, lane_row, lane_ids[:num_normal])
+    shapes, notes = _shapes(chosen, lane_row, lane_ids[:num_normal], parsed.left_hand)
     edges = _edge_rows(chosen, net, node_row)
     outer = _outer_rows(chosen, edges)
     split_beside_ends(shapes, outer[outer < num_normal])
     points, first_point = point_rows(shapes)
 
     lanes = _lane_rows(chosen, edges, points, first_point, outer, parsed.left_hand)
+    _bar_changes(lanes, lane_ids, parsed)
     links = _link_rows(movements, lane_row, lanes, node_row, signal_rows)
     into = _connect(lanes, links, movements, lane_row)
     paths = [_path(move, lane_row, lanes, points) for move in movements]
@@ -129,6 +148,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         [_path(move, lane_row, lanes, points, APPROACH_M) for move in movements],
         ways,
     )
+    _add_stop_offsets(lanes, lane_ids, parsed.stop_offsets_m)
     fill_conflicts(lanes, links, conflicts, first_conflict)
     unfed = unfed_beside(links, lanes, points)
     sweeps = _fill_sweeps(Movements(links, conflicts, ways, unfed))
@@ -158,18 +178,84 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         junction_kinds=kinds,
         geo=_geo_reference(net),
         left_hand=parsed.left_hand,
+        notes=(*parsed.notes, *notes),
     )
 
 
+def _bar_changes(lanes: NDArray[np.void], lane_ids: Sequence[str], parsed: ParsedNet) -> None:
+    """Set the bits of classes that must not change lanes.
+
+    SUMO's "left" is towards the middle of the road, which is the right in left-hand traffic.
+    """
+    inwards, outwards = NO_CHANGE_LEFT, NO_CHANGE_RIGHT
+    if parsed.left_hand:
+        inwards, outwards = outwards, inwards
+    for row, name in zip(lanes, lane_ids, strict=True):
+        if name in parsed.changes and not row["internal"]:
+            to_left, to_right = map(permission_bits, parsed.changes[name])
+            row["permissions"] |= (ALL_CLASSES & ~to_left) << inwards
+            row["permissions"] |= (ALL_CLASSES & ~to_right) << outwards
+
+
+def _add_stop_offsets(
+    lanes: NDArray[np.void], lane_ids: Sequence[str], offsets_m: dict[str, float]
+) -> None:
+    """Move stop lines back; those of a lane win over those of its edge."""
+    for row, name in zip(lanes, lane_ids, strict=True):
+        offset_m = offsets_m.get(name, offsets_m.get(name.rpartition("_")[0], 0.0))
+        if offset_m > 0.0 and not row["internal"]:
+            most_m = max(float(row["length_m"]) - 1.0, 0.0)
+            row["stop_back_m"] = max(float(row["stop_back_m"]), min(offset_m, most_m))
+
+
 def _shapes(
-    chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str]
-) -> list[Shape]:
-    """Return the drivable centre line of each lane, (n, 3) in m; lanes of roads come first."""
+    chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str], left_hand: bool
+) -> tuple[list[Shape], tuple[str, ...]]:
+    """Return the drivable centre line of each lane, (n, 3) in m, and notes on changed lanes.
+
+    Lanes of roads come first.
+    """
     shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
     refuse_points(shapes[: len(normal_ids)], normal_ids)
-    mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
+    widths_m = [lane.getWidth() for lane in chosen.lanes]
+    ways = [_way(move, lane_row) for move in chosen.movements]
+    roads = _roads(chosen, len(normal_ids))
+    notes = []
+    strips = find_strips(shapes, widths_m, roads, left_hand)
+    if strips:
+        move_apart(shapes, strips, ways, left_hand)
+        ids = _some(
+            [f"{normal_ids[a]} and {normal_ids[b]}" for one in strips for a, b in one.lanes]
+        )
+        most_m = max(strip.apart_m for strip in strips)
+        notes.append(
+            f"moved {len(strips)} pairs of opposite edges by up to {most_m:.1f} m, because their "
+            f"lanes were on the same strip: {ids}"
+        )
+    rounded = round_corners(shapes, widths_m, [road.lanes for road in roads])
+    if rounded:
+        ids = _some([normal_ids[row] for row in rounded])
+        notes.append(
+            f"rounded the corners of {len(rounded)} lanes, which are too tight for a car: {ids}"
+        )
+    mend_backward_paths(shapes, ways)
     extend_stubs(shapes, _before(chosen, lane_row))
-    return shapes
+    return shapes, tuple(notes)
+
+
+def _some(ids: Sequence[str]) -> str:
+    return ", ".join(ids[:_NAMED]) + (", …" if len(ids) > _NAMED else "")
+
+
+def _roads(chosen: NetworkSelection, num_normal: int) -> list[Road]:
+    """Return the edges that are not inside a junction."""
+    edges = [id(lane.getEdge()) for lane in chosen.lanes[:num_normal]]
+    starts = [row for row in range(num_normal) if row == 0 or edges[row] != edges[row - 1]]
+    owners = [chosen.lanes[row].getEdge() for row in starts]
+    return [
+        Road(range(*bounds), id(edge.getFromNode()), id(edge.getToNode()))
+        for edge, bounds in zip(owners, pairwise([*starts, num_normal]), strict=True)
+    ]
 
 
 def _geo_reference(net: Any) -> GeoReference | None:
@@ -301,9 +387,9 @@ def _link_rows(
             raise MapError(
                 f"from lane '{connection.getFromLane().getID()}' to lane "
                 f"'{connection.getToLane().getID()}' are {link['length_m']:.6g} m over the "
-                f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both"
+                f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both lanes"
             )
-        # netconvert splits a path where drivers wait inside the junction.
+        # netconvert splits the path of a link where drivers wait inside the junction.
         link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf
         link["junction"] = node_row[id(movement.node)]
         link["index"] = movement.index
@@ -316,7 +402,7 @@ def _link_rows(
 
 
 def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
-    """Return the SWEEP rows, and fill the fields of links about them."""
+    """Return the SWEEP rows, and fill the fields of links that refer to them."""
     sweeps, first = sweep_rows(movements)
     links = movements.links
     links["first_sweep"], links["num_sweeps"] = first[:-1], np.diff(first)
@@ -362,7 +448,7 @@ def _connect(
     movements: Sequence[Movement],
     lane_row: dict[int, int],
 ) -> NDArray[np.int32]:
-    """Fill the connections of lanes: links from them, successors of internal ones, lanes before."""
+    """Fill the connections of lanes: links, successors of internal lanes, and preceding lanes."""
     rows = np.arange(len(lanes))
     lanes["first_link"] = np.searchsorted(links["from_lane"], rows, side="left")
     lanes["num_links"] = np.searchsorted(links["from_lane"], rows, side="right")
@@ -399,8 +485,8 @@ def _path(
 ) -> LinkPath | None:
     """Return the sampled path of a link along its chain of internal lanes.
 
-    It may begin `approach_m` before the junction, with negative positions, and end `beyond_m` after
-    it.
+    The path begins `approach_m` before the junction, at a negative position, and ends `beyond_m`
+    after it.
     """
     if not movement.chain:
         return None

@@ -9,7 +9,7 @@ from typing import Any
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import VEHICLE_CLASSES
 
-_ALL = (1 << len(VEHICLE_CLASSES)) - 1
+ALL_CLASSES = (1 << len(VEHICLE_CLASSES)) - 1
 _ROAD = sum(1 << bit for bit, name in enumerate(VEHICLE_CLASSES) if name not in ("tram", "bicycle"))
 
 
@@ -18,7 +18,7 @@ class Movement:
     """A permitted movement over a junction, before it becomes a LINK."""
 
     connection: Any  # sumolib's connection out of a normal lane
-    # sumolib's internal lanes on its way, in order; empty if the map has none
+    # sumolib's internal lanes along the movement, in order; empty if the map has none
     chain: tuple[Any, ...]
     node: Any  # sumolib's junction
     index: int  # the movement's bit in the junction's request
@@ -37,7 +37,7 @@ def permission_bits(classes: Iterable[str]) -> int:
     """Return the bits of LANE["permissions"] for SUMO's names of vehicle classes."""
     allowed = set(classes)
     if "all" in allowed:
-        return _ALL
+        return ALL_CLASSES
     return sum(1 << bit for bit, name in enumerate(VEHICLE_CLASSES) if name in allowed)
 
 
@@ -91,7 +91,7 @@ def select(net: Any) -> NetworkSelection:
 
 
 def _movements(net: Any, node: Any) -> Iterable[Movement]:
-    """Yield all movements over a junction; their order gives its request's bits, as in SUMO."""
+    """Yield all movements over a junction in SUMO's order, which gives the bits of requests."""
     index = 0
     for lane_id in node._incLanes or ():
         if not lane_id:

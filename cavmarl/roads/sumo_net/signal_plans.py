@@ -29,15 +29,14 @@ def with_programs(
     """Return a network whose signals also have the programs of additional files.
 
     As in SUMO, the program that is loaded last runs, and every signal has a program `off`. A <WAUT>
-    says when its signals switch their program: at once, in any phase; and every program counts its
-        time
-    from the beginning. A choice overrides all of this.
+    gives the times at which its signals switch programs. They switch at once, in any phase, and the
+    time of every program starts with the episode. `chosen` overrides files and timetables.
 
     `files`: additional files in loading order; elements that do not concern signals are ignored.
     `chosen`: program by signal.
 
-    Returns a network with another `source_hash`, as it has several sources. Raises MapError: a file
-    is broken, a signal or program is unknown, or a program does not fit.
+    Returns a network whose `source_hash` covers all sources. Raises MapError: a file is broken, a
+    signal or program is unknown, or a program does not fit its signal.
     """
     chosen = chosen or {}
     if not files and not chosen:
@@ -62,20 +61,20 @@ def with_programs(
 
 
 def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetwork:
-    """Return a network with signals that fail while the world runs, and stay off.
+    """Return a network with signals that fail during the episode, and stay off.
 
-    They switch to their program `off`; links that must yield anyway blink.
+    Failed signals switch to their program `off`; links with a duty to yield blink.
 
-    `outages`: by signal, the time of its failure in s since the beginning of the episode.
+    `outages`: time of failure by signal, in s since the beginning of the episode.
 
-    Returns a network with another `source_hash`. Raises MapError: a signal is unknown.
+    Returns a network with a new `source_hash`. Raises MapError: a signal is unknown.
     """
     rows = SignalRows.of(network)
     sources = [network.source_hash]
     for signal_id, at_s in sorted(outages.items()):
         _check_signal(rows, signal_id, "outage")
         row = rows.row[signal_id]
-        # An added program would run at once; this one waits for its time.
+        # `_program` may append a program, which would run at once; restore the present program.
         present = rows.signals[row][0]
         off = _program(network, rows, signal_id, OFF, "outage")
         rows.signals[row][0] = present
@@ -121,7 +120,7 @@ def _follow(network: RoadNetwork, rows: SignalRows, timetable: Timetable) -> Non
 def _program(
     network: RoadNetwork, rows: SignalRows, signal_id: str, program_id: str, place: str
 ) -> int:
-    """Return the PROGRAM row of a name; the program `off` is created when needed."""
+    """Return the PROGRAM row of a name; create the program `off` if it is needed."""
     if program_id == OFF and (signal_id, OFF) not in rows.program_row:
         rows.add(_off(network, rows, signal_id))
     if (signal_id, program_id) not in rows.program_row:
@@ -134,7 +133,7 @@ def _program(
 
 
 def _off(network: RoadNetwork, rows: SignalRows, signal_id: str) -> SignalProgram:
-    """Return the program with the signal off: links that must yield anyway blink."""
+    """Return the program of a failed signal: links with a duty to yield blink, others are off."""
     row = rows.row[signal_id]
     letters = ["O"] * rows.signals[row][1]
     for link in network.links[network.links["signal"] == row]:

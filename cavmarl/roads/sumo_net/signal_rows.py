@@ -15,12 +15,12 @@ from cavmarl.core.errors import MapError
 from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
 from cavmarl.roads.sumo_net.programs import ProgramPhase, SignalProgram
 
-# Trains switch these signals. No trains run here, so their links count as links without a signal.
+# Trains switch these signals. There are no trains, so their links count as links without a signal.
 RAIL_KINDS = ("rail_signal", "rail_crossing")
 
 MAX_MS = 10**12  # SUMO's largest time: 30 years
 
-# SUMO's default distance from detector to stop line, in seconds at the limit.
+# SUMO's default distance from detector to stop line, in seconds at the speed limit.
 DETECTOR_GAP_S = 2.0
 
 # Parameters of actuated programs that are not implemented; `map check` lists such programs.
@@ -51,6 +51,7 @@ class SignalRows:
         self.switches: list[tuple[int, float, int]] = []
         self.row: dict[str, int] = {}
         self.program_row: dict[tuple[str, str], int] = {}
+        self.used_links: dict[int, int] = {}  # by row; the links of a signal that exist
         self.num_controllers = 0
         self.phase_detectors: list[int] = []
         self.specs: dict[
@@ -65,6 +66,9 @@ class SignalRows:
         rows.row = {name: row for row, name in enumerate(rows.ids)}
         rows.signals = [[int(s["program"]), int(s["num_links"])] for s in network.signals]
         rows.programs = network.programs.tolist()
+        for link in network.links[network.links["signal"] >= 0]:
+            signal, index = int(link["signal"]), int(link["signal_index"])
+            rows.used_links[signal] = max(rows.used_links.get(signal, 0), index + 1)
         rows.program_ids = list(network.program_ids)
         rows.program_row = {
             (rows.ids[program["signal"]], name): row
@@ -82,15 +86,23 @@ class SignalRows:
     def add(self, program: SignalProgram) -> None:
         """Append a program; the last program of a signal runs, as in SUMO.
 
-        Raises MapError: the program has no phases, phases of different lengths, an unknown letter,
-            a
+        A program without phases changes the offset of the known program with its name.
+
+        Raises MapError: the program has no type, states of different lengths, an unknown letter, a
         cycle of zero length, or the name of another program.
         """
         signal_id = program.signal_id
+        known = self.program_row.get((signal_id, program.program_id))
+        if known is not None and not program.phases:
+            fields = self.programs[known]
+            self.programs[known] = (*fields[:3], program.offset_s, *fields[4:])
+            return
         cycle = sum(phase.duration_s for phase in program.phases)
         if not program.phases or not program.phases[0].state or cycle <= 0.0:
             raise _error(signal_id, "has a program without phases or without duration")
-        if (signal_id, program.program_id) in self.program_row:
+        if not program.kind:
+            raise _error(signal_id, f"has a program '{program.program_id}' without type")
+        if known is not None:
             raise _error(signal_id, f"has two programs '{program.program_id}'")
         if signal_id not in self.row:
             self.row[signal_id] = len(self.ids)
@@ -100,7 +112,7 @@ class SignalRows:
         row = len(self.programs)
         first = len(self.phases)
         for number, phase in enumerate(program.phases):
-            self._add_phase(program, phase, number, first, self.signals[signal][1])
+            self._add_phase(program, phase, number, first, signal)
         actuated = program.kind == "actuated"
         if actuated:
             self.specs[row] = program
@@ -125,11 +137,17 @@ class SignalRows:
         return self.num_controllers - 1
 
     def _add_phase(
-        self, program: SignalProgram, phase: ProgramPhase, number: int, first: int, num_links: int
+        self, program: SignalProgram, phase: ProgramPhase, number: int, first: int, signal: int
     ) -> None:
-        signal_id = program.signal_id
-        if len(phase.state) != num_links:
+        signal_id, num_links = program.signal_id, self.signals[signal][1]
+        if len(phase.state) != len(program.phases[0].state):
             raise _error(signal_id, "has phases for different numbers of links")
+        if len(phase.state) < self.used_links.get(signal, num_links):
+            raise _error(
+                signal_id,
+                f"has a program '{program.program_id}' with {len(phase.state)} states for "
+                f"{self.used_links.get(signal, num_links)} links",
+            )
         if phase.duration_s < 0 or phase.min_s < 0 or phase.max_s < 0:
             raise _error(signal_id, "has a phase of negative duration")
         if unknown := set(phase.state) - set(SIGNAL_STATES):
@@ -150,7 +168,9 @@ class SignalRows:
                 0,
             )
         )
-        self.letters.extend(map(SIGNAL_STATES.index, phase.state))
+        # As in SUMO, states beyond the signal's links have no effect.
+        state = phase.state[:num_links].ljust(num_links, "r")
+        self.letters.extend(map(SIGNAL_STATES.index, state))
 
     def set_detectors(self, program: int, phase: int, detectors: list[int]) -> None:
         """Set the DETECTOR rows that prolong a phase, given by its number, of a program."""

@@ -1,13 +1,14 @@
 """Reads SUMO's network files with sumolib, and adds checks that sumolib lacks.
 
 sumolib merges edges of the same name, accepts NaN as a speed, and raises a bare KeyError for
-missing attributes. Here, every element is checked first. Error messages have a place and a remedy.
+missing attributes. This module checks every element first. Messages have a place and a remedy.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from cavmarl.roads.sumo_net.programs import ProgramReader, SignalProgram
 from cavmarl.roads.sumo_net.xml_source import limit, read_xml
 
 MAX_LANE_POINTS = 100_000
-MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # environment variable for another limit
+MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # environment variable that changes this limit
 _MAX_COORDINATE_M = 1e8  # more than twice around the Earth
 
 _REQUIRED = {
@@ -45,10 +46,14 @@ class _CheckedReader(ContentHandler):
         self.reader = NetReader(withInternal=True, withFoes=True)
         self.programs = ProgramReader(path)
         self.left_hand = False
+        self.changes: dict[str, tuple[list[str], list[str]]] = {}
+        self.stop_offsets_m: dict[str, float] = {}
+        self.ignored: Counter[str] = Counter()
         self._path = path
         self._seen: set[tuple[str, str]] = set()
         self._edge = ""
         self._next_lane = 0
+        self._lane = ""  # empty: outside of lanes
         self._most_points = limit(MOST_POINTS, MAX_LANE_POINTS)
         self._root = ""
         self._locator: Any = None
@@ -61,6 +66,7 @@ class _CheckedReader(ContentHandler):
             self._check_version(attrs)
             self.left_hand = self._is_true(name, attrs, "lefthand", "false")
         self._check(name, attrs)
+        self._read_rules(name, attrs)
         self.programs.start(name, attrs, self._locator.getLineNumber())
         try:
             self.reader.startElement(name, attrs)
@@ -72,6 +78,8 @@ class _CheckedReader(ContentHandler):
                 self.reader._currentConnection.setParam("keepClear", "false")
 
     def endElement(self, name: str) -> None:
+        if name == "lane":
+            self._lane = ""
         self.programs.end(name)
         try:
             self.reader.endElement(name)
@@ -104,6 +112,28 @@ class _CheckedReader(ContentHandler):
             for key in ("response", "foes"):
                 if not _BITS.fullmatch(attrs[key]):
                     raise self._error(name, attrs, f"has {key}='{attrs[key]}', must be bits")
+
+    def _read_rules(self, name: str, attrs: Mapping[str, str]) -> None:
+        """Read the rules of lanes that sumolib does not read, and count the other ones."""
+        if name == "lane":
+            self._lane = attrs["id"]
+            changes = tuple(attrs.get(key) or "all" for key in ("changeLeft", "changeRight"))
+            if changes != ("all", "all"):
+                self.changes[self._lane] = changes[0].split(), changes[1].split()
+        elif name == "neigh":
+            self.ignored["<neigh> elements (overtaking on the opposite lane)"] += 1
+        elif name == "stopOffset":
+            self._read_stop_offset(attrs)
+
+    def _read_stop_offset(self, attrs: Mapping[str, str]) -> None:
+        if "value" not in attrs:
+            raise self._error("stopOffset", attrs, "has no attribute 'value'")
+        self._check_number("stopOffset", "value", attrs)
+        for_cars = {"all", "passenger"} & set(attrs.get("vClasses", "all").split())
+        if not for_cars or {"all", "passenger"} & set(attrs.get("exceptions", "").split()):
+            self.ignored["stop offsets that do not hold for passenger cars"] += 1
+        elif float(attrs["value"]) > 0.0:
+            self.stop_offsets_m[self._lane or self._edge] = float(attrs["value"])
 
     def _check_version(self, attrs: Mapping[str, str]) -> None:
         if "version" not in attrs:
@@ -162,6 +192,10 @@ class ParsedNet(NamedTuple):
     net: Any  # a `sumolib.net.Net`
     programs: list[SignalProgram]
     left_hand: bool  # whether the map has left-hand traffic
+    # SUMO's classes that may change to the left and to the right, of lanes where not all may
+    changes: dict[str, tuple[list[str], list[str]]]
+    stop_offsets_m: dict[str, float]  # from the stop line to the end, by id of an edge or a lane
+    notes: tuple[str, ...]  # elements that are not simulated, with counts
 
 
 def parse_net(path: Path) -> ParsedNet:
@@ -174,4 +208,11 @@ def parse_net(path: Path) -> ParsedNet:
     """
     handler = _CheckedReader(path)
     read_xml(path, handler)
-    return ParsedNet(handler.reader.getNet(), handler.programs.programs, handler.left_hand)
+    return ParsedNet(
+        handler.reader.getNet(),
+        handler.programs.programs,
+        handler.left_hand,
+        handler.changes,
+        handler.stop_offsets_m,
+        tuple(f"{count} {what} ignored" for what, count in sorted(handler.ignored.items())),
+    )

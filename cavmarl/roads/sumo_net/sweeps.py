@@ -1,6 +1,6 @@
 """Sweeps: where vehicles on two movements would touch although no conflict separates them.
 
-Conflicts are about cars between two stop lines. A bus cuts bends, over adjacent lanes, over
+Conflicts describe cars on the junction. The body of a bus sweeps over adjacent lanes in bends, over
 vehicles that wait at the next line, and over vehicles that have just left the junction. So for each
 pair of sizes, bodies are moved along both ways, including some metres before and after the
 junction.
@@ -37,17 +37,19 @@ class SweptBody(NamedTuple):
     half_width_m: float
 
 
-# Bodies of the size classes: car, van or truck, bus. A vehicle counts as the next longer class.
+# Bodies of the size classes: car, van or truck, bus. Lengths in between count as the longer class.
 BODIES = tuple(map(SweptBody, (0.5 * m for m in SIZE_BODIES_M), (0.95, 1.25, 1.3)))
 STEP_M = 0.5
-BEFORE_M = 10.0  # distance of the front before its line, and
-BEYOND_M = 4.0  # of the rear after the junction, within which bodies are examined;
-TURN_BEYOND_M = 8.0  # beside a U-turn, which reaches this far over the adjacent lane
+# Bodies are examined from this distance of the front before its line to this distance of the rear
+# after the junction; a U-turn reaches farther over the adjacent lane.
+BEFORE_M = 10.0
+BEYOND_M = 4.0
+TURN_BEYOND_M = 8.0
 MARGIN_M = STEP_M
-BEHIND_M = 1.0  # distance of a following vehicle behind a rear on its way
-LEAST_ASIDE_M = 0.5  # minimum offset from its way of a body whose rear swings back
+BEHIND_M = 1.0  # distance of a following vehicle behind the rear of its leader
+LEAST_ASIDE_M = 0.5  # minimum offset of a body from its way at which its rear swings back
 TURNAROUND = ord("t")
-AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # part of a way that `poses_on_rails` needs at each end
+AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # length of lane that `poses_on_rails` needs at each end
 assert len(BODIES) == len(SIZE_LENGTHS_M) + 1
 
 
@@ -57,7 +59,7 @@ class Movements(NamedTuple):
     links: NDArray[np.void]  # LINK (K,), with conflicts
     conflicts: NDArray[np.void]  # CONFLICT
     ways: Sequence[LinkPath | None]  # over the junction, with `AHEAD_M` of the lanes at its ends
-    # for links that turn round: adjacent target lanes that vehicles only enter at a departure; see
+    # for each U-turn: lanes beside its target lane that only departing vehicles enter, see
     # `unfed_beside`
     unfed: Mapping[int, Sequence[LinkPath]] = MappingProxyType({})
 
@@ -65,9 +67,9 @@ class Movements(NamedTuple):
 def unfed_beside(
     links: NDArray[np.void], lanes: NDArray[np.void], points: NDArray[np.void]
 ) -> dict[int, list[LinkPath]]:
-    """Return, for each LINK that turns round, adjacent target lanes into which no link leads.
+    """Return, for each U-turn (LINK row), lanes beside its target lane into which no link leads.
 
-    Their positions are those of the link: the lanes begin at the link's length.
+    Positions are measured along the U-turn: the lanes begin at the link's length.
     """
     fed = np.zeros(len(lanes), dtype=np.bool_)
     fed[links["to_lane"]] = True
@@ -114,7 +116,7 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
 
 
 def _by_own_size(row: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the sort key of a link's rows: a driver reads only rows of its size."""
+    """Return a sort key that keeps rows of one size together: a driver reads only these."""
     return (row[1], *row)
 
 
@@ -151,7 +153,7 @@ def find_pair(
     movements: Movements,
     pair: tuple[int, int],  # LINK rows
     one: tuple[NDArray[np.float64], SweptBody],  # poses on the first link, and the body
-    other: tuple[NDArray[np.float64], SweptBody],  # on the second link
+    other: tuple[NDArray[np.float64], SweptBody],  # the same on the second link
 ) -> tuple[Area, Area] | None:
     """Return where two bodies on two links touch, on each link, if no conflict separates them."""
     a, b = (movements.links[link] for link in pair)
@@ -197,7 +199,7 @@ def _hull(one: Range, other: Range) -> Range:
 
 
 def _areas(found: Range, half_m: float, foe_half_m: float) -> tuple[Area, Area] | None:
-    """Return the areas on both ways from a range of `swept_range`, or None if nothing touches."""
+    """Return the areas on both ways, given the result of `swept_range`, or None without contact."""
     first, last, foe_first, foe_last = found
     if first == np.inf:
         return None
@@ -206,7 +208,7 @@ def _areas(found: Range, half_m: float, foe_half_m: float) -> tuple[Area, Area] 
 
 
 def _begin_m(link: np.void, enter_m: float) -> float:
-    """Return the start of a conflict's area; a front at its waiting position is before it."""
+    """Return the start of a conflict's area, moved behind a front at its waiting position."""
     waits = enter_m >= link["wait_m"] - LINE_MARGIN_M
     return float(max(enter_m, link["wait_m"] + WAIT_SLACK_M + STEP_M if waits else 0.0))
 
@@ -218,7 +220,7 @@ def _find_behind(
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    """Find contacts of a vehicle that turns round, and of its rear, with vehicles behind it."""
+    """Find contacts of a vehicle that makes a U-turn, and of its rear, with vehicles behind it."""
     way = movements.ways[turn]
     assert way is not None
     length = float(movements.links["length_m"][turn])
@@ -254,9 +256,9 @@ def _find_beside(
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    """Find where a U-turn swings over the start of a lane on which vehicles have departed.
+    """Find where a U-turn sweeps over the start of a lane on which vehicles have departed.
 
-    They are listed for the U-turn's link, as if they had come from it.
+    The rows have the U-turn's link as link and foe, as if these vehicles had come from there.
     """
     length = float(movements.links["length_m"][turn])
     for foe, (foe_half, foe_wide) in enumerate(BODIES):

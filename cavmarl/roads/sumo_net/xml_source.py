@@ -1,8 +1,7 @@
-"""Reads untrusted XML without entities, document types and bombs; errors have a line.
+"""Reads untrusted XML: rejects entities, document types and bombs; errors name the line.
 
 Three limits can be changed by environment variables: the size of the text in bytes, its ratio to
-    the
-size of the gzipped file, and the nesting depth of elements.
+the size of the gzipped file, and the nesting depth of elements.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from defusedxml.expatreader import DefusedExpatParser
 
 from cavmarl.core.errors import CavmarlError, ConfigError, MapError
 
-# A country in OSM is larger than this, but so is no world that one machine can simulate.
+# The OSM data of a country is larger than this, but no world that one machine can simulate is.
 MAX_XML_BYTES = 1 << 30
-LIMIT = "CAVMARL_MAX_XML_BYTES"  # environment variable for another limit
+LIMIT = "CAVMARL_MAX_XML_BYTES"  # environment variable that changes this limit
 # Maps and demand are compressed by a factor of 5 to 40, bombs by up to 1,032.
 MAX_XML_RATIO = 100
 RATIO_LIMIT = "CAVMARL_MAX_XML_RATIO"
@@ -46,7 +45,7 @@ _GZIP_MAGIC = b"\x1f\x8b"
 
 
 class _Depth:
-    """Counts open elements, as deep nesting would use unlimited memory."""
+    """Counts open elements and limits them, because deep nesting would use unlimited memory."""
 
     def __init__(self) -> None:
         self._most, self._open = limit(DEPTH_LIMIT, MAX_XML_DEPTH), 0
@@ -91,7 +90,7 @@ class _Builder(TreeBuilder):
 
 
 class _Limited(io.RawIOBase):
-    """A stream that raises an error beyond a maximum size, against compressed bombs."""
+    """A stream that raises an error beyond a maximum size, to stop decompression bombs."""
 
     def __init__(self, raw: io.BufferedReader) -> None:
         packed = raw.read(2) == _GZIP_MAGIC
@@ -121,13 +120,13 @@ class _Limited(io.RawIOBase):
 def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = MapError) -> None:
     """Pass the elements of a plain or gzipped XML file to a SAX `handler`.
 
-    Exceptions of the handler are not caught. `failure`: type of the error to raise for this kind of
-    file.
+    Exceptions of the handler are not caught. `failure`: type of the errors to raise, which depends
+    on the kind of file.
 
     Raises:
-        CavmarlError: an error of the type `failure`: the file is missing, is not well-formed XML,
-            is too large or too deep, or declares a document type or entities. The message names the
-            file and, if known, the line.
+        CavmarlError: (of the type `failure`) the file is missing, is not well-formed XML, is too
+            large or too deeply nested, or declares a document type or entities. The message names
+            the file and, if known, the line.
     """
     try:
         with path.open("rb") as raw:
@@ -153,7 +152,7 @@ def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = 
 
 
 def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[CavmarlError]) -> None:
-    """Raise an error for encodings that would make the parser raise errors of other types."""
+    """Refuse encodings outside of `_ENCODINGS`: the parser would raise errors of other types."""
     declared = declared_encoding(stream.read(_DECLARATION_BYTES))
     stream.seek(0)
     if declared and declared.lower() not in _ENCODINGS:

@@ -47,7 +47,7 @@ ROAD_FACE = 2
 FIRST_FACE = 3
 
 _FACES_OF_PRISM = 6
-_SEEN_OF_PRISM = 3  # at most
+_SEEN_OF_PRISM = 3  # largest number of faces that one camera sees
 
 # With 12 bytes per pixel, a band and its output fit in the second-level cache of a core.
 BAND_PIXELS = 1 << 14

@@ -1,11 +1,11 @@
 """highway-env's `LidarObservation`: distance and radial speed in equal sectors around a vehicle.
 
 The sectors do not turn with the vehicle: the centre of cell k lies k steps clockwise from east (the
-frame of `vehicle_features`). The sensor differs from `lidar`, whose rays intersect bodies exactly
-and turn with the vehicle, as highway-env does: a vehicle is seen if its centre is in range; it is
-also drawn into the cell of its centre, at its distance less half its width; inside a body,
-distances are negative; and speeds, like distances, are divided by the range in metres. Empty cells
-have the range as distance and as speed.
+frame of `vehicle_features`). The sensor does what highway-env does, and so differs from `lidar`,
+whose rays intersect bodies exactly and turn with the vehicle. A vehicle is seen if its centre is in
+range. It is also drawn into the cell of its centre, at its distance less half its width. Inside a
+body, distances are negative. Speeds, like distances, are divided by the range in metres. Empty
+cells have the range as distance and as speed.
 """
 
 from __future__ import annotations

@@ -26,8 +26,8 @@ from cavmarl.core.math.rng import STREAM_SENSOR, below
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays
 
-# In the order of config_sensors.VEHICLE_FEATURES; last is `on_road`, a feature of a place, not of a
-# vehicle.
+# In the order of `config.sensors.VEHICLE_FEATURES`; then `on_road`, a feature of a place and not
+# of a vehicle.
 FEATURE_PRESENCE = 0
 FEATURE_X = 1
 FEATURE_Y = 2

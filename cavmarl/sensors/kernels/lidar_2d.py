@@ -60,7 +60,7 @@ def _ray_to_box(
         half_length: half the box's size along x.
         half_width: half the box's size along y.
     """
-    # Negative if the ray starts inside the strip; beyond any range if it points away from it.
+    # These are negative if the ray starts inside the strip, and huge if it points away from it.
     enter_x = (x - half_length) / max(closing_x, _PARALLEL)
     enter_y = (y - half_width) / max(closing_y, _PARALLEL)
     distance = max(max(enter_x, enter_y), 0.0)
@@ -91,7 +91,7 @@ def _rays_over(
     `along`, `beside`: position of the origin from the centre along and across the box, in m, at
     least 0.
     """
-    # Both are multiplied by the distance to the centre, which cancels out.
+    # Both lengths are multiplied by the distance to the centre, which cancels in their ratio.
     ahead = x * x + y * y - (half_length * along + half_width * beside)
     across = half_length * beside + half_width * along
     if across >= (PI - ANGLE_ERROR_RAD) * ahead:
@@ -114,7 +114,7 @@ def _scan_body(
     out: NDArray[np.void],
 ) -> None:
     """Intersect the rays of `lidar` with one body."""
-    # All in the frame of the ego vehicle, in which the rays are given.
+    # Transform the body to the frame of the ego vehicle, in which the rays are given.
     dx = body["x"] - ego["x"]
     dy = body["y"] - ego["y"]
     x = dx * ego_cos + dy * ego_sin

@@ -47,7 +47,7 @@ AGE_SCALE_S = 1.0
 NUM_LOOKS = 10  # number of predicted moments
 LOOK_S = 0.5  # time between predicted moments
 SLOWEST_MPS = 3.0  # the ego vehicle is assumed to drive at least this fast, even if it stands
-WAIT_MPS = 2.0  # an approach that is 1 s later ranks like one that is this many metres farther
+WAIT_MPS = 2.0  # in ranking approaches, 1 s later counts like this many metres farther
 GAP_HALF_M = 2.0  # a gap of this length has a closeness of 0.5
 WHEN_HALF_S = 2.0  # a time of this length has a soonness of 0.5
 PLACE_HALF_M = 10.0  # a distance of this length is scaled to 0.5
@@ -74,10 +74,10 @@ class ConflictsSensor(NamedTuple):
     told: NDArray[np.void]  # BODY (inbox,) scratch: present positions of vehicles in messages
     indicators: bool  # whether others indicate their link over the next junction
     looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: predicted poses of the ego vehicle
-    heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: of a vehicle in a message
-    others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) scratch: of `Grid.bodies`
+    heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: poses of a vehicle in a message
+    others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) scratch: poses of `Grid.bodies`
     indicated: NDArray[np.float64]  # (capacity,) indicated turn of each body: 1 left, -1 right
-    foreseen: NDArray[np.int64]  # (capacity,) grid filling at which these were written
+    foreseen: NDArray[np.int64]  # (capacity,) grid filling of each body's `others`, `indicated`
     filling: NDArray[np.int64]  # (1,) number of the present grid filling
     ranked: NDArray[np.void]  # RANKED (count,) scratch
 
@@ -201,10 +201,10 @@ def _predict_other(
 def _nearest_approach(
     row: np.void, body: np.void, looks: NDArray[np.float64], others: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Return the gap in m and the time in s of the approach between two boxes that ranks first.
+    """Return the gap in m and the time in s of the most critical approach between two boxes.
 
-    The gap is the sum of the gaps along and across the ego vehicle. `looks`, `others` (NUM_LOOKS,
-    4): predicted poses of the ego vehicle and of the other one.
+    The gap is the sum of the gaps along and across the ego vehicle; a later gap counts as larger.
+    `looks`, `others` (NUM_LOOKS, 4): predicted poses of the ego vehicle and of the other one.
     """
     half_length = 0.5 * row["length"]
     half_width = 0.5 * row["width"]
@@ -242,7 +242,7 @@ def _right_of_way(
 ) -> float:
     """Return 1 if the other vehicle has priority over `link`, -1 if it must yield, else 0.
 
-    It has priority if it is on a link, or may take one, that goes before `link`.
+    The other vehicle has priority if its link, or a link that it may take, goes before `link`.
     """
     if link < 0 or is_off_lanes(other):
         return 0.0

@@ -145,7 +145,7 @@ def _observe_crossing(
 ) -> float:
     """Write `other` if it reaches a place that both links share earlier than any other so far.
 
-    Only vehicles inside the junction count, and those that have the right of way and no red signal.
+    Only vehicles inside the junction count, and vehicles with the right of way and no red signal.
     Returns the earliest arrival in s, at most `soonest`.
     """
     first = roads.links[link]["first_conflict"]
@@ -196,8 +196,8 @@ def observe_lanes(
     """Write gaps and relative speeds on the lanes around, and the first vehicle to cross the path.
 
     `i`: row of the agent's vehicle. `phase`: (num_signals,) present PHASE rows. `sensors`: range
-    and position of the sensor; a range of 0 switches it off. `observation`: (D,), of which
-    `LANES_FEATURES` numbers are written; 0 before.
+    and position of the sensor; a range of 0 switches it off. `observation`: (D,); this
+    writes `LANES_FEATURES` numbers of it, which must be 0 before.
     """
     range_m = sensors.lanes_range_m
     if range_m == 0.0:

@@ -1,10 +1,11 @@
 """The surroundings of one vehicle in its own frame, for imaging sensors.
 
 The frame has its origin at the vehicle's position on the road; x points ahead, y left, and z up,
-perpendicular to the road under the vehicle. It turns with heading and pitch. In it, the ground is
-the plane z = 0, bodies are upright prisms over oriented rectangles, and buildings are walls on the
-ground. Slopes are therefore seen as far as they are even; the ground never hides a body. As for
-every sensor, bodies more than `LEVEL_HEIGHT_M` above or below are not seen.
+perpendicular to the road under the vehicle. The frame turns with heading and pitch. In it, the
+ground is the plane z = 0, bodies are upright prisms over oriented rectangles, and buildings are
+walls on the ground. So a slope is rendered correctly while its gradient stays the same, and the
+ground never hides a body. As for every sensor, bodies more than `LEVEL_HEIGHT_M` above or below are
+not seen.
 
 The result does not depend on a body's row or on the zone that owns it.
 """

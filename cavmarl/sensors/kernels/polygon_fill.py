@@ -2,8 +2,8 @@
 
 The reciprocal of a face's depth is linear in picture coordinates, and so are the half-planes of its
 edges. A face is drawn row by row, from its first to its last column, with one addition per pixel;
-the nearest face is kept. This is exact for every orientation of the camera, including roll, and
-casts no rays.
+the nearest face is kept. The method is exact for every orientation of the camera, including roll,
+and casts no rays.
 
 A picture is drawn in bands of rows that fit in the core's own cache with all data per pixel. Rows
 do not depend on each other, and only results are written to memory that cores share.

@@ -142,7 +142,7 @@ def _ray_to_prism(
     `place`: start of the ray, mirrored into the first octant. `closing`: decrease of each
     coordinate per metre along the ray. `half`: half the sizes of the box.
     """
-    # Negative if the ray starts inside the slab; beyond any range if it points away from it.
+    # These are negative if the ray starts inside the slab, and huge if it points away from it.
     enter_x = (place[0] - half[0]) / max(closing[0], _PARALLEL)
     enter_y = (place[1] - half[1]) / max(closing[1], _PARALLEL)
     enter_z = (place[2] - half[2]) / max(closing[2], _PARALLEL)

@@ -317,7 +317,15 @@ def sense(
             outputs.places[w, agent, 1] = row["y"]
             if has_entered(row, ticks_per_step):
                 continue
-            write_terms(roads, rows, i, grid, step_s, outputs.terms[w, agent])
+            write_terms(
+                roads,
+                rows,
+                i,
+                travel.types[row["vtype"]],
+                grid,
+                step_s,
+                outputs.terms[w, agent],
+            )
             outputs.acted[w, agent] = True
             outputs.terminated[w, agent] = row["events"] & EVENTS_THAT_END != 0
             outputs.events[w, agent] = row["events"]

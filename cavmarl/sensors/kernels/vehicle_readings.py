@@ -191,7 +191,8 @@ def _way_ahead(
 def bend(x0: float, y0: float, x1: float, y1: float, x2: float, y2: float) -> float:
     """Return the curvature of the circle through three points in 1/m, positive to the left.
 
-    It is four times the triangle's area over the product of its sides; 0 if two points coincide.
+    The curvature is four times the triangle's area over the product of its sides; 0 if two points
+    coincide.
     """
     ax, ay = x1 - x0, y1 - y0
     bx, by = x2 - x1, y2 - y1

@@ -44,7 +44,7 @@ class _Camera(ImagingSensor[C]):
 
     kernel = take_pictures
     written_as: ClassVar[DTypeLike] = np.uint8
-    _own: tuple[Any, ...]  # the last arguments: scratch, the same as bits, palette, classes
+    _own: tuple[Any, ...]  # arguments `scratch` to `classes` of `take_pictures`
 
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         super().__init__(name, config, platform)

@@ -39,7 +39,7 @@ class SensedScene(NamedTuple):
 
 
 class Platform(NamedTuple):
-    """The vehicles and worlds that sensors are mounted in."""
+    """The vehicles that carry the sensors, and their worlds."""
 
     network: RoadNetwork
     body: np.void  # VTYPE of agents' vehicles

@@ -83,7 +83,7 @@ def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratc
     """Order the owned rows by lane, so that neighbours on the road are neighbours in memory."""
     found = 0
     for i in range(owned):
-        # Scripted vehicles may stand in many lists, or in none.
+        # Scripted vehicles may be in several lists, or in none.
         if rows[i]["driver"] == DRIVER_SCRIPTED or is_lost(rows[i]):
             scratch.order[found] = i
             found += 1
@@ -98,7 +98,7 @@ def _order_by_lane(roads: RoadArrays, rows: NDArray[np.void], owned: int, scratc
 def _delay(
     pending: NDArray[np.float64], w: int, agent: int, tick: int, throttle: float, steering: float
 ) -> tuple[float, float]:
-    """Append an agent's command to the delayed commands, and return the one that is due."""
+    """Append an agent's command to the delayed commands, and return the due command."""
     slots = pending.shape[2]
     last = (tick + slots - 1) % slots
     pending[w, agent, last, 0] = throttle

@@ -33,7 +33,7 @@ COMMITTED, NEXT = 0, 1  # items of `Members.sides`
 
 
 class Members(NamedTuple):
-    """The zones of a call."""
+    """The zones in which a call runs a phase."""
 
     numbers: NDArray[np.int64]  # (n,) the numbers of the zones, rising
     frames: NDArray[np.void]  # FRAME (n,) of the spatial index of each zone

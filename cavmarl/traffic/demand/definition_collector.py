@@ -27,6 +27,7 @@ from cavmarl.traffic.demand.demand_records import (
     FLOW_REGULAR,
     LANE_BEST,
     LANE_CURRENT,
+    MAX_NUMBER,
     POS_BASE,
     POS_GIVEN,
     POS_MAX,
@@ -39,7 +40,6 @@ from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 
 DAY_MS = 86_400_000  # SUMO's length of a flow without an end
 MIN_RATE = 1e-12  # 1/s, lower limit of rates
-MAX_NUMBER = 1 << 40  # for flows without a number: larger than every cap
 
 _EXPONENTIAL = re.compile(r"exp\(([^()]*)\)")
 _PER_HOUR = ("vehsPerHour", "perHour")
@@ -125,6 +125,8 @@ _NO_DEPARTURE = ("triggered", "containerTriggered", "split", "now")
 _WAY = ("from", "to", "via", "fromJunction", "toJunction", "viaJunctions", "fromTaz", "toTaz")
 _OFF_MAP = ("fromXY", "toXY", "viaXY", "fromLonLat", "toLonLat", "viaLonLat")
 _UNUSED = ("departEdge", "arrivalEdge", "departPosLat", "arrivalPosLat", "insertionChecks")
+# Checked, but without effect: a trip ends near the end of its last edge. The values are defaults.
+_ARRIVAL = {"arrivalLane": "current", "arrivalPos": "max", "arrivalSpeed": "current"}
 # Attributes of routes and stops that do not define the way.
 _LOOKS = frozenset(("color", "cost", "savings", "exitTimes", "routeLength", "reason"))
 # SUMO's old names, which its own files still contain.
@@ -150,6 +152,7 @@ class DefinitionCollector:
         end_ms: int,
         max_departures: int,
         departs: Mapping[str, str],  # attributes of departures without their own
+        scale: float = 1.0,  # vehicles that depart for each departure
     ) -> None:
         self.report = report
         self.named: dict[str, dict[str, Element]] = {}
@@ -165,6 +168,7 @@ class DefinitionCollector:
         self._begin_ms, self._end_ms = begin_ms, end_ms
         self._max_departures = max_departures
         self._departs = departs
+        self._scale = scale
         self._departures = 0.0
         self._latest_ms: dict[str, int] = {}  # by file
 
@@ -227,6 +231,10 @@ class DefinitionCollector:
             if key in element.attrs:
                 what = f"attribute {key} of {element.name} is not modelled"
                 self.report.tolerate(what, element.place)
+        for key, default in _ARRIVAL.items():
+            if element.attrs.get(key, default) != default:
+                what = f"{key} of {element.name} has no effect: trips end near the last edge's end"
+                self.report.tolerate(what, element.place)
         timing = self._timing(element, flow, start)
         self._check_room(element, timing)
         row: Iterable[float] = (
@@ -257,7 +265,7 @@ class DefinitionCollector:
 
     def _check_room(self, element: Element, timing: Timing) -> None:
         end = self._end_ms if self._end_ms >= 0 else timing.end_ms
-        self._departures += timing.expected(self._begin_ms, end)
+        self._departures += self._scale * timing.expected(self._begin_ms, end)
         if self._departures > self._max_departures:
             raise element.error(
                 f"makes more than {self._max_departures} departures with those before it",

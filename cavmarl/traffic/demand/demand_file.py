@@ -12,18 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import DemandError
+from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.driving.vehicle_types import STATED_FIELDS, VTYPE
 from cavmarl.roads.network import RoadNetwork, content_of
 from cavmarl.traffic.demand.definition_collector import DefinitionCollector
-from cavmarl.traffic.demand.demand_records import ORDER, POS_GIVEN, Choices
+from cavmarl.traffic.demand.demand_records import FLOW_REGULAR, ORDER, POS_GIVEN, Choices
 from cavmarl.traffic.demand.drawing import (
     DRAW_REROUTE,
     DRAW_ROUTE,
     DRAW_TYPE,
     chances,
+    copied,
     departures_ms,
+    scaled_flows,
 )
-from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport
+from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, late_begin
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.rerouters import Rerouters
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
@@ -67,8 +70,10 @@ class DemandFile:
     # (num_edges, n) LANE row by SUMO's index on the edge, -1 if there is none
     lane_table: NDArray[np.int32]
     begin_ms: int  # start of the simulation that the files are meant for
+    has_begin: bool  # whether the files state it; otherwise it is 0; not part of the hash
     end_ms: int  # end of the simulation; `MAX_TIME_MS` if the files name none
     step_ms: int
+    scale: float  # number of vehicles that depart for one departure of the files
     report: DemandReport  # counts of elements that were read and tolerated
 
     def __post_init__(self) -> None:
@@ -95,7 +100,9 @@ class DemandFile:
                 digest.update(content_of(stated))
             elif isinstance(value, tuple):
                 digest.update("\0".join(value).encode())
-            elif isinstance(value, int):
+            elif isinstance(value, float) and value != 1.0:
+                digest.update(f"{field.name}={value!r}".encode())
+            elif isinstance(value, int) and not isinstance(value, bool):
                 digest.update(f"{field.name}={value}".encode())
         return digest.hexdigest()
 
@@ -109,6 +116,8 @@ class DemandFile:
         """
         end_ms = self.end_ms if until_s is None else min(self.end_ms, round(until_s * 1000.0))
         rows, numbers, times = departures_ms(self.elements, key, self.begin_ms, end_ms)
+        if self.scale != 1.0:
+            rows, numbers, times = copied(self.elements, rows, numbers, times, self.scale)
         order = np.lexsort((numbers, rows, times))
         rows, numbers, times = rows[order], numbers[order], times[order]
         types = self._pick(self.type_choices, "types", rows, numbers, key, DRAW_TYPE)
@@ -135,7 +144,7 @@ class DemandFile:
 
     @property
     def may_look(self) -> bool:
-        """Whether any vehicle may have a rerouting device."""
+        """True if any vehicle may have a rerouting device."""
         return any(
             bool((chance > 0.0).any())
             for chance in (self.elements["reroute"], self.types["reroute"])
@@ -165,11 +174,49 @@ class DemandFile:
         """Return SUMO's name of the vehicle of one ORDER ()."""
         row = int(order["element"])
         name = self.element_ids[row]
-        return f"{name}.{order['number']}" if self.elements[row]["flow"] else name
+        numbered = self.elements[row]["flow"] or order["number"] > 0
+        return f"{name}.{order['number']}" if numbered else name
 
     def place(self, row: int) -> str:
         element = self.elements[row]
         return f"{self.report.files[int(element['file'])]}, line {element['line']}"
+
+    @property
+    def tolerated(self) -> tuple[str, ...]:
+        """What was left out or replaced in the files, one line each with its count."""
+        return tuple(self.report.lines())
+
+    def begun(self, horizon_s: float) -> DemandFile:
+        """Return this demand with a begin at which vehicles depart within an episode.
+
+        If the files state no begin, and no vehicle departs in the first `horizon_s`, the demand
+        begins in the second of its first departure. The report says so, and also if no vehicle
+        departs within an episode nevertheless.
+        """
+        if self._departs_within(horizon_s):
+            return self
+        elements = self.elements
+        some = elements[(elements["number"] > 0) & (elements["end_ms"] > elements["begin_ms"])]
+        if not len(some):
+            return self
+        first = some[np.argmin(some["begin_ms"])]
+        first_ms = int(first["begin_ms"])
+        place = f"{self.report.files[int(first['file'])]}, line {first['line']}"
+        begun = self if self.has_begin else replace(self, begin_ms=first_ms // 1000 * 1000)
+        stays = not begun._departs_within(horizon_s)
+        what = late_begin(self.begin_ms / 1000.0, horizon_s, first_ms, stays)
+        self.report.tolerate(what, place)
+        return self if stays else begun
+
+    def _departs_within(self, horizon_s: float) -> bool:
+        """Return whether a vehicle may depart within an episode."""
+        end_ms = min(self.begin_ms + round(horizon_s * 1000.0), self.end_ms)
+        elements = self.elements
+        random = elements[elements["pattern"] != FLOW_REGULAR]
+        may = (random["begin_ms"] < end_ms) & (random["end_ms"] > self.begin_ms)
+        may &= random["number"] > 0
+        regular = elements[elements["pattern"] == FLOW_REGULAR]
+        return bool(may.any()) or len(departures_ms(regular, 0, self.begin_ms, end_ms)[0]) > 0
 
     def to_report(self) -> str:
         """Return lines for a terminal: counts of read and tolerated elements."""
@@ -198,16 +245,18 @@ def read_demand(
     *,
     on_bad_route: Literal["error", "skip"] = "error",
     max_departures: int = MAX_DEPARTURES,
+    programs: Sequence[Path] = (),
 ) -> DemandFile:
     """Read SUMO's files of vehicles, routes, types and stopping places.
 
     Args:
-        paths: `.rou.xml` and `.add.xml` files, plain or gzipped, in any order; a `.sumocfg` stands
-            for the files and the times that it names.
+        paths: `.rou.xml` and `.add.xml` files, plain or gzipped, in any order; a configuration of
+            SUMO (`.sumocfg`) stands for the files and options that it names.
         network: the map.
         on_bad_route: how to handle vehicles whose class cannot drive their route, and stops off
             the route: refuse the file, or leave them out and count them in the report.
         max_departures: maximum number of vehicles.
+        programs: files whose signal programs are read elsewhere, so that they are not counted.
 
     Raises:
         DemandError: files are missing, broken, contradictory, or made for another map.
@@ -216,15 +265,20 @@ def read_demand(
     """
     if on_bad_route not in ("error", "skip"):
         raise DemandError(f"on_bad_route='{on_bad_route}': choose 'error' or 'skip'")
-    report = DemandReport()
-    config = _configuration(paths)
-    begin_ms, end_ms = config.begin_ms, config.end_ms
-    collector = DefinitionCollector(report, begin_ms, end_ms, max_departures, config.departs)
+    report = DemandReport(program_files=frozenset(path.resolve() for path in programs))
+    config = _configuration(paths, report)
+    begin_ms, end_ms = config.begin_ms or 0, config.end_ms
+    collector = DefinitionCollector(
+        report, begin_ms, end_ms, max_departures, config.departs, config.scale
+    )
     for path in config.files:
         read_elements(path, report, collector.take)
     index = MapIndex(network)
-    resolver = Resolver(collector, index, skip=on_bad_route == "skip")
+    skip = on_bad_route == "skip" or config.skips_bad_routes
+    resolver = Resolver(collector, index, skip, config.types)
     elements = resolver.elements()
+    if config.scale != 1.0:
+        elements = scaled_flows(elements, config.scale)
     rerouters = resolver.rerouters()
     routes, route_edges, stops = resolver.routes.arrays()
     return DemandFile(
@@ -244,22 +298,27 @@ def read_demand(
         device=config.rerouting,
         lane_table=index.lane_table,
         begin_ms=begin_ms,
+        has_begin=config.begin_ms is not None,
         end_ms=end_ms if end_ms >= 0 else MAX_TIME_MS,
         step_ms=config.step_ms,
+        scale=config.scale,
         report=report,
     )
 
 
-def _configuration(paths: Sequence[Path]) -> SumoConfigFile:
-    """Return the last configuration among `paths`, with all files to read."""
+def _configuration(paths: Sequence[Path], report: DemandReport) -> SumoConfigFile:
+    """Return the configuration among `paths`, with all files to read."""
     files: list[Path] = []
-    config = SumoConfigFile(None, (), 0, -1, 1000, DeviceOptions(), {})
+    config: SumoConfigFile | None = None
     for path in map(Path, paths):
-        if path.suffix == ".sumocfg":
-            config = read_sumo_config(path)
-            files.extend(config.files)
-        else:
+        if not is_sumo_config(path):
             files.append(path)
+            continue
+        if config is not None:
+            raise DemandError(f"{path}: is the second SUMO configuration; give one, or its files")
+        config = read_sumo_config(path, report)
+        files.extend(config.files)
     if not files:
         raise DemandError("no demand file is given; name a .rou.xml or a .sumocfg")
+    config = config or SumoConfigFile()
     return replace(config, files=tuple(files))

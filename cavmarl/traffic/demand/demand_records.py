@@ -30,6 +30,8 @@ POS_FREE = 3  # the first gap
 POS_RANDOM_FREE = 4  # random; if that place is taken, the first gap
 POS_LAST = 5  # behind the last vehicle
 POS_MAX = 6  # arrival: at the end of the lane
+POS_CENTER = 7  # arrival: in the middle of the lane
+POS_STOP = 8  # where the first stop ends, if it is on the first edge; only in definitions
 
 SPEED_GIVEN = 0
 SPEED_RANDOM = 1
@@ -46,6 +48,10 @@ _DEPART_POS = {
     "free": POS_FREE,
     "random_free": POS_RANDOM_FREE,
     "last": POS_LAST,
+    "stop": POS_STOP,
+    # SUMO puts these vehicles at the start of the lane, too.
+    "splitFront": POS_BASE,
+    "random_location": POS_BASE,
 }
 _DEPART_SPEED = {
     "random": SPEED_RANDOM,
@@ -68,7 +74,7 @@ CODES = {
     },
     "arrivalLane": {"current": LANE_CURRENT, "first": LANE_FIRST, "random": LANE_RANDOM},
     "departPos": _DEPART_POS,
-    "arrivalPos": {"max": POS_MAX, "random": POS_RANDOM},
+    "arrivalPos": {"max": POS_MAX, "random": POS_RANDOM, "center": POS_CENTER},
     "departSpeed": _DEPART_SPEED,
     "arrivalSpeed": {"current": SPEED_CURRENT},
 }
@@ -80,6 +86,8 @@ UNTIL_DEPARTURE = 2  # from the vehicle's departure (stops of standalone routes)
 FLOW_REGULAR = 0  # also single vehicles, as flows of one
 FLOW_EXPONENTIAL = 1  # gaps are exponentially distributed
 FLOW_PROBABILITY = 2  # one vehicle in each second with this probability
+
+MAX_NUMBER = 1 << 40  # of flows without a number: larger than every cap
 
 _ENTRY_AND_EXIT = [
     ("depart_lane", np.int32),  # LANE_* or a lane, see above

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 from cavmarl.core.math.elementary import log1p
 from cavmarl.core.math.elementary_arrays import cos_all, log1p_all
 from cavmarl.core.math.rng import STREAM_DEMAND, fill_uniform
-from cavmarl.traffic.demand.demand_records import FLOW_PROBABILITY, FLOW_REGULAR
+from cavmarl.traffic.demand.demand_records import (
+    FLOW_EXPONENTIAL,
+    FLOW_PROBABILITY,
+    FLOW_REGULAR,
+    MAX_NUMBER,
+)
 
 DRAW_TIME = STREAM_DEMAND
 DRAW_TYPE = STREAM_DEMAND + 1
@@ -69,11 +74,67 @@ def _regular(
     return rows, numbers, start[rows] + numbers * elements["period_ms"][rows]
 
 
+def scaled_flows(elements: NDArray[np.void], scale: float) -> NDArray[np.void]:
+    """Return ELEMENT (n,) with the flows of a demand that is multiplied by `scale`.
+
+    As in SUMO, `scale` multiplies the number of vehicles of a flow, rounded, and divides its
+    period. `copied` multiplies flows with a probability, and vehicles outside of flows.
+    """
+    found = elements.copy()
+    regular = elements["flow"] & (elements["pattern"] == FLOW_REGULAR)
+    for row in np.flatnonzero(regular):
+        flow = found[row]
+        period = int(flow["period_ms"])
+        number = int(flow["number"])
+        if period > 0:
+            number = min(number, -(-int(flow["end_ms"] - flow["begin_ms"]) // period))
+        flow["number"] = math.floor(number * scale + 0.5)
+        if scale > 0.0:
+            flow["period_ms"] = math.floor(period / scale)
+            span = int(flow["number"]) * int(flow["period_ms"])
+            flow["end_ms"] = int(flow["begin_ms"]) + max(span, 1)
+    exponential = elements["pattern"] == FLOW_EXPONENTIAL
+    found["rate"][exponential] *= scale
+    limited = exponential & (elements["number"] < MAX_NUMBER)
+    found["number"][limited] = np.floor(elements["number"][limited] * scale + 0.5)
+    if scale == 0.0:
+        found["number"] = 0
+    return found
+
+
+def copied(
+    elements: NDArray[np.void],
+    rows: NDArray[np.int64],
+    numbers: NDArray[np.int64],
+    times: NDArray[np.int64],
+    scale: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return departures (m,) of a demand that is multiplied by `scale`; see `scaled_flows`.
+
+    As in SUMO, the k-th vehicle of a flow with a probability, or the k-th vehicle outside of flows,
+    departs floor(scale) times, and once more if k · part mod 1000 < part, where `part` is the
+    fraction of the scale in thousandths. A flow numbers all its vehicles; a copy of another vehicle
+    has the number of the copy.
+
+    `rows`, `numbers`, `times`: departures (n,) as in `departures_ms`.
+    """
+    whole, part = divmod(math.floor(scale * 1000.0 + 0.5), 1000)
+    singles = np.cumsum(~elements["flow"]) - 1
+    in_flow = elements["flow"][rows]
+    done = in_flow & (elements["pattern"][rows] != FLOW_PROBABILITY)
+    k = np.where(in_flow, numbers, singles[rows])
+    count = np.where(done, 1, whole + (k % 1000 * part % 1000 < part))
+    before = np.cumsum(count) - count
+    copies = np.arange(int(count.sum())) - np.repeat(before, count)
+    first = np.where(done, k, np.where(in_flow, k * whole + -(-k * part // 1000), 0))
+    return np.repeat(rows, count), np.repeat(first, count) + copies, np.repeat(times, count)
+
+
 def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]:
     """Return times as sums of random gaps after the start, one draw per vehicle.
 
-    Gaps are exponential, -ln(1 - u) / rate, or count trials: with a probability p in each full
-    second, the next success comes after 1 + floor(ln(1 - u) / ln(1 - p)) trials, for any step.
+    Gaps are exponential, -ln(1 - u) / rate; or they are numbers of trials, one in each full second
+    whatever the step: with probability p, 1 + floor(ln(1 - u) / ln(1 - p)) until a success.
     """
     trials = flow["pattern"] == FLOW_PROBABILITY
     rate, wanted = float(flow["rate"]), int(flow["number"])

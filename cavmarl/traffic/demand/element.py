@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from pathlib import Path
 
 from cavmarl.core.errors import CavmarlError, DemandError
 
@@ -39,6 +40,18 @@ def near(name: str, known: Iterable[str]) -> str:
     names = list(known)
     matches = get_close_matches(name, names, n=3) or names[:3]
     return f"similar names: {', '.join(matches)}" if matches else "the files have none"
+
+
+def late_begin(begin_s: float, horizon_s: float, first_ms: int, stays: bool) -> str:
+    """Describe a demand of which no vehicle departs in the `horizon_s` from `begin_s`.
+
+    `first_ms`: time of the first departure. `stays`: whether the episode begins at `begin_s`
+    nevertheless, instead of at the first departure.
+    """
+    none = f"no vehicle departs in the {horizon_s:g} s from {begin_s:g} s"
+    if stays:
+        return f"{none}, but from {first_ms // 1000} s: change horizon_s, or begin in the .sumocfg"
+    return f"the demand begins at {first_ms // 1000} s, as {none}"
 
 
 def _or(words: Iterable[str]) -> str:
@@ -159,6 +172,7 @@ class DemandReport:
     read: dict[str, int] = field(default_factory=dict)
     # things left out or replaced, by a phrase that describes them
     tolerated: dict[str, Tally] = field(default_factory=dict)
+    program_files: frozenset[Path] = frozenset()  # files whose signal programs are read elsewhere
 
     def count(self, kind: str) -> None:
         self.read[kind] = self.read.get(kind, 0) + 1

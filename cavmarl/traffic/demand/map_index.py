@@ -63,8 +63,8 @@ class MapIndex:
         row = self.edge_row.get(name, -1)
         if row < 0:
             raise element.error(
-                f"names the edge '{name}', which the map '{self.network.name}' does not have or "
-                "not for road vehicles",
+                f"names the edge '{name}', but the map '{self.network.name}' has no such edge for "
+                "road vehicles",
                 f"use files that were made for this map; {near(name, self.edge_row)}",
             )
         return row
@@ -80,8 +80,8 @@ class MapIndex:
         if len(unknown) * 2 > len(names) > 1:
             some = ", ".join(list(self.edge_row)[:5])
             raise element.error(
-                f"names {len(names)} edges, of which the map '{self.network.name}' has only "
-                f"{len(names) - len(unknown)}",
+                f"names {len(names)} edges, but the map '{self.network.name}' has only "
+                f"{len(names) - len(unknown)} of them",
                 f"use files that were made for this map; its edges are named {some} …",
             )
         return tuple(self.edge(name, element) for name in names)
@@ -94,8 +94,8 @@ class MapIndex:
         row = self.lane_row.get(name, -1)
         if row < 0 or name.startswith(":"):
             raise element.error(
-                f"names the lane '{name}', which the map '{self.network.name}' does not have or "
-                "not for road vehicles",
+                f"names the lane '{name}', but the map '{self.network.name}' has no such lane for "
+                "road vehicles",
                 near(name, [known for known in self.lane_row if not known.startswith(":")]),
             )
         return row

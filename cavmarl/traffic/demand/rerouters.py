@@ -75,8 +75,8 @@ def read_rerouters(
     """Read the rerouters of files; ignored parts are counted in `report`.
 
     `elements`: <rerouter>s with their children. `routes`: receives the routes that they name.
-    `type_ids`: names by VTYPE row. `known_types`: names of all types, including those that use no
-    road.
+    `type_ids`: names by VTYPE row. `known_types`: names of all types, including types that use
+    no road.
 
     Raises DemandError: an edge, route, type, time or probability is invalid; CapacityError: there
     are more than `MAX_INTERVALS` intervals, or more than `MAX_RULES` intervals times edges.

@@ -17,7 +17,7 @@ def device(element: Element) -> tuple[float, int]:
         element: a <vType>, <vehicle>, <trip> or <flow> with its <param> children.
 
     Returns:
-        The probability of having it, and the period of searches in ms; -1 if not given.
+        The probability of having the device, and the period of searches in ms; -1 if not given.
 
     Raises:
         DemandError: a probability outside [0, 1], or an invalid time.
@@ -35,7 +35,7 @@ def device(element: Element) -> tuple[float, int]:
 class DeviceOptions(NamedTuple):
     """Settings of the device in a `.sumocfg` for all vehicles; the defaults are SUMO's."""
 
-    chance: float = 0.0  # probability of having it, if neither vehicle nor type sets it
+    chance: float = 0.0  # probability of having the device, if neither vehicle nor type sets it
     period_ms: int = 0  # between searches, if neither vehicle nor type sets it; 0: one search
     adaptation_steps: int = 180  # number of averaged samples of the edges' speeds
     adaptation_interval_ms: int = 1000  # between samples

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.traffic.demand.definition_collector import DefinitionCollector
 from cavmarl.traffic.demand.demand_records import (
     LANE_CURRENT,
+    POS_BASE,
+    POS_GIVEN,
+    POS_STOP,
+    SPEED_GIVEN,
     UNTIL_ABSOLUTE,
     UNTIL_FLOW,
     Choices,
@@ -27,7 +31,7 @@ from cavmarl.traffic.demand.type_table import TypeTable
 from cavmarl.traffic.trip_ways import TripWays
 
 log = logging.getLogger(__name__)
-NAMED = 5  # maximum number of left-out ids that are named
+NAMED = 5  # maximum number of ids in the warning about left-out vehicles
 
 # Classes whose own lanes are missing in road networks: see `sumo_net.selection`.
 _PARTLY_MAPPED = sum(1 << VEHICLE_CLASSES.index(name) for name in ("bicycle", "tram"))
@@ -42,13 +46,19 @@ class Resolver:
         ids: ids of the remaining elements, by row.
     """
 
-    def __init__(self, collector: DefinitionCollector, index: MapIndex, skip: bool) -> None:
+    def __init__(
+        self,
+        collector: DefinitionCollector,
+        index: MapIndex,
+        skip: bool,
+        type_defaults: Mapping[str, str],  # attributes of types without their own
+    ) -> None:
         self._index = index
         self._skip = skip
         self._ways = TripWays(index.network)
         self._report = collector.report
         self._named = named = collector.named
-        self.types = TypeTable(named, self._report)
+        self.types = TypeTable(named, self._report, type_defaults)
         places = named.get("stopping place", {})
         stop_reader = StopReader(index, places, self._report, skip)
         self.routes = RouteTable(index, named, stop_reader, self._report)
@@ -64,6 +74,7 @@ class Resolver:
         self.ids = [ids[row] for row in np.flatnonzero(keep)]
         self._check_ids()
         self._place_stops(list(collector.stops.values()))
+        self._depart_at_stops()
 
     def elements(self) -> NDArray[np.void]:
         return self._elements
@@ -170,7 +181,7 @@ class Resolver:
         return some
 
     def _gap(self, route: int, permissions: int) -> str | None:
-        """Return why a class cannot drive a route; if bad routes are skipped, also search ways."""
+        """Return why a class cannot drive a route; to skip bad routes, also find ways of trips."""
         edges, exact = self.routes.edges(route), self.routes.exact(route)
         gap = self._index.gap(edges, exact, permissions)
         if gap is None and self._skip and not exact:
@@ -207,13 +218,13 @@ class Resolver:
         if lane < 0:
             return True
         name = self._missing_lane(routes, lane, 0)
-        problem = f"which edge '{name}' does not have or not for road vehicles" if name else ""
+        problem = f"but edge '{name}' has no such lane for road vehicles" if name else ""
         lanes = self._index.network.lanes
         for vtype in self._options(self._type_options, types).rows:
             for route in self._options(self._route_options, routes).rows if not name else ():
                 row = self._index.lane_table[self.routes.edges(route)[0], lane]
                 if not int(lanes[row]["permissions"]) & self.types.permissions(vtype):
-                    problem = f"which is closed to type '{self.types.names[vtype]}'"
+                    problem = f"but the lane is closed to type '{self.types.names[vtype]}'"
             if problem and not self._tolerates(vtype, user):
                 raise user.error(
                     f"has departLane='{lane}', {problem}",
@@ -252,3 +263,28 @@ class Resolver:
                 until_from = UNTIL_FLOW if element["flow"] else UNTIL_ABSOLUTE
                 placed[key] = self.routes.stops_with(routes[0], stops, until_from)
             element["first_stop"], element["num_stops"] = placed[key]
+
+    def _depart_at_stops(self) -> None:
+        """Replace `departPos="stop"` by the end of the first stop, or by the start of the lane."""
+        elements = self._elements
+        rows = np.flatnonzero(elements["depart_pos_code"] == POS_STOP)
+        if not len(rows):
+            return
+        routes, route_edges, stops = self.routes.arrays()
+        lane_table = self._index.lane_table
+        for row in rows:
+            element = elements[row]
+            element["depart_pos_code"] = POS_BASE
+            options = self._options(self._route_options, int(element["routes"])).rows
+            source = element if element["first_stop"] >= 0 else routes[options[0]]
+            edge = int(route_edges[routes[options[0]]["first_edge"]])
+            if len(options) > 1 or source["num_stops"] == 0:
+                continue
+            stop = stops[source["first_stop"]]
+            lane = int(stop["lane"])
+            if self._index.network.lanes[lane]["edge"] != edge:
+                continue
+            element["depart_pos_code"] = POS_GIVEN
+            element["depart_pos"] = float(stop["end"]) / self._index.scale(lane)
+            element["depart_lane"] = int(np.flatnonzero(lane_table[edge] == lane)[0])
+            element["depart_speed_code"], element["depart_speed"] = SPEED_GIVEN, 0.0

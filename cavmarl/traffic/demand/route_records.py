@@ -166,7 +166,9 @@ class StopReader:
 
 MAX_ROUTE_EDGES = 50_000_000  # sum over all routes
 
-_PLACES = ("Junction", "Taz", "XY", "LonLat")
+# Attributes that name a place and not an edge. As in SUMO, an edge replaces the first ones.
+_REPLACED_BY_EDGES = ("Junction", "Taz")
+_COORDINATES = ("XY", "LonLat")
 
 
 class RouteTable:
@@ -270,10 +272,18 @@ class RouteTable:
 
     def _way(self, source: Element) -> int:
         """Store a trip: the edges to pass in order, without immediate repetitions."""
-        for place in _PLACES:
-            if f"from{place}" in source.attrs or f"to{place}" in source.attrs:
+        used = [f"{end}{place}" for end in ("from", "to", "via") for place in _COORDINATES]
+        used += [
+            f"{end}{place}"
+            for end in ("from", "to")
+            for place in _REPLACED_BY_EDGES
+            if end not in source.attrs
+        ]
+        for key in (*used, "viaJunctions"):
+            if key in source.attrs:
                 raise source.error(
-                    f"goes from or to a {place}", "name edges with 'from' and 'to' (duarouter)"
+                    f"has the attribute {key}",
+                    "name edges with 'from', 'via' and 'to' (duarouter converts places to edges)",
                 )
         stops = [child for child in source.children if child.name == "stop"]
         at_stops = self.stop_reader.edges(stops)

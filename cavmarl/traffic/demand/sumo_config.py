@@ -1,97 +1,113 @@
-"""SUMO's configuration files: network, demand files and times."""
+"""Options of SUMO's configurations that concern demand and time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-from xml.sax.handler import ContentHandler
 
 from cavmarl.core.errors import DemandError
-from cavmarl.roads.sumo_net.xml_source import read_xml
+from cavmarl.roads.sumo_net.sumo_options import (
+    GivenOption,
+    differs_from_default,
+    files_of,
+    known_options,
+    read_options,
+)
 from cavmarl.traffic.demand.demand_records import CODES
-from cavmarl.traffic.demand.element import Element
+from cavmarl.traffic.demand.element import DemandReport, Element
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 
-_ROOTS = ("configuration", "sumoConfiguration")
-_OPTIONS = {
-    "n": "net-file",
-    "net": "net-file",
-    "r": "route-files",
-    "a": "additional-files",
-    "b": "begin",
-    "e": "end",
+MAX_SCALE = 1000.0
+
+# Why options are not obeyed, by kind or name; other options are "not modelled".
+_REASONS = {
+    "seed": "is not used: the seed of the world is",
+    "unread": "is not read",
+    "step-length": "is not used: a tick lasts `clock.sim_dt_s`",
+    "time-to-teleport": "is not modelled: no vehicle is teleported",
 }
 
 
 @dataclass(frozen=True)
 class SumoConfigFile:
-    """The settings of a `.sumocfg` that concern network, demand and time."""
+    """The settings of a configuration that concern demand and time."""
 
-    net_file: Path | None  # the road network; None if the file names none
-    files: tuple[Path, ...]  # additional files, then route files, in SUMO's order of reading
-    begin_ms: int  # start of the simulation
-    end_ms: int  # end of the simulation; -1: when the demand has ended
-    step_ms: int  # length of a step
-    rerouting: DeviceOptions  # options of the rerouting device
-    departs: Mapping[str, str]  # departLane and departSpeed of vehicles without their own
-
-
-class _Handler(ContentHandler):
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.options: dict[str, Element] = {}
-        self._path = path
-        self._root = ""
-        self._locator: Any = None
-
-    def startElement(self, name: str, attrs: Any) -> None:
-        element = Element(name, dict(attrs.items()), str(self._path), self._locator.getLineNumber())
-        if not self._root:
-            self._root = name
-            if name not in _ROOTS:
-                raise element.error(
-                    "is not the root of a SUMO configuration", "give a file with <configuration>"
-                )
-        elif "value" in element.attrs or "v" in element.attrs:
-            element.attrs = {"value": element.attrs.get("value", element.attrs.get("v", ""))}
-            self.options[_OPTIONS.get(name, name)] = element
+    files: tuple[Path, ...] = ()  # additional files, then route files, in SUMO's order of reading
+    begin_ms: int | None = None  # start of the simulation; None: not given
+    end_ms: int = -1  # end of the simulation; -1: when the demand has ended
+    step_ms: int = 1000  # length of a step
+    # options of the rerouting device
+    rerouting: DeviceOptions = field(default_factory=DeviceOptions)
+    # attributes of departures and of types without their own
+    departs: Mapping[str, str] = field(default_factory=dict)
+    types: Mapping[str, str] = field(default_factory=dict)
+    scale: float = 1.0  # factor of the number of departures
+    skips_bad_routes: bool = False  # whether vehicles that cannot drive their route are left out
 
 
-def read_sumo_config(path: Path) -> SumoConfigFile:
-    """Read a `.sumocfg`.
+def read_sumo_config(path: Path, report: DemandReport | None = None) -> SumoConfigFile:
+    """Read a configuration of SUMO; `report` counts the options that are not obeyed.
 
-    Raises DemandError: the file is missing, is no SUMO configuration, or has an invalid time.
+    Raises DemandError: the file is missing or is no SUMO configuration, SUMO has no such option, an
+    option is set twice, a named file does not exist, or a value is invalid.
     """
-    handler = _Handler(path)
-    read_xml(path, handler, DemandError)
-    options = handler.options
+    given = read_options(path, DemandError)
+    if report is not None:
+        tell_ignored(path, given, report)
+    options = {
+        name: Element(name, {"value": option.value}, str(path), option.line)
+        for name, option in given.items()
+    }
 
-    def paths(name: str) -> list[Path]:
-        text = options[name].attrs["value"] if name in options else ""
-        return [path.parent / part.strip() for part in text.split(",") if part.strip()]
-
-    def time_ms(name: str, default: int) -> int:
+    def time_ms(name: str) -> int | None:
         element = options.get(name)
         # SUMO writes -1 for no end.
-        if element is None or element.attrs["value"].strip().startswith("-1"):
-            return default
+        if element is None or (name == "end" and element.attrs["value"].startswith("-1")):
+            return None
         return element.time_ms("value")
 
-    net = paths("net-file")
-    step_ms = time_ms("step-length", 1000)
-    if step_ms <= 0:
+    end_ms = time_ms("end")
+    step_ms = time_ms("step-length")
+    if step_ms == 0:
         raise options["step-length"].error("is no valid step length", "write seconds above 0")
+    scale = options.get("scale")
+    skips = options.get("ignore-route-errors")
     return SumoConfigFile(
-        net_file=net[0] if net else None,
-        files=tuple(paths("additional-files") + paths("route-files")),
-        begin_ms=time_ms("begin", 0),
-        end_ms=time_ms("end", -1),
-        step_ms=step_ms,
+        files=tuple(files_of(path, given, ["additional-files", "route-files"], DemandError)),
+        begin_ms=time_ms("begin"),
+        end_ms=-1 if end_ms is None else end_ms,
+        step_ms=1000 if step_ms is None else step_ms,
         rerouting=DeviceOptions.of(options),
         departs=_departs(options),
+        types=_types(options),
+        scale=1.0 if scale is None else scale.number("value", 1.0, least=0.0, most=MAX_SCALE),
+        skips_bad_routes=skips is not None and skips.flag("value", False),
     )
+
+
+def tell_ignored(
+    path: Path,
+    given: Mapping[str, GivenOption],
+    report: DemandReport,
+    ignored: Collection[str] = ("time", "seed", "traffic", "unread"),
+) -> None:
+    """Count the options of a configuration that change traffic and are not obeyed.
+
+    `ignored`: kinds of options that are not obeyed; begin and end are obeyed.
+    """
+    for name, option in given.items():
+        known = known_options()[name]
+        if known.kind not in ignored or name in ("begin", "end"):
+            continue
+        if name == "time-to-teleport":
+            differs = not option.value.startswith("-") and option.value.strip("0:.") != ""
+        else:
+            differs = name == "step-length" or differs_from_default(known, option.value)
+        if differs:
+            reason = _REASONS.get(name, _REASONS.get(known.kind, "is not modelled"))
+            what = f"option {name} = {option.value} {reason}"
+            report.tolerate(what, f"{path}, line {option.line}")
 
 
 def _departs(options: Mapping[str, Element]) -> dict[str, str]:
@@ -104,4 +120,16 @@ def _departs(options: Mapping[str, Element]) -> dict[str, str]:
         found[key] = element.attrs["value"].strip()
         if found[key] not in CODES[key]:
             element.number("value", 0.0, least=0.0, words=CODES[key])
+    return found
+
+
+def _types(options: Mapping[str, Element]) -> dict[str, str]:
+    """Return the attributes of types that a configuration sets for types without their own."""
+    found = {}
+    model, deviation = options.get("default.carfollowmodel"), options.get("default.speeddev")
+    if model is not None:
+        found["carFollowModel"] = model.attrs["value"]
+    # SUMO's default -1 means the deviation of the class.
+    if deviation is not None and deviation.number("value", -1.0) >= 0.0:
+        found["speedDev"] = deviation.attrs["value"]
     return found

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.driving.driver_models import NEAREST_MODEL, model_code, model_names
+from cavmarl.driving.driver_models import NEAREST_MODEL, has_model, model_code, model_names
 from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.vehicle_types import (
     ALL_PERMISSIONS,
@@ -64,8 +65,12 @@ def vehicle_class(element: Element) -> str:
     return name
 
 
-def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | None:
+def vtype_record(
+    element: Element, report: DemandReport, defaults: Mapping[str, str] | None = None
+) -> NDArray[np.void] | None:
     """Return VTYPE () of a <vType>; None for a class that does not use roads.
+
+    `defaults`: attributes of types without their own.
 
     Raises DemandError: a value is impossible.
     """
@@ -74,6 +79,10 @@ def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | N
         if child.name.startswith(_MODEL_PREFIX):
             attrs = {**child.attrs, **attrs}
             attrs.setdefault("carFollowModel", child.name.removeprefix(_MODEL_PREFIX))
+    for key, value in (defaults or {}).items():
+        # A distribution of speed factors has its own deviation.
+        if key != "speedDev" or not _SPEED_FACTOR.fullmatch(attrs.get("speedFactor", "").strip()):
+            attrs.setdefault(key, value)
     element = Element(element.name, attrs, element.path, element.line, element.children)
     name = vehicle_class(element)
     if name in NO_ROAD_CLASSES:
@@ -115,8 +124,8 @@ def _model(element: Element, report: DemandReport) -> int:
     name = element.attrs.get("carFollowModel", "Krauss").strip()
     # SUMO 0.x also wrote carFollowing-Krauss here.
     name = name.removeprefix(_MODEL_PREFIX)
-    known = (*model_names(), *NEAREST_MODEL)
-    if name not in known:
+    if name not in NEAREST_MODEL and not has_model(name):
+        known = (*model_names(), *NEAREST_MODEL)
         raise element.error(f"has the unknown carFollowModel '{name}'", near(name, known))
     nearest = NEAREST_MODEL.get(name, name)
     if nearest != name:
@@ -153,7 +162,7 @@ def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: flo
     record["speed_dev"] = values.number("speedDev", deviation, least=0.0)
     record["min_speed_factor"] = least = values.number("least", MIN_SPEED_FACTOR, least=0.0)
     record["max_speed_factor"] = most = values.number("most", MAX_SPEED_FACTOR, above=0.0)
-    # A fixed factor may be any; for a distribution, the mean must lie between the bounds.
+    # A fixed factor has no bounds; for a distribution, the mean must lie between the bounds.
     if record["speed_dev"] > 0.0 and not least <= mean <= most:
         raise element.error(
             f"has speedFactor='{text}', whose mean is not between {least:g} and {most:g}",
@@ -168,13 +177,19 @@ class TypeTable:
         names: id by row.
     """
 
-    def __init__(self, named: dict[str, dict[str, Element]], report: DemandReport) -> None:
+    def __init__(
+        self,
+        named: dict[str, dict[str, Element]],
+        report: DemandReport,
+        defaults: Mapping[str, str],  # attributes of types without their own
+    ) -> None:
         self.names: list[str] = []
         self._types = dict(named.get("vType", {}))
         self._distributions = named.get("vTypeDistribution", {})
         self._rows: list[NDArray[np.void]] = []
         self._row: dict[str, int] = {}
         self._report = report
+        self._defaults = defaults
         # Invalid types are refused even if no vehicle uses them.
         for name, element in self._types.items():
             self._resolve(name, element)
@@ -208,7 +223,7 @@ class TypeTable:
 
     def _resolve(self, name: str, element: Element) -> int:
         if name not in self._row:
-            record = vtype_record(element, self._report)
+            record = vtype_record(element, self._report, self._defaults)
             self._row[name] = -1 if record is None else len(self._rows)
             if record is not None:
                 self._rows.append(record)

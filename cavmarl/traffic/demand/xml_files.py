@@ -52,7 +52,7 @@ class _Handler(ContentHandler):
         self._report = report
         self._take = take
         self._including = (*including, path.resolve())
-        self._depth = 0  # of the element around the next one
+        self._depth = 0  # number of open elements
         self._skipping = 0  # depth of the outermost skipped element
         self._tree: list[Element] = []  # from the definition to the innermost open element
         self._inside = 0  # elements of this definition so far
@@ -111,12 +111,14 @@ class _Handler(ContentHandler):
             )
 
     def _skip(self, element: Element) -> None:
+        self._skipping = self._depth
+        if element.name in _PROGRAMS and self._including[-1] in self._report.program_files:
+            return
         known = element.name in _SKIPPED
         what = f"<{element.name}> is not read" if known else f"unknown element <{element.name}>"
         if element.name in _PROGRAMS:
             what += " as demand (signal programs: `map.programs`)"
         self._report.tolerate(what, element.place)
-        self._skipping = self._depth
 
     def _include(self, element: Element) -> None:
         path = self._path.parent / element.text("href")

@@ -192,7 +192,7 @@ def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
 def may_entry_be_swept(
     roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch
 ) -> bool:
-    """Return whether swept areas lie where a vehicle enters: ahead, or occupied ones behind."""
+    """Return whether a vehicle enters near swept areas: ahead, or behind with a vehicle in them."""
     to_line = roads.lanes[row["lane"]]["length_m"] - row["s"]
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
     if ahead >= 0 and roads.links[ahead]["num_sweeps"] > 0:

@@ -129,8 +129,8 @@ def entry_place(
 ) -> float:
     """Return the place on its lane where the centre of a departure enters, in m.
 
-    The whole body is on the lane, with its front before the line. If the lane is too short for
-    both, the rear is behind the start of the lane.
+    The front is before the line and the rear is on the lane. If the lane is shorter than the body,
+    the rear is behind the start of the lane.
     """
     length = roads.lanes[lane]["length_m"]
     half = 0.5 * kind["length"]
@@ -224,11 +224,11 @@ def _behind_last_m(
     most: float,
     scratch: Scratch,
 ) -> float:
-    """Return how far before `most`, the last place of the lane, a departure with `last` enters.
+    """Return how far (m) before `most`, the lane's last place, a departure with code `last` enters.
 
-    The result is in m. Behind the last vehicle in view of the end, the departure keeps the gap it
-    needs to stop. Without such a vehicle it keeps its reaction time to the end, because vehicles
-    may follow beyond. It reads nothing farther away, which the zone of the end does not know.
+    Behind the last vehicle in view of the lane's end, the departure keeps the gap that it needs to
+    stop. Without such a vehicle it keeps its reaction time to the end, because there may be
+    vehicles beyond the end. Vehicles out of view are unknown to the zone of the lane's end.
     """
     k = first_from(scratch, lane, roads.lanes[lane]["length_m"] - travel.view_m, departure["id"])
     wanted = _wanted_speed(roads, travel, key, departure, kind, lane, most, k, scratch)

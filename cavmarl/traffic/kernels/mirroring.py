@@ -17,14 +17,14 @@ from cavmarl.core.math.elementary import atan, cosine, sine
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, ZoneState
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SUMO, EVENT_ARRIVED
-from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step
+from cavmarl.driving.kernels.lanes.route_following import distance_left, free_speed, own_step
 from cavmarl.driving.kernels.motion.motion import account, before_tick, lane_before
 from cavmarl.driving.kernels.motion.tracking import side_lane
 
 BODY_LANES = 8  # maximum number of lanes between the front and the centre of a body
 BLINKS_RIGHT = 1  # bits of SUMO's vehicle signals
 BLINKS_LEFT = 2
-EDGES_BEHIND = 2  # edges from the front's edge back to the centre's, at most; or one ahead
+EDGES_BEHIND = 2  # the centre is at most this many edges behind the front's edge, or one ahead
 
 
 class Paths(NamedTuple):
@@ -72,7 +72,8 @@ def mirror(
                 continue
             _stand_in(roads, travel, paths, seen[place], row)
             row["throttle"] = (row["speed"] - before.speed) / dt
-            account(row, before, roads, 1.0, dt)
+            kind = travel.types[row["vtype"]]
+            account(row, before, free_speed(roads.lanes[before.lane], kind, 1.0), dt)
         if found:
             zoned.num_outer[zone, w] = -1
     return gone

@@ -39,8 +39,8 @@ def find_asking(
 ) -> int:
     """List the vehicles that search for a way in this second, by ascending id.
 
-    They are background vehicles of the demand on a road that have no stop ahead, and whose next
-    search is due or that have come to an edge with rerouters.
+    These are background vehicles of the demand that are outside junctions, have no stop ahead, and
+    either are due for a search or have come to an edge with rerouters.
 
     `has_rules`: (num_edges,) whether an edge has rerouters. `looks`: LOOK, by VEHICLE["order"];
     edges without rerouters are noted as seen. `asking`: receives the rows of the vehicles.

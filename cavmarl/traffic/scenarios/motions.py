@@ -109,8 +109,8 @@ class Ride:
     start_m: float  # of the centre, from the start of the first lane
     end_m: float  # of the centre, from the start of the first lane
     speed_mps: float  # speed between the ends
-    start_mps: float = 0.0  # at the beginning
-    end_mps: float = 0.0  # at the end
+    start_mps: float = 0.0  # speed at the beginning
+    end_mps: float = 0.0  # speed at the end
 
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float

@@ -39,9 +39,9 @@ ON_ROAD = (1 << len(VEHICLE_CLASSES)) - 1
 class Shadow(NamedTuple):
     """A stretch of a lane that a body covers."""
 
-    start: float  # in m along the lane
-    end: float  # m/s of the body along the lane, at least 0
-    speed: float  # of the body along the lane in m/s, not below 0
+    start: float  # m along the lane
+    end: float  # m along the lane
+    speed: float  # of the body along the lane in m/s, at least 0
 
     def joined(self, other: Shadow) -> Shadow:
         """Return the smallest stretch that contains both stretches."""
@@ -176,7 +176,7 @@ FRAME = record(
 
 COVER = record(
     ("s", np.float64),  # middle of the covered part of the lane, m
-    ("half", np.float64),  # and half its length
+    ("half", np.float64),  # half the length of that part, m
     ("speed", np.float64),  # m/s along the lane, at least 0
     ("lane", np.int32),
 )

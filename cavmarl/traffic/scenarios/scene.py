@@ -111,7 +111,7 @@ def _range(about: Field[Any]) -> str:
 
 Meeting = tuple[Crossing, Scene]
 
-FREE_M = 20.0  # beyond the junction, where a built-in driver takes over
+FREE_M = 20.0  # distance beyond the junction at which a built-in driver takes over
 
 
 def approach(streets: Streets, link: int, far_m: float, speed_mps: float) -> Seat | None:

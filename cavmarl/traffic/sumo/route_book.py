@@ -17,7 +17,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand.demand_records import STOP, UNTIL_ABSOLUTE
 from cavmarl.traffic.kernels.mirroring import Paths
 
-MAX_WAY_STEPS = 8_000_000  # of all worlds; memory that is never written takes no space
+MAX_WAY_STEPS = 8_000_000  # limit for all worlds; memory that is never written takes no space
 
 
 class RouteBook:
@@ -61,7 +61,7 @@ class RouteBook:
         return self._worlds[w].arrays(self._nowhere)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert the ways of rows, VEHICLE or departures, to the world `worlds` later."""
+        """Convert the ways of rows, VEHICLE or departures, to those of world w + `worlds`."""
         own = rows["way"] >= self._first - len(self._network.lanes)
         rows["way"] += own * (worlds * self._of_world)
 
@@ -161,7 +161,7 @@ def _with_room(array: NDArray[Any], used: int, wanted: int) -> NDArray[Any]:
     return larger
 
 
-MAX_STOPS = 2_000_000  # of all worlds; memory that is never written takes no space
+MAX_STOPS = 2_000_000  # limit for all worlds; memory that is never written takes no space
 OF_WORLD = 200_000
 
 ReportedStop = tuple[int, float, float, float, float, bool]
@@ -240,7 +240,7 @@ class StopBook:
         return StopRange(first, end)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert the stops of rows, VEHICLE or departures, to the world `worlds` later."""
+        """Convert the stops of rows, VEHICLE or departures, to those of world w + `worlds`."""
         has_some = rows["stop"] >= 0
         for name in ("stop", "stops_end"):
             rows[name] += has_some * (worlds * self._of_world)

@@ -138,7 +138,7 @@ class SumoSimulation:
     def _on_road(
         self,
     ) -> tuple[Sequence[str], NDArray[np.int32], NDArray[np.int32], list[list[Any]]]:
-        """Find the vehicles on the map's lanes, and register those that have just entered.
+        """Find the vehicles on the map's lanes, and register newly entered vehicles.
 
         Returns names, numbers and LANE rows, and the reports of newly entered vehicles.
         """
@@ -168,7 +168,7 @@ class SumoSimulation:
         return [*compress(names, is_here)], numbers[is_here], rows[is_here], fresh
 
     def _row_of(self, kind: str) -> int:
-        """Return the row of a type; a vehicle's own type, `type@vehicle`, counts as its origin."""
+        """Return the row of a type; a vehicle's own type, `type@vehicle`, has the row of `type`."""
         row = self._type_row.get(kind, self._type_row.get(kind.partition("@")[0]))
         if row is None:
             raise LookupError(f"type '{kind}' is in none of the files")
@@ -212,7 +212,7 @@ class SumoSimulation:
         return rows
 
     def _place(self, moved: NDArray[np.void]) -> None:
-        """Place the puppets; add new ones and remove those that are no longer listed."""
+        """Place the puppets. Add new puppets, and remove puppets that are not listed."""
         vehicle = self._vehicle
         present = set(vehicle.getIDList()) if len(moved) or self._puppets else set()
         wanted = {int(row["id"]) for row in moved}

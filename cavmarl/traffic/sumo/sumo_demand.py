@@ -24,7 +24,7 @@ from cavmarl.driving.vehicle_types import (
 )
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.xml_source import read_bytes
-from cavmarl.traffic.sumo.sumo_input import SumoInput, command_words, read_input
+from cavmarl.traffic.sumo.sumo_input import SumoInput, begun, command_words, read_input
 from cavmarl.traffic.sumo.sumo_process import SumoProcess, choose_interface
 
 _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergency_decel", "tau",
@@ -48,8 +48,13 @@ class SumoDemand:
     type_ids: tuple[str, ...]  # names of `types`, then of types that use no road
     content_hash: str  # hash of all files
 
+    @property
+    def tolerated(self) -> tuple[str, ...]:
+        """What is not obeyed or not usual in the files, one line each with its count."""
+        return self.given.tolerated
+
     def setup(self) -> dict[str, Any]:
-        """Return what a process receives once; types by VTYPE row of the world's table."""
+        """Return the setup that a process receives once, with VTYPE rows of the world's table."""
         return _names(self.network, self.interface) | {
             "drives": self.drives,
             "types": {
@@ -74,7 +79,7 @@ def read_sumo_demand(
     Raises DemandError: SUMO refuses the files on this map (the error quotes SUMO), or its signals
     differ from the map's; MissingExtraError: SUMO is not installed.
     """
-    given = read_input(files)
+    given = begun(read_input(files), config.horizon_s)
     interface = choose_interface(config.sumo.interface)
     process = SumoProcess(_names(network, interface) | {"types": {}, "drives": False})
     try:

@@ -130,8 +130,8 @@ class ToldLog:
             )
         if words[_TICKS] < count:
             raise SumoError(
-                f"of {count} ticks of a SUMO {words.item(_TICKS)} are on record: no other process "
-                "can replace it; reset the worlds"
+                f"the log of a SUMO process has {words.item(_TICKS)} of {count} ticks, so no other "
+                "process can replace it; reset the worlds"
             )
         return _read(words, count)
 

@@ -7,52 +7,29 @@ from __future__ import annotations
 
 import gzip
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import BytesIO
-from os.path import isfile
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, tostring
 
 import defusedxml.ElementTree
 from defusedxml.common import DefusedXmlException
 
-from cavmarl.core.errors import ConfigError, SumoError, require
+from cavmarl.core.errors import ConfigError, DemandError, SumoError, require
+from cavmarl.core.xml_root import is_sumo_config
+from cavmarl.roads.sumo_net.sumo_options import files_of, known_options, read_options
 from cavmarl.roads.sumo_net.xml_source import declared_encoding, read_bytes, read_tree
+from cavmarl.traffic.demand.element import DemandReport, late_begin, parse_time_ms
+from cavmarl.traffic.demand.element import Element as DemandElement
+from cavmarl.traffic.demand.sumo_config import tell_ignored
+from cavmarl.traffic.demand.xml_files import read_elements
 
-_INPUTS = {
-    "net-file": "net-file",
-    "net": "net-file",
-    "n": "net-file",
-    "route-files": "route-files",
-    "routes": "route-files",
-    "r": "route-files",
-    "additional-files": "additional-files",
-    "additional": "additional-files",
-    "a": "additional-files",
-}
-_DROPPED_SECTIONS = ("input", "output", "report", "gui_only", "time", "traci_server")
-# Options that change traffic and name no file. Options that only report are dropped; all others
-# are refused.
-_CHANGES_TRAFFIC = re.compile(
-    r"step-method\.ballistic|extrapolate-departpos|no-internal-links|junction-taz|lateral-resolution"
-    r"|scale|scale-suffix|max-num-[a-z]+|max-depart-delay|random-depart-offset|route-steps"
-    r"|waiting-time-memory|startup-wait-threshold|[a-z]+-insert|insertion-checks|keep-after-arrival"
-    r"|lanechange\.(duration|overtake-right)|slope-centered|parking\.maneuver|use-stop-[a-z]+"
-    r"|ride\.stop-tolerance|routing-algorithm|replay-rerouting|railway\.max-train-length|random"
-    r"|seed|thread-rngs|threads|pedestrian\.(model|timegap-crossing|striping\.[\w.-]+)"
-    r"|(ignore-|time-to-|meso|railsignal)[\w.-]*"
-    r"|(collision|intermodal-collision|tls|default|emergencydecel|mapmatch|weights|persontrip"
-    r"|overhead-wire)\.[\w.-]+"
-    r"|device\.(rerouting|bluelight|driverstate|friction|glosa|toc|battery|stationfinder|taxi)"
-    r"\.(?!file$|.*output$)[\w.-]+|person-device\.rerouting\.[\w.-]+"
-)
-_REPORTS = re.compile(
-    r".*(output|log|\.file$).*|device\.(ssm|fcd|tripinfo|vehroute|emissions|elechybrid|example)\..*"
-    r"|no-warnings|verbose|aggregate-warnings|xml-validation.*"
-)
+_BEGINS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # attribute of the begin
+# Kinds of options that are passed to SUMO.
+_PASSED = ("read", "traffic", "beyond")
 # A file without these words makes SUMO write nothing. A character reference may hide them.
 _MAY_WRITE = re.compile(rb"\bfile\b|dest|output|&#|include", re.IGNORECASE)
 _COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
@@ -69,28 +46,30 @@ class SumoInput:
     route_files: tuple[Path, ...]  # demand that SUMO reads during the run
     additional_files: tuple[Path, ...]  # types, stops, signal programs; read first
     begin_s: float = 0.0  # when the demand begins
-    # SUMO's options from the sections of the configuration that change traffic
+    has_begin: bool = False  # whether the configuration states it
+    # options of the configuration that change traffic
     options: dict[str, str] = field(default_factory=dict)
     net_file: Path | None = None  # the map named by the configuration
+    tolerated: tuple[str, ...] = ()  # options that are not obeyed, one per line
 
 
 def read_input(demand: Sequence[Path]) -> SumoInput:
     """Sort demand files by their kind.
 
     Args:
-        demand: one `.sumocfg`, or files of routes, trips and flows and additional files.
+        demand: one configuration of SUMO, or files of routes, trips and flows and additional files.
 
     Raises:
         ConfigError: there is no file, a file cannot be read, or it is no demand.
     """
     if not demand:
         raise ConfigError("no demand: give --demand FILE (.rou.xml, .add.xml or .sumocfg)")
-    if len(demand) == 1 and demand[0].name.endswith(".sumocfg"):
+    if len(demand) == 1 and is_sumo_config(demand[0]):
         return _read_config(demand[0])
     routes, additional = [], []
     for path in demand:
         root = _root_tag(path)
-        if root == "routes":
+        if root in ("routes", "trips", "flows", "vtypes", "vTypes"):
             routes.append(path.resolve())
         elif root in ("additional", "add", "tlLogics"):
             additional.append(path.resolve())
@@ -100,6 +79,31 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
                 ".sumocfg alone"
             )
     return SumoInput(tuple(routes), tuple(additional))
+
+
+def begun(given: SumoInput, horizon_s: float) -> SumoInput:
+    """Return an input with a begin at which vehicles depart within an episode; see `DemandFile`.
+
+    Files that cannot be read are left to SUMO.
+    """
+    firsts: list[tuple[int, str]] = []
+    begin_ms = round(1000.0 * given.begin_s)
+
+    def take(element: DemandElement) -> None:
+        if element.name in _BEGINS:
+            time_ms = parse_time_ms(element.attrs.get(_BEGINS[element.name], "0"))
+            firsts.append((begin_ms if time_ms is None else time_ms, element.place))
+
+    with suppress(DemandError):
+        for path in (*given.route_files, *given.additional_files):
+            read_elements(path, DemandReport(), take)
+    first_ms, place = min(firsts, default=(begin_ms, ""))
+    if first_ms < begin_ms + 1000.0 * horizon_s:
+        return given
+    report = DemandReport()
+    report.tolerate(late_begin(given.begin_s, horizon_s, first_ms, given.has_begin), place)
+    begin_s = given.begin_s if given.has_begin else float(first_ms // 1000)
+    return replace(given, begin_s=begin_s, tolerated=(*given.tolerated, *report.lines()))
 
 
 def without_outputs(path: Path, folder: Path) -> Path:
@@ -153,35 +157,32 @@ def _silence(element: Element, path: Path) -> bool:
 
 
 def _read_config(path: Path) -> SumoInput:
-    files: dict[str, list[Path]] = {"net-file": [], "route-files": [], "additional-files": []}
-    options: dict[str, str] = {}
-    begin = "0"
-    for section in _root(path):
-        for option in section:
-            value = option.get("value", "")
-            if option.tag in _INPUTS:
-                names = value.replace(" ", ",").split(",")
-                files[_INPUTS[option.tag]] += [path.parent / name for name in names if name]
-            elif section.tag == "time" and option.tag in ("begin", "b"):
-                begin = value
-            elif section.tag in _DROPPED_SECTIONS or _REPORTS.fullmatch(option.tag):
-                continue
-            elif _CHANGES_TRAFFIC.fullmatch(option.tag):
-                options[option.tag] = value
-            else:
-                raise ConfigError(
-                    f"{path}: option <{option.tag}> does not change traffic; remove it"
-                )
-    missing = [name for group in files.values() for name in group if not isfile(name)]
-    if missing:
-        raise ConfigError(f"{path}: names {missing[0]}, which does not exist")
+    given = read_options(path, ConfigError)
+    report = DemandReport()
+    tell_ignored(path, given, report, ("time", "seed", "unread"))
+    begin = given["begin"].value if "begin" in given else "0"
+    begin_ms = parse_time_ms(begin)
+    if begin_ms is None:
+        raise ConfigError(
+            f"{path}: begin = '{begin}' is no time; give seconds or hours:minutes:seconds"
+        )
     return SumoInput(
-        route_files=tuple(name.resolve() for name in files["route-files"]),
-        additional_files=tuple(name.resolve() for name in files["additional-files"]),
-        begin_s=_seconds(begin, path),
-        options=options,
-        net_file=files["net-file"][0].resolve() if files["net-file"] else None,
+        route_files=_resolved(files_of(path, given, ["route-files"], ConfigError)),
+        additional_files=_resolved(files_of(path, given, ["additional-files"], ConfigError)),
+        begin_s=begin_ms / 1000.0,
+        has_begin="begin" in given,
+        options={
+            name: option.value
+            for name, option in given.items()
+            if name == "end" or known_options()[name].kind in _PASSED
+        },
+        net_file=next(iter(_resolved(files_of(path, given, ["net-file"], ConfigError))), None),
+        tolerated=tuple(report.lines()),
     )
+
+
+def _resolved(files: Iterable[Path]) -> tuple[Path, ...]:
+    return tuple(file.resolve() for file in files)
 
 
 def _root(path: Path) -> Element:
@@ -212,18 +213,6 @@ def _readable(path: Path) -> Iterator[None]:
         raise ConfigError(f"{path}: broken gzip ({error}); make the file again") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-
-def _seconds(text: str, path: Path) -> float:
-    """Parse a time of SUMO: seconds, or [days:]hours:minutes:seconds."""
-    try:
-        parts = [float(part) for part in text.split(":")]
-    except ValueError as error:
-        raise ConfigError(
-            f"{path}: begin = '{text}' is no time; give seconds or hours:minutes:seconds"
-        ) from error
-    weights = (86400.0, 3600.0, 60.0, 1.0)[-len(parts) :]
-    return sum(part * weight for part, weight in zip(parts, weights, strict=True))
 
 
 def command_words(

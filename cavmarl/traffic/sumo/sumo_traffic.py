@@ -1,8 +1,8 @@
 """`SumoTraffic`: SUMO's part in a tick of W worlds, in one place for any division.
 
 `sumo-traffic`: SUMO moves its vehicles, which are rows here, and sees the vehicles of this
-package. Both sides move their vehicles from tick t to t + 1 by the state at t: this package moves
-first, which needs only t; then SUMO receives the new places and takes its step.
+package. Both sides compute the state at tick t + 1 from the state at t. This package moves its
+vehicles first; then SUMO receives their new places and takes its step.
 
 `sumo-demand`: SUMO runs the demand by itself. A vehicle that departs there is ordered here at the
 same tick, with its type, route, stops, lane and speed factor. A vehicle that is rerouted there is
@@ -268,7 +268,7 @@ class SumoTraffic:
             self._shown.show(w, self.worlds.at(w).letters, phase)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert rows, VEHICLE or departures, to those of the world `worlds` later.
+        """Convert rows of world w, VEHICLE or departures, to those of world w + `worlds`.
 
         Ways and stops are written, because each world has its own part of their tables.
         """

@@ -199,7 +199,7 @@ def _list_within(
     for j in range(first_row, last_row + 1):
         begin = cells.start[j * cells.num_x + first_column]
         end = cells.start[j * cells.num_x + last_column + 1]
-        # The place is always written, here and below, because a branch would be unpredictable.
+        # Write the place before the test, here and below: a branch would often be mispredicted.
         for b in range(begin, end):
             dx = air.x[b] - x
             dy = air.y[b] - y
@@ -261,7 +261,7 @@ def add_cams(
     box: NDArray[np.void],
     num: int,
 ) -> int:
-    """Add the nearest senders that a receiver did not know; return the new number of known ones."""
+    """Add the nearest senders that are new to a receiver; return the number of known senders."""
     air = scratch.cams
     reach_m = channel.reach_m
     limit = reach_m * reach_m
@@ -276,7 +276,7 @@ def add_cams(
             dy = packets[p]["y"] - y
             reachable -= dx * dx + dy * dy <= limit
         if num == box.size:
-            # Ignore stations farther away than all known ones.
+            # The inbox is full: ignore stations farther away than all known stations.
             limit = min(limit, scratch.squared[num - 1])
             reach_m = math.sqrt(limit)
         heard = _list_within(air, own, x, y, reach_m, limit, scratch.heard)

@@ -28,8 +28,9 @@ _ULP = 1.0 / (1 << 53)
 class Channel(NamedTuple):
     """A radio channel; see `v2x.channel.make_channel`.
 
-    Probabilities of reception are tables of B levels of channel load by whole metres, from 0 m on.
-    Values in between are interpolated linearly; the last interval extends to all larger distances.
+    Tables of the probability of reception have a row for each of B levels of channel load and a
+    column for each whole metre from 0 m on. Distances in between are interpolated linearly; the
+    last interval extends to all larger distances.
     """
 
     reach_m: float  # no reception beyond; inf: no limit
@@ -44,10 +45,7 @@ class Channel(NamedTuple):
 
 @kernel
 def receiver_word(key: np.uint64, receiver: int) -> np.uint64:
-    """Return the receiver's half of a random number.
-
-    `receiver`: station.
-    """
+    """Return the receiver's half of a random number; `receiver` is a station."""
     return mix(mix(np.uint64(key) + _GOLDEN) ^ (np.uint64(receiver) * _GOLDEN))
 
 

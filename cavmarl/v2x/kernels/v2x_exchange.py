@@ -109,7 +109,7 @@ def _receive_objects(
     box: NDArray[np.void],
     num: int,
 ) -> int:
-    """Receive reports of vehicles, by the vehicles themselves and by stations that see them."""
+    """Receive reports about vehicles, from the vehicles themselves or stations that see them."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
     refresh_by_cams(channel, me, level, packets, reports, scratch, box, num)
@@ -349,8 +349,8 @@ def exchange_messages(
         if sending.cpm_period > 0 or sending.unit_cpm_period > 0:
             for k in range(num):
                 station = scratch.stations[k]
-                scratch.everybody[k] = zoned.rows[side, station["zone"], w, station["row"]]
-            fill_grid(scratch.everybody, num, scratch.bodies)
+                scratch.vehicles[k] = zoned.rows[side, station["zone"], w, station["row"]]
+            fill_grid(scratch.vehicles, num, scratch.bodies)
         slots = sending.latency + 1
         slot = tick % slots
         mail.num_packets[w, slot] = 0

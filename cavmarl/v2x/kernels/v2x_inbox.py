@@ -44,7 +44,7 @@ def find(box: NDArray[np.void], num: int, subject: int) -> int:
 def is_better(report: np.void, other: np.void) -> bool:
     """Return whether a report of a subject replaces another one: the newer report wins.
 
-    Of several reports of one tick, the subject's own report wins, then that of the smallest sender.
+    Of reports of one tick, the subject's own report wins, then the report with the smallest sender.
     """
     if report["tick"] != other["tick"]:
         return bool(report["tick"] > other["tick"])

@@ -44,7 +44,7 @@ def visible(
     A vehicle is hidden if a nearer body or a wall blocks the straight line to its centre.
 
     Args:
-        scratch: `bodies` filled; `seen` gets rows of `everybody`, nearest first.
+        scratch: `bodies` filled; `seen` gets rows of `vehicles`, nearest first.
         own: row of the station itself; -1: the station is no vehicle.
         x: position of the station, m.
         y: position of the station, m.

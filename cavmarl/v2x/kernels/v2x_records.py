@@ -69,7 +69,7 @@ PACKET = record(
     ("tick", np.int64),  # tick of sending
     ("x", np.float64),  # m, position of the sender
     ("y", np.float64),
-    ("word", np.uint64),  # its half of random numbers
+    ("word", np.uint64),  # the packet's half of random numbers, see `packet_word`
     ("kind", np.int32),
     ("first", np.int32),  # index of its first report
     ("count", np.int64),
@@ -104,7 +104,7 @@ RECEIVER = record(
     ("id", np.int64),  # -1: none
     ("x", np.float64),
     ("y", np.float64),
-    ("word", np.uint64),  # its half of random numbers
+    ("word", np.uint64),  # the receiver's half of random numbers, see `receiver_word`
 )
 
 
@@ -180,11 +180,11 @@ class V2xScratch(NamedTuple):
     spare: NDArray[np.void]  # STATION (C,)
     receivers: NDArray[np.void]  # RECEIVER (R,)
     bodies: Grid  # grid of vehicles in id order
-    everybody: NDArray[np.void]  # VEHICLE (C,) in id order
+    vehicles: NDArray[np.void]  # VEHICLE (C,) in id order
     next_cams: NDArray[np.void]  # LAST_CAM (C,)
     near: NDArray[np.int32]  # (MAX_NEAR,) bodies around a station, nearest first
     near_squared: NDArray[np.float64]
-    seen: NDArray[np.int32]  # (MAX_NEAR,) those that the station sees, as rows of `everybody`
+    seen: NDArray[np.int32]  # (MAX_NEAR,) vehicles that the station sees, as rows of `vehicles`
     cams: Air  # CAMs
     others: Air  # all other packets
     kinds: NDArray[np.int64]  # (NUM_KINDS,) number of packets received now

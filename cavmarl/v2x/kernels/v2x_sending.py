@@ -93,7 +93,7 @@ def phase_left_s(
     time: float,
     dt: float,
 ) -> float:
-    """Return the remaining time of the present phase in s; of an actuated program, the earliest."""
+    """Return the remaining time of the present phase in s; the shortest one if it is actuated."""
     program = roads.programs[program_at(roads, signal, time, dt)]
     row = phase[signal]
     if program["controller"] >= 0:
@@ -109,7 +109,7 @@ def phase_left_s(
 def _open(
     mail: Mail, w: int, slot: int, sender: int, tick: int, x: float, y: float, kind: int, count: int
 ) -> int:
-    """Begin a packet of `count` reports; return the index of its first report, or -1 if full."""
+    """Begin a packet of `count` reports; return the index of its first report; -1: no room."""
     number = mail.num_packets[w, slot]
     first = mail.num_reports[w, slot]
     if number == mail.packets.shape[2] or first + count > mail.reports.shape[2]:
@@ -235,7 +235,7 @@ def _send_seen(
     if first < 0:
         return
     for k in range(num):
-        row = scratch.everybody[scratch.seen[k]]
+        row = scratch.vehicles[scratch.seen[k]]
         report = mail.reports[w, slot, first + k]
         vclass = types[row["vtype"]]["vclass"]
         _write_vehicle(report, row, sender, KIND_CPM, vclass, tick, tick + sending.memory_ticks)

@@ -117,7 +117,7 @@ def note_own(
     mine: Flags,  # (W · A,) is written: these agents in the chosen worlds
     owner: Owners,  # (W · A,) is written: the number, or `UNOWNED`
 ) -> None:
-    """Record which agents belong to this process, as far as it knows."""
+    """Record which agents belong to this process, as far as this process knows."""
     at = 0
     for w in range(own.shape[0]):
         for agent in range(own.shape[1]):
@@ -202,7 +202,7 @@ def take_actions(
 
 
 class Outcome(NamedTuple):
-    """The arrays with results of agents."""
+    """The arrays with the results of agents."""
 
     common: tuple[Bytes, ...]  # data that all processes share
     sensed: tuple[Table, ...]  # observations
@@ -212,21 +212,21 @@ class Outcome(NamedTuple):
 
 
 @inlined_kernel
-def _has_ended(told: Outcome, w: int) -> bool:
-    ended = told.episode_over[w]
-    for agent in range(told.terminations.shape[1]):
-        ended |= told.terminations[w, agent]
+def _has_ended(outcome: Outcome, w: int) -> bool:
+    ended = outcome.episode_over[w]
+    for agent in range(outcome.terminations.shape[1]):
+        ended |= outcome.terminations[w, agent]
     return bool(ended)
 
 
 @kernel
 def pack_results(
-    told: Outcome,
+    outcome: Outcome,
     own: Flags,  # (W, A) agents that have sensed in this process
     chosen: Flags,  # (W,) the worlds that have been reset, or stepped
     before: Flags,  # (W, A) agents that had sensed here before worlds were reset
     of_step: bool,  # whether results are of a step; if not, of a reset
-    with_common: bool,  # whether to include `told.common`
+    with_common: bool,  # whether to include `outcome.common`
     mine: Flags,  # (W · A,) scratch
     words: Words,  # is written
     data: Bytes,  # the same memory
@@ -234,27 +234,27 @@ def pack_results(
     """Write a frame of results."""
     end = 0
     if with_common:
-        for part in told.common:
+        for part in outcome.common:
             end = _put(part, data, end)
     num_agents = own.shape[1]
     at = _aligned(end)
     for w in range(chosen.size):
         for agent in range(num_agents):
             mine[w * num_agents + agent] = chosen[w] and own[w, agent]
-    end = at + pack_agents(mine, told.sensed, words[at // 8 :], data[at:])
+    end = at + pack_agents(mine, outcome.sensed, words[at // 8 :], data[at:])
     if of_step:
         at = _aligned(end)
         for w in range(chosen.size):
-            ended = _has_ended(told, w)
+            ended = _has_ended(outcome, w)
             for agent in range(num_agents):
                 mine[w * num_agents + agent] = ended and before[w, agent]
-        end = at + pack_agents(mine, told.final, words[at // 8 :], data[at:])
+        end = at + pack_agents(mine, outcome.final, words[at // 8 :], data[at:])
     return end
 
 
 @kernel
 def take_results(
-    told: Outcome,  # is written
+    outcome: Outcome,  # is written
     chosen: Flags,  # (W,) the worlds that have been reset, or stepped
     of_step: bool,  # whether results are of a step; if not, of a reset
     with_common: bool,  # true for the process whose results are read first
@@ -267,39 +267,39 @@ def take_results(
     """Read a frame of results."""
     end = 0
     if with_common:
-        for part in told.common:
+        for part in outcome.common:
             end += part.size
         if end > data.size:
             return False
         end = 0
-        for part in told.common:
+        for part in outcome.common:
             end = _take(part, data, end)
-        _begin(told, chosen, of_step, owner)
+        _begin(outcome, chosen, of_step, owner)
     at = _aligned(end)
     if at > data.size:
         return False
-    size = take_agents(told.sensed, words[at // 8 :], data[at:], number, owner)
+    size = take_agents(outcome.sensed, words[at // 8 :], data[at:], number, owner)
     end = at + size
     if size >= 0 and of_step:
         at = _aligned(end)
         if at > data.size:
             return False
-        size = take_agents(told.final, words[at // 8 :], data[at:], number, unread)
+        size = take_agents(outcome.final, words[at // 8 :], data[at:], number, unread)
         end = at + size
     return bool(size >= 0 and end == data.size)
 
 
 @inlined_kernel
-def _begin(told: Outcome, chosen: Flags, of_step: bool, owner: Owners) -> None:
+def _begin(outcome: Outcome, chosen: Flags, of_step: bool, owner: Owners) -> None:
     """Clear the observations and the owners of all agents in the chosen worlds."""
-    num_agents = told.terminations.shape[1]
+    num_agents = outcome.terminations.shape[1]
     for w in range(chosen.size):
-        ended = of_step and _has_ended(told, w)
+        ended = of_step and _has_ended(outcome, w)
         for agent in range(w * num_agents, (w + 1) * num_agents):
             if chosen[w]:
                 owner[agent] = UNOWNED
-                for table in told.sensed:
+                for table in outcome.sensed:
                     table[agent, :] = 0
             if ended:
-                for table in told.final:
+                for table in outcome.final:
                     table[agent, :] = 0

@@ -18,7 +18,7 @@ NEAR = np.dtype(
         ("vehicle", np.int64),
         ("source", np.int64),  # zone that owns the vehicle
         ("row", np.int64),  # index of its row in this zone
-        ("target", np.int64),  # zone in which it is or will be
+        ("target", np.int64),  # zone that contains the vehicle now or soon
         ("crossed", np.bool_),  # whether it is beyond the hysteresis, outside of the source zone
         ("depth_m", np.float64),  # distance outside of the source zone; inside, the negative
         # distance to the target zone
@@ -42,22 +42,22 @@ def find_near(
     zoned: ZoneState,  # the rows of all zones
     side: int,  # the buffer of rows, 0 or 1
     w: int,
-    # whether to check all owned rows, or only those that `exchange` has found near a border
-    everybody: bool,
+    # whether to check all owned rows, or only rows that `exchange` has found near a border
+    check_all: bool,
     # NEAR (2 C,) is written, in the order of zones and rows; a crossing precedes an approach
     out: NDArray[np.void],
 ) -> int:  # number of entries
     """Find owned vehicles that have crossed a border or are near one.
 
     A vehicle has crossed a border if it is farther than the hysteresis outside of its owner's zone.
-    It is near a zone in which it would be, after such a crossing, in `ahead_s` at its present
+    It is near a zone if it would have crossed into that zone after `ahead_s` at its present
     velocity.
     """
     found = 0
     for zone in range(zones.rects.shape[0]):
         owned = zoned.num_owned[zone, w]
-        for n in range(owned if everybody else zoned.num_border[zone, w]):
-            i = n if everybody else zoned.border[zone, w, n]
+        for n in range(owned if check_all else zoned.num_border[zone, w]):
+            i = n if check_all else zoned.border[zone, w, n]
             if i < owned:
                 row = zoned.rows[side, zone, w, i]
                 found = _add_near(zones, borders, row, zone, i, out, found)
@@ -78,7 +78,7 @@ def _add_near(
     rects = zones.rects
     x = row["x"]
     y = row["y"]
-    # Vehicles farther inside cannot leave the zone in that time. Infinite rims stay infinite.
+    # Vehicles farther inside cannot leave the zone within `ahead_s`. Infinite rims stay infinite.
     margin = borders.max_speed_mps * borders.ahead_s
     if (
         rects[zone, 0] + margin < x
@@ -183,7 +183,7 @@ def take_over(vehicle: int, target: int, epoch: int, zoned: ZoneState, side: int
 
 @inlined_kernel
 def _owned_row(vehicle: int, zone: int, hint: int, zoned: ZoneState, side: int, w: int) -> int:
-    """Return the row of a zone's owned vehicle, probably `hint`; -1 if it does not own it."""
+    """Return the row of a zone's owned vehicle, probably `hint`; -1 if the zone does not own it."""
     rows = zoned.rows[side, zone, w]
     owned = zoned.num_owned[zone, w]
     found = hint

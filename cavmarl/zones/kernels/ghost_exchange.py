@@ -20,9 +20,9 @@ from cavmarl.zones.kernels.ownership_changes import BorderRecords, look_on
 from cavmarl.zones.kernels.zone_lookup import (
     Halo,
     ZoneArrays,
-    is_asked_about,
     is_inside,
     is_seen,
+    may_be_considered,
     note_outer,
     squared_distance,
     zone_of,
@@ -38,7 +38,7 @@ def exchange(
     touching_m: float,  # a ghost farther outside of a zone cannot touch a vehicle of the zone
     borders: Borders,
     # the ghosts and their numbers, border and num_border are written. Only owned rows in `outer`
-    # are read; if there is no list of them, it is made here
+    # are read; if this list is missing, it is made here
     zoned: ZoneState,
     side: int,  # the buffer of rows, 0 or 1
     first: int,  # the first world
@@ -49,9 +49,9 @@ def exchange(
 
     A zone needs a vehicle if and only if a driver there may consider it; see
     `visibility_tests.find_looks`. If a late transfer leaves a vehicle outside of its owner's zone,
-    the vehicle is published as usual, also to the zone in which it is.
+    the vehicle is published as usual, also to the zone that contains it.
     """
-    # Vehicles farther away cannot cross a border within `ahead_s`.
+    # Vehicles farther from a border cannot cross it within `ahead_s`.
     border_m = borders.max_speed_mps * borders.ahead_s
     count = zones.rects.shape[0]
     for w in range(first, last):
@@ -151,8 +151,8 @@ def _publish(
 ) -> None:
     """Append the owned rows of one zone to the rows of all zones that need them.
 
-    The targets are found first, in batches of the size of `due`. Their branches are unpredictable,
-    and in a loop of their own they do not delay the copies.
+    The target zones are found first, in batches of the size of `due`. This search has unpredictable
+    branches, which do not delay the copies if the search has its own loop.
     """
     near_limit = touching_m * touching_m
     border_limit = border_m * border_m
@@ -184,7 +184,7 @@ def _publish(
                 if other == zone:
                     continue
                 squared = squared_distance(zones.rects, other, x, y)
-                sought = (squared <= sure_limit) | is_asked_about(halo, watch, outer)
+                sought = (squared <= sure_limit) | may_be_considered(halo, watch, outer)
                 _note_due(due[num_due], outer, other, squared, near_limit, border_limit)
                 num_due += int((squared <= seen_limit) & sought)
         else:
@@ -236,7 +236,7 @@ def _send(
 def _note_all_outer(
     inner: NDArray[np.float64], zoned: ZoneState, side: int, zone: int, w: int
 ) -> None:
-    """List a zone's outer rows, as `advance` does, if rows have changed since."""
+    """List a zone's outer rows, as `advance` does, if rows have changed after `advance`."""
     outer = 0
     for i in range(zoned.num_owned[zone, w]):
         row = zoned.rows[side, zone, w, i]

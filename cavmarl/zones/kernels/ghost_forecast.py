@@ -1,7 +1,7 @@
 """Forecast of a row one tick later: nodes send only the words of a ghost that differ from it.
 
 Sender and receiver compute the same forecast, with the same operations on the same numbers. So rows
-arrive bit for bit whatever a driver does; a good forecast only saves bytes.
+arrive bit for bit in any case; a good forecast only saves bytes.
 
 A background driver chooses an acceleration (`throttle`). Speed, rates and sums follow from it, as
 in `motion.move_background` and `motion.account`. The position on the map depends on the roads, and
@@ -38,7 +38,7 @@ class Forecast(NamedTuple):
 
     dt: float  # s of a tick
     ticks_per_step: int
-    way_to_go: int  # in a row followed by its step, the word with the step's `to_go`
+    way_to_go: int  # index of the step's `to_go` among the words of a row and its step
     limits: Floats  # (lanes,) m/s
     beyond: Floats  # (lanes,) m from a lane's start to the end of the link that it is in
     row_bounds: Bounds  # of the indices in a row
@@ -48,56 +48,58 @@ class Forecast(NamedTuple):
 
 
 @inlined_kernel
-def is_told(told: np.uint64, word: int) -> bool:
+def is_known(bits: np.uint64, word: int) -> bool:
     """Return whether the bit of a word is set."""
-    return bool(told >> np.uint64(word) & np.uint64(1))
+    return bool(bits >> np.uint64(word) & np.uint64(1))
 
 
 @inlined_kernel
-def foresee(
-    law: Forecast,
+def write_forecast(
+    forecast: Forecast,
     before: Floats,  # the row one tick ago, with its step
     before_words: Words,  # the same memory
     row: Floats,  # the present row; a word of the forecast is read only after it is written
     row_words: Words,  # the same memory
-    told: np.uint64,  # bits of words that are known, and are not written
+    known: np.uint64,  # a bit per word; known words are not written
     found: Floats,  # is written: a copy of the row before, or `row` itself
     found_words: Words,  # the same memory
 ) -> None:
     """Write the words that change in every tick, each after the words that it depends on."""
-    dt = law.dt
-    if not is_told(told, SPEED):
+    dt = forecast.dt
+    if not is_known(known, SPEED):
         speed = before[SPEED] + row[THROTTLE] * dt
         found[SPEED] = min(max(speed, 0.0), MAX_SPEED_MPS)
-    if not is_told(told, ACCEL):
+    if not is_known(known, ACCEL):
         found[ACCEL] = (row[SPEED] - before[SPEED]) / dt
-    if not is_told(told, JERK):
+    if not is_known(known, JERK):
         if row[SPEED] == 0.0 and before[SPEED] == 0.0:
             found[JERK] = -before[ACCEL] / dt
         else:
             found[JERK] = (row[ACCEL] - before[ACCEL]) / dt
-    if not is_told(told, S):
+    if not is_known(known, S):
         found[S] = before[S] + row[SPEED] * dt
     driven = abs(before[SPEED]) * dt
-    if not is_told(told, DISTANCE):
+    if not is_known(known, DISTANCE):
         found[DISTANCE] = before[DISTANCE] + driven
-    if not is_told(told, FREE_S):
-        limit = law.limits[_lane(law, before_words)]
+    if not is_known(known, FREE_S):
+        limit = forecast.limits[_lane(forecast, before_words)]
         found[FREE_S] = before[FREE_S] + driven / (before[FACTOR] * limit)
-    if not is_told(told, WAIT_S):
+    if not is_known(known, WAIT_S):
         found[WAIT_S] = before[WAIT_S] + dt if abs(row[SPEED]) < STANDING_MPS else 0.0
-    if not is_told(told, TO_GO):
-        found[TO_GO] = row[law.way_to_go] + (-row[S] + law.beyond[_lane(law, row_words)])
-    begins = before_words[TICK] % law.ticks_per_step == 0  # a step
-    if not is_told(told, STEP_TO_GO):
+    if not is_known(known, TO_GO):
+        found[TO_GO] = row[forecast.way_to_go] + (
+            -row[S] + forecast.beyond[_lane(forecast, row_words)]
+        )
+    begins = before_words[TICK] % forecast.ticks_per_step == 0  # a step
+    if not is_known(known, STEP_TO_GO):
         found[STEP_TO_GO] = before[TO_GO] if begins else before[STEP_TO_GO]
-    if not is_told(told, STEP_JERK):
+    if not is_known(known, STEP_JERK):
         found[STEP_JERK] = (0.0 if begins else before[STEP_JERK]) + abs(row[JERK]) * dt
-    if not is_told(told, TICK):
+    if not is_known(known, TICK):
         found_words[TICK] = before_words[TICK] + 1
 
 
 @inlined_kernel
-def _lane(law: Forecast, row: Words) -> int:
+def _lane(forecast: Forecast, row: Words) -> int:
     lane = row[LANE] & _LOW
-    return int(lane) if lane < law.limits.size else 0
+    return int(lane) if lane < forecast.limits.size else 0

@@ -44,7 +44,7 @@ CHANGE = np.dtype(
         ("approached", np.int64),  # tick in which it was near first
         ("prepare_depth_m", np.float64),  # distance outside of the source's zone in that tick,
         ("switch_depth_m", np.float64),  # at the change of owner,
-        ("release_depth_m", np.float64),  # and one tick later; NaN: it has left the world
+        ("release_depth_m", np.float64),  # and one tick later; NaN: the vehicle has left the world
         # duration since it was near first; until the tick ends, clock time of the first approach
         ("ms", np.float64),
     ],
@@ -63,11 +63,11 @@ DUE = np.dtype(
 )
 """A row that must be copied to a zone as a ghost."""
 
-AT_ONCE = 512
+BATCH_SIZE = 512
 """Size of a batch of rows to copy; larger than the greatest number of zones."""
 
-LATE = 256
-"""Number of unread changes from which on they are read; a tick may add one per vehicle to it."""
+UNREAD_LIMIT = 256
+"""Unread changes are read from this number on. A tick may add one more change per vehicle."""
 
 
 class BorderRecords(NamedTuple):
@@ -78,7 +78,7 @@ class BorderRecords(NamedTuple):
     num_crossed: NDArray[np.int64]  # (W,) entries of `near` that have crossed
     owned: NDArray[np.int64]  # (W,) number of vehicles when `near` was made
     coming: NDArray[np.void]  # COMING (W, 2, 2 C) near, owner unchanged; two lists, swapped a tick
-    turn: NDArray[np.int64]  # (W,) index of the present list; the other is of the tick before
+    turn: NDArray[np.int64]  # (W,) index of the present list; the other list is of the tick before
     num_coming: NDArray[np.int64]  # (W, 2)
     known: NDArray[np.int64]  # (W,) entries of the present list that were in the list before
     acknowledged: NDArray[np.int64]  # (W,) sum of the entries of `coming` in all earlier ticks
@@ -86,9 +86,9 @@ class BorderRecords(NamedTuple):
     tick: NDArray[np.int64]  # (W,) tick of the rows in which `near` was found
     ms: NDArray[np.float64]  # (W,) clock time at the begin of that tick
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
-    changes: NDArray[np.void]  # CHANGE (W, C + LATE) that are not read yet
+    changes: NDArray[np.void]  # CHANGE (W, C + UNREAD_LIMIT) that are not read yet
     num_changes: NDArray[np.int64]  # (W,)
-    due: NDArray[np.void]  # DUE (AT_ONCE,) scratch of `exchange`
+    due: NDArray[np.void]  # DUE (BATCH_SIZE,) scratch of `exchange`
 
 
 def make_book(num_worlds: int, capacity: int) -> BorderRecords:
@@ -109,9 +109,9 @@ def make_book(num_worlds: int, capacity: int) -> BorderRecords:
         tick=numbers(),
         ms=np.zeros(num_worlds),
         newborn=numbers(capacity),
-        changes=np.zeros((num_worlds, capacity + LATE), CHANGE),
+        changes=np.zeros((num_worlds, capacity + UNREAD_LIMIT), CHANGE),
         num_changes=numbers(),
-        due=np.zeros(AT_ONCE, DUE),
+        due=np.zeros(BATCH_SIZE, DUE),
     )
 
 
@@ -122,13 +122,13 @@ def look(
     zoned: ZoneState,  # the rows of all zones
     side: int,  # the buffer of rows, 0 or 1
     w: int,
-    everybody: bool,  # whether to check all owned rows, see `find_near`
+    check_all: bool,  # whether to check all owned rows, see `find_near`
     num_newborn: int,  # vehicles in `book.newborn[w, :num_newborn]` are left out
     book: BorderRecords,  # `near` and `coming` are written
 ) -> None:
     """Record vehicles that are near a border or have crossed it."""
     near = book.near[w]
-    found = find_near(zones, borders, zoned, side, w, everybody, near)
+    found = find_near(zones, borders, zoned, side, w, check_all, near)
     num = 0
     crossed = 0
     for n in range(found):
@@ -165,17 +165,17 @@ def hand_over(
     zoned: ZoneState,  # the rows of all zones
     side: int,  # the buffer of rows, 0 or 1
     w: int,
-    everybody: bool,  # whether rows have changed since `look_on`
+    check_all: bool,  # whether rows have changed since `look_on`
     num_newborn: int,  # see `look`
     book: BorderRecords,  # is written
 ) -> int:
-    """Give every vehicle beyond its zone's hysteresis to the zone in which it is.
+    """Give every vehicle beyond its zone's hysteresis to the zone that contains it.
 
     Returns:
         The number of changes, which are at the end of `book.changes` by rising ids; or NOT_OWNED or
         NOT_SEEN, with the failed change after them.
     """
-    if everybody:
+    if check_all:
         look(zones, borders, zoned, side, w, True, num_newborn, book)
     near = book.near[w]
     changed = 0
@@ -197,7 +197,7 @@ def hand_over(
 def _follow_swap(
     zoned: ZoneState, w: int, near: np.void, changed: int, book: BorderRecords
 ) -> None:
-    """Update the row of a vehicle that has moved into the row of one that left its zone.
+    """Update the row of a vehicle that has moved into the row of a vehicle that left its zone.
 
     Both have changed their zone in this tick. Without this, `release` would search all rows.
     """

@@ -1,7 +1,8 @@
 """Frames that two processes exchange about the rows of a tick: ghosts and vehicles that leave.
 
 If another process hosts a zone, the zone has no owned rows here, and `exchange` writes only its
-ghosts. If a ghost was in the frame before, only the words that differ from their forecast are sent.
+ghosts. For a ghost that was in the frame before, only words that differ from their forecast are
+sent.
 A ghost has V + S + 2 words: its row, its step, the place of the step, its world.
 
 A frame for a process with k zones in W worlds has these words:
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.codes import COUNT_REROUTED
-from cavmarl.zones.kernels.ghost_forecast import Forecast, foresee, is_told
+from cavmarl.zones.kernels.ghost_forecast import Forecast, is_known, write_forecast
 from cavmarl.zones.kernels.row_bounds import is_bounded
 
 ID = 0  # the word of a row with the vehicle's id
@@ -38,7 +39,7 @@ NO_FRAME = -(1 << 62)
 Words = NDArray[np.int64]
 
 
-class Both(NamedTuple):
+class ExchangeState(NamedTuple):
     """The state that a process exchanges with another process."""
 
     rows: Words  # (2, k, W, C, V) of all zones
@@ -81,10 +82,10 @@ def count_own(
 
 @kernel
 def pack_frame(
-    both: Both,
+    both: ExchangeState,
     side: int,
     passing: Passing,
-    law: Forecast,
+    forecast: Forecast,
     before: Ghosts,  # of the frame before
     slots: NDArray[np.int32],  # scratch; its size is a power of two above the number of `before`
     now: Ghosts,  # the first rows are written: the ghosts
@@ -120,15 +121,15 @@ def pack_frame(
         for i in range(passing.num[w]):
             _copy(passing.rows[w, i], 0, frame, at, row)
             at += row
-    frame[0] = at + _pack_ghosts(both, side, law, before, slots, now, frame, first, total, at)
+    frame[0] = at + _pack_ghosts(both, side, forecast, before, slots, now, frame, first, total, at)
     return int(total)
 
 
 @inlined_kernel
 def _pack_ghosts(
-    both: Both,
+    both: ExchangeState,
     side: int,
-    law: Forecast,
+    forecast: Forecast,
     before: Ghosts,
     slots: NDArray[np.int32],
     now: Ghosts,
@@ -158,12 +159,12 @@ def _pack_ghosts(
                     _copy(ghost, 0, frame, at, ghost.size)
                     at += ghost.size
                 else:
-                    _copy(before.words[found], 0, law.words, 0, ghost.size)
-                    foresee(
-                        law, before.floats[found], before.words[found],
-                        now.floats[n], ghost, np.uint64(0), law.floats, law.words,
+                    _copy(before.words[found], 0, forecast.words, 0, ghost.size)
+                    write_forecast(
+                        forecast, before.floats[found], before.words[found],
+                        now.floats[n], ghost, np.uint64(0), forecast.floats, forecast.words,
                     )  # fmt: skip
-                    bits, at = _pack_differences(law.words, ghost, frame, at)
+                    bits, at = _pack_differences(forecast.words, ghost, frame, at)
                 frame[first + n] = found
                 frame[first + total + n] = np.int64(bits)
                 n += 1
@@ -205,7 +206,7 @@ def _differ(known: Words, ghost: Words, first: int) -> bool:
 
 
 @inlined_kernel
-def _count_ghosts(both: Both, frame: Words) -> int:
+def _count_ghosts(both: ExchangeState, frame: Words) -> int:
     """Return the number of ghosts in a frame; -1 if `pack_frame` has not made the frame.
 
     The caller must not read more of the frame if the result is -1, or if there is no room for the
@@ -237,10 +238,10 @@ def _count_ghosts(both: Both, frame: Words) -> int:
 
 @kernel
 def take_frame(
-    both: Both,
+    both: ExchangeState,
     side: int,
     passing: Passing,  # is written
-    law: Forecast,
+    forecast: Forecast,
     before: Ghosts,  # of the frame before
     now: Ghosts,  # the first rows are written: the ghosts
     frame: Words,
@@ -251,7 +252,7 @@ def take_frame(
 
     Returns:
         The number n of ghosts; -1 - n if there is no room for them; `NO_FRAME` if `pack_frame` has
-        not made the frame. If the result is below 0, no rows are appended.
+        not made the frame. If the result is negative, no rows are appended.
     """
     total = _count_ghosts(both, frame)
     if total < 0:
@@ -260,21 +261,23 @@ def take_frame(
         return int(-1 - total)
     num_worlds = both.num_owned.shape[1]
     first = 1 + 3 * num_worlds
-    like = first + both.mine.size * num_worlds * 2
-    at = words = like + 2 * total
+    before_at = first + both.mine.size * num_worlds * 2
+    at = words = before_at + 2 * total
     row = passing.rows.shape[2]
     for w in range(num_worlds):
         leaving = frame[1 + 2 * num_worlds + w]
         if passing.num[w] + leaving > passing.rows.shape[1]:
             return NO_FRAME
         for _ in range(leaving):
-            if not is_bounded(frame[words : words + row], law.row_bounds):
+            if not is_bounded(frame[words : words + row], forecast.row_bounds):
                 return NO_FRAME
             words += row
-    if not _unpack(law, before, now, total, frame, like, words):
+    if not _unpack(forecast, before, now, total, frame, before_at, words):
         return NO_FRAME
     for n in range(total):
-        if not is_bounded(now.words[n], law.bounds) or not _is_of_world(now.words[n], num_worlds):
+        if not is_bounded(now.words[n], forecast.bounds) or not _is_of_world(
+            now.words[n], num_worlds
+        ):
             return NO_FRAME
     for w in range(num_worlds):
         both.running[w] += frame[1 + w]
@@ -300,7 +303,7 @@ def _is_of_world(ghost: Words, num_worlds: int) -> bool:
 
 
 @inlined_kernel
-def _put(both: Both, side: int, zone: int, w: int, ghost: Words, is_near: bool) -> None:
+def _put(both: ExchangeState, side: int, zone: int, w: int, ghost: Words, is_near: bool) -> None:
     """Append a ghost to the rows of a zone."""
     rows = both.rows[side, zone, w]
     steps = both.steps[zone, w]
@@ -330,19 +333,19 @@ def _copy(source: Words, first: int, target: Words, to: int, num: int) -> None:
 
 @inlined_kernel
 def _unpack(
-    law: Forecast,
+    forecast: Forecast,
     before: Ghosts,
     now: Ghosts,
     num: int,
     frame: Words,
-    like: int,  # start of the ghosts' indices in the frame before
+    before_at: int,  # start in `frame` of the ghosts' indices in the frame before
     at: int,  # start of the ghosts' words
 ) -> bool:
     """Write the ghosts of a frame to `now`. Return whether the frame is valid."""
     size = now.words.shape[1]
     for n in range(num):
-        found = frame[like + n]
-        bits = np.uint64(frame[like + num + n])
+        found = frame[before_at + n]
+        bits = np.uint64(frame[before_at + num + n])
         if found >= before.words.shape[0] or bits > _every_bit(size):
             return False
         ghost = now.words[n]
@@ -356,13 +359,13 @@ def _unpack(
         for first in range(0, size, GROUP):
             if bits >> np.uint64(first) & _every_bit(GROUP):
                 for c in range(first, min(first + GROUP, size)):
-                    if is_told(bits, c):
+                    if is_known(bits, c):
                         if at == frame.size:
                             return False
                         ghost[c] = frame[at]
                         at += 1
-        foresee(
-            law, before.floats[found], before.words[found],
+        write_forecast(
+            forecast, before.floats[found], before.words[found],
             now.floats[n], ghost, bits, now.floats[n], ghost,
         )  # fmt: skip
     return at == frame.size

@@ -16,7 +16,7 @@ class VisibilityScratch(NamedTuple):
     ahead: NDArray[np.float64]  # (L,) distance from a driver of the zone to a lane's start, m
     behind: NDArray[np.float64]  # (L,) distance from a lane's end to a vehicle with followers, m
     to_line: NDArray[np.float64]  # (L,) distance from a lane's end to the line of a foe, m
-    to_room: NDArray[np.float64]  # (L,) the same, to foes in `swept`
+    to_room: NDArray[np.float64]  # (L,) the same for the lines of foes in `swept`
     beyond: NDArray[np.float64]  # (L,) distance from a junction in `asked` to a lane, m
     asked: NDArray[np.bool_]  # (K,) links that a driver of the zone may want to enter
     foe: NDArray[np.bool_]  # (K,) foes of these links

@@ -1,12 +1,12 @@
 """The parts of lanes with vehicles that a zone's drivers may consider.
 
 A halo is as wide as the farthest look in any direction. But a driver looks only along its route, at
-vehicles beside it, and at vehicles that approach the lines before it; most lanes within the halo
-are none of these. This module follows the roads from the zone's own lanes, and finds the part of
-each lane in which vehicles can matter. A part that is too large costs superfluous copies; a part
-that is too small is an error.
+vehicles beside it, and at vehicles that approach the stop lines before it. Most lanes within the
+halo have no such vehicles. This module follows the roads from the zone's own lanes, and finds the
+part of each lane in which vehicles can matter. A part that is too large causes needless copies; a
+part that is too small causes wrong results.
 
-This runs once per partition, not in ticks.
+The search runs once per partition, not in each tick.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from cavmarl.zones.kernels.zone_lookup import squared_distance
 
 AT_LINE_M = 0.2  # a vehicle within this distance of a line may be about to cross it
 ASIDE_M = 10.0  # bound of the distance, and of the difference in s, of adjacent places on an edge
-BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # distance to the end of lanes with possible followers
+BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # distance back to the end of lanes with followers
 ROUNDING_M = 0.1  # bound of the rounding of sums over lanes and of float32
 
 
@@ -40,7 +40,7 @@ ROUNDING_M = 0.1  # bound of the rounding of sums over lanes and of float32
 def _within(
     rect: NDArray[np.float64], x: float, y: float, to_x: float, to_y: float
 ) -> tuple[float, float]:
-    """Return the part of a segment in a rectangle, as shares from 0 to 1; (inf, -inf) if none."""
+    """Return the part of a segment in a rectangle, as shares from 0 to 1; else (inf, -inf)."""
     low = 0.0
     high = 1.0
     for axis in range(2):
@@ -207,13 +207,13 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
         own = scratch.first[lane] <= scratch.last[lane]
         if row["internal"]:
             if own:
-                _ask(roads, roads.links[row["link"]]["from_lane"], scratch)
+                _mark_links_after(roads, roads.links[row["link"]]["from_lane"], scratch)
         elif (own and row["length_m"] - scratch.last[lane] <= see_m) or (
             scratch.ahead[lane] + row["length_m"] <= see_m
         ):
-            _ask(roads, lane, scratch)
+            _mark_links_after(roads, lane, scratch)
         if own and not row["internal"] and scratch.first[lane] <= SWEPT_BEYOND_M + half_m:
-            _ask_behind(roads, lane, scratch)
+            _mark_links_beside(roads, lane, scratch)
     for link in range(roads.links.shape[0]):
         if scratch.asked[link]:
             first = roads.links[link]["first_conflict"]
@@ -227,7 +227,7 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
                     scratch.foe[sweep["foe"]] = True
                     scratch.swept[sweep["foe"]] = True
     grown = True
-    while grown:  # on equal roads, drivers follow circles of vehicles that give way
+    while grown:  # on equal roads, drivers consider cycles of vehicles that yield to each other
         grown = False
         for link in range(roads.links.shape[0]):
             if not (scratch.foe[link] and on_equal_road(roads, link)):
@@ -241,8 +241,8 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
 
 
 @kernel
-def _ask(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
-    """Mark all links that lead on from the edge of a lane."""
+def _mark_links_after(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
+    """Mark all links that begin at the edge of a lane."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         first = roads.lanes[other]["first_link"]
@@ -251,12 +251,12 @@ def _ask(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
 
 
 @kernel
-def _ask_behind(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
-    """Mark links beside those that lead to a lane: their vehicles may obstruct its start."""
+def _mark_links_beside(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
+    """Mark links whose vehicles may obstruct the start of a lane."""
     for k in range(roads.lanes[lane]["num_into"]):
         before = roads.lanes[roads.into[roads.lanes[lane]["first_into"] + k]]
         if before["internal"]:
-            _ask(roads, roads.links[before["link"]]["from_lane"], scratch)
+            _mark_links_after(roads, roads.links[before["link"]]["from_lane"], scratch)
 
 
 @kernel
@@ -313,7 +313,8 @@ def _merge_from(roads: RoadArrays, lane: int, way: float, looks: NDArray[np.void
 def _look_at_merges(roads: RoadArrays, scratch: VisibilityScratch, looks: NDArray[np.void]) -> None:
     """Make vehicles visible from farther away before foes' lines where vehicles merge.
 
-    They are on the lanes before these lines, or on lanes with the right of way that lead to them.
+    These vehicles are on the lanes before the lines, or on lanes with the right of way that lead
+    to these lanes.
     """
     for lane in range(roads.lanes.shape[0]):
         if scratch.to_line[lane] == 0.0 and roads.lanes[lane]["merges"]:

@@ -71,14 +71,15 @@ class Halo(NamedTuple):
     halo_m: float
     inner: NDArray[np.float64]  # (k, 4) the part of a zone in which no other zone sees vehicles
     near_start: NDArray[np.int32]  # (k + 1,)
-    near: NDArray[np.int32]  # near[near_start[z] : near_start[z + 1]]: zones within the halo of
-    # zone z, including z
+    # near[near_start[z] : near_start[z + 1]]: zones within the halo of zone z, including z
+    near: NDArray[np.int32]
     sure_m: float  # all vehicles within this distance are seen
     seen_m: float  # between `sure_m` and this, vehicles in `watchers` are seen; beyond it, none
     line_m: float  # a vehicle whose centre is farther before a line has not reached the line
     watcher_start: NDArray[np.int32]  # (L + 1,); (1,) if sure_m is seen_m: there are no watchers
-    watchers: NDArray[np.void]  # WATCH: watchers[watcher_start[l] : watcher_start[l + 1]] are the
-    # zones that may see vehicles on lane l, and the vehicles that they see
+    # WATCH: watchers[watcher_start[l] : watcher_start[l + 1]] are the zones that may see vehicles
+    # on lane l, and the vehicles that they see
+    watchers: NDArray[np.void]
 
 
 @kernel
@@ -151,9 +152,9 @@ def note_outer(outer: np.void, row: np.void, i: int) -> None:
 
 
 @inlined_kernel
-def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
+def may_be_considered(halo: Halo, watch: np.void, row: np.void) -> bool:
     """Return whether a driver of a zone that watches a vehicle's lane may consider the vehicle."""
-    # The results are unpredictable, so branches would cost more than the work that they save.
+    # No branches: they are unpredictable, and would cost more than the work that they save.
     s = row["s"]
     reach_m = registration_distance_m(row["speed"])
     to_line = watch["line"] - s
@@ -162,9 +163,11 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
     comes = (to_line < reach_m) & (not is_let)
     merges = (watch["merge"] - s < MERGES_M) & (not stands)
     follows = watch["back"] - s < reach_m
-    swept = watch["room"] - s < reach_m  # waiting drivers leave room even if it may be ignored
-    asked: bool = (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | merges | swept
-    return asked
+    swept = watch["room"] - s < reach_m  # waiting drivers leave room even if they may ignore it
+    considered: bool = (
+        (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | merges | swept
+    )
+    return considered
 
 
 @inlined_kernel
@@ -181,5 +184,5 @@ def is_seen(
         return True
     for k in range(halo.watcher_start[row["lane"]], halo.watcher_start[row["lane"] + 1]):
         if halo.watchers[k]["zone"] == zone:
-            return is_asked_about(halo, halo.watchers[k], row)
+            return may_be_considered(halo, halo.watchers[k], row)
     return False

@@ -1,7 +1,7 @@
 """Halos: the areas beyond their borders that zones see.
 
-A halo is a distance (decision 012): a zone gets every vehicle within it, from neighbours and from
-zones that do not touch it.
+A halo is a distance (decision 012): a zone gets every vehicle within this distance, from neighbours
+and from zones that do not touch it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.zones.kernels.zone_lookup import LOOK, WATCH, Halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-# Added to the halo, so that rounding cannot make it too narrow.
+# Margin of the halo, so that rounding cannot make it too narrow.
 _ROUNDING_M = 1e-6
 
 

@@ -1,6 +1,6 @@
 """Layouts of zones: a grid, strips, or recursive coordinate bisection.
 
-Bisection halves the weight of the map (lanes or expected vehicles) across its longer side, then
+Bisection halves the weight of the map (lanes or expected vehicles) across its longer side, and then
 each half again (Berger and Bokhari, IEEE Trans. Computers C-36, 1987). A number of zones that is
 not a power of two is split as evenly as possible. Grid and strips have equal sides.
 """
@@ -29,7 +29,7 @@ _RIM_M = 5.0
 # How far a cut may move to avoid junctions: as a share of a zone's side or of the lesser weight.
 _SIDE_SHIFT = 0.25
 _WEIGHT_SHIFT = 0.1
-# Distance of such a cut from the junction, if there is room.
+# Distance of a moved cut from the junction, if there is room.
 _CLEAR_M = 1.0
 
 
@@ -201,7 +201,7 @@ def _quiet_cut(
     axis: int,  # 0: between left and right, 1: between below and above
     window: tuple[float, float, float],  # first allowed, wanted and last allowed cut
 ) -> float:
-    """Return the cut within a window that divides the fewest junctions, nearest to the wanted."""
+    """Return the cut in a window that divides the fewest junctions; on a tie, the nearest one."""
     first, wanted, last = window
     across = 1 - axis
     boxes = area.junctions

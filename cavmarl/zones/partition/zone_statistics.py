@@ -38,7 +38,8 @@ class ZoneStatistics:
     vehicles: tuple[int, ...]  # by position; zeros without positions
     # upper bound: vehicles of other zones within the halo; zeros without positions
     ghosts: tuple[int, ...]
-    # zones with a side shorter than the halo; they are exact, but most of their vehicles are ghosts
+    # zones with a side shorter than the halo; their results are exact, but most of their vehicles
+    # are ghosts
     narrow: tuple[int, ...]
 
     @property

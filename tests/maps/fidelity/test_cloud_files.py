@@ -78,7 +78,7 @@ def test_each_kind_gives_the_same_points(
     assert cloud.counts == {"read": 3, "no numbers": 0}
 
 
-def test_what_is_no_place_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_invalid_points_are_dropped_and_counted(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\nnan,2,3\n1,inf,3\n4,5,6\n")
     cloud = read_cloud(tmp_path / "a.csv")
     assert len(cloud.points) == 2
@@ -107,7 +107,7 @@ def test_what_is_no_place_is_left_out_and_counted(tmp_path: Path) -> None:
         ("none.csv", None, "cannot be read"),
     ],
 )
-def test_what_is_no_cloud_is_refused(
+def test_a_file_without_a_point_cloud_is_refused(
     tmp_path: Path, name: str, content: str | None, words: str
 ) -> None:
     if content is not None:

@@ -79,7 +79,7 @@ def test_other_places_do_not_converge() -> None:
     assert any("more than" in problem for problem in found.problems)
 
 
-def test_a_plane_is_told_to_slide() -> None:
+def test_a_plane_is_reported_as_underdetermined() -> None:
     rng = np.random.default_rng(7)
     plane = np.column_stack([rng.uniform(0.0, 50.0, (5000, 2)), np.zeros(5000)])
     found = align(moved(plane, motion(0.5, 0.0, 0.0, 0.0)), Target(plane))
@@ -116,7 +116,7 @@ def test_wrong_numbers_are_refused() -> None:
         drop_outliers(cloud, float("nan"))
     with pytest.raises(ConfigError, match="keep 2"):
         align(cloud.points, Target(cloud.points), keep=2.0)
-    with pytest.raises(MapError, match="must be at least 50"):
+    with pytest.raises(MapError, match="at least 50 are needed"):
         Target(cloud.points[:10])
     with pytest.raises(ConfigError, match="x,y,z,yaw"):
         start_transform("1,2")

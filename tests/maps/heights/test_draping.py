@@ -152,7 +152,7 @@ def test_steep_roads_are_named(town: Path, tmp_path: Path, grade: float, steep: 
     assert bool(check_map(result.path).steep_lanes) is steep
 
 
-def test_steeper_roads_are_refused_unless_told(town: Path, tmp_path: Path) -> None:
+def test_steeper_roads_are_refused_unless_allowed(town: Path, tmp_path: Path) -> None:
     model = write_geotiff(tmp_path / "steep.tif", plane(0.0, 0.3))
     with pytest.raises(MapError, match=r"(?s)30%, more than 25%.*Hill Road.*--limit-grade"):
         built(town, model)
@@ -211,7 +211,7 @@ def test_without_a_model_bridges_and_tunnels_leave_flat_ground_where_they_cross_
         crossed = [n for n, name in enumerate(network.lane_ids) if re.match(r"-?14_", name)]
         assert crossed
         assert not any(network.lane_polyline(lane)[:, 2].any() for lane in crossed)
-    with pytest.raises(MapError, match="give it with the source"):
+    with pytest.raises(MapError, match="build the map again"):
         built(over.path, write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05)))
 
 

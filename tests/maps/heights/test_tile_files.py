@@ -20,7 +20,7 @@ FEET = (1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326, 4099, 0, 1, 9002)
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.int32, np.uint16])
-def test_geotiffs_say_the_heights_of_the_ground(tmp_path: Path, kind: type) -> None:
+def test_heights_are_read_from_geotiffs(tmp_path: Path, kind: type) -> None:
     model = HeightModel([write_geotiff(tmp_path / "g.tif", GROUND, kind=kind)])
     heights, coverage = model.at(PLACES)
     assert np.abs(heights - GROUND(*PLACES.T)).max() < (0.01 if kind is np.float32 else 1.1)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS
+from cavmarl.roads.sumo_net.sumo_options import map_of_config
 from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.demand.element import DemandReport, Element
-from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.demand.type_table import vtype_record
 from tests.support.kept_maps import network_of
 from tests.traffic.demand.conftest import Reader, sumo_binary
@@ -141,9 +141,7 @@ def test_scenarios_of_the_wheel_are_read(game: str) -> None:
     config = Path(sumo_binary("sumo")).parents[1] / f"tools/game/{game}.sumocfg"
     if not config.exists():
         pytest.skip(f"this version of SUMO has no {game}")
-    net_file = read_sumo_config(config).net_file
-    assert net_file is not None
-    file = read_demand([config], network_of(net_file))
+    file = read_demand([config], network_of(map_of_config(config)))
     orders = file.draw(1)
     assert len(orders) > 0
     assert np.all(np.diff(orders["depart"]) >= 0.0)

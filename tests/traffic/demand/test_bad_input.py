@@ -37,7 +37,7 @@ def refused(demand: Reader, body: str, *words: str, error: type[Exception] = Dem
         'speedFactor="normc(1)"', 'vClass="boat"', 'carFollowModel="Foo"',
     ],
 )  # fmt: skip
-def test_types_that_cannot_exist(demand: Reader, attribute: str) -> None:
+def test_invalid_types_are_refused(demand: Reader, attribute: str) -> None:
     refused(demand, f'<vType id="t" {attribute}/>', "line 2", '<vType id="t">')
 
 
@@ -80,7 +80,9 @@ def test_flows_that_sumo_refuses(demand: Reader, timing: str) -> None:
         ('<vTypeDistribution id="d" vTypes="x"/><vehicle id="a" type="d" depart="0" route="r"/>',
          ("unknown type 'x'",)),
         ('<trip id="a" depart="0" from="AB"/>', ("no to",)),
-        ('<trip id="a" depart="0" fromTaz="1" toTaz="2"/>', ("duarouter",)),
+        ('<trip id="a" depart="0" fromTaz="1" toTaz="2"/>', ("fromTaz", "duarouter")),
+        ('<trip id="a" depart="0" from="AB" fromXY="1,2" to="BC"/>', ("fromXY", "duarouter")),
+        ('<trip id="a" depart="0" from="AB" to="BC" viaXY="1,2"/>', ("viaXY", "duarouter")),
         ('<vehicle id="a" depart="0"><route edges="AB BC CD"/></vehicle>',
          ("'CD'", "made for this map", "similar names: ")),
         ('<vehicle id="a" depart="0"><route edges="1 2 3 AB"/></vehicle>',
@@ -136,7 +138,7 @@ def test_the_ignoring_and_the_allowed_drive_everywhere(demand: Reader) -> None:
         ('lane="AB_0" duration="-5"', ("negative time",)),
     ],
 )
-def test_stops_that_cannot_be_made(demand: Reader, stop: str, words: tuple[str, ...]) -> None:
+def test_invalid_stops_are_refused(demand: Reader, stop: str, words: tuple[str, ...]) -> None:
     body = f'<vehicle id="a" depart="0"><route edges="AB BC"/>\n<stop {stop}/></vehicle>'
     refused(demand, body, "line 3", *words)
 
@@ -172,7 +174,7 @@ def test_endless_repetition_is_refused(demand: Reader) -> None:
         ('<?xml version="1.0" encoding="foo"?><routes/>', ("UTF-8",)),
     ],
 )
-def test_files_that_are_none(
+def test_files_without_demand_are_refused(
     town: RoadNetwork, tmp_path: Path, text: str, words: tuple[str, ...]
 ) -> None:
     path = tmp_path / "x.rou.xml"
@@ -205,7 +207,7 @@ def test_includes_gzip_and_byte_order_marks_are_read(town: RoadNetwork, tmp_path
     assert [Path(name).name for name in file.report.files] == ["a.rou.xml", "b.rou.xml.gz"]
 
 
-def test_what_is_no_demand_is_counted(demand: Reader) -> None:
+def test_elements_other_than_demand_are_counted(demand: Reader) -> None:
     file = demand(
         '<person id="p" depart="0"><walk from="AB" to="BC"/></person>'
         '<e1Detector id="e" lane="AB_0" pos="1" file="x"/><foo><vehicle id="inside"/></foo>'

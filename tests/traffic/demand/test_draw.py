@@ -15,6 +15,7 @@ from cavmarl.traffic.demand import Choices, read_demand
 from cavmarl.traffic.demand.demand_records import (
     LANE_BEST,
     LANE_FIRST,
+    POS_BASE,
     POS_GIVEN,
     SPEED_AVERAGE,
     SPEED_GIVEN,
@@ -196,7 +197,7 @@ def test_departures_that_name_no_lane_and_speed_have_sumos_or_the_configurations
     assert (element["depart_speed_code"], element["depart_speed"]) == speed
 
 
-def test_a_speed_of_departures_that_is_none_is_an_error_of_the_configuration(
+def test_an_invalid_departure_speed_is_an_error_of_the_configuration(
     town: RoadNetwork, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.sumocfg"
@@ -204,3 +205,57 @@ def test_a_speed_of_departures_that_is_none_is_an_error_of_the_configuration(
     path.write_text(text, encoding="utf-8")
     with pytest.raises(DemandError, match=r"run\.sumocfg, line 2.*fast"):
         read_demand([path], town)
+
+
+def test_a_trip_of_od2trips_goes_from_edge_to_edge(demand: Reader) -> None:
+    plain = '<trip id="v0" depart="0" from="AB" to="BC" departLane="free" departSpeed="max"'
+    file = demand(f'{plain} fromTaz="1" toTaz="2" fromJunction="x"/>')
+    assert file.draw(0).tobytes() == demand(f"{plain}/>").draw(0).tobytes()
+    assert not file.report.tolerated
+
+
+STOP = '<stop lane="AB_1" endPos="70" duration="5"/>'
+
+
+@pytest.mark.parametrize(
+    ("word", "stop", "code", "position"),
+    [
+        ("base", "", POS_BASE, 0.0),
+        ("splitFront", "", POS_BASE, 0.0),
+        ("random_location", "", POS_BASE, 0.0),
+        ("stop", "", POS_BASE, 0.0),
+        ("stop", STOP.replace("AB", "BC"), POS_BASE, 0.0),
+        ("stop", STOP, POS_GIVEN, 70.0),
+    ],
+)
+def test_words_for_the_position_of_departures_are_sumos(
+    demand: Reader, word: str, stop: str, code: int, position: float
+) -> None:
+    """SUMO 1.28 inserts these vehicles at 70 m or, with their front, at 5.1 m."""
+    file = demand(
+        f'<vehicle id="a" depart="0" departPos="{word}"><route edges="AB BC"/>{stop}</vehicle>'
+    )
+    (order,) = file.draw(0)
+    assert (order["depart_pos_code"], order["depart_pos"]) == (code, pytest.approx(position))
+    if code == POS_GIVEN:
+        assert file.network.lane_ids[order["depart_lane"]] == "AB_1"
+        assert (order["depart_speed_code"], order["depart_speed"]) == (SPEED_GIVEN, 0.0)
+
+
+def test_a_vehicle_departs_at_the_stop_of_its_route(demand: Reader) -> None:
+    file = demand(
+        f'<route id="r" edges="AB BC">{STOP}</route>'
+        '<flow id="a" number="2" end="9" departPos="stop" route="r"/>'
+    )
+    assert file.draw(0)["depart_pos"].tolist() == pytest.approx([70.0, 70.0])
+
+
+@pytest.mark.parametrize("word", ["random", "center", "20"])
+def test_positions_of_arrivals_are_counted(demand: Reader, word: str) -> None:
+    file = demand(
+        f'<vehicle id="a" depart="0" arrivalPos="{word}" arrivalLane="current">'
+        '<route edges="AB"/></vehicle>'
+    )
+    ((what, tally),) = file.report.tolerated.items()
+    assert what.startswith("arrivalPos of vehicle has no effect")
+    assert tally.count == 1

@@ -24,7 +24,7 @@ def rerouter(inside: str, attrs: str = 'edges="AB"', span: str = 'begin="10" end
     return f'{CAR}<rerouter id="r" {attrs}><interval {span}>{inside}</interval></rerouter>'
 
 
-def test_rules_say_where_when_and_to_whom(demand: Reader) -> None:
+def test_rules_have_an_edge_a_time_and_vehicles(demand: Reader) -> None:
     file = demand(
         '<vType id="x"/><vType id="y"/><route id="q" edges="XB BC"/>'
         + CAR
@@ -91,7 +91,7 @@ def test_closings_are_for_classes(demand: Reader, attrs: str, classes: int) -> N
         (rerouter("") + '<rerouter id="r" edges="AB"/>', ["unique"]),
     ],
 )
-def test_rerouters_that_cannot_be_are_refused(demand: Reader, body: str, words: list[str]) -> None:
+def test_invalid_rerouters_are_refused(demand: Reader, body: str, words: list[str]) -> None:
     with pytest.raises(DemandError) as caught:
         demand(body)
     assert "x.rou.xml, line 2" in str(caught.value)
@@ -128,7 +128,7 @@ def test_what_is_not_acted_on_is_counted(demand: Reader, body: str, said: str) -
     assert not file.rerouters.closings.size
 
 
-def test_what_rerouters_say_is_part_of_the_content(demand: Reader) -> None:
+def test_rerouters_are_part_of_the_content_hash(demand: Reader) -> None:
     hashes = {
         demand(rerouter(inside)).content_hash
         for inside in (
@@ -163,7 +163,7 @@ def params(**said: str) -> str:
         ("", params(probability="1", period="12.5"), (True, 12_500)),
     ],
 )
-def test_what_a_vehicle_says_counts_before_what_its_type_says(
+def test_settings_of_a_vehicle_override_those_of_its_type(
     demand: Reader, of_type: str, of_vehicle: str, found: tuple[bool, int]
 ) -> None:
     route = '<route edges="AB BC"/>'
@@ -185,9 +185,7 @@ def test_what_a_vehicle_says_counts_before_what_its_type_says(
     ],
 )
 @pytest.mark.parametrize("where", ["vType", "vehicle"])
-def test_devices_that_cannot_be_are_refused(
-    demand: Reader, said: str, words: str, where: str
-) -> None:
+def test_invalid_devices_are_refused(demand: Reader, said: str, words: str, where: str) -> None:
     vehicle = CAR if where == "vType" else CAR.replace("</vehicle>", f"{said}</vehicle>")
     body = f'<vType id="t">{said if where == "vType" else ""}</vType>{vehicle}'
     with pytest.raises(DemandError) as caught:
@@ -221,7 +219,7 @@ def config(town: RoadNetwork, tmp_path: Path) -> Config:
     return Config(tmp_path, town)
 
 
-def test_a_configuration_speaks_for_all(config: Config) -> None:
+def test_a_configuration_applies_to_all_vehicles(config: Config) -> None:
     assert config.read().device == DeviceOptions()
     assert not config.read().may_look
     assert not config.read(probability="-1").may_look
@@ -244,7 +242,7 @@ def test_a_configuration_speaks_for_all(config: Config) -> None:
         ({"adaptation_weight": "0.5"}, "adaptation-steps"),
     ],
 )
-def test_configurations_that_cannot_be_are_refused(
+def test_invalid_configurations_are_refused(
     config: Config, options: dict[str, str], words: str
 ) -> None:
     with pytest.raises(DemandError) as caught:

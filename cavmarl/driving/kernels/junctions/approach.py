@@ -50,7 +50,7 @@ APPROACH = np.dtype(
 def register_links(
     roads: RoadArrays,
     travel: TripTables,
-    rows: NDArray[np.void],  # VEHICLE (C,), of which `num` live
+    rows: NDArray[np.void],  # VEHICLE (C,); rows[:num] live
     num: int,  # live rows
     step: NDArray[np.void],  # (C,) the PLAN of each row's lane; updated
     step_at: NDArray[np.int64],  # (C,) positions of `step` in the table, see `Worlds`; updated

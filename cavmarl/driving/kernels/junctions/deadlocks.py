@@ -99,7 +99,7 @@ def yields_in_deadlock(
     roads: RoadArrays,
     rows: NDArray[np.void],
     row: np.void,  # VEHICLE
-    link: int,  # that it takes next
+    link: int,  # LINK that it takes next
     asking: np.void,  # VEHICLE whose driver asks: `row`, or a vehicle that yields to it
     scratch: Scratch,
 ) -> bool:

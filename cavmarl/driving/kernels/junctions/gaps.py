@@ -39,12 +39,12 @@ from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 
 BRISK_ACCEL = 2.5  # m/s²: assumed acceleration of a driver towards a shared area
 GENTLE_ACCEL = 1.8  # m/s²: to be safe, assumed acceleration out of a shared area
-GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # the same for vehicles with a lower acceleration
+GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # relative to the acceleration of any vehicle
 HARD_STOP = 5.0  # m/s²: a vehicle that needs more to stop before the line will not stop
 AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the own line)
 STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the own driver has waited long
 STEERED_AHEAD_S = 3.0  # time gap if one of both vehicles is steered, which may take longer
-STEERED_MERGE_AHEAD_S = 1.5  # the same if both drive into the same lane, where one can follow
+STEERED_MERGE_AHEAD_S = 1.5  # time gap if both then drive into one lane, where one can follow
 SPEEDING_UP_MPS2 = 0.1  # from this acceleration on, a foe is assumed to keep accelerating
 GAP_S = 1.0  # time between the exit of one vehicle from a shared area and the entry of another
 SET_OFF_S = 0.5  # a standing vehicle starts this long before another vehicle leaves the area
@@ -55,9 +55,9 @@ FORCED_STOP = 4.5  # m/s²: the deceleration that such a driver expects
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a slower stream lets others merge
 STUCK_S = 90.0  # after this wait, a driver may also pass stopped vehicles that must yield to it
-RESCUED_S = 300.0  # the same if both drive as in SUMO, which would teleport a vehicle then
+RESCUED_S = 300.0  # `STUCK_S` if both drive as in SUMO, which would teleport a vehicle then
 STOP_SIGN_S = 0.5  # time to stand at a stop sign, and before a tie is broken
-STOOD_S = 0.1  # the same for background vehicles, as in SUMO
+STOOD_S = 0.1  # `STOP_SIGN_S` of background vehicles, as in SUMO
 ARRIVES_M = 1.0  # a trip that ends at most this far behind a line does not cross the junction
 STATE_MAJOR = ord("M")
 STATE_STOP = ord("s")
@@ -120,7 +120,7 @@ def _has_turn(row: np.void, link: int) -> bool:
 
 @inlined_kernel
 def _is_yielding(row: np.void, link: int) -> bool:
-    """Return whether a standing vehicle yields at `link`; an agent's does so at its stop line."""
+    """Return whether a standing vehicle yields at `link`; an agent stopped at its line does."""
     stands: bool = row["driver"] == DRIVER_AGENT and row["wait_s"] > 0.0
     return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
 
@@ -145,7 +145,7 @@ def may_ignore(
     """Return whether a driver at `link` may ignore a foe at `foe_link` with the right of way.
 
     `signal` is the state of the foe's signal; `state` and `foe_state` are those of the links. After
-    a wait of `stuck_s` s, the driver also may_ignore a foe that stands and yields.
+    a wait of `stuck_s` s, the driver may also ignore a foe that stands and yields.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
@@ -336,7 +336,7 @@ def _blocks_inside(
         apart = distance + conflict["leave_m"] - half - to_clear
         return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # wait until there is room behind it
     if _in_turn(target["state"]) and _has_turn(row, link) and to_area > ROOM_M:
-        return HOLD_NONE  # it would lose its turn by stopping again, and can wait before the area
+        return HOLD_NONE  # stopping again would lose the turn; the row can wait before the area
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # A foe that has just started will accelerate; a foe that brakes may have to stop.
@@ -414,7 +414,7 @@ def hold_for_foe(
         return HOLD_NONE
     speed, to_line = row["speed"], distance - half
     if not (steered or conflict["merging"]) and speed <= STANDING_MPS:
-        # A waiting vehicle counts as being at its line or waiting position, where SUMO's stand.
+        # A waiting vehicle counts as being at its line or waiting position, as it would in SUMO.
         inside = to_line < 0.0 and target["wait_m"] < math.inf
         ahead = to_line + target["wait_m"] if inside else to_line
         to_line -= min(max(ahead, 0.0), LINE_MARGIN_M)

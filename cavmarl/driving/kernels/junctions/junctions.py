@@ -313,7 +313,7 @@ def behind_merging(
     roads: RoadArrays,
     kind: np.void,
     row: np.void,
-    link: int,  # that the vehicle takes next
+    link: int,  # LINK that the vehicle takes next
     distance: float,  # from the vehicle's centre to the end of its lane, m
     scratch: Scratch,
 ) -> float:
@@ -401,7 +401,7 @@ def constraint_inside(
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     i: int,  # row of the vehicle
-    link: int,  # that the vehicle drives on
+    link: int,  # LINK that the vehicle drives on
     place: float,  # distance of its centre beyond the end of the previous lane, m
     way: int,  # the vehicle's `way` beyond the junction
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows

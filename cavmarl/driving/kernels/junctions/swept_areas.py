@@ -66,7 +66,7 @@ def stop_before_foe_sweep(
     roads: RoadArrays,
     rows: NDArray[np.void],  # VEHICLE (C,)
     i: int,  # row of the vehicle
-    link: int,  # that the vehicle is on, or takes next
+    link: int,  # LINK that the vehicle is on, or takes next
     place: float,  # distance of its front beyond the stop line, m
     # if the vehicle has to stop anyway: it leaves room for foes this close to their lines, m; else
     # -inf
@@ -93,9 +93,9 @@ def stop_before_foe_sweep(
         if sweep["own"] != own or rear > sweep["leave_m"]:
             continue
         if has_left and place > sweep["enter_m"] + AT_AREA_M:
-            continue  # it has left the junction and clears the area
+            continue  # row i has left the junction and clears the area
         if own == STEERED and room_m > 0.0 and -MOST_BACK_M < sweep["enter_m"] <= 0.0:
-            stop = min(stop, max(sweep["enter_m"], place))  # it waits where no foe sweeps over it
+            stop = min(stop, max(sweep["enter_m"], place))  # wait where no foe sweeps over row i
         same_lane = roads.links[sweep["foe"]]["from_lane"] == roads.links[link]["from_lane"]
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
@@ -123,7 +123,7 @@ def stop_before_foe_sweep(
 def foe_would_sweep_over(
     roads: RoadArrays,
     row: np.void,  # VEHICLE that enters
-    link: int,  # that it takes next
+    link: int,  # LINK that it takes next
     place: float,  # distance of its front beyond the stop line, m
     scratch: Scratch,
 ) -> bool:

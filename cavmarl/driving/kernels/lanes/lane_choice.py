@@ -27,11 +27,12 @@ from cavmarl.driving.kernels.lanes.lane_index import (
     last_on,
     num_ahead,
 )
-from cavmarl.driving.kernels.lanes.route_following import next_step
+from cavmarl.driving.kernels.lanes.route_following import free_speed, next_step
 from cavmarl.driving.kernels.lanes.side_clearance import has_side_clearance
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import accel_behind, no_constraint, wish
 from cavmarl.driving.kernels.motion.ordered_stops import STAY, change_for_stop
+from cavmarl.roads.kernels.plans import is_barred
 
 LOOK_BACK_M = 60.0  # distance within which followers count for a lane change
 # Drivers start to look for a gap this far, plus this travel time, before a mandatory change.
@@ -41,7 +42,7 @@ MAX_BRAKING_ACCEPTED = 4.0  # m/s², largest deceleration that a driver accepts 
 MAX_BRAKING_NEEDED = 4.0  # m/s², largest deceleration that a mandatory change imposes
 QUEUED_M = 7.5  # length of lane per vehicle in a queue
 TURN_IN_M = 5.0  # distance behind a junction where long vehicles still turn into adjacent lanes
-SPARE_M = 2.0  # this rule holds on lanes longer, by this, than two vehicles need to swap lanes
+SPARE_M = 2.0  # on a short lane, `TURN_IN_M` is reduced so that this much room is left
 SLOW_MPS = 2.0  # below this speed, a lane change needs side clearance to stopped vehicles
 CREEP_MPS = 1.0  # up to this speed, a mandatory change is possible to the very end of the lane
 SIDEWAYS_S = 2.5  # duration of a lane change, which has to end before the lane does
@@ -82,13 +83,6 @@ def room_for_further_changes(lane: np.void, row: np.void, step: np.void) -> floa
     return float(min(further, max(MERGE_ROOM_SHARE * lane["length_m"] - MERGE_ROOM_M, 0.0)))
 
 
-@inlined_kernel
-def _desired(roads: RoadArrays, kind: np.void, row: np.void, lane: int) -> float:
-    """Return the desired speed in m/s of a driver on a lane."""
-    limit = min(roads.lanes[lane]["speed_mps"], kind["desired_max_speed"])
-    return float(min(limit * row["speed_factor"], kind["max_speed"]))
-
-
 @kernel
 def wish_on_lane(
     roads: RoadArrays,
@@ -104,7 +98,7 @@ def wish_on_lane(
     """
     lane = row["lane"]
     kind = travel.types[row["vtype"]]
-    desired = _desired(roads, kind, row, lane)
+    desired = free_speed(roads.lanes[lane], kind, row["speed_factor"])
     # Leaders beyond the view may belong to another zone and may be unknown here.
     follows = (
         k + 1 < scratch.lane_end[lane] and scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m
@@ -168,7 +162,7 @@ def imposed_on_followers(
     """Return the lowest acceleration in m/s² that a change to `s` on `target` imposes on others.
 
     The result is -inf if a follower is beside that place. A fast follower far behind may have to
-    brake harder than a near one that stands, so every lane that leads to `target` is searched.
+    brake harder than a stopped follower nearby, so every lane that leads to `target` is searched.
     """
     kind = travel.types[row["vtype"]]
     half = 0.5 * row["length"]
@@ -183,7 +177,7 @@ def imposed_on_followers(
         other = rows[follower["row"]]
         theirs = travel.types[other["vtype"]]
         pace = follower["speed"]
-        limit = _desired(roads, theirs, other, target)
+        limit = free_speed(roads.lanes[target], theirs, other["speed_factor"])
         net = gap - follower["half"] - half
         asked = accel_behind(theirs, pace, limit, net, row["speed"], kind["decel"])
         # A standing or slow vehicle cannot brake for long, whatever the model returns.
@@ -211,7 +205,7 @@ def change_is_safe(
     s = beside_s(roads, row["lane"], target, row["s"])
     if s >= roads.lanes[target]["length_m"]:
         return False  # the target lane has already ended
-    desired = _desired(roads, kind, row, target)
+    desired = free_speed(roads.lanes[target], kind, row["speed_factor"])
     ahead = 0.0
     j = ahead_on(scratch, target, s, row["id"], travel.view_m)
     if j >= 0:
@@ -255,7 +249,7 @@ def rear_is_inside(lane: np.void, row: np.void) -> bool:
     spare = lane["length_m"] - 2.0 * row["length"] - room
     near_m = min(TURN_IN_M, max(spare - SPARE_M, 0.0))
     if row["driver"] == DRIVER_AGENT and row["speed"] < CREEP_MPS:
-        near_m = 0.0  # it may have stopped there for the lane change
+        near_m = 0.0  # the agent may have stopped there for the lane change
     inside: bool = spare > 0.0 and row["s"] < 0.5 * row["length"] + near_m
     return inside
 
@@ -277,6 +271,8 @@ def _may_change(
     target = lane["left"] if side > 0 else lane["right"]
     if lane["internal"] or target < 0 or (needed != 0 and needed != side):
         return False
+    if is_barred(roads, row["lane"], side, travel.types[row["vtype"]]["permissions"]):
+        return False
     if rear_is_inside(lane, row):
         return False
     rest = lane["length_m"] - row["s"] - SIDEWAYS_S * row["speed"]
@@ -287,7 +283,7 @@ def _may_change(
             return False
         # Early exit: even on an empty lane the gain would be too small.
         kind = travel.types[row["vtype"]]
-        desired = _desired(roads, kind, row, target)
+        desired = free_speed(roads.lanes[target], kind, row["speed_factor"])
         if wish(kind, row["speed"], desired, no_constraint(kind)) - own_wish < MIN_ACCEL_GAIN:
             return False
         beyond = travel.steps[row["way"] + target]

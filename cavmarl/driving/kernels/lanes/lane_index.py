@@ -92,7 +92,7 @@ def _fill(
 def index_lanes(
     roads: RoadArrays,
     travel: TripTables,  # the vehicles' types
-    rows: NDArray[np.void],  # VEHICLE (C,), of which `num` live
+    rows: NDArray[np.void],  # VEHICLE (C,); rows[:num] live
     num: int,  # live rows
     scratch: Scratch,  # the lists by lane and entries are written
 ) -> None:

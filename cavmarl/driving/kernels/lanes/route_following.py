@@ -20,7 +20,7 @@ MOST_CHANGES = 8  # lane changes at the end of one lane
 
 @inlined_kernel
 def own_step(roads: RoadArrays, row: np.void) -> int:
-    """Return the index in `TripTables.steps`: of its lane, or in a junction of the next lane."""
+    """Return the `TripTables.steps` row of a vehicle's lane; in a junction, of the next lane."""
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
@@ -90,12 +90,19 @@ def next_step_of_plan(
     return -1, way, -1
 
 
+@inlined_kernel
+def free_speed(lane: np.void, kind: np.void, speed_factor: float) -> float:
+    """Return the speed in m/s of a vehicle alone on a LANE, by its VTYPE and speed factor."""
+    limit = min(lane["speed_mps"], kind["desired_max_speed"])
+    return float(min(limit * speed_factor, kind["max_speed"]))
+
+
 @kernel
 def route_time_s(roads: RoadArrays, travel: TripTables, row: np.void, begin_s: float) -> float:
     """Return the time in s after which a trip counts as too long.
 
-    It is the time at the speed limits times `TripTables.trip_horizon`, plus for each signal one
-    cycle of the program that is active at `begin_s`.
+    The result is the time at the speed limits times `TripTables.trip_horizon`, plus for each signal
+    one cycle of the program that is active at `begin_s`.
     """
     lane, way = row["lane"], row["way"]
     free_s = -row["s"] / roads.lanes[lane]["speed_mps"]

@@ -23,7 +23,7 @@ def has_side_clearance(
     roads: RoadArrays,
     rows: NDArray[np.void],  # VEHICLE (C,)
     row: np.void,  # VEHICLE that moves, or would move, to the middle of a lane
-    target: int,  # that LANE
+    target: int,  # LANE to whose middle it moves
     s: float,  # position of its centre on that lane, m
     d: float,  # offset of its centre from the middle of that lane, m, positive to the left
     side: int,  # to which it moves: 1 left, -1 right

@@ -13,7 +13,7 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import cos_sin, tangent
 from cavmarl.core.math.geometry import wrap_angle
 
-MAX_SPEED_MPS = 40.0  # the motor limits the speed
+MAX_SPEED_MPS = 40.0  # limit of the motor
 MIN_SPEED_MPS = -40.0
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import cos_sin, cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap
-from cavmarl.core.math.neighbors import Grid, aim, cell_at, cell_columns, cell_rows
+from cavmarl.core.math.neighbors import Grid, cell_at, cell_columns, cell_rows, move_area
 
 APART_M = 1e-6  # larger than rounding errors of a distance
 
@@ -63,7 +63,7 @@ def find_contacts(
     added to the grid.
     """
     grid.newest[:] = -1
-    aim(grid, rows, num)
+    move_area(grid, rows, num)
     largest = 0.0
     found = False
     for i in range(num):

@@ -21,7 +21,12 @@ from cavmarl.core.records.arrays import LaneGrid, RoadArrays, TripTables
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_RED_LIGHT, SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
-from cavmarl.driving.kernels.lanes.route_following import distance_left, next_step, own_step
+from cavmarl.driving.kernels.lanes.route_following import (
+    distance_left,
+    free_speed,
+    next_step,
+    own_step,
+)
 from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE
 from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 from cavmarl.driving.kernels.motion.ordered_stops import advance_stop
@@ -29,7 +34,7 @@ from cavmarl.driving.kernels.motion.tracking import locate, side_lane
 
 LATERAL_MPS = 1.4  # largest lateral speed of a lane change
 LATERAL_RATIO = 0.35  # largest lateral speed as a share of the speed
-LATERAL_MIN_MPS = 0.5  # but at least this, so that no vehicle is stuck between two lanes
+LATERAL_MIN_MPS = 0.5  # least value of that limit, so that no vehicle is stuck between two lanes
 MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle that changes lanes and its lane
 MAX_SWING_M = 0.3  # largest distance by which its corners swing out
 MAX_BODY_LANES = 8  # lanes that a body can cover, in each direction from its centre
@@ -137,17 +142,17 @@ def place_on_lane(roads: RoadArrays, travel: TripTables, row: np.void) -> float:
 
 
 @inlined_kernel
-def account(row: np.void, before: Before, roads: RoadArrays, pace: float, dt: float) -> None:
+def account(row: np.void, before: Before, free_mps: float, dt: float) -> None:
     """Update the rates, distances and waiting time of a record after any kind of motion.
 
-    `pace` is the free-flow speed divided by the speed limit.
+    `free_mps`: the vehicle's `free_speed` on the lane before the tick.
     """
     row["accel"] = (row["speed"] - before.speed) / dt
     row["jerk"] = (row["accel"] - before.accel) / dt
     row["yaw_rate"] = wrap_angle(row["heading"] - before.heading) / dt
     driven = abs(before.speed) * dt
     row["distance_m"] += driven
-    row["free_s"] += driven / (pace * roads.lanes[before.lane]["speed_mps"])
+    row["free_s"] += driven / free_mps
     row["wait_s"] = row["wait_s"] + dt if abs(row["speed"]) < STANDING_MPS else 0.0
     row["step_jerk"] += abs(row["jerk"]) * dt
     row["tick"] += 1
@@ -244,7 +249,8 @@ def move_background(
         row["to_go"] = distance_left(roads, row, travel.steps[own_step(roads, row)])
     if row["to_go"] <= ARRIVE_M + 0.5 * row["length"]:
         row["events"] |= EVENT_ARRIVED
-    account(row, before, roads, row["speed_factor"], dt)
+    kind = travel.types[row["vtype"]]
+    account(row, before, free_speed(roads.lanes[before.lane], kind, row["speed_factor"]), dt)
     advance_stop(roads, travel, row, before.lane, dt)
 
 
@@ -291,4 +297,4 @@ def move_agent(
     row["to_go"] = step["to_go"] - row["s"]
     if row["to_go"] <= ARRIVE_M:
         row["events"] |= EVENT_ARRIVED
-    account(row, before, roads, 1.0, dt)
+    account(row, before, free_speed(roads.lanes[before.lane], kind, 1.0), dt)

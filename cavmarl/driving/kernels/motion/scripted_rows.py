@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
-from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step
+from cavmarl.driving.kernels.lanes.route_following import distance_left, free_speed, own_step
 from cavmarl.driving.kernels.motion.motion import account, before_tick
 
 
@@ -57,7 +57,8 @@ def follow_script(
         row["goal"] = frame["following"]
         frame = travel.scripts.frames[row["goal"]]
     stand_at(frame, row)
-    account(row, before, roads, row["speed_factor"], dt)
+    kind = travel.types[row["vtype"]]
+    account(row, before, free_speed(roads.lanes[before.lane], kind, row["speed_factor"]), dt)
     if frame["released_to"] >= 0:
         _let_go(roads, travel, row, frame["released_to"])
 

@@ -16,7 +16,7 @@ from cavmarl.driving.kernels.motion.steering import steer_to_lane
 from cavmarl.driving.kernels.motion.tracking import locate
 
 ACCEL = 1.5  # m/s², out of a bend
-MOST_MPS = 10.0  # so that successive poses, a tick apart, are close to one another
+MOST_MPS = 10.0  # top speed, so that successive poses, a tick apart, are close to one another
 LEAST_MPS = 1.0
 LANES_AHEAD = 4  # number of lanes ahead whose bends limit the speed
 

@@ -44,7 +44,7 @@ NEAR_TURN_M = 10.0  # distance to a junction at which its turn counts
 TURN_MPS = 3.5  # in and behind junctions, slower cars steer as at this speed
 TURNING_RATIO = 1.118  # radius of the turning circle over the wheelbase, wheels turned by 45°
 SLOW_MPS = 3.0  # a slower car that changes lanes may stop askew
-SWING_OUT_M = 0.1  # then its front extends at most this far beyond the far side of the lane
+SWING_OUT_M = 0.1  # largest distance of the front of such a car beyond the far side of the lane
 CHORD_M = 1.5  # lanes have corners: their direction is that of a chord of twice this length
 
 

@@ -15,7 +15,7 @@ from cavmarl.driving.kernels.motion.steering import steer_to_lane
 from cavmarl.driving.kernels.motion.tracking import locate
 
 TRIAL_MPS = 3.5  # approximate speed of drivers in sharp bends
-FASTER_MPS = 4.2  # the same in bends of 90°
+FASTER_MPS = 4.2  # approximate speed in bends of 90°
 TRIAL_DT_S = 0.1
 SWING_M = 0.5  # tolerated distance of a body beyond the middle of a road
 BEYOND_M = 12.0  # distance before and behind a junction within which a car swings out

@@ -1,6 +1,6 @@
 """An oncoming car attempts a U-turn, fails and stands across the agent's lane.
 
-It reverses, turns further and drives off in front of the agent: a three-point turn.
+The car reverses, turns further and drives off in front of the agent: a three-point turn.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class Parameters:
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, Meeting]:
-    """Return straight movements crossed by another one that has priority when the signal is off."""
+    """Return straight movements that must yield to a crossing movement if the signal is off."""
     crossings = (
         crossing
         for crossing in streets.crossings("s", yields=True, merges=False)

@@ -60,14 +60,16 @@ def bridges(network: RoadNetwork) -> Place:
     return np.array(found)
 
 
-def test_through_a_roundabout(built_map: Callable[[str], Path], tmp_path: Path) -> None:
+def test_a_border_through_a_roundabout_changes_nothing(
+    built_map: Callable[[str], Path], tmp_path: Path
+) -> None:
     net = built_map("osm/berlin_siegessaeule.osm.gz")
     radius, middle = roundabouts(net, load_network(net))[0]
     assert radius > 40.0
     equal_around(middle, net, tmp_path, crossings=10)
 
 
-def test_through_a_bridge_and_what_is_under_it(
+def test_a_border_through_a_bridge_changes_nothing(
     built_map: Callable[[str], Path], tmp_path: Path
 ) -> None:
     net = built_map("xodr/Town04.xodr")
@@ -77,7 +79,7 @@ def test_through_a_bridge_and_what_is_under_it(
 
 
 @pytest.mark.parametrize("env", ["grid4x4", "town", "merge"])
-def test_through_the_busiest_junction(env: str, tmp_path: Path) -> None:
+def test_a_border_through_the_busiest_junction_changes_nothing(env: str, tmp_path: Path) -> None:
     net = find_map(env)
     network = load_network(net)
     internal = np.flatnonzero(network.lanes["internal"])

@@ -175,7 +175,7 @@ def drive(env: cavmarl.CavEnv) -> None:
         env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
 
 
-def test_what_depends_on_the_order_of_others_is_refused() -> None:
+def test_functions_that_depend_on_the_order_of_vehicles_are_refused() -> None:
     def first(view: cavmarl.AgentView) -> float:
         return float(view.others["x"][0]) if view.others.size else 0.0
 
@@ -198,13 +198,13 @@ def test_unknown_and_taken_names_are_refused() -> None:
         cavmarl.parallel_env(ENV, overrides={"sensors.registered": ["nose"]})
     with pytest.raises(ConfigError, match=r"backend = 'moon': there is no backend"):
         cavmarl.parallel_env(ENV, backend="moon")
-    with pytest.raises(ConfigError, match="cavmarl's own"):
+    with pytest.raises(ConfigError, match="cavmarl has this name"):
         cavmarl.register_term("speeding", nothing)
-    with pytest.raises(ConfigError, match="cavmarl's own"):
+    with pytest.raises(ConfigError, match="cavmarl has this name"):
         cavmarl.register_sensor("lidar", nothing, features=[cavmarl.Feature("a", "b")])
-    with pytest.raises(ConfigError, match="cavmarl's own"):
+    with pytest.raises(ConfigError, match="cavmarl has this name"):
         cavmarl.register_driver_model("EIDM", nothing)
-    with pytest.raises(ConfigError, match="cavmarl's own"):
+    with pytest.raises(ConfigError, match="cavmarl has this name"):
         cavmarl.register_backend("ray", nothing)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="Numba cannot compile"):
         cavmarl.register_driver_model("wrong", lambda *_: open("x"))  # type: ignore[arg-type,return-value]

@@ -68,14 +68,14 @@ def oversized() -> bytes:
 @pytest.mark.parametrize(
     ("raw", "match"),
     [
-        (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" + bytes(40), "begins no frame"),
-        (hello_in(2), "a frame of version 2, this is 1: install the same version"),
-        (oversized(), "bytes is none"),
-        (hello_in(1)[:-3] + b"\xff\xff\xff", "not what was sent"),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" + bytes(40), "does not begin a frame"),
+        (hello_in(2), "a frame has version 2, this end has 1: install the same version"),
+        (oversized(), "bytes is too large"),
+        (hello_in(1)[:-3] + b"\xff\xff\xff", "does not match its checksum"),
     ],
     ids=["another protocol", "another version", "too large", "damaged"],
 )
-def test_strangers_are_told_why_and_the_world_goes_on(
+def test_unknown_callers_get_a_reason_and_the_world_continues(
     address: Path, raw: bytes, match: str
 ) -> None:
     with FollowedWorld(make_env(), address) as world:
@@ -88,7 +88,7 @@ def test_strangers_are_told_why_and_the_world_goes_on(
         assert found == reference(3, {})
 
 
-def test_one_that_says_nothing_is_let_go(address: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_caller_is_dropped(address: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reception, "GREETING_S", 0.0)
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
@@ -97,7 +97,7 @@ def test_one_that_says_nothing_is_let_go(address: Path, monkeypatch: pytest.Monk
         assert "not introduced itself" in refusal(silent)
 
 
-def test_one_that_speaks_byte_by_byte_is_not_waited_for(
+def test_a_slow_caller_does_not_block_the_world(
     address: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = hello_in(1)
@@ -134,7 +134,7 @@ def test_a_crowd_does_not_keep_a_follower_out(address: Path) -> None:
             connection.close()
 
 
-def test_a_world_without_descriptors_lets_the_oldest_caller_go(address: Path) -> None:
+def test_without_descriptors_the_oldest_caller_is_dropped(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
         first = call(address)
@@ -154,14 +154,14 @@ def test_a_world_without_descriptors_lets_the_oldest_caller_go(address: Path) ->
     ("speak", "match"),
     [
         (lambda wire: wire.send(Say.HELLO, 0, payload_of(Hello("again", []))), "sent HELLO"),
-        (lambda wire: os.write(wire.fileno(), b"garbage " * 20), "begins no frame"),
+        (lambda wire: os.write(wire.fileno(), b"garbage " * 20), "does not begin a frame"),
         (lambda wire: wire.send(Say.CONTROL, 0, {"frame": "x"}), "not a Control"),
         (lambda wire: wire.send(Say.CONTROL, 0, None), "not a Control"),
         (lambda wire: wire.send(Say.CONTROL, 0, {"frame": 0, "controls": {}, "more": 1}), "more"),
     ],
     ids=["hello twice", "garbage", "no number", "nothing", "more than is known"],
 )
-def test_a_follower_that_says_nonsense_is_let_go(
+def test_a_follower_with_invalid_messages_is_dropped(
     address: Path, speak: Callable[[FramedSocket], object], match: str
 ) -> None:
     with FollowedWorld(make_env(), address) as world:
@@ -230,9 +230,7 @@ def test_any_payload_is_a_message_or_a_typed_error(payload: object) -> None:
         ("<f4", [2, 3], 1, "2 samples with 1 stamps"),
     ],
 )
-def test_arrays_that_cannot_be_are_refused(
-    dtype: str, shape: list[int], stamps: int, words: str
-) -> None:
+def test_invalid_arrays_are_refused(dtype: str, shape: list[int], stamps: int, words: str) -> None:
     near, far = socket.socketpair()
     view = ArrayView("car_0", "lidar", dtype, shape, [0.0] * stamps, [False] * stamps)
     world, line = FollowerConnection(far, "a follower"), FollowerConnection(near, "the world")
@@ -266,7 +264,7 @@ def test_a_port_needs_a_secret_that_callers_know() -> None:
         assert world.seats == ()
 
 
-def test_a_name_that_steers_the_terminal_is_refused(address: Path) -> None:
+def test_a_name_with_control_characters_is_refused(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         caller = threading.Thread(target=lambda: said.append(refusal_of(world)))
         said: list[str] = []
@@ -283,7 +281,7 @@ def refusal_of(world: FollowedWorld) -> str:
     return str(error.value)
 
 
-def test_a_port_of_this_machine_will_do_too() -> None:
+def test_followers_can_connect_by_a_local_port() -> None:
     with FollowedWorld(make_env(), 0, secret="of this world") as world:
         assert isinstance(world.address, int)
         follower = seated(world, ["car_0"], secret="of this world")

@@ -81,7 +81,7 @@ def begins_on_the_street(simulation: Simulation, seed: int) -> bool:
     return bool(row["lane"] == 0 and row["s"] < 150.0)
 
 
-def test_who_went_astray_bars_no_lane_and_nobody_can_tell(
+def test_a_lost_vehicle_blocks_no_lane_in_any_division(
     worlds: tuple[Simulation, Simulation],
 ) -> None:
     whole, divided = worlds

@@ -1,0 +1,272 @@
+"""Prepares OpenDRIVE files for netconvert, which ignores limits of roads and left-hand traffic."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree.ElementTree import Element, ParseError, SubElement, tostring
+
+from defusedxml.common import DefusedXmlException
+
+from cavmarl.core.errors import MapError
+from cavmarl.maps.provenance import RoadDefaults
+from cavmarl.maps.traffic_sides import Side
+from cavmarl.roads.sumo_net.xml_source import read_tree
+
+NO_LIMIT_MPS = 142.0 / 3.6  # as netconvert reads `maxspeed=none` of OSM
+WALKING_MPS = 5.0 / 3.6  # lower limits are more likely a wrong unit
+LEAST_PART_M = 1.0  # netconvert makes an edge of each part of a road with its own limit
+
+_UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6, "kph": 1.0 / 3.6, "mph": 0.44704}
+# Lane types that vehicles drive on, with the speed of netconvert's type map in m/s.
+_TRAVELLED = {
+    "driving": 13.89, "entry": 22.22, "exit": 22.22, "onRamp": 22.22, "offRamp": 22.22,
+    "mwyEntry": 22.22, "mwyExit": 22.22, "bus": 13.89, "taxi": 13.89,
+}  # fmt: skip
+# Types that netconvert leaves out without a word, and the type that they are read as.
+_READ_AS = {"slipLane": "driving", "shared": "driving", "connectingRamp": "offRamp"}
+# netconvert would open these lanes to through traffic, or close them without a word.
+_NOT_TRAVELLED = frozenset(("parking", "stop", "HOV", "bidirectional"))
+# Netconvert's type map leaves these out, or closes them to road vehicles, which is meant.
+_NO_LANES = frozenset(
+    "none shoulder border median curb sidewalk walking biking restricted special1 special2 "
+    "special3 rail tram roadWorks".split()
+)
+# In addition to netconvert's type map.
+TYPE_MAP = b"""<types>
+  <type id="bus" priority="1" speed="13.89" width="3.65" allow="bus taxi emergency"/>
+  <type id="taxi" priority="1" speed="13.89" width="3.65" allow="taxi emergency"/>
+</types>
+"""
+_SIDES: dict[str, Side] = {"RHT": "right", "LHT": "left"}
+_INVALID = "speed limits whose max or unit is invalid"
+
+Limits = list[tuple[float, float | None]]  # position in m, and the limit in m/s from there on
+
+
+@dataclass
+class OpenDriveSource:
+    """The roads of an OpenDRIVE file, changed so that netconvert reads them as they are meant.
+
+    Attributes:
+        root: the changed document.
+        changed: whether it differs from the file.
+        defaults: roads without a speed limit, by type of road.
+        counts: what was ignored or looks wrong.
+    """
+
+    path: Path
+    tolerant: bool  # count invalid elements instead of raising an error
+    root: Element = field(init=False)
+    changed: bool = False
+    defaults: tuple[RoadDefaults, ...] = ()
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        """Read the file; raises MapError if it is broken, or a speed limit is invalid."""
+        try:
+            self.root = read_tree(self.path)
+        except (ParseError, DefusedXmlException, ValueError, OSError) as error:
+            raise MapError(f"{self.path}: cannot be read ({error}): export it again") from error
+        self._set_lane_types()
+        self._set_limits()
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what was ignored or looks wrong, with counts."""
+        return tuple(f"{count} {what}" for what, count in sorted(self.counts.items()))
+
+    def content(self) -> bytes:
+        text: bytes = tostring(self.root, "utf-8")
+        return text
+
+    def use_side(self, given: Side | None) -> Side:
+        """Return the traffic side, and change the roads for it.
+
+        `given`: None: decide by the `rule` of the roads.
+
+        Raises MapError: a rule is invalid, or the rules differ and no side is given.
+        """
+        rules = Counter(road.get("rule", "RHT") for road in self.root.iter("road"))
+        if not rules.keys() <= _SIDES.keys():
+            unknown = ", ".join(repr(rule) for rule in sorted(rules.keys() - _SIDES.keys()))
+            raise MapError(f"{self.path}: roads with rule={unknown}: must be RHT or LHT; repair it")
+        if given is None and len(rules) > 1:
+            raise MapError(
+                f"{self.path}: {rules['RHT']} roads have rule RHT (the default) and {rules['LHT']} "
+                "LHT: a network has one side; split the map, or choose the side: cavmarl map build "
+                f"{self.path} --traffic-side left or right"
+            )
+        side = given or (_SIDES[next(iter(rules))] if rules else "right")
+        for rule, number in rules.items():
+            if _SIDES[rule] != side:
+                self.counts[f"roads with rule {rule} are built for {side}-hand traffic"] += number
+        if side == "left":
+            self._swap_sides()
+            self.changed = True
+        return side
+
+    def _swap_sides(self) -> None:
+        """Exchange the lanes on the left and on the right of all reference lines.
+
+        In left-hand traffic, lanes on the left of the line lead along it. netconvert takes those on
+        the right, and places them on the left if it has `--lefthand`.
+        """
+        for section in self.root.iter("laneSection"):
+            for side in [*section.iterfind("left"), *section.iterfind("right")]:
+                side.tag = "right" if side.tag == "left" else "left"
+                side[:] = reversed(side[:])
+                for lane in side.iterfind("lane"):
+                    _negate(lane, "id")
+                    for link in (
+                        *lane.iterfind("link/predecessor"),
+                        *lane.iterfind("link/successor"),
+                    ):
+                        _negate(link, "id")
+        for link in self.root.iter("laneLink"):
+            _negate(link, "from")
+            _negate(link, "to")
+        for validity in self.root.iter("validity"):
+            _negate(validity, "fromLane")
+            _negate(validity, "toLane")
+
+    def _roads(self) -> Iterator[Element]:
+        """Yield the roads outside of junctions, where netconvert makes its own paths."""
+        return (road for road in self.root.iter("road") if road.get("junction", "-1") == "-1")
+
+    def _set_lane_types(self) -> None:
+        """Replace lane types that netconvert does not know, and close lanes to through traffic."""
+        for lane in self.root.iter("lane"):
+            kind = lane.get("type", "none")
+            if kind in _READ_AS:
+                lane.set("type", _READ_AS[kind])
+                self.counts[f"lanes of type {kind} are read as {_READ_AS[kind]}"] += 1
+            elif kind not in _TRAVELLED and kind not in _NO_LANES:
+                lane.set("type", "none")
+                what = "are left out" if kind in _NOT_TRAVELLED else "are unknown and left out"
+                self.counts[f"lanes of type {kind} {what}"] += 1
+            else:
+                continue
+            self.changed = True
+
+    def _set_limits(self) -> None:
+        """Write the limits of roads to their lanes, and count the roads without a limit."""
+        kinds: Counter[str] = Counter()
+        without: dict[str, Counter[str]] = {}
+        for road in self._roads():
+            types = sorted(road.iterfind("type"), key=lambda kind: self._number(kind, "s"))
+            kind = types[0].get("type", "unknown") if types else "unknown"
+            kinds[kind] += 1
+            limits: Limits = []
+            for entry in types:
+                speed = entry.find("speed")
+                limit = None if speed is None else self._limit(speed, road)
+                limits.append((self._number(entry, "s"), limit))
+            used = self._set_limits_of_lanes(road, limits)
+            if used:
+                speed_mps = min(used, key=lambda value: (-used[value], value))
+                without.setdefault(kind, Counter())[f"{speed_mps:g}"] += 1
+            slowest = min((limit for _, limit in limits if limit is not None), default=math.inf)
+            if slowest < WALKING_MPS:
+                self.counts[f"roads with a speed limit below {WALKING_MPS:.2f} m/s (5 km/h)"] += 1
+        self.defaults = tuple(
+            RoadDefaults(kind, kinds[kind], "maxspeed", used.most_common(1)[0][0], used.total())
+            for kind, used in sorted(without.items())
+        )
+
+    def _set_limits_of_lanes(self, road: Element, of_road: Limits) -> Counter[float]:
+        """Return the default speeds in m/s that lanes of a road have for want of a limit."""
+        used: Counter[float] = Counter()
+        sections = sorted(
+            road.iterfind("lanes/laneSection"), key=lambda one: self._number(one, "s")
+        )
+        ends = [*(self._number(one, "s") for one in sections[1:]), self._number(road, "length")]
+        for section, end in zip(sections, ends, strict=True):
+            begin = self._number(section, "s")
+            for lane in (*section.iterfind("left/lane"), *section.iterfind("right/lane")):
+                usual = _TRAVELLED.get(lane.get("type", ""))
+                if usual is None:
+                    continue
+                records = lane.findall("speed")
+                of_lane = [
+                    (begin + self._number(speed, "sOffset"), self._limit(speed, road))
+                    for speed in records
+                ]
+                parts = _parts(begin, end, of_road, sorted(of_lane, key=lambda part: part[0]))
+                if any(limit is None for _, limit in parts):
+                    used[usual] += 1
+                if all(limit is None for _, limit in parts) and not records:
+                    continue
+                for speed in records:
+                    lane.remove(speed)
+                for at, limit in parts:
+                    value = usual if limit is None else limit
+                    words = {"sOffset": f"{at - begin:.6g}", "max": f"{value:.6g}", "unit": "m/s"}
+                    SubElement(lane, "speed", words)
+                self.changed = True
+        return used
+
+    def _limit(self, speed: Element, road: Element) -> float | None:
+        """Return a limit in m/s; None if the file leaves it undefined."""
+        text, unit = speed.get("max", "").strip(), speed.get("unit", "").strip() or "m/s"
+        if text in ("no limit", "none"):
+            return NO_LIMIT_MPS
+        if text in ("undefined", ""):
+            return None
+        try:
+            limit = float(text) * _UNITS[unit]
+        except (ValueError, KeyError):
+            limit = math.nan
+        if limit == 0.0:
+            return None
+        if math.isfinite(limit) and limit > 0.0:
+            return limit
+        if not self.tolerant:
+            raise MapError(
+                f"{self.path}: road '{road.get('id')}': <speed max='{text}' unit='{unit}'/>: must "
+                f"be a number from 0 on, 'no limit' or 'undefined', in {', '.join(_UNITS)}: repair "
+                f"it, or ignore such limits: cavmarl map build {self.path} --tolerant"
+            )
+        self.counts[_INVALID] += 1
+        return None
+
+    def _number(self, element: Element, key: str) -> float:
+        """Return a position or length in m; netconvert reports those that it cannot read."""
+        try:
+            value = float(element.get(key, "0"))
+        except ValueError:
+            return 0.0
+        return value if math.isfinite(value) else 0.0
+
+
+def _negate(element: Element, key: str) -> None:
+    text = element.get(key, "").strip()
+    if text not in ("", "0"):
+        element.set(key, text[1:] if text[0] == "-" else f"-{text.removeprefix('+')}")
+
+
+def _parts(begin: float, end: float, of_road: Limits, of_lane: Limits) -> Limits:
+    """Return the limits along a lane between two positions in m: the lane's own, else the road's.
+
+    Parts shorter than `LEAST_PART_M` at its ends belong to the adjacent parts.
+    """
+    at = {place for place, _ in (*of_road, *of_lane)}
+    last = end - LEAST_PART_M
+    starts = [begin, *sorted(s for s in at if begin + LEAST_PART_M < s < last)]
+    parts: Limits = []
+    for start in starts:
+        seen = start + LEAST_PART_M if start == begin else start
+        limit = _last_before(of_lane, seen)
+        if limit is None:
+            limit = _last_before(of_road, seen)
+        if not parts or limit != parts[-1][1]:
+            parts.append((start, limit))
+    return parts
+
+
+def _last_before(limits: Limits, place: float) -> float | None:
+    row = bisect_right(limits, place, key=lambda part: part[0]) - 1
+    return limits[row][1] if row >= 0 else None

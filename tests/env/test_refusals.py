@@ -1,0 +1,98 @@
+"""Calls that a closed or new environment refuses, and arguments that do not exist."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cavmarl
+from cavmarl.core.errors import (
+    ActionError,
+    CavmarlError,
+    ConfigError,
+    EpisodeError,
+    RegisteredFunctionError,
+    UnknownArgumentError,
+)
+from cavmarl.core.extensions import REGISTERED_TERMS
+
+MAKERS: dict[str, Any] = {"parallel_env": cavmarl.parallel_env, "make_vec": cavmarl.make_vec}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_closed_environment_refuses(name: str) -> None:
+    env: Any = MAKERS[name]("ring", agents=2)
+    env.reset(seed=0)
+    actions = env.suggest_actions()
+    env.close()
+    env.close()
+    for call in (env.reset, env.state, env.suggest_actions, lambda: env.step(actions)):
+        with pytest.raises(EpisodeError, match=r"after close\(\): make another environment"):
+            call()
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_new_environment_has_no_state(name: str) -> None:
+    env: Any = MAKERS[name]("ring", agents=2)
+    for call in (env.state, env.suggest_actions):
+        with pytest.raises(EpisodeError, match=r"before reset\(\): call reset\(seed=…\) first"):
+            call()
+    env.close()
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_an_unknown_argument_is_told_the_nearest(name: str) -> None:
+    with pytest.raises(UnknownArgumentError, match=r"'num_agents': did you mean agents\?") as told:
+        MAKERS[name]("ring", num_agents=3)
+    assert isinstance(told.value, CavmarlError)
+    assert isinstance(told.value, TypeError)
+    assert isinstance(told.value, ConfigError)
+
+
+@pytest.mark.parametrize("agent", ["x", 3, ["car_0"]])
+def test_an_unknown_agent_has_no_space(agent: Any) -> None:
+    env = cavmarl.parallel_env("ring", agents=2)
+    for space in (env.action_space, env.observation_space):
+        with pytest.raises(ActionError, match=re.escape(f"no agent {agent!r}: the ids are car_0")):
+            space(agent)
+    assert env.action_space("car_1") is env.action_space("car_0")
+    env.close()
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.int8, np.uint8, np.bool_])
+def test_whole_numbers_are_no_throttle_and_steering(kind: Any) -> None:
+    message = rf"dtype is {np.dtype(kind)}; .*pass floats \(float32 or float64\)"
+    env = cavmarl.parallel_env("ring", agents=2)
+    env.reset(seed=0)
+    with pytest.raises(ActionError, match=message):
+        env.step({agent: np.zeros(2, kind) for agent in env.agents})
+    env.step({agent: np.zeros(2, np.float64) for agent in env.agents})
+    env.close()
+    vec = cavmarl.make_vec("ring", agents=2)
+    vec.reset(seed=0)
+    with pytest.raises(ActionError, match=message):
+        vec.step(np.zeros((1, 2, 2), kind))
+    vec.close()
+
+
+def drive(vec: cavmarl.CavVectorEnv) -> None:
+    vec.reset(seed=0)
+    vec.step(vec.suggest_actions())
+
+
+@pytest.mark.parametrize("answer", ["fast", None, [1.0, "a"], [[1.0], [1.0, 2.0]]])
+def test_a_registered_function_returns_numbers(answer: Any) -> None:
+    def text(view: cavmarl.AgentView) -> Any:
+        return answer
+
+    cavmarl.register_term("text", text)
+    try:
+        vec = cavmarl.make_vec("ring", agents=1, overrides={"terms.weights": {"text": 1.0}})
+        with pytest.raises(RegisteredFunctionError, match=r"'text' returned .*1 finite number"):
+            drive(vec)
+        vec.close()
+    finally:
+        REGISTERED_TERMS.remove("text")
