@@ -18,6 +18,8 @@ Drawn = TypeVar("Drawn")
 
 # Features of a draw, with their probabilities; each can be excluded by name. Kinds of nets:
 KINDS = {"grid": 0.36, "spider": 0.2, "random": 0.29, "cut": 0.15}
+# nets with narrow places, drawn from a stream of their own instead of one of `KINDS`,
+NARROW = {"zipper": 0.05, "signal_pair": 0.05}
 # types of junctions (SUMO's names; zipper and unregulated define no right of way where ways cross),
 JUNCTIONS = {
     "priority": 0.26,
@@ -52,7 +54,7 @@ DEPARTURES = (
     {"departLane": "best", "departSpeed": "0", "departPos": "random_free"},
 )
 FEATURES = frozenset(
-    (*KINDS, *JUNCTIONS, *SIGNALS, *SHARES, *LEVELS, *MIXES, "fringe", "everywhere")
+    (*KINDS, *NARROW, *JUNCTIONS, *SIGNALS, *SHARES, *LEVELS, *MIXES, "fringe", "everywhere")
 )
 _SPEEDS_MPS = (8.33, 13.89, 13.89, 19.44, 27.78)
 _LANES = (1, 1, 2, 2, 3, 4)
@@ -62,8 +64,8 @@ _LANES = (1, 1, 2, 2, 3, 4)
 class NetDraw:
     """The properties of a net."""
 
-    kind: str  # of `KINDS`
-    options: tuple[str, ...]  # of netgenerate, or of netconvert for a cut
+    kind: str  # of `KINDS` or `NARROW`
+    options: tuple[str, ...]  # of netgenerate, or of netconvert for a cut or a zipper
     length_m: float  # of a typical edge, or half the side of a cut
     num_lanes: int  # upper bound on netgenerate's edges
 
@@ -100,8 +102,13 @@ def draw_world(seed: int, without: Collection[str] = ()) -> WorldDraw:
     """
     check_features(without)
     chance = _Chance(seed, without)
-    kind = chance.one_of(KINDS)
-    net = _cut(chance) if kind == "cut" else _generated(chance, kind)
+    kind = _narrow(seed, without)
+    if kind:
+        chance.features.append(kind)
+        net = _zipper(chance) if kind == "zipper" else _signal_pair(chance)
+    else:
+        kind = chance.one_of(KINDS)
+        net = _cut(chance) if kind == "cut" else _generated(chance, kind)
     level = chance.one_of(LEVELS)
     mixes = {"cars": 1.0} if kind == "cut" else {"cars": 0.4, "vans": 0.2, "all": 0.4}
     fringe = chance.one_of({"fringe": 0.6, "everywhere": 0.4}) == "fringe"
@@ -156,6 +163,40 @@ class _Chance:
     def whole(self, low: int, high: int) -> int:
         """Draw an integer within both bounds, inclusive."""
         return int(self._random.integers(low, high + 1))
+
+
+def _narrow(seed: int, without: Collection[str]) -> str:
+    """Draw a feature of `NARROW`, or "" for the other worlds.
+
+    A stream of its own leaves the other worlds of all seeds as they are.
+    """
+    place = float(np.random.default_rng([seed, 3]).random())
+    for name, share in NARROW.items():
+        if place < share:
+            signals = name == "signal_pair" and "traffic_light" in without
+            return "" if name in without or signals else name
+        place -= share
+    return ""
+
+
+def _zipper(chance: _Chance) -> NetDraw:
+    """Draw a road in both directions, on which lanes become one in turn."""
+    limit_mps = chance.any_of(_SPEEDS_MPS)
+    length_m = round(chance.between(150.0, 300.0) * max(1.0, limit_mps / 13.89), 1)
+    return NetDraw("zipper", (f"--default.speed={limit_mps}",), length_m, chance.whole(2, 4))
+
+
+def _signal_pair(chance: _Chance) -> NetDraw:
+    """Draw pairs of signals on parallel roads, 10 to 40 m of road apart."""
+    length_m, num_lanes = round(chance.between(120.0, 220.0), 1), chance.whole(1, 2)
+    apart_m = chance.between(10.0, 40.0) + 14.0 + 6.4 * num_lanes
+    words = ["--grid=true", f"--grid.x-length={length_m}", f"--grid.y-length={apart_m:.1f}"]
+    words += [f"--grid.x-number={chance.whole(1, 3)}", "--grid.y-number=2"]
+    words += [f"--grid.attach-length={length_m}", f"--default.lanenumber={num_lanes}"]
+    words += ["--default-junction-type=traffic_light", "--no-turnarounds.except-deadend=true"]
+    words.append(f"--tls.default-type={chance.one_of(SIGNALS)}")
+    chance.features.append("traffic_light")
+    return NetDraw("signal_pair", tuple(words), length_m, num_lanes)
 
 
 def _generated(chance: _Chance, kind: str) -> NetDraw:

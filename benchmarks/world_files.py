@@ -75,6 +75,8 @@ def make_net(draw: WorldDraw, folder: Path, maps: Sequence[Path]) -> Path:
     net = folder / NET_FILE
     if draw.net.kind == "cut":
         _cut(draw, net, maps)
+    elif draw.net.kind == "zipper":
+        _zippers(draw, net)
     else:
         _run_tool(
             "bin/netgenerate", *draw.net.options, f"--seed={draw.seed}", f"--output-file={net}"
@@ -99,6 +101,28 @@ def _cut(draw: WorldDraw, net: Path, maps: Sequence[Path]) -> None:
         if int((~load_network(net).edges["internal"]).sum()) >= _LEAST_EDGES:
             return
     raise MapError(f"{source}: {_CUTS} cuts of {2 * half:.0f} m have no roads; give larger maps")
+
+
+def _zippers(draw: WorldDraw, net: Path) -> None:
+    """Build a road in both directions whose two inner lanes become one at each node."""
+    most = draw.net.num_lanes
+    nodes, edges, connections = (Element(name) for name in ("nodes", "edges", "connections"))
+    for n in range(most + 1):
+        kind = {"type": "zipper"} if 0 < n < most else {}
+        SubElement(nodes, "node", kind | {"id": f"n{n}", "x": str(n * draw.net.length_m), "y": "0"})
+    for way, begin in (("f", range(most)), ("b", range(most, 0, -1))):
+        for k, (n, lanes) in enumerate(zip(begin, range(most, 0, -1), strict=True)):
+            ends = {"from": f"n{n}", "to": f"n{n + (1 if way == 'f' else -1)}"}
+            SubElement(edges, "edge", ends | {"id": f"{way}{k}", "numLanes": str(lanes)})
+            for lane in range(lanes if lanes > 1 else 0):
+                row = {"from": f"{way}{k}", "to": f"{way}{k + 1}", "fromLane": str(lane)}
+                SubElement(connections, "connection", row | {"toLane": str(min(lane, lanes - 2))})
+    options = []
+    for name, root in (("node", nodes), ("edge", edges), ("connection", connections)):
+        path = net.with_name(f"{name}s.xml")
+        ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+        options.append(f"--{name}-files={path}")
+    _run_tool("bin/netconvert", *options, *draw.net.options, f"--output-file={net}")
 
 
 def _write_demand(draw: WorldDraw, net: Path, routes: Path, seconds: int) -> None:

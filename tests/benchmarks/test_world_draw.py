@@ -14,6 +14,7 @@ from benchmarks.world_draw import (
     KINDS,
     LEVELS,
     MIXES,
+    NARROW,
     SHARES,
     SIGNALS,
     WorldDraw,
@@ -60,11 +61,30 @@ def test_features_that_cannot_be_left_out_are_refused(without: tuple[str, ...]) 
 def test_a_world_has_one_of_each_kind_of_feature() -> None:
     for draw in draw_all():
         features = draw.features
-        for names in (KINDS, LEVELS, MIXES):
+        for names in (KINDS | NARROW, LEVELS, MIXES):
             assert len(set(features) & set(names)) == 1
-        cut = "cut" in features
-        assert len(set(features) & set(JUNCTIONS)) == (0 if cut else 1)
-        assert not cut or not set(features) & set(SHARES)
+        plain = bool({"cut", "zipper"} & {*features})
+        assert len(set(features) & set(JUNCTIONS)) == (0 if plain else 1)
+        assert not plain or not set(features) & set(SHARES)
+
+
+def test_narrow_places_leave_the_other_worlds_as_they_are() -> None:
+    narrow = [draw for draw in draw_all() if draw.net.kind in NARROW]
+    assert 0.05 < len(narrow) / len(SEEDS) < 0.15
+    others = {draw.seed: draw for draw in draw_all(tuple(NARROW))}
+    for draw in draw_all():
+        assert draw.net.kind in NARROW or draw == others[draw.seed]
+
+
+def test_zippers_and_pairs_of_signals_are_on_the_map(tmp_path: Path) -> None:
+    net, _ = make_files(first_with("zipper"), tmp_path / "zipper", SECONDS, ())
+    links = load_network(net).links
+    zippers = links[links["state"] == ord("Z")]
+    assert len(zippers) >= 4
+    assert (zippers["num_conflicts"] == 1).all()
+    net, _ = make_files(first_with("signal_pair"), tmp_path / "pair", SECONDS, ())
+    edges = load_network(net).edges
+    assert 5.0 < float(edges["length_m"][~edges["internal"]].min()) < 45.0
 
 
 @pytest.mark.parametrize(
