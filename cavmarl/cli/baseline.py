@@ -1,4 +1,4 @@
-"""`cavmarl baseline`: compares random, built-in, trained and oracle drivers on a map."""
+"""`cavmarl baseline`: compares random, built-in and trained drivers on a map."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from rich.markup import escape
 
-from cavmarl.cli.evaluate import report_cell
+from cavmarl.cli.evaluate import driver_cell
 from cavmarl.cli.output import (
     OUTPUT,
     PAGE_EXTRAS,
@@ -46,13 +46,13 @@ def baseline(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Compare four drivers on a map, and write a page.
+    """Compare drivers on a map, and write a page.
 
-    The drivers are random actions, `idm`, a trained driver, and as the oracle `idm` alone on the
-    road.
+    Random actions, `idm` and a trained driver drive the same trips in traffic. For the cost of
+    traffic, `idm` also drives alone on the road.
     """
     require_all(PAGE_EXTRAS)
-    from cavmarl.evaluate.baseline import baseline_rows, figures, run_baseline, write_baseline
+    from cavmarl.evaluate.baseline import baseline_drivers, figures, run_baseline, write_baseline
 
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
     folder = out or Path("runs/baseline") / f"{Path(where).name.split('.')[0]}-{stamp}"
@@ -76,14 +76,16 @@ def baseline(
             seed=seed,
             progress=show,
         )
-    drivers = baseline_rows(found)
+    drivers = baseline_drivers(found)
     rows = [
-        (metric.title, *(report_cell(metric, row[k]) for row in drivers.values()))
-        for k, metric in enumerate(figures())
+        (metric.title, *(driver_cell(metric, driver) for driver in drivers.values()))
+        for metric in figures()
     ]
     counts = [str(one.trips) for part in found.values() for one in part.policies.values()]
     title = f"{Path(where).name}, {episodes} episodes, seed {seed}"
-    caption = "oracle: idm alone on the road. Shares [Wilson's 95 %], means (SD)"
+    caption = (
+        "idm alone: without other vehicles, on other trips. Shares [Wilson's 95 %], means (SD)"
+    )
     heads = ("", *map(escape, drivers))
     table = grid(heads, [("trips", *counts), *rows], escape(title), caption, wraps=True)
     console.print(table)

@@ -161,9 +161,7 @@ def report_table(found: EvaluationReport) -> Table:
     """Return a table of all metrics with one column per driver."""
     drivers = found.policies.values()
     rows = [["trips", *(str(driver.trips) for driver in drivers)]]
-    rows += _metric_rows(
-        lambda metric: [report_cell(metric, driver[metric.name]) for driver in drivers]
-    )
+    rows += _metric_rows(lambda metric: [driver_cell(metric, driver) for driver in drivers])
     rows += _transfer_rows([driver.transfers for driver in drivers])
     rows.append(["world step, ms", *(_least(driver, "step_ms") for driver in drivers)])
     rows.append(["policy, ms", *(_least(driver, "policy_ms") for driver in drivers)])
@@ -295,6 +293,11 @@ def _caption(repeats: int) -> str:
     if repeats > 1:
         return "mean of the runs, ± or [95 % interval between runs], (SD within a run)"
     return "shares [Wilson's 95 %], means (SD within the run); one run: no interval of means"
+
+
+def driver_cell(metric: Metric, driver: PolicyReport) -> str:
+    """Return `report_cell` of a driver; `>` before a lower bound."""
+    return ("> " if driver.is_above(metric) else "") + report_cell(metric, driver[metric.name])
 
 
 def report_cell(metric: Metric, found: Found) -> str:

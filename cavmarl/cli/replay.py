@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from cavmarl.cli.output import (
     OUTPUT,
@@ -22,6 +24,7 @@ from cavmarl.cli.output import (
     about,
     about_file,
     flag,
+    grid,
     write_json,
 )
 from cavmarl.cli.view import check_display
@@ -34,7 +37,9 @@ if TYPE_CHECKING:
 
 
 def replay(
-    path: Annotated[Path, typer.Argument(help="The folder that --record wrote.")],
+    path: Annotated[
+        Path, typer.Argument(help="The folder that --record wrote, or a folder of such folders.")
+    ],
     world: Annotated[int, about("Number of the world, from 0.", metavar="N")] = 0,
     episode: Annotated[int, about("Number of the episode, from 0.", metavar="N")] = 0,
     video: Annotated[
@@ -62,7 +67,10 @@ def replay(
     imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Show a recording from above, or export it."""
+    """Show a recording from above, or export it.
+
+    A folder that holds several recordings is listed.
+    """
     from cavmarl.core.errors import ConfigError, RecordingError, require_all
 
     shows = video is not None or not (web or fcd or csv or mcap)
@@ -72,11 +80,16 @@ def replay(
         | (VIDEO_EXTRAS if video else WINDOW_EXTRAS if shows else {})
         | ({"mcap": "record"} if mcap else {})
     )
-    from cavmarl.recordings.recording import Recording
+    from cavmarl.recordings.recording import Recording, recordings_in
     from cavmarl.recordings.recording_exports import EXPORTS
 
     if web and video is not None:
         raise ConfigError(f"--web and --video {video}: use only one of the two")
+    if folders := recordings_in(path):
+        if web or video or fcd or csv or mcap:
+            raise ConfigError(f"{path}: holds {len(folders)} recordings; name one: {folders[0]}")
+        _list(folders, json_path)
+        return
     recording = Recording.open(path)
     ticks = recording.ticks(world, episode)
     if not ticks:
@@ -111,6 +124,28 @@ def replay(
         "video": None if video is None else str(video),
     }
     write_json(json_path, document)
+
+
+def _list(folders: Sequence[Path], json_path: Path | None) -> None:
+    """List recordings."""
+    from cavmarl.recordings.recording import Recording
+
+    found: dict[str, dict[str, Any]] = {}
+    for folder in folders:
+        recording = Recording.open(folder)
+        found[str(folder)] = {
+            "environment": recording.head.environment,
+            "worlds": len(recording.worlds),
+            "episodes": sum(len(recording.episodes(world)) for world in recording.worlds),
+            "whole": recording.is_whole,
+        }
+    rows = [
+        (escape(name), escape(one["environment"]), str(one["worlds"]), str(one["episodes"]))
+        for name, one in found.items()
+    ]
+    heads = ("recording", "environment", "worlds", "episodes")
+    Console().print(grid(heads, rows, caption="`cavmarl replay RECORDING` shows one", lefts=2))
+    write_json(json_path, {"recordings": found})
 
 
 def _show(

@@ -38,7 +38,7 @@ def suite(
         typer.Argument(
             metavar="SUITE", help="Name of a suite in configs/suites/, or a .yaml file."
         ),
-    ] = "standard",
+    ] = "tasks",
     maps: Annotated[Path, about("Folder of the map files.", metavar="DIR")] = Path("maps"),
     policy: Policies = None,
     episodes: Episodes = 4,

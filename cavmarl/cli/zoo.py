@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cavmarl.cli.listing import sentence_about
 from cavmarl.cli.output import (
     JsonPath,
     about,
@@ -53,7 +54,10 @@ def list_drivers(json_path: JsonPath = None) -> None:
         shares = (number(entry.shares.get(key), 100.0) for key in SHORT)
         cells = (f"{entry.weights_bytes / 1000.0:.0f}", entry.environment or "no result")
         rows.append((escape(entry.name), *cells, str(entry.trips), *shares))
-    Console().print(grid(heads, rows, caption="shares in % of the result's trips", wraps=True))
+    console = Console()
+    about_each = [(escape(one.name), escape(sentence_about(one.folder))) for one in found]
+    console.print(grid(("driver", "what it is"), about_each, lefts=2))
+    console.print(grid(heads, rows, caption="shares in % of the result's trips", wraps=True))
     fields = ("environment", "weights_bytes", "trips", "shares")
     told = {one.name: {field: getattr(one, field) for field in fields} for one in found}
     refused = {one.name: {"refused": one.refused} for one in entries if one.refused}

@@ -226,7 +226,7 @@ def find_settings(what: str, name: str) -> Path:
     if Path(name).is_file():
         return Path(name)
     folder, usual = {
-        "rig": ("rigs", "ten_sensors"), "suite": ("suites", "standard"), "train": ("train", "merge")
+        "rig": ("rigs", "ten_sensors"), "suite": ("suites", "tasks"), "train": ("train", "merge")
     }[what]  # fmt: skip
     for place in places("configs"):
         path = place / folder / f"{name}.yaml"

@@ -1,8 +1,8 @@
-"""Baselines for a map: random actions, the built-in driver, a trained driver and an oracle.
+"""Baselines for a map: random actions, the built-in driver and a trained driver, and no traffic.
 
-All drive the same trips under the rules of one environment on another map. The oracle is the
-built-in driver alone on the road. As nothing hinders it, it bounds what a driver in traffic can
-reach; the difference to it is the cost of traffic.
+Three drivers drive the same trips in traffic, under the rules of one environment on another map.
+The built-in driver also drives alone on the road, on other trips of the map. The difference to that
+row estimates the cost of traffic. It is no bound: another driver can be better.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from cavmarl.evaluate.episodes import Progress
 from cavmarl.evaluate.evaluation import evaluate, load_map, load_tables, load_tracks
 from cavmarl.evaluate.metrics import KM_PER_INFRACTION, METRICS, Metric
 from cavmarl.evaluate.provenance.manifest import write_text
-from cavmarl.evaluate.report import EvaluationReport, Found
+from cavmarl.evaluate.report import EvaluationReport, PolicyReport
 
 RULES = "cities"  # the environment whose rules and trained driver are used
 GENERALIST = "cities_ippo"
-ORACLE = "oracle"
+FREE_ROAD = "idm alone"
 AMONG, ALONE = "among", "alone"  # subfolders of the results
 FIGURES = (
     "success",
@@ -76,21 +76,21 @@ def run_baseline(
     alone = min(64, 8 * episodes)
     return {
         AMONG: evaluate(busy, drivers, episodes=episodes, out=out / AMONG, progress=progress),
-        ALONE: evaluate(empty, {ORACLE: "idm"}, episodes=alone, out=out / ALONE, progress=progress),
+        ALONE: evaluate(
+            empty, {FREE_ROAD: "idm"}, episodes=alone, out=out / ALONE, progress=progress
+        ),
     }
 
 
-def baseline_rows(found: Mapping[str, EvaluationReport]) -> dict[str, list[Found]]:
-    """Return the `FIGURES` of each driver, with the oracle last."""
+def baseline_drivers(found: Mapping[str, EvaluationReport]) -> dict[str, PolicyReport]:
+    """Return the results of each driver, with `FREE_ROAD` last."""
     return {
-        name: [driver[figure] for figure in FIGURES]
-        for part in (AMONG, ALONE)
-        for name, driver in found[part].policies.items()
+        name: driver for part in (AMONG, ALONE) for name, driver in found[part].policies.items()
     }
 
 
 def figures() -> Sequence[Metric]:
-    """Return the metrics of a row of `baseline_rows`."""
+    """Return the metrics of the table, in the order of `FIGURES`."""
     by_name = {metric.name: metric for metric in METRICS}
     return [by_name[name] for name in FIGURES]
 
@@ -118,7 +118,7 @@ def write_baseline(folder: Path, found: Mapping[str, EvaluationReport], path: Pa
             name: driver.trips for part in found.values() for name, driver in part.policies.items()
         },
         "metrics": figures(),
-        "rows": {name: _texts(row) for name, row in baseline_rows(found).items()},
+        "rows": {name: _texts(driver) for name, driver in baseline_drivers(found).items()},
         "outcomes": plots.plot_outcomes(report),
         "maps": {
             name: plots.plot_map(outline, tracks[name], tables[name][0], plots.color_of(k))
@@ -128,14 +128,14 @@ def write_baseline(folder: Path, found: Mapping[str, EvaluationReport], path: Pa
     write_text(path, template.render(content))
 
 
-def _texts(row: Sequence[Found]) -> list[tuple[str, str]]:
+def _texts(driver: PolicyReport) -> list[tuple[str, str]]:
     """Return mean and interval of each figure as texts."""
-    return [
-        (
-            "-" if one.mean is None else f"{metric.scale * one.mean:.2f}",
-            ""
-            if one.interval is None
-            else f"{metric.scale * one.interval.low:.1f} … {metric.scale * one.interval.high:.1f}",
-        )
-        for metric, one in zip(figures(), row, strict=True)
-    ]
+    texts = []
+    for metric in figures():
+        one = driver[metric.name]
+        above = "> " if driver.is_above(metric) else ""
+        mean = "-" if one.mean is None else f"{above}{metric.scale * one.mean:.2f}"
+        ends = one.interval and (one.interval.low, one.interval.high)
+        spread = " … ".join(f"{metric.scale * end:.1f}" for end in ends) if ends else ""
+        texts.append((mean, spread))
+    return texts

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from cavmarl.evaluate.episodes import Speed
 from cavmarl.evaluate.map_table import rows_by_map
-from cavmarl.evaluate.metrics import METRICS, Metric, least_value, metric_values
+from cavmarl.evaluate.metrics import (
+    INFRACTIONS,
+    KM_PER_INFRACTION,
+    METRICS,
+    Metric,
+    least_value,
+    metric_values,
+)
 from cavmarl.evaluate.statistics import (
     Interval,
     Within,
@@ -84,6 +91,12 @@ class PolicyReport:
 
     def __getitem__(self, metric: str) -> Found:
         return self.metrics[metric]
+
+    def is_above(self, metric: Metric) -> bool:
+        """Return whether the true value is above the mean: no infraction in all kilometres."""
+        if metric.name != KM_PER_INFRACTION or self[metric.name].mean is None:
+            return False
+        return not any(self[name].mean for name in INFRACTIONS)
 
 
 @dataclass(frozen=True)

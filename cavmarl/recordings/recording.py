@@ -33,6 +33,14 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 _INDEX = np.dtype([("episode", "<i4"), ("tick", "<i8"), ("part", "<i4"), ("row", "<i4")])
 
 
+def recordings_in(folder: Path) -> list[Path]:
+    """Return the recordings at most three levels below a folder that is no recording itself."""
+    if (folder / HEAD_FILE).is_file():
+        return []
+    found = [file for depth in (1, 2, 3) for file in folder.glob(f"{'*/' * depth}{HEAD_FILE}")]
+    return sorted(file.parent for file in found)
+
+
 class Recording:
     """A recording, read part by part on demand.
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from typing import Any
+from weakref import WeakValueDictionary
 
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.viewer.frame_publisher import FramePublisher
@@ -22,6 +23,10 @@ from cavmarl.viewer.viewed_world import first_stage
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
 FRAME_HEIGHT_PX = 560  # in a notebook
+
+
+# Pages of `show` by the id of their environment, which each page keeps alive.
+_SHOWN: WeakValueDictionary[int, ShownEnv] = WeakValueDictionary()
 
 
 class ShownEnv:
@@ -179,9 +184,15 @@ def show(
         control: whether pages may pause, step and slow the program; `step` then waits for them.
         title: description of what drives the worlds.
 
+    If the environment is already shown, its earlier page is closed, so that the new one can have
+    the same port.
+
     Raises:
         ServiceError: the port is taken.
         MissingExtraError: starlette, uvicorn or websockets are not installed.
     """
     options = WebOptions(host, port, token, control=control, framed=True)
-    return ShownEnv(env, options, title=title, tell=print)
+    if (earlier := _SHOWN.get(id(env))) is not None:
+        earlier.close()
+    _SHOWN[id(env)] = shown = ShownEnv(env, options, title=title, tell=print)
+    return shown
