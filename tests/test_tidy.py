@@ -63,7 +63,7 @@ PASSED_ON = {
 
 # A new capability raises these two by what it needs; the commit says why.
 PACKAGE_LINES = 115_500
-REACHABLE_LINES = 74_500  # from `make_vec` and `parallel_env`
+REACHABLE_LINES = 76_300  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
 SHARED_MODULE_NAMES: set[str] = set()

@@ -49,7 +49,7 @@ COMPARED = ("success", "collision", "delay_s")
 
 
 @dataclass(frozen=True)
-class Task:
+class DemoTask:
     """What is trained: the keys of the settings file that the demo shows."""
 
     env: str
@@ -131,10 +131,10 @@ def demo(
     )
 
 
-def _task(decisions: int | None) -> Task:
+def _task(decisions: int | None) -> DemoTask:
     settings = cast(dict[str, Any], read_yaml(find_settings("train", SETTINGS)))
     trained = settings["total_agent_steps"] if decisions is None else decisions
-    return Task(settings["env"], settings["start"], trained)
+    return DemoTask(settings["env"], settings["start"], trained)
 
 
 def _speed(seed: int) -> float:
@@ -183,7 +183,7 @@ def _show(console: Console, found: EvaluationReport) -> None:
     console.print(grid(["driver", *(metric.title for metric in shown)], rows))
 
 
-def _story(task: Task, trained: Path, found: EvaluationReport, films: dict[str, Path]) -> Any:
+def _story(task: DemoTask, trained: Path, found: EvaluationReport, films: dict[str, Path]) -> Any:
     """Return the story of the page, in the figures of this run."""
     from cavmarl.evaluate.page import Story
 

@@ -30,7 +30,7 @@ class Story:
         title: headline of the page.
         paragraphs: text.
         compared: names of the metrics in a short table.
-        curve: `progress.csv` of the training.
+        curve: the file progress.csv of the training.
         films: caption → animated WebP, which becomes a part of the page.
         commands: (command, purpose) of what to try next.
     """

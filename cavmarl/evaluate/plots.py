@@ -208,7 +208,7 @@ def _ways(tracks: Rows) -> list[NDArray[np.float64]]:
 def plot_learning(rows: Sequence[Mapping[str, str]]) -> str:
     """Plot a training: success and collisions of the last trips, by decisions.
 
-    `rows`: of its `progress.csv`.
+    `rows`: rows of its file progress.csv.
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained")

@@ -100,9 +100,9 @@ def make_policy(path: Path, env: Environment) -> Policy:
     """Return the policy in a model file; its suffix says which library reads it.
 
     `.zip`: a model that stable-baselines3 saved (extra `train`); if it was trained with
-    VecNormalize, `NAME.pkl` beside it has the statistics. `.pt`, `.ts`: a TorchScript module (extra
-    `train`). `.onnx`: an ONNX model with one input (extra `onnx`). Files of the first two kinds can
-    contain code, which this function runs.
+    VecNormalize, the file NAME.pkl beside it has the statistics. `.pt`, `.ts`: a TorchScript
+    module (extra `train`). `.onnx`: an ONNX model with one input (extra `onnx`). Files of the first
+    two kinds can contain code, which this function runs.
 
     Raises:
         MissingExtraError: the library is not installed.
