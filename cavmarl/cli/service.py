@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
+from cavmarl.balance.load_score import THRESHOLDS, WEIGHTS, LoadRule
 from cavmarl.cli.output import (
     OUTPUT,
     SERVICE,
@@ -26,7 +29,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import ServiceError, require
+from cavmarl.core.errors import ConfigError, ServiceError, require
 from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -65,6 +68,22 @@ Key = Annotated[
 ]
 
 
+def _joined(shares: tuple[float, ...]) -> str:
+    return ",".join(map(str, shares))
+
+
+def _shares(option: str, text: str) -> tuple[float, float, float]:
+    """Return three shares; raise ConfigError if the text is no list of three numbers."""
+    try:
+        cpu, ram, gpu = (float(word) for word in text.split(","))
+    except ValueError:
+        raise ConfigError(
+            f"{option} {text}: must be three numbers, of CPU, RAM and GPU, for example "
+            "0.85,0.9,0.95"
+        ) from None
+    return cpu, ram, gpu
+
+
 def serve(
     host: Annotated[str, about("Address to listen on.", metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[
@@ -85,6 +104,15 @@ def serve(
     lease_s: Annotated[
         float, about("Duration of a session's lease in seconds.", metavar="S", min=1.0)
     ] = 30.0,
+    thresholds: Annotated[
+        str,
+        about(
+            "Shares of CPU, RAM and GPU above which a node gets no sessions.", metavar="CPU,RAM,GPU"
+        ),
+    ] = _joined(THRESHOLDS),
+    weights: Annotated[
+        str, about("Weights of CPU, RAM and GPU in the LoadScore.", metavar="CPU,RAM,GPU")
+    ] = _joined(WEIGHTS),
 ) -> None:
     """Run the coordination service.
 
@@ -95,7 +123,8 @@ def serve(
     from cavmarl.service.server import ServerOptions
     from cavmarl.service.server import serve as run
 
-    rules = BrokerRules(beat_s=beat_s, missed_beats=missed_beats, lease_s=lease_s)
+    load = LoadRule(_shares("--weights", weights), _shares("--thresholds", thresholds))
+    rules = BrokerRules(beat_s=beat_s, missed_beats=missed_beats, lease_s=lease_s, load=load)
     options = ServerOptions(host, port, store, certificate, key, rules=rules)
     run(options, _print)
 
@@ -149,8 +178,12 @@ def submit(
         make_folder(folder)
         with progress_bar(console) as bar:
             task = bar.add_task(job)
+            told_reasons = {""}
 
             def show(found: dict[str, Any]) -> None:
+                if found["waits_for"] not in told_reasons:
+                    told_reasons.add(found["waits_for"])
+                    bar.console.print(f"{job} waits: {found['waits_for']}", markup=False)
                 done, total = found["progress"] or (0, None)
                 what = f"{job}: {found['state']}"
                 bar.update(task, description=what, completed=done, total=total)
@@ -183,13 +216,14 @@ def nodes(
                 client.post(f"/nodes/{name}/{word}")
         found = client.get("/nodes")
     rows = [
-        (one["name"], f"{one['address']}:{one['client_port']}", _state(one),
+        (escape(one["name"]), f"{one['address']}:{one['client_port']}", _state(one),
          *(_share((one["load"] or {}).get(name)) for name in ("cpu", "ram", "gpu")),
          _share(one["score"]), f"{one['sessions']}/{one['slots']}", f"{one['age_s']:.1f}")
         for one in found["nodes"]
     ]  # fmt: skip
-    heads = ("node", "address", "state", "cpu", "ram", "gpu", "score", "sessions", "age, s")
+    heads = ("node", "address", "state", "cpu", "ram", "gpu", "score", "used", "age, s")
     Console().print(grid(heads, rows, lefts=3))
+    _print_reasons((one["name"], reason) for one in found["nodes"] for reason in one["limits"])
     write_json(json_path, found)
 
 
@@ -222,6 +256,8 @@ def sessions(
         for one in found["sessions"]
     ]  # fmt: skip
     Console().print(grid(("session", "owner", "kind", "state", "node", "placed"), rows, lefts=5))
+    waiting = [(one["id"], one["waits_for"]) for one in found["sessions"] if one["waits_for"]]
+    _print_reasons(waiting)
     write_json(json_path, found)
 
 
@@ -309,8 +345,13 @@ def read_secret(secret_file: Path | None) -> str:
 
 
 def _state(node: dict[str, Any]) -> str:
-    words = [node["state"], *(["draining"] if node["draining"] else []), *node["excluded"]]
-    return " ".join(words)
+    return "draining" if node["draining"] else str(node["state"])
+
+
+def _print_reasons(rows: Iterable[tuple[str, str]]) -> None:
+    """Print under a table why nodes accept nothing, or why jobs wait."""
+    for name, reason in rows:
+        Console().print(f"{name}: {reason}", markup=False, highlight=False)
 
 
 def _share(value: float | None) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from cavmarl.balance.load_score import Utilisation
+from cavmarl.balance.load_score import DEFAULT_RULE, LoadRule, Utilisation
 from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.job_queue import JobQueue
@@ -23,6 +23,7 @@ from cavmarl.service.node_selection import (
     LiveNode,
     NoNodeError,
     choose,
+    limits_of,
     overloads,
     score_of,
 )
@@ -53,6 +54,7 @@ class BrokerRules:
     max_skew_s: float = 5.0  # tolerated difference of the clocks of a node and of the service
     max_nodes: int = 10_000
     max_sessions: int = 1000  # open sessions of one identity
+    load: LoadRule = DEFAULT_RULE  # thresholds and weights for the load of a node
 
 
 class Broker:
@@ -128,7 +130,7 @@ class Broker:
         live.counters, live.jobs = dict(body.counters), dict(body.jobs)
         live.muted.clear()
         live.refresh()
-        resources = overloads(live.use)
+        resources = overloads(live.use, self.rules.load)
         if resources != node.excluded:
             kind = "node.overloaded" if resources else "node.admissible"
             self.log.record(kind, name, {"resources": resources, **asdict(live.use)})
@@ -150,7 +152,7 @@ class Broker:
         nodes = [one for _, one in sorted(self.log.state.nodes.items()) if one.state != "left"]
         return [
             {"name": one.name, "state": "draining" if one.draining else one.state,
-             "score": score_of(one, self.live[one.name]),
+             "score": score_of(one, self.live[one.name], self.rules.load),
              "sessions": len(self.live[one.name].hosted)}
             for one in nodes[:MOST_SCORES]
         ]  # fmt: skip
@@ -261,9 +263,10 @@ class Broker:
         session = SessionRecord(id=number, owner=identity.id, **data)
         try:
             chosen = self._choose(session, ())
-        except NoNodeError:
+        except NoNodeError as error:
             if job is None:
                 raise
+            self.jobs.note(session, error)
             chosen = None
         self.log.record("session.opened", number, data, actor=identity.id, owner=identity.id)
         self._touched[number] = self._clock_s()
@@ -372,13 +375,22 @@ class Broker:
                 return one
         return None
 
+    @property
+    def _max_age_s(self) -> float:
+        return self.rules.beat_s * self.rules.missed_beats
+
+    def limits_of(self, name: str) -> list[str]:
+        """Return why a node accepts no session now, and what to do; empty: it does."""
+        is_old = self.age_s(name) > self._max_age_s
+        return limits_of(self.log.state.nodes[name], self.live[name], is_old, self.rules.load)
+
     def _choose(self, session: SessionRecord, avoided: Sequence[str]) -> Chosen:
         began_s = time.perf_counter()
-        age_s = self.rules.beat_s * self.rules.missed_beats
         try:
             return choose(
                 self.log.state.nodes, self.live, session,
-                now_s=self._clock_s(), max_age_s=age_s, avoided=avoided,
+                now_s=self._clock_s(), max_age_s=self._max_age_s, avoided=avoided,
+                rule=self.rules.load,
             )  # fmt: skip
         finally:
             self.took_s(time.perf_counter() - began_s)

@@ -38,6 +38,7 @@ class JobQueue:
         self._log, self._choose, self._assign, self._end = log, choose, assign, end
         self._failures = RateLimit(FAILURES_HZ, FAILURES, clock_s)
         self._next = ""  # the job at which the last pass stopped
+        self._reasons: dict[tuple[str, ...], str] = {}  # of the last failed search, by kind
 
     def may_try(self) -> bool:
         """Return whether another search may fail without exceeding the rate limit."""
@@ -47,6 +48,16 @@ class JobQueue:
         """Count a failed search."""
         if self._failures.has(""):
             self._failures.take("")
+
+    def note(self, session: SessionRecord, error: NoNodeError) -> None:
+        """Keep the reason why jobs like this one wait."""
+        self._reasons[_kind_of(session)] = str(error)
+
+    def reason_of(self, session: SessionRecord) -> str:
+        """Return why a queued job waits; empty: no search has failed yet, or it does not wait."""
+        if session.id not in self._log.state.waiting:
+            return ""
+        return self._reasons.get(_kind_of(session), "")
 
     def place(self) -> None:
         """Assign jobs to nodes that can run them."""
@@ -58,10 +69,7 @@ class JobQueue:
         hopeless = set()
         for number in waiting[first:] + waiting[:first]:
             session = self._log.state.sessions[number]
-            kind = (
-                session.owner_name,
-                *session.needs,
-            )  # all other properties are the same for every job
+            kind = _kind_of(session)
             if kind in hopeless:
                 continue
             if not self.may_try():
@@ -69,8 +77,9 @@ class JobQueue:
                 return
             try:
                 self._assign(number, self._choose(session, ()))
-            except NoNodeError:
+            except NoNodeError as error:
                 hopeless.add(kind)
+                self.note(session, error)
                 self.has_failed()
 
     def end_hopeless(self, max_placements: int) -> None:
@@ -85,4 +94,10 @@ class JobQueue:
                 continue
             told = {"of": "job in the queue", "after_s": waited_s}
             self._log.record("session.timeout", number, told, owner=session.owner)
-            self._end(session, f"no node took it within {session.wait_s:g} s")
+            why = self.reason_of(session) or "no node was free"
+            self._end(session, f"no node took it within {session.wait_s:g} s: {why}")
+
+
+def _kind_of(session: SessionRecord) -> tuple[str, ...]:
+    """Return what the choice of a node depends on; all other properties are alike for jobs."""
+    return session.owner_name, *session.needs

@@ -25,6 +25,8 @@ from cavmarl.balance.load_score import (
 from cavmarl.core.errors import NoAdmissibleWorkerError, ServiceError
 from cavmarl.service.service_records import NodeRecord, SessionRecord
 
+MOST_TOLD = 5  # nodes that a message names
+
 
 class Exclusion(NamedTuple):
     """A node that is not chosen, and the reason."""
@@ -78,17 +80,37 @@ class NoNodeError(ServiceError):
     """
 
     def __init__(self, exclusions: tuple[Exclusion, ...]) -> None:
-        counts: dict[str, int] = {}
-        for one in exclusions:
-            counts[one.reason] = counts.get(one.reason, 0) + 1
-        said = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
+        told = "; ".join(f"{one.node}: {explain(one)}" for one in exclusions[:MOST_TOLD])
+        more = len(exclusions) - MOST_TOLD
+        also = f"; and {more} other nodes" if more > 0 else ""
         super().__init__(
-            f"no node can take this ({said or 'none is registered'}); try again later, ask with "
-            "wait_s, or start one: cavmarl node --service URL",
+            f"no node can take this ({told or 'no node is registered'}{also}). Wait, ask with "
+            "wait_s, or start another node: cavmarl node --service URL",
             503,
             "no-node",
         )
         self.exclusions = exclusions
+
+
+# Reasons of exclusions other than load, and what to do.
+_CURES = {
+    UNAVAILABLE: "does not answer, or cannot be reached; start it again",
+    "stale": "has sent no load lately; it may be starting, or be too slow",
+    "draining": "accepts no sessions: cavmarl nodes --resume NODE",
+    "capacity": "has no free slot; end a session, or start it with more --slots",
+    "capability": "lacks a required capability; start it with --capability",
+    "access": "does not serve you; start it with --allow NAME",
+}
+
+
+def explain(one: Exclusion) -> str:
+    """Return why a node is excluded, which limit counts, and what to do."""
+    if one.value is None or one.threshold is None:
+        return _CURES.get(one.reason, one.reason)
+    return (
+        f"{one.reason} {one.value:.2f} is above the threshold {one.threshold:g}; wait, or raise it "
+        "with cavmarl serve --thresholds"
+    )
 
 
 def choose(
@@ -137,6 +159,16 @@ def choose(
     return Chosen(names[found.worker], outcome, score, tuple(exclusions))
 
 
+def limits_of(node: NodeRecord, known: LiveNode, is_old: bool, rule: LoadRule) -> list[str]:
+    """Return why a node would accept no session of a client without needs, and what to do."""
+    reason = _state_against(node, known, is_old)
+    if reason is not None:
+        return [explain(Exclusion(node.name, reason))]
+    assert known.use is not None
+    found = find_rejections([Candidate(0, known.use)], rule)
+    return [explain(Exclusion(node.name, *one[1:])) for one in found]
+
+
 def overloads(use: Utilisation, rule: LoadRule = DEFAULT_RULE) -> list[str]:
     """Return the resources above their thresholds."""
     return [one.resource for one in find_rejections([Candidate(0, use)], rule)]
@@ -153,16 +185,24 @@ def _reason_against(
     node: NodeRecord, known: LiveNode, session: SessionRecord, is_old: bool
 ) -> str | None:
     """Return the first reason other than load why a node cannot accept a session, or None."""
+    state = _state_against(node, known, is_old)
+    if state not in (None, "capacity"):
+        return state
+    if node.allowed and session.owner_name not in node.allowed:
+        return "access"
+    if session.needs and not set(session.needs) <= set(node.capabilities):
+        return "capability"
+    return state
+
+
+def _state_against(node: NodeRecord, known: LiveNode, is_old: bool) -> str | None:
+    """Return the reason why a node can accept no session at all, or None."""
     if node.state != "up":
         return UNAVAILABLE
     if is_old or known.use is None:
         return "stale"
     if node.draining:
         return "draining"
-    if node.allowed and session.owner_name not in node.allowed:
-        return "access"
-    if session.needs and not set(session.needs) <= set(node.capabilities):
-        return "capability"
     if len(known.hosted) + len(known.zones_of) >= node.slots:
         return "capacity"
     return None

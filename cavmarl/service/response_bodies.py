@@ -73,6 +73,7 @@ class NodeStatus(_Answer):
     state: Literal["up", "down", "left"]
     draining: bool
     excluded: list[str]  # resources above their thresholds
+    limits: list[str]  # why it accepts no session, with the limit and what to do
     load: Load | None  # null: no heartbeat yet
     score: float | None
     sessions: int
@@ -200,6 +201,7 @@ class Session(_Answer):
     members: list[str]
     told_number: int
     progress: list[int] | None  # of a job: steps done, total; null: not reported yet
+    waits_for: str  # of a queued job: why no node takes it; empty: nothing is known
 
 
 class SessionList(_Answer):

@@ -99,7 +99,8 @@ def node_answer(service: Service, node: NodeRecord) -> response_bodies.NodeStatu
     return response_bodies.NodeStatus(
         **asdict(node),
         load=None if live.use is None else response_bodies.Load(**asdict(live.use)),
-        score=score_of(node, live),
+        score=score_of(node, live, service.broker.rules.load),
+        limits=service.broker.limits_of(node.name),
         sessions=len(live.hosted),
         zones_of=list(live.zones_of),
         age_s=round(service.broker.age_s(node.name), 3),
@@ -112,7 +113,8 @@ def session_answer(service: Service, session: SessionRecord) -> response_bodies.
     del found["saved_blob"], found["owners"]
     live = service.broker.live.get(session.node or "")
     progress = None if live is None else live.jobs.get(session.id)
-    return response_bodies.Session(**found, progress=progress)
+    waits_for = service.broker.jobs.reason_of(session)
+    return response_bodies.Session(**found, progress=progress, waits_for=waits_for)
 
 
 def event_answer(line: LogEvent) -> response_bodies.EventLine:

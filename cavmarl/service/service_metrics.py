@@ -53,7 +53,7 @@ class ServiceMetrics(PrometheusCollector):
         scores = {
             name: score
             for name, node in state.nodes.items()
-            if (score := score_of(node, live[name])) is not None
+            if (score := score_of(node, live[name], broker.rules.load)) is not None
         }
         yield _gauge("node_load_score", "LoadScore of a node, eq. (1).", "node", scores)
         hosted = {name: len(one.hosted) for name, one in live.items()}

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from cavmarl.balance.load_score import LoadRule
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
@@ -124,6 +125,35 @@ def test_one_overloaded_resource_excludes_a_node(
     assert "node.overloaded" in fleet.kinds()
     fleet.beat("a", **{name: value - 0.001 for name, value in busy.items()})
     assert fleet.open().node == "a"
+
+
+def test_a_job_that_waits_says_which_limit_it_waits_for(fleet: Fleet) -> None:
+    fleet.join("a", slots=1)
+    fleet.beat("a", cpu=0.97)
+    job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
+    limit = "cpu 0.97 is above the threshold 0.85; wait, or raise it with cavmarl serve --threshold"
+    assert f"no node can take this (a: {limit}" in fleet.broker.jobs.reason_of(job)
+    assert fleet.broker.limits_of("a")[0].startswith(limit)
+    fleet.beat("a", cpu=0.1)
+    assert job.node == "a"
+    assert fleet.broker.jobs.reason_of(job) == ""
+    assert "--slots" in fleet.broker.limits_of("a")[0]
+    with pytest.raises(NoNodeError, match=r"a: has no free slot; .* --slots\)\. Wait, ask with"):
+        fleet.open()
+    fleet.broker.drain(fleet.nodes, "a")
+    assert "cavmarl nodes --resume" in fleet.broker.limits_of("a")[0]
+    fleet.now_s += 10.0
+    assert fleet.broker.limits_of("a")[0].startswith("has sent no load lately")
+
+
+def test_thresholds_and_weights_are_rules(tmp_path: Path) -> None:
+    rule = LoadRule(weights=(1.0, 0.0, 0.0), thresholds=(0.98, 0.9, 0.95))
+    fleet = Fleet(tmp_path / "store.sqlite", load=rule)
+    fleet.join("a")
+    fleet.beat("a", cpu=0.97, ram=0.5)
+    assert fleet.broker.limits_of("a") == []
+    assert fleet.open().score == pytest.approx(0.97)
+    fleet.close()
 
 
 def test_capacity_capability_and_access_exclude_nodes(fleet: Fleet) -> None:
@@ -287,7 +317,8 @@ def test_what_has_taken_too_long_is_a_timeout_on_record(fleet: Fleet) -> None:
     assert job.state == "queued"
     fleet.now_s += 2.0
     fleet.broker.sweep()
-    assert (job.state, job.message) == ("failed", "no node took it within 30 s")
+    assert job.state == "failed"
+    assert job.message.startswith("no node took it within 30 s: no node can take this (no node is")
     fleet.join("a")
     assert fleet.beat("a")["jobs"] == []
     session = fleet.open()
