@@ -76,11 +76,12 @@ def refused(env: CavEnv, actions: Any, error: type[Exception], *words: str) -> N
         (None, ("car_1",)),
         ([], ("car_1", "(0,)", "(2,)")),
         ([[0.0], [0.0, 0.0]], ("car_1",)),
-        (["a", "b"], ("car_1", "numbers")),
+        (["a", "b"], ("car_1", "floats")),
         ("ab", ("car_1",)),
-        (np.array([0.0, 0.0], dtype=object), ("car_1", "object", "numbers")),
-        (np.array([0j, 0j]), ("car_1", "complex", "numbers")),
-        (np.array([True, False]), ("car_1", "bool", "numbers")),
+        (np.array([0.0, 0.0], dtype=object), ("car_1", "object", "floats")),
+        (np.array([0j, 0j]), ("car_1", "complex", "floats")),
+        (np.array([True, False]), ("car_1", "bool", "floats")),
+        (np.array([1, 0]), ("car_1", "int64", "floats")),
         ({"throttle": 0.0}, ("car_1",)),
         ([10**400, 0], ("car_1",)),
     ],
@@ -90,8 +91,8 @@ def test_a_wrong_continuous_action_is_refused(value: Any, words: tuple[str, ...]
     refused(make(), {"car_0": FINE, "car_1": value, "car_2": FINE}, ActionError, *words)
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.int8, np.int64, np.uint8])
-def test_dtypes_that_cast_without_loss_are_accepted(dtype: type[np.generic]) -> None:
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_floats_of_any_size_are_accepted(dtype: type[np.generic]) -> None:
     env, twin = make(), make()
     env.step(dict.fromkeys(env.agents, np.array([1, 0], dtype=dtype)))
     twin.step(dict.fromkeys(twin.agents, np.array([1.0, 0.0])))
@@ -182,7 +183,7 @@ def test_values_beyond_the_range_can_be_clipped_and_are_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "first", "idle"), [("continuous", [0.5, 0.1], [0, 0]), ("discrete", 3, 1)]
+    ("kind", "first", "idle"), [("continuous", [0.5, 0.1], [0.0, 0.0]), ("discrete", 3, 1)]
 )
 def test_missing_actions_can_be_held_and_are_counted(kind: str, first: Any, idle: Any) -> None:
     env = make(action__missing_action="hold", action__kind=kind)
@@ -273,11 +274,11 @@ def test_seeds_that_are_none_are_refused(seed: Any) -> None:
         (np.zeros((2, 3)), ("(2, 3)",)),
         (np.zeros((2, 3, 3)), ("(2, 3, 3)",)),
         (np.zeros(()), ("()",)),
-        (None, ("numbers",)),
-        ({"car_0": FINE}, ("numbers",)),
-        ([[1.0], [1.0, 2.0]], ("numbers",)),
-        (np.zeros((2, 3, 2), dtype=complex), ("complex", "numbers")),
-        (np.zeros((2, 3, 2), dtype=bool), ("bool", "numbers")),
+        (None, ("floats",)),
+        ({"car_0": FINE}, ("floats",)),
+        ([[1.0], [1.0, 2.0]], ("floats",)),
+        (np.zeros((2, 3, 2), dtype=complex), ("complex", "floats")),
+        (np.zeros((2, 3, 2), dtype=bool), ("bool", "floats")),
         (np.full((2, 3, 2), np.nan), ("world 0", "car_0", "throttle", "finite")),
         (np.full((2, 3, 2), 1.5), ("world 0", "car_0", "[-1, 1]")),
     ],

@@ -85,7 +85,7 @@ def test_a_run_is_played_to_several_agents(capsys: pytest.CaptureFixture[str]) -
         (["pedestrian_crossing", "--param", "walk_mps"], "must be KEY=VALUE"),
         (["pedestrian_crossing", "--param", 'walk_mps="fast"'], "must be KEY=VALUE"),
         (["pedestrian_crossing", "--map", "ring"], "has no place for it"),
-        (["failed_u_turn", "--agents", "99"], "set at most"),
+        (["failed_u_turn", "--agents", "99"], "and at most"),
         (["signal_outage", "--map", "merge"], "it needs a signal"),
         (["pedestrian_crossing", "--density", "some"], "must be one of none, low, high"),
         (["pedestrian_crossing", "--picture", "crossing.jpg"], "must end in .png"),

@@ -38,7 +38,7 @@ def test_the_refusal_of_a_driver_names_the_way_out() -> None:
     with pytest.raises(PolicyError) as caught:
         load_policy("cities_residual", make_vec("merge", **SMALL))
     said = str(caught.value)
-    assert said.startswith("The policy cities_residual expects different sensors and actions from")
+    assert said.startswith("The policy cities_residual expects different sensors and actions than")
     assert "Add --sensors-of cities_residual" in said
     assert "sensors_of='cities_residual' in Python" in said
 

@@ -77,7 +77,7 @@ def test_a_roundabout_in_london_is_driven_clockwise(
     for _ in range(1200):
         drive(world)
         assert (world.vehicles(0)["hit"] < 0).all()
-    assert world.vehicles(0)["distance_m"].max() > 200.0
+    assert world.traffic_stats(0).arrived > 40
 
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path))
     assert read_network(map_file(path)).left_hand

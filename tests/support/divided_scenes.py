@@ -22,7 +22,7 @@ MARGIN_M = 20.0  # beyond the arms' ends, within the zones
 TICK_S = 0.05
 # No vehicle of the file departs in the time of a scene: it says which types and ways there are.
 LATE_S = 900
-CLOCK = {"clock.sim_dt_s": TICK_S, "clock.ctrl_dt_s": TICK_S, "horizon_s": 200.0}
+CLOCK = {"clock.sim_dt_s": TICK_S, "clock.ctrl_dt_s": TICK_S, "horizon_s": 1000.0}
 # Zones see no further than bodies touch, but for vehicles that drivers ask about.
 CLOCK |= {"zones.approach_ticks": 2}
 

@@ -207,7 +207,7 @@ def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     with (
-        pytest.raises(ConfigError, match=r"names .*none\.rou\.xml, which does not exist"),
+        pytest.raises(ConfigError, match=r"names .*none\.rou\.xml', which does not exist"),
         coupled("grid4x4", [path]),
     ):
         pass

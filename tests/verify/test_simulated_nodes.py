@@ -289,7 +289,7 @@ def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(OwnerChanges, "take_over", later)
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **checked)
-    assert "the records have" in found.lines[0].wrong[0]
+    assert "the records 4, or epochs differ" in found.lines[0].wrong[0]
     unchecked = {**checked, "overrides": {}}
     assert verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **unchecked).holds
 

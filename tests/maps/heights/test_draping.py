@@ -17,6 +17,7 @@ from cavmarl.maps.heights.height_model import HeightModel
 from cavmarl.maps.netconvert import BuildResult, build_network
 from cavmarl.maps.projection import unproject
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net import reader
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.kept_maps import network_of
 from tests.support.terrain import TOWN, plane, write_geotiff, write_hgt
@@ -63,7 +64,11 @@ def plane_of(path: Path) -> list[str]:
     return ["/".join(node) for node in nodes]
 
 
-def test_heights_are_the_models_and_nothing_moves(town: Path, tmp_path: Path) -> None:
+def test_heights_are_the_models_and_nothing_moves(
+    town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Draping adds points, which the rounding of corners would follow; so it is left out here."""
+    monkeypatch.setattr(reader, "round_corners", lambda *_: [])
     rolling = plane(0.02, 0.05)
     model = write_geotiff(
         tmp_path / "ground.tif",
