@@ -28,8 +28,7 @@ def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     [
         ("train ppo", "'torch' is", "train"),
         ("train ppo_sb3", "'torch'", "train"),
-        ("demo", "'torch' and 'sumo' and 'pygame' and 'imageio_ffmpeg' and 'matplotlib'",
-         "render,report,sumo,train"),
+        ("demo", "'torch' and 'matplotlib' and 'jinja2' and 'pygame' and 'PIL'", "demo"),
         ("evaluate town -p model.zip --html page.html --record kept",
          "'sumo' and 'stable_baselines3' and 'torch' and 'matplotlib' and 'jinja2' and 'pyarrow'",
          "record,report,sumo,train"),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cavmarl import CavEnv, ConfigError, parallel_env
-from cavmarl.core.errors import WorkerError
+from cavmarl.core.errors import EpisodeError
 from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from tests.support.pools import alive
 
@@ -81,7 +81,7 @@ def test_the_processes_end_with_the_environment() -> None:
         _ = env.simulation
     env.close()
     assert alive(pids) == []
-    with pytest.raises(WorkerError, match="closed"):
+    with pytest.raises(EpisodeError, match="after close"):
         env.reset(seed=0)
 
 

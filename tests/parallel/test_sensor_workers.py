@@ -21,7 +21,7 @@ import pytest
 
 import cavmarl
 from cavmarl import CavVectorEnv, make_vec
-from cavmarl.core.errors import ConfigError, WorkerError
+from cavmarl.core.errors import ConfigError, EpisodeError, WorkerError
 from cavmarl.parallel.sensor_workers import sensor_pool as sensor_farm
 from cavmarl.parallel.sensor_workers import sensor_shares
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
@@ -276,7 +276,7 @@ def test_closing_and_forgetting_leave_no_process_behind() -> None:
             gc.collect()
         else:
             vec.close()
-            with pytest.raises(WorkerError, match="closed"):
+            with pytest.raises(EpisodeError, match="after close"):
                 vec.reset(seed=0)
         assert _gone(pids)
         assert len(os.listdir("/proc/self/fd")) < descriptors

@@ -11,7 +11,7 @@ import pytest
 
 from cavmarl import ActionError, CapacityError, ConfigError, make_vec
 from cavmarl.config.registry import entries
-from cavmarl.core.errors import WorkerDeathError, WorkerError
+from cavmarl.core.errors import EpisodeError, WorkerDeathError, WorkerError
 from cavmarl.parallel.processes.worker_processes import WorkerProcesses
 from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 
@@ -76,7 +76,7 @@ def test_returned_arrays_outlive_the_workers(make: Make) -> None:
     observations, _ = vec.reset(seed=1)
     vec.close()
     assert observations.any()
-    with pytest.raises(WorkerError, match="closed"):
+    with pytest.raises(EpisodeError, match="after close"):
         vec.reset(seed=1)
 
 

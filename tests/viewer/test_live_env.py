@@ -20,7 +20,7 @@ from websockets.sync.client import ClientConnection, connect
 import cavmarl
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import LoadSnapshot
-from cavmarl.core.errors import ConfigError, ServiceError
+from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate import evaluate
 from cavmarl.viewer.live_env import ShownEnv
@@ -127,8 +127,9 @@ def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVector
         policy = httpx.get(shown.address).headers["content-security-policy"]
         assert "frame-ancestors 'self' http://127.0.0.1:* http://localhost:* vscode" in policy
         assert "unsafe" not in policy
-        with pytest.raises(ServiceError, match="give another --port"):
-            cavmarl.show(vec, port=int(shown.address.split(":")[2].strip("/")))
+        port = int(shown.address.split(":")[2].strip("/"))
+        with cavmarl.show(vec, port=port) as again, joined(again.address):
+            assert again.address == shown.address
 
 
 def test_an_evaluation_is_watched_and_stays_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
