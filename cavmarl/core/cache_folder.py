@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
-from cavmarl.core.notices import print_once
+_REPORTED: set[Path] = set()
 
 
 def cache_dir() -> Path:
@@ -19,7 +20,12 @@ def cache_dir() -> Path:
 
 def report_unwritable(error: OSError) -> None:
     """Report once, on standard error, that the cache cannot be written."""
-    print_once(
-        f"{cache_dir()} cannot be written ({error.strerror or error}), so every process must "
-        "compile kernels and read maps again; set CAVMARL_CACHE_DIR to a writable folder"
-    )
+    folder = cache_dir()
+    if folder not in _REPORTED:
+        _REPORTED.add(folder)
+        print(
+            f"cavmarl: {folder} cannot be written ({error.strerror or error}), so every process "
+            "must compile kernels and read maps again; set CAVMARL_CACHE_DIR to a writable folder",
+            file=sys.stderr,
+            flush=True,
+        )

@@ -26,7 +26,7 @@ from cavmarl.core.huge_pages import trim
 from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.maps.buildings import with_buildings
-from cavmarl.maps.netconvert import map_file
+from cavmarl.maps.netconvert import conversion_notes, map_file
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.roads.joined_maps import join
@@ -211,6 +211,9 @@ def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
     if refused:
         raise MapError("\n".join(refused))
     network = join(networks)
+    for file in files:
+        for note in conversion_notes(file):
+            log.warning("%s: %s", map_name(file), note)
     for note in network.notes:
         log.warning("%s: %s", network.name, note)
     return _LOADED.setdefault((has_agents, *contents), network)

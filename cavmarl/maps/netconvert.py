@@ -21,7 +21,6 @@ from typing import Any
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
-from cavmarl.core.notices import print_once
 from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
@@ -203,8 +202,7 @@ def build_network(
 def map_file(path: str | Path) -> Path:
     """Return the SUMO network of a map file: the file itself, or the result of netconvert.
 
-    A configuration of SUMO stands for the network that it names. What netconvert had to ignore or
-    to guess is printed once per process.
+    A configuration of SUMO stands for the network that it names.
 
     Raises MapError: see `build_network`.
     """
@@ -219,11 +217,16 @@ def map_file(path: str | Path) -> Path:
     entry = _cache_entry(path, _OPTIONS[kind])
     if not entry.exists():
         build_network(path)
-    told = read_provenance(entry)
-    for key in ("traffic side", "defaults", "notes"):
-        if not told.get(key, "right").startswith("right"):
-            print_once(f"{path}: {key}: {told[key]}")
     return entry
+
+
+def conversion_notes(path: Path) -> list[str]:
+    """Return what the conversion of a network from another format decided, guessed or ignored."""
+    origin = read_provenance(path)
+    if origin.get("traffic side", "").startswith("right"):
+        del origin["traffic side"]  # the usual one
+    told = ("traffic side", "defaults", "notes")
+    return [f"{key}: {origin[key]}" for key in told if key in origin]
 
 
 def _cache_entry(

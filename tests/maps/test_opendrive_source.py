@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from cavmarl.config.registry import load_config
 from cavmarl.core.errors import MapError
-from cavmarl.maps.netconvert import build_network, map_file
+from cavmarl.engine.world_setup import load_roads
+from cavmarl.maps.netconvert import build_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.map_sources import ROAD, built_from, road_file
@@ -73,7 +75,7 @@ def test_limits_change_along_a_road_and_those_of_lanes_win(tmp_path: Path) -> No
 
 
 def test_roads_without_a_limit_are_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "map.xodr"
     path.write_text(road_file(ROAD.replace("<type/>", '<type s="0" type="town"/>')))
@@ -88,9 +90,9 @@ def test_roads_without_a_limit_are_counted(
     }
     assert result.provenance["defaults"] == "town maxspeed=13.89 (1 of 1 roads)"
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path))
-    map_file(path)
-    map_file(path)
-    assert capsys.readouterr().err.count("town maxspeed=13.89 (1 of 1 roads)") == 1
+    one, other = (load_roads(*load_config(path)) for _ in range(2))
+    assert one is other
+    assert caplog.text.count("defaults: town maxspeed=13.89 (1 of 1 roads)") == 1
 
 
 def test_very_low_limits_are_counted(tmp_path: Path) -> None:

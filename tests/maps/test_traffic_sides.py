@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from cavmarl.cli import app
 from cavmarl.core.errors import ConfigError, MapError
-from cavmarl.maps.netconvert import build_network, map_file
+from cavmarl.maps.netconvert import build_network, conversion_notes, map_file
 from cavmarl.maps.traffic_sides import Side, sides_at
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
@@ -56,7 +56,7 @@ def test_places_at_a_border_do_not_decide() -> None:
 
 
 def test_a_roundabout_in_london_is_driven_clockwise(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "map.osm"
     path.write_text(osm_file(ROUNDABOUT, 51.5, -0.1))
@@ -81,7 +81,9 @@ def test_a_roundabout_in_london_is_driven_clockwise(
 
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path))
     assert read_network(map_file(path)).left_hand
-    assert "traffic side: left (by the place of its roads)" in capsys.readouterr().err
+    side, defaults = conversion_notes(map_file(path))
+    assert side == "traffic side: left (by the place of its roads)"
+    assert defaults.startswith("defaults: highway.secondary lanes=1 (12 of 12 edges)")
 
 
 def test_the_option_decides_against_the_place(tmp_path: Path) -> None:
