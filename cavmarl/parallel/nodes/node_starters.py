@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeAlias
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.core.huge_pages import huge_heap
+from cavmarl.core.private_files import check_private
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.network.mpi_transport import MPI, mpi_transport
 from cavmarl.parallel.network.ray_actors import RayActors
@@ -293,12 +294,11 @@ def read_key(path: Path) -> bytes:
     """
     make = "make one: (umask 077; openssl rand -hex 32 > FILE), the same file on all machines"
     try:
+        check_private("key file", path)
         with open(path, "rb") as file:
-            key, mode = file.read(1 << 16).strip(), path.stat().st_mode
+            key = file.read(1 << 16).strip()
     except OSError as error:
         raise ConfigError(f"key file {path}: {error.strerror or error}; {make}") from error
-    if mode & 0o077:
-        raise ConfigError(f"key file {path}: other users can read it; run chmod 600 {path}")
     if len(key) < MIN_KEY:
         raise ConfigError(f"key file {path}: has {len(key)} of {MIN_KEY} characters; {make}")
     return key
