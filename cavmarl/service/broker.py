@@ -341,10 +341,8 @@ class Broker:
         """Store the state of a world after a number of commands."""
         if number < session.saved_number:
             raise problem("conflict", f"command {session.saved_number} is stored already")
-        before, sha256 = session.saved_blob, self.log.keep(content)
+        sha256 = self.log.keep(content)
         self._tell(session, "saved", {"number": number, "sha256": sha256, "bytes": len(content)})
-        if before != sha256:
-            self._drop(before)
 
     def hand_over(self, session: SessionRecord, body: TransfersBody) -> None:
         """Record vehicles that have changed zone, and vehicles whose change is prepared."""
@@ -421,13 +419,11 @@ class Broker:
             live.hosted.discard(session.id)
             live.muted.discard(session.id)
             live.refresh()
-        blob = session.saved_blob
         self.zone_nodes.end(session)
         self.prepared.pop(session.id, None)
         data = {"message": message}
         self.log.record(f"session.{word}", session.id, data, actor=actor, owner=session.owner)
         self._touched[session.id] = self._clock_s()
-        self._drop(blob)
 
     def _fail(self, session: SessionRecord, message: str) -> None:
         self._end(session, "failed", "service", message)
@@ -435,15 +431,6 @@ class Broker:
     def _forget(self, session: SessionRecord) -> None:
         self._tell(session, "forgotten", {})
         del self._touched[session.id]
-        for sha256 in session.results.values():
-            self._drop(sha256)
-
-    def _drop(self, sha256: str | None) -> None:
-        """Delete content unless another session refers to it."""
-        for one in self.log.state.sessions.values():
-            if sha256 == one.saved_blob or sha256 in one.results.values():
-                return
-        self.log.drop(sha256)
 
     def _empty(self, name: str) -> None:
         live = self.live[name]
