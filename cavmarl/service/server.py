@@ -11,6 +11,7 @@ import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from cavmarl.core.errors import ServiceError
+from cavmarl.core.private_files import check_private
 from cavmarl.core.server_address import is_loopback, listen, shown_host
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
@@ -93,12 +94,19 @@ def first_admin(log: EventLog, access: Access) -> str | None:
 
 
 def check_transport(host: str, certificate: Path | None, key: Path | None) -> None:
-    """Raise ServiceError if secrets would be sent to other machines without encryption."""
+    """Check that secrets are encrypted on the way to other machines.
+
+    Raises:
+        ServiceError: they would not be, or a file is missing.
+        ConfigError: other users can read the private key.
+    """
     if (certificate is None) != (key is None):
         raise ServiceError("give both --certificate and --key, or neither")
     for path in (certificate, key):
         if path is not None and not path.is_file():
             raise ServiceError(f"{path}: does not exist; give the path of a PEM file")
+    if key is not None:
+        check_private("--key", key)
     if certificate is None and not is_loopback(host):
         raise ServiceError(
             f"--host {host}: other machines can reach it, and without TLS its secrets can be read: "
