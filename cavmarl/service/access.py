@@ -147,7 +147,10 @@ class Access:
         )  # fmt: skip
 
     def state_token(self, session: SessionRecord, number: int, content: bytes) -> str:
-        """Return the service's signature of a saved state, for the node of its session alone."""
+        """Return the service's signature of a saved state, for the node of its session alone.
+
+        Nodes check it with the public keys. With a shared key, each node could sign, too.
+        """
         return self._sign(
             {"sub": session.id, "aud": f"node:{session.node}", "number": number,
              "sha256": hashlib.sha256(content).hexdigest(), "use": "state"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
@@ -170,7 +171,9 @@ def _read_json(content: bytes) -> Any:
     if deepest > MOST_NESTED:
         raise HTTPException(422, f"body: is nested {deepest} deep: at most {MOST_NESTED}")
     try:
-        found = json.loads(content.decode(), parse_constant=_refuse_constant)
+        found = json.loads(
+            content.decode(), parse_constant=_refuse_constant, parse_float=_finite_number
+        )
         if _SURROGATE.search(content):
             json.dumps(found, ensure_ascii=False).encode()
     except json.JSONDecodeError:
@@ -178,6 +181,13 @@ def _read_json(content: bytes) -> Any:
     except ValueError as error:  # UnicodeError, a constant or a number with too many digits
         raise HTTPException(422, f"body: is not valid JSON in UTF-8 ({error!s:.100})") from None
     return found
+
+
+def _finite_number(text: str) -> float:
+    number = float(text)
+    if math.isinf(number):
+        raise ValueError(f"{text:.20} is too large")
+    return number
 
 
 def _refuse_constant(name: str) -> NoReturn:

@@ -27,7 +27,7 @@ from cavmarl.service.node_selection import (
     overloads,
     score_of,
 )
-from cavmarl.service.request_bodies import BeatBody, NodeBody, TransfersBody
+from cavmarl.service.request_bodies import MOST_WORLDS, BeatBody, NodeBody, TransfersBody
 from cavmarl.service.service_records import (
     SESSION_OVER,
     IdentityRecord,
@@ -36,6 +36,7 @@ from cavmarl.service.service_records import (
 )
 from cavmarl.service.zone_nodes import ZoneNodes
 
+MOST_RESULTS = 256  # files of one job
 SHOWN_EXCLUSIONS = 10  # maximum number of excluded nodes that an event lists
 MOST_SCORES = 100  # maximum number of LoadScores that a node gets for its pages
 
@@ -346,6 +347,8 @@ class Broker:
 
     def hand_over(self, session: SessionRecord, body: TransfersBody) -> None:
         """Record vehicles that have changed zone, and vehicles whose change is prepared."""
+        if any((world := row[0]) >= MOST_WORLDS for row in body.transfers):
+            raise problem("refused", f"transfers: world {world} is not below {MOST_WORLDS}")
         if body.transfers:
             data = {"number": body.at, "transfers": body.transfers}
             self._tell(session, "handed_over", data)
@@ -353,6 +356,8 @@ class Broker:
 
     def add_result(self, session: SessionRecord, name: str, content: bytes) -> None:
         """Store a file that a job has produced."""
+        if name not in session.results and len(session.results) >= MOST_RESULTS:
+            raise problem("too-many", f"{MOST_RESULTS} results of a job are kept")
         sha256 = self.log.keep(content)
         self._tell(session, "result", {"name": name, "sha256": sha256, "bytes": len(content)})
 

@@ -141,9 +141,9 @@ async def open_worlds(
 
 
 async def _begin(link: NodeLink, worlds: SessionWorlds, session: str, configuration: str) -> None:
-    """Create the worlds of a session; a session whose state cannot be used ends as failed."""
-    document = await link.configuration(configuration)
+    """Create the worlds of a session; a session whose content cannot be used ends as failed."""
     try:
+        document = await link.configuration(configuration)
         state, number = await link.saved_state(session)
         keys = await link.open_door(session, document)
         await asyncio.to_thread(worlds.add, session, document, state, number, keys)
@@ -152,7 +152,7 @@ async def _begin(link: NodeLink, worlds: SessionWorlds, session: str, configurat
     except ServiceError as error:
         if error.problem == "damaged":
             with suppress(ServiceError):  # another node has it, or the service ends it later
-                await link.fail(session, f"saved state: {error}")
+                await link.fail(session, str(error))
         raise
     finally:
         link.close_key_file(session)

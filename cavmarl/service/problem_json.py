@@ -13,6 +13,7 @@ from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.service.error_names import PROBLEM_TYPE, PROBLEMS, without_folders
@@ -58,6 +59,7 @@ def serve_routes(app: FastAPI, routers: Sequence[APIRouter]) -> None:
     app.add_exception_handler(CavmarlError, _on_error)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_http)
+    app.add_exception_handler(ClientDisconnect, _on_disconnect)
     app.add_exception_handler(Exception, _on_fault)
 
 
@@ -112,6 +114,10 @@ async def _on_http(request: Request, error: Exception) -> JSONResponse:
     if error.status_code == 405:
         headers["Allow"] = ", ".join(sorted(_methods_of(request)))
     return _refuse(request, name, str(error.detail), status=error.status_code, headers=headers)
+
+
+async def _on_disconnect(request: Request, _: Exception) -> JSONResponse:
+    return _refuse(request, "bad-body", "the connection was closed before the end of the body")
 
 
 def _methods_of(request: Request) -> set[str]:

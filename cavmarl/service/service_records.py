@@ -10,8 +10,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-ROLES = ("viewer", "client", "operator", "admin", "node")
 Role = Literal["viewer", "client", "operator", "admin", "node"]
+ROLES: tuple[Role, ...] = ("viewer", "client", "operator", "admin", "node")
 
 SessionState = Literal["queued", "active", "closed", "done", "failed"]
 STATE_HEADER = "Cavmarl-State"  # of an answer with a state: the service's signature of it

@@ -7,8 +7,10 @@ import hashlib
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import httpx
@@ -19,13 +21,14 @@ from sqlalchemy import create_engine, text
 from cavmarl.client import Client
 from cavmarl.client.service_protocol import Ask, Flow, ServiceFlows
 from cavmarl.core.errors import ConfigError, ServiceError
+from cavmarl.service.broker import MOST_RESULTS
 from cavmarl.service.configurations import add_configuration, read_configuration
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore, digest_of
 from cavmarl.service.node_app import make_node_app
 from cavmarl.service.node_link import NodeLink
-from cavmarl.service.request_bodies import ConfigurationBody
-from cavmarl.service.session_worlds import SessionWorlds
+from cavmarl.service.request_bodies import MOST_WORLDS, ConfigurationBody, TransfersBody
+from cavmarl.service.session_worlds import SessionWorld, SessionWorlds
 from tests.support.fleet import Fleet
 from tests.support.loopback_service import LoopbackService, loopback_service
 
@@ -133,9 +136,37 @@ def test_a_state_that_cannot_be_used_ends_its_session_alone(service: LoopbackSer
         assert (answer.status_code, title_of(answer)) == (410, "damaged")
         found = service.ask("client", "GET", f"/sessions/{opened['session']}").json()
         assert found["state"] == "failed"
-        assert "state" in found["message"]
+        assert found["message"]
     assert open_on_node(service, good).status_code == 200
     assert not [line for line in service.log.lines if "Traceback" in line]
+
+
+def test_a_changed_state_is_damaged_or_usable() -> None:
+    """A node signs nothing; another node's state may be any bytes."""
+    document = {**WORLD, "max_cycles": None, "num_envs": 2, "seed": 0, "overrides": {}}
+    world = SessionWorld(document, None, 0, {})
+    world.command("reset", 1, 0, b"", False)
+    state = world.state()
+    world.close()
+    assert state is not None
+    SessionWorld(document, state, 1, {}).close()
+    random = Random(0)
+    changed = [b"x", state[:1], state[1:], state[:-1], state + b"\0", b"\0" * len(state)]
+    for _ in range(24):
+        place, length = random.randrange(len(state)), random.choice([1, 8, 100])
+        changed.append(state[:place] + random.randbytes(length) + state[place + length :])
+        changed.append(state[:place] + state[place + length :])
+    problems = Counter(problem_of_state(document, content) for content in changed)
+    assert problems.keys() <= {"", "damaged"}
+    assert problems["damaged"] > 0.9 * len(changed)
+
+
+def problem_of_state(document: dict[str, Any], state: bytes) -> str:
+    try:
+        SessionWorld(document, state, 1, {}).close()
+    except ServiceError as error:
+        return error.problem
+    return ""
 
 
 # Content
@@ -189,6 +220,20 @@ def test_content_without_users_is_deleted(fleet: Fleet) -> None:
     assert stored() == set()
 
 
+def test_a_node_cannot_fill_the_memory_of_the_service(fleet: Fleet) -> None:
+    fleet.join("a")
+    session = fleet.open()
+    for k in range(MOST_RESULTS):
+        fleet.broker.add_result(session, f"{k}.csv", b"x")
+    fleet.broker.add_result(session, "0.csv", b"y")
+    with pytest.raises(ServiceError, match="results of a job") as refused:
+        fleet.broker.add_result(session, "another.csv", b"x")
+    assert refused.value.problem == "too-many"
+    body = TransfersBody(at=1, transfers=[[MOST_WORLDS, 0, 1, 2, 0, 1, 1]])
+    with pytest.raises(ServiceError, match="world 1024"):
+        fleet.broker.hand_over(session, body)
+
+
 # Bodies
 
 
@@ -213,6 +258,7 @@ def test_deep_bodies_are_refused_in_one_line(
         '{"environment": "merge", "\\udfff": 1}',
         '{"environment": "merge", "seed": 1' + "0" * 5000 + "}",
         '{"environment": "merge", "seed": Infinity}',
+        '{"environment": "merge", "overrides": {"clock.sim_dt_s": 1e400}}',
         '{"environment": "merge", "name": "\xff"}'.encode("latin-1"),
     ],
 )
@@ -289,7 +335,7 @@ def test_unknown_keys_make_a_node_ask_once_a_second_at_most(service: LoopbackSer
     for k in range(60):
         token = jwt.encode({"sub": "x"}, "k" * 32, "HS256", headers={"kid": f"key-{k:08x}"})
         bearer = {"Authorization": f"Bearer {token}"}
-        assert httpx.get(url, headers=bearer).status_code == 401
+        assert service.http.get(url, headers=bearer).status_code == 401
     service.access.public_keys = keys  # type: ignore[method-assign]
     assert len(asked) <= 2.0 + (time.monotonic() - began_s)
     bearer = {"Authorization": f"Bearer {opened['token']}"}

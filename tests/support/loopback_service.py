@@ -32,7 +32,7 @@ from cavmarl.service.node_app import make_node_app
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.server import ServerOptions, uvicorn_config
-from cavmarl.service.service_records import Role
+from cavmarl.service.service_records import ROLES, Role
 from cavmarl.service.session_worlds import SessionWorlds
 
 T = TypeVar("T")
@@ -67,6 +67,7 @@ class LoopbackService:
     broker: Broker
     log: Lines
     loop: asyncio.AbstractEventLoop
+    http: httpx.Client
     secrets: dict[str, str] = field(default_factory=dict)  # by names of identities
     nodes: dict[str, tuple[NodeLink, str]] = field(default_factory=dict)
     worlds: dict[str, SessionWorlds] = field(default_factory=dict)
@@ -97,16 +98,20 @@ class LoopbackService:
         """Send a request with the token of an identity; without a name, none."""
         headers = {"Authorization": f"Bearer {self.token(name)}"} if name else {}
         headers |= given.pop("headers", {})
-        return httpx.request(method, f"{self.url}/v1{path}", headers=headers, timeout=30.0, **given)
+        return self.http.request(method, f"{self.url}/v1{path}", headers=headers, **given)
 
     def start_node(self, name: str, identity: str, slots: int = 4) -> NodeLink:
         """Start a node whose beats are sent until `stop_node`."""
         found: NodeLink = self.run(self._start_node(name, identity, slots))
+        self.wait_for_beat(name)
+        return found
+
+    def wait_for_beat(self, name: str) -> None:
+        """Wait until the service knows the load of a node."""
         until_s = time.monotonic() + 30.0
         while self.broker.live[name].use is None:
             assert time.monotonic() < until_s
             time.sleep(0.02)
-        return found
 
     async def _start_node(self, name: str, identity: str, slots: int) -> NodeLink:
         listener = listen("127.0.0.1", 0)
@@ -154,7 +159,8 @@ def loopback_service(
     )
     listener = listen("127.0.0.1", 0)
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    running = LoopbackService(url, events, access, broker, Lines(), loop)
+    http = httpx.Client(timeout=30.0)
+    running = LoopbackService(url, events, access, broker, Lines(), loop, http)
 
     async def begin() -> None:
         running._serve(make_app(service), listener)
@@ -170,12 +176,13 @@ def loopback_service(
 
     running.run(begin())
     try:
-        for role in ("viewer", "client", "operator", "admin", "node"):
-            running.grant(role, role)  # type: ignore[arg-type]
+        for role in ROLES:
+            running.grant(role, role)
         yield running
     finally:
         for worlds in running.worlds.values():
             worlds.keep_only(set())
+        http.close()
         running.run(end())
         for name in LOGGERS:
             logging.getLogger(name).removeHandler(running.log)
