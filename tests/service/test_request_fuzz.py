@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections import Counter
 from pathlib import Path
 from random import Random
@@ -50,11 +51,20 @@ def renew(service: LoopbackService, fuzz: RequestFuzz) -> None:
             service.ask("client", "DELETE", f"/sessions/{one['id']}")
     opened = [service.ask("client", "POST", "/sessions", json=body).json() for _ in range(2)]
     fuzz.tokens["lease"] = opened[0]["token"]
+    bearer = {"Authorization": f"Bearer {opened[0]['token']}"}
+    world = f"{service.nodes['a'][1]}/v1/worlds/{opened[0]['session']}"
+    for command in ("", "/reset?number=1&seed=0"):
+        until_s = time.monotonic() + 20.0  # the node learns of new keys and of its resumption
+        while (answer := service.http.post(world + command, headers=bearer)).status_code != 200:
+            assert time.monotonic() < until_s, answer.text
+            time.sleep(0.05)
+    service.ask("node", "PUT", f"/jobs/{opened[0]['session']}/results/a.csv", content=b"1,2")
     refresh = service.access.exchange(service.secrets["viewer"])["refresh_token"]
     fuzz.known = {
         "node": "a",
         "session": opened[0]["session"],
         "closable": opened[1]["session"],
+        "next": "2",
         "sha256": found,
         "secret": service.secrets["viewer"],
         "refresh": refresh,

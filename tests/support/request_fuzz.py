@@ -36,9 +36,13 @@ TEMPLATES: list[tuple[str, str, str, Any]] = [
      {"name": "n", "environment": "merge", "agents": 2, "background": 1, "max_cycles": 9,
       "zones": 1, "nodes": 1, "num_envs": 1, "seed": 3,
       "overrides": {"sensors.lidar.rays": 4, "clock": {"sim_dt_s": 0.1}}}),
+    ("POST", "/v1/configurations", "client",
+     {"environment": "merge",
+      "overrides": {"population": {"agents": 1}, "sensors": {"lidar": {"rays": 4}},
+                    "terms": {"weights": {"progress": 1.0}}, "scenario.name": "cut_in"}}),
     ("GET", "/v1/configurations/{sha256}", "client", None),
     ("POST", "/v1/sessions", "client",
-     {"configuration": "{sha256}", "node": "{node}", "needs": ["gpu"], "wait_s": 0.0}),
+     {"configuration": "{sha256}", "node": "{node}", "needs": [], "wait_s": 0.0}),
     ("POST", "/v1/sessions/{session}/resolve", "client", {"unreachable": ["b"], "wait_s": 0.0}),
     ("GET", "/v1/sessions", "client", None),
     ("GET", "/v1/sessions/{session}", "client", None),
@@ -67,7 +71,8 @@ TEMPLATES: list[tuple[str, str, str, Any]] = [
 NODE_TEMPLATES: list[tuple[str, str, str, Any]] = [
     ("POST", "/v1/worlds/{session}?save=1", "lease", None),
     ("POST", "/v1/worlds/{session}/reset?number=1&seed=0", "lease", None),
-    ("POST", "/v1/worlds/{session}/step?number=2&quiet=1", "lease", b"\0" * 8),
+    ("POST", "/v1/worlds/{session}/step?number={next}", "lease", b"\0" * 8),
+    ("POST", "/v1/worlds/{session}/step?number={next}&quiet=1", "lease", b"\xff" * 8),
     ("GET", "/v1/worlds/{session}/hash", "lease", None),
     ("GET", "/v1/worlds/{session}/suggestion", "lease", None),
     ("GET", "/v1/worlds/{session}/transfers", "lease", None),
@@ -144,14 +149,18 @@ class RequestFuzz:
     tokens: dict[str, str] = field(default_factory=dict)
 
     def make(self, templates: list[tuple[str, str, str, Any]]) -> RawRequest:
-        method, path, role, body = self.random.choice(templates)
-        path = path.format(**self.known)
         changes = self.random.randint(0, 4)
+        if self.random.random() < 0.4 and (documents := [one for one in templates if is_json(one)]):
+            method, path, role, body = self.random.choice(documents)
+            in_tree, changes = max(changes, 1), 0
+        else:
+            method, path, role, body = self.random.choice(templates)
+            in_tree = 0
+        path = path.format(**self.known)
         if isinstance(body, dict):
             document = self._filled(body)
-            while changes and self.random.random() < 0.5:
+            for _ in range(in_tree):
                 document = self._change_tree(document)
-                changes -= 1
             content = _clamped(document)
         else:
             content = body or b""
@@ -182,10 +191,11 @@ class RequestFuzz:
 
     def _change_tree(self, document: Any) -> Any:
         """Return a document with one part changed, removed or added."""
-        if not isinstance(document, dict | list) or not document or self.random.random() < 0.15:
+        if not isinstance(document, dict | list) or not document or self.random.random() < 0.2:
             return self._value(document)
         keys = list(document) if isinstance(document, dict) else list(range(len(document)))
-        key = self.random.choice(keys)
+        inner = [key for key in keys if isinstance(document[key], dict | list)]
+        key = self.random.choice(inner if inner and self.random.random() < 0.5 else keys)
         found = document.copy()
         kind = self.random.random()
         if kind < 0.1:
@@ -197,7 +207,7 @@ class RequestFuzz:
         return found
 
     def _value(self, old: Any) -> Any:
-        if self.random.random() < 0.1:
+        if self.random.random() < 0.2:
             nested: Any = old
             for _ in range(self.random.choice([3, 31, 40, 200, 900])):
                 nested = [nested] if self.random.random() < 0.5 else {"a": nested}
@@ -205,6 +215,10 @@ class RequestFuzz:
         if self.random.random() < 0.1:
             return [old] * self.random.choice([2, 70, 3000])
         return self.random.choice(VALUES)
+
+
+def is_json(template: tuple[str, str, str, Any]) -> bool:
+    return isinstance(template[3], dict)
 
 
 def _clamped(document: Any) -> bytes:
