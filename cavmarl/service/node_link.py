@@ -28,6 +28,7 @@ NEW_S = 5.0  # time for which a new session is kept without being announced by t
 GPU_EVERY = 5  # heartbeats between two measurements of the GPUs
 JOIN_S = 60.0  # time in which the nodes of a session's zones must connect
 KEYS_S = 1.0  # shortest time between two requests for the service's keys
+KEYS_KEPT_S = 60.0  # after which known keys are asked for again; the service may have new ones
 MOST_MESSAGE = 2000  # characters of the reason why a session or a job has failed
 MOST_ROWS = 1000  # transfers in one body, which is limited to 256 KiB
 
@@ -117,28 +118,40 @@ class NodeLink:
         self._expected = {one: until for one, until in self._expected.items() if until > now_s}
         return {*told, *self._expected}
 
-    async def public_key(self, number: str) -> Any:
+    async def public_key(self, number: str, pause_s: float = KEYS_S) -> Any:
         """Return a key that verifies tokens; raise KeyError if the service is known to have none.
 
-        The service is asked at most once per KEYS_S, so tokens with invented keys cost little.
+        Args:
+            number: id of the key.
+            pause_s: time after a request to the service in which it is not asked again for an
+                unknown key, so that tokens of clients with invented keys cost little.
         """
         async with self._asking_for_keys:
-            if number not in self._keys and time.monotonic() >= self._keys_s + KEYS_S:
+            until_s = self._keys_s + (KEYS_KEPT_S if number in self._keys else pause_s)
+            if time.monotonic() >= until_s:
                 self._keys_s = time.monotonic()
-                keys = (await self.ask("GET", "/keys")).json()["keys"]
-                self._keys = {one["kid"]: jwt.PyJWK(one).key for one in keys}
+                try:
+                    keys = (await self.ask("GET", "/keys")).json()["keys"]
+                except ServiceError:  # without it, sessions continue until their leases end
+                    if number not in self._keys:
+                        raise
+                else:
+                    self._keys = {one["kid"]: jwt.PyJWK(one).key for one in keys}
         return self._keys[number]
 
-    async def claims(self, token: str, use: str, session: str) -> dict[str, Any]:
+    async def claims(
+        self, token: str, use: str, session: str, pause_s: float = KEYS_S
+    ) -> dict[str, Any]:
         """Return what the service has signed for this node, a session and a use.
 
         Raises:
             KeyError or jwt.InvalidTokenError: the token was not signed by the service for these.
         """
         number = str(jwt.get_unverified_header(token).get("kid"))
+        key = await self.public_key(number, pause_s)
         claims: dict[str, Any] = jwt.decode(
-            token, await self.public_key(number), [ALGORITHM], audience=f"node:{self.name}",
-            issuer=ISSUER, options={"require": ["exp", "iat", "sub"], "verify_iat": False},
+            token, key, [ALGORITHM], audience=f"node:{self.name}", issuer=ISSUER,
+            options={"require": ["exp", "iat", "sub"], "verify_iat": False},
         )  # fmt: skip
         if claims.get("use") != use or claims["sub"] != session:
             raise jwt.InvalidTokenError("the token has another purpose")
@@ -160,7 +173,8 @@ class NodeLink:
             return None, 0
         state: bytes = answer.content
         try:
-            claims = await self.claims(answer.headers.get(STATE_HEADER, ""), "state", session)
+            signature = answer.headers.get(STATE_HEADER, "")
+            claims = await self.claims(signature, "state", session, pause_s=0.0)
         except (jwt.InvalidTokenError, KeyError):
             claims = {}
         signed = claims.get("sha256"), str(claims.get("number"))

@@ -342,6 +342,29 @@ def test_unknown_keys_make_a_node_ask_once_a_second_at_most(service: LoopbackSer
     assert httpx.get(url, headers=bearer).status_code != 401
 
 
+def test_a_node_forgets_keys_that_the_service_has_replaced(
+    service: LoopbackService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = service.nodes["a"][0]
+    old = next(reversed(service.events.state.keys))
+    service.run(link.public_key(old, 0.0))
+    for _ in range(2):
+        service.ask("admin", "POST", "/keys")
+    service.run(link.public_key(old))  # until the next look
+    monkeypatch.setattr("cavmarl.service.node_link.KEYS_KEPT_S", 0.0)
+    with pytest.raises(KeyError):
+        service.run(link.public_key(old))
+
+
+def test_a_new_key_signs_states_at_once(service: LoopbackService) -> None:
+    opened = open_session(service)
+    save(service, opened, b"state")
+    link = service.nodes["a"][0]
+    for _ in range(3):
+        service.ask("admin", "POST", "/keys")
+        assert service.run(link.saved_state(opened["session"])) == (b"state", 1)
+
+
 def test_a_node_says_so_if_it_cannot_ask_for_keys() -> None:
     """The client then resolves the session again, until the service is back."""
     body = {"name": "a", "address": "127.0.0.1", "client_port": 1, "simulator_port": 1}
