@@ -169,6 +169,14 @@ def problem_of_state(document: dict[str, Any], state: bytes) -> str:
     return ""
 
 
+def test_the_signature_of_a_state_opens_no_session(service: LoopbackService) -> None:
+    opened = open_session(service)
+    session = service.broker.log.state.sessions[opened["session"]]
+    opened["token"] = service.access.state_token(session, 0, b"")
+    answer = open_on_node(service, opened)
+    assert (answer.status_code, title_of(answer)) == (401, "bad-token")
+
+
 # Content
 
 
@@ -244,7 +252,8 @@ def test_deep_bodies_are_refused_in_one_line(
 ) -> None:
     service.log.lines.clear()
     for opening, closing in ("[]", ('[{"a":', "}]")):
-        body = f'{{"{key}": {opening * depth}1{closing * depth}}}'
+        nested = f"{opening * depth}1{closing * depth}"
+        body = f'{{"environment": "merge", "{key}": {{"a": {nested}}}}}'
         answer = service.ask("client", "POST", "/configurations", content=body, headers=JSON)
         assert (answer.status_code, title_of(answer)) == (422, "bad-body")
     assert sum(map(len, service.log.lines)) <= 400
