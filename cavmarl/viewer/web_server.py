@@ -20,6 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from cavmarl.core.errors import MessageError, ServiceError
+from cavmarl.core.request_heads import BoundedHeads
 from cavmarl.core.server_address import is_loopback, listen, shown_host
 from cavmarl.viewer.page_requests import CONTROLS, MAX_TEXT, read_object, read_request
 from cavmarl.viewer.subscribers import PageWatcher
@@ -80,7 +81,7 @@ class WebServer:
             server_header=False,
             lifespan="off",
             loop="asyncio",
-            http="httptools",
+            http=BoundedHeads,
             ws=DroppedWhenDone,
             ws_max_size=4 * MAX_TEXT,
             ws_per_message_deflate=False,
