@@ -57,6 +57,20 @@ def limit_memory(most_bytes: int) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
 
 
+def occupy_standard_descriptors() -> None:
+    """Open the null device for each of standard input, output and error that is closed.
+
+    Otherwise a new descriptor gets such a number, and a child process that should inherit it gets
+    its own standard input instead.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            # It takes the lowest number that is free, which is this one.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+
+
 # Runs in a new interpreter: with threads, code between fork and exec may hang.
 _WRAPPER = """
 import ctypes, os, resource, signal, sys
@@ -66,6 +80,11 @@ if int(sys.argv[4]):
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     most = int(sys.argv[4]) if hard == resource.RLIM_INFINITY else min(int(sys.argv[4]), hard)
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+for number in range(3):
+    try:
+        os.fstat(number)
+    except OSError:
+        os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
 if os.getppid() == int(sys.argv[3]):
     os.execv(sys.argv[5], sys.argv[5:])
 """

@@ -64,7 +64,9 @@ def read_table(path: Path, schema: Any) -> Any:
             for chunk in column.chunks:
                 if wrong := _wrong_values(chunk):
                     raise damaged(path, f"column {name} {wrong}")
-        return table.cast(schema)
+        table = table.cast(schema)
+        table.validate(full=True)  # also that texts are UTF-8
+        return table
     except FileNotFoundError:
         raise RecordingError(
             f"{path}: is missing, although its part was committed; restore it, or remove the files "

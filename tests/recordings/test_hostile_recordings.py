@@ -71,6 +71,19 @@ def exchanged(one: str, other: str) -> Callable[[pa.Table], pa.Table]:
     return change
 
 
+def text_of(file: str, old: bytes, new: bytes) -> Forge:
+    """Replace bytes of a table that is neither compressed nor has checksums."""
+
+    def forge(path: Path) -> None:
+        table = pq.read_table(path / file)
+        pq.write_table(table, path / file, compression="none", use_dictionary=False)
+        content = (path / file).read_bytes()
+        assert old in content
+        (path / file).write_bytes(content.replace(old, new))
+
+    return forge
+
+
 def many_rows(file: str, num_groups: int, num_rows: int) -> Forge:
     """Write many equal rows, which take a few bytes each."""
 
@@ -138,6 +151,7 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (columns_of(EVENTS, lambda table: table.drop_columns(["tick"])), "it has the columns"),
     (columns_of(VEHICLES, exchanged("x", "lane")), "it has the columns"),
     (columns_of(VEHICLES, exchanged("x", "y")), "it has the columns"),
+    (text_of("world-0/handovers/000000.parquet", b"STEP", b"ST\x80P"), "UTF8|UTF-8"),
     (many_rows(VEHICLES, 45, 100_000), "it has 4500000 rows"),
     (many_rows(VEHICLES, 1, 100_000), "100000 rows of"),
     (many_rows(FRAMES, 12, 100_000), "1200000 rows"),

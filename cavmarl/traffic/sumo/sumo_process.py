@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, SumoError, missing
 from cavmarl.core.huge_pages import huge_heap
-from cavmarl.core.processes import is_fork, refuse_fork
+from cavmarl.core.processes import is_fork, occupy_standard_descriptors, refuse_fork
 from cavmarl.roads.sumo_net.xml_source import limit
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_history import MOVED, SEEN
@@ -64,6 +64,7 @@ class SumoProcess:
     """
 
     def __init__(self, setup: Mapping[str, Any]) -> None:
+        occupy_standard_descriptors()
         ours, theirs = socket.socketpair()
         output = tempfile.TemporaryFile()
         with_thread = threading.current_thread() is threading.main_thread()
