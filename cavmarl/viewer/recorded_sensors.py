@@ -65,7 +65,8 @@ class RecordedSensors:
 
     def _drawn(self, draw: Callable[..., list[Shape]], *values: Any) -> list[Shape]:
         try:
-            return draw(*values)
+            with np.errstate(invalid="ignore"):  # recorded numbers may be NaN
+                return draw(*values)
         except (ArithmeticError, IndexError, KeyError, TypeError, ValueError) as error:
             raise RecordingError(
                 f"{self._recording.path}: its sensor data do not fit the settings of its sensors "
