@@ -18,7 +18,6 @@ from cavmarl.cli.output import (
     SERVICE,
     Episodes,
     JsonPath,
-    Policies,
     Repeats,
     about,
     flag,
@@ -143,10 +142,25 @@ def grant(
         _print(client.post("/identities", {"name": name, "role": role})["secret"])
 
 
-@with_world()
+@with_world(is_here=False)
 def submit(
     world: WorldSpec,
-    policy: Policies = None,
+    env: Annotated[
+        str,
+        typer.Argument(
+            metavar="ENV", help="Name of an environment that the service and its nodes have."
+        ),
+    ],
+    policy: Annotated[
+        list[str] | None,
+        about(
+            "Driver to evaluate: the name of one that the service and its nodes have. Repeat the "
+            "option to compare drivers with the first one [default: idm].",
+            "--policy",
+            "-p",
+            metavar="POLICY",
+        ),
+    ] = None,
     episodes: Episodes = 32,
     repeats: Repeats = 1,
     wait_s: Annotated[
