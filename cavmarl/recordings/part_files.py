@@ -15,7 +15,7 @@ from cavmarl.recordings.parquet_pages import ParquetSize, parquet_size
 
 MOST_ROWS = 1 << 22  # of one table in one part
 MOST_RECORDS = 1 << 20  # of one table with texts or lists, and of structures in lists, in one part
-MOST_VALUES = 1 << 24  # of one column with lists in one part
+MOST_VALUES = 1 << 26  # of one column with lists in one part
 MOST_BYTES = 1 << 31  # of the rows of one table in one part
 MOST_TEXT_BYTES = 1 << 28  # of one column in one part
 MOST_FILE_BYTES = 1 << 31
