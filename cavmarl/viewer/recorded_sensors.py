@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,20 +54,20 @@ class RecordedSensors:
             found["terms"] = named_terms(head.terms, row["terms"])
             found["observation"] = named_numbers(head.features, row["values"])
             if self._config is not None:
-                shapes += self._drawn(observed_shapes, self._config, row["values"])
+                shapes += self._drawn(partial(observed_shapes, self._config, row["values"]))
         if not sensors:
             return found
         if self._config is not None:
             for name, settings in self._config.rig.items():
                 sample = self._newest(SAMPLES + name, tick, vehicle)
                 if sample is not None:
-                    shapes += self._drawn(sampled_shapes, name, settings, sample)
+                    shapes += self._drawn(partial(sampled_shapes, name, settings, sample))
         return {**found, "shapes": shapes, "note": self._note}
 
-    def _drawn(self, draw: Callable[..., list[Shape]], *values: Any) -> list[Shape]:
+    def _drawn(self, draw: Callable[[], list[Shape]]) -> list[Shape]:
         try:
             with np.errstate(invalid="ignore"):  # recorded numbers may be NaN
-                return draw(*values)
+                return draw()
         except (ArithmeticError, IndexError, KeyError, TypeError, ValueError) as error:
             raise RecordingError(
                 f"{self._recording.path}: its sensor data do not fit the settings of its sensors "
