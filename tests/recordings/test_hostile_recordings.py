@@ -151,7 +151,7 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (columns_of(EVENTS, lambda table: table.drop_columns(["tick"])), "it has the columns"),
     (columns_of(VEHICLES, exchanged("x", "lane")), "it has the columns"),
     (columns_of(VEHICLES, exchanged("x", "y")), "it has the columns"),
-    (text_of("world-0/handovers/000000.parquet", b"STEP", b"ST\x80P"), "UTF8|UTF-8"),
+    (text_of("world-0/handovers/000000.parquet", b"COMMIT", b"COMM\x80T"), "UTF8|UTF-8"),
     (many_rows(VEHICLES, 45, 100_000), "it has 4500000 rows"),
     (many_rows(VEHICLES, 1, 100_000), "100000 rows of"),
     (many_rows(FRAMES, 12, 100_000), "1200000 rows"),
