@@ -82,7 +82,7 @@ def _wrong_vehicles(frames: Sequence[RecordedFrame], rows: NDArray[np.void], num
         "driver": range(DRIVER_BACKGROUND, DRIVER_SUMO + 1),
         "blinker": range(-1, 2),
     }
-    if wrong := ColumnCheck(ints, _FLOATS, ("to_go",)).wrong(rows):
+    if wrong := ColumnCheck(ints, _FLOATS, ("to_go",), {}).wrong(rows):
         return wrong
     for name in ("length", "width", "height"):
         wrong_size = ~((rows[name] > 0.0) & (rows[name] <= MOST_SIZE_M))

@@ -25,9 +25,11 @@ from cavmarl.traffic.native import NativeTraffic
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
+LEAST_FACTOR = 1e-6  # of desired speeds; a vehicle of a smaller one never gets anywhere
 _LARGEST = 1e12  # limit of all numbers in metres or seconds
-_LONGEST_WAY = 200_000  # lanes
 _ENDLESS = ("to_go", "step_to_go")  # fields that are infinite without a route
+_LEAST = dict.fromkeys(("s", "wait_s", "stopped_s", "distance_m", "free_s", "step_jerk"), 0.0)
+_LEAST |= {"speed_factor": LEAST_FACTOR}
 _FLOATS = tuple(name for name in VEHICLE.names or () if VEHICLE[name].kind == "f")
 _INT32 = tuple(name for name in VEHICLE.names or () if VEHICLE[name] == np.int32)
 MOST = int(np.iinfo(np.int32).max)
@@ -41,15 +43,21 @@ class ColumnCheck:
         ints: allowed ranges of integer columns.
         floats: columns of floating-point numbers, in metres, seconds or radians.
         endless: those of `floats` that may be infinite.
+        least: the smallest allowed numbers of some of `floats`.
     """
 
     def __init__(
-        self, ints: Mapping[str, range], floats: Sequence[str], endless: Sequence[str]
+        self,
+        ints: Mapping[str, range],
+        floats: Sequence[str],
+        endless: Sequence[str],
+        least: Mapping[str, float],
     ) -> None:
         self._ints, self._floats = tuple(ints), tuple(floats)
         self._low = np.array([allowed.start for allowed in ints.values()])
         self._high = np.array([allowed.stop - 1 for allowed in ints.values()])
         self._endless = [self._floats.index(name) for name in endless]
+        self._least = np.array([least.get(name, -np.inf) for name in floats])
 
     def wrong(self, rows: NDArray[np.void]) -> str:
         """Return what is wrong with a number of one of the rows; empty if nothing."""
@@ -62,10 +70,11 @@ class ColumnCheck:
         floats = np.stack([rows[name] for name in self._floats], axis=1)
         usual = np.abs(floats) <= _LARGEST
         usual[:, self._endless] |= floats[:, self._endless] == np.inf
+        usual &= floats >= self._least
         if usual.all():
             return ""
         row, column = np.argwhere(~usual)[0].tolist()
-        return _of(rows[row], self._floats[column], f"is not a number up to ±{_LARGEST:g}")
+        return _of(rows[row], self._floats[column], f"is no allowed number up to ±{_LARGEST:g}")
 
 
 class RowCheck:
@@ -117,7 +126,7 @@ class RowCheck:
         }
         every = range(-MOST - 1, MOST + 1)
         ints = {name: values.get(name, every) for name in _INT32}
-        self._columns = ColumnCheck(ints, _FLOATS, _ENDLESS)
+        self._columns = ColumnCheck(ints, _FLOATS, _ENDLESS, _LEAST)
         types = travel.types
         self._radius_m = 0.5 * float(_diagonals_m(types).max()) + 1e-6
         self._height_m = float(types["height"].max()) + 1e-6
@@ -196,9 +205,11 @@ class RowCheck:
         if self._is_moved:  # after the load, SUMO sends the routes again
             follow &= at < travel.num_fixed
         rows, lane, way = rows[follow], lane[follow], way[follow]
-        for _ in range(_LONGEST_WAY):
-            if not len(rows):
-                return ""
+        past_way, past_lane, num_steps = way, lane, 0
+        while len(rows):
+            if num_steps & (num_steps - 1) == 0:
+                past_way, past_lane = way, lane
+            num_steps += 1
             step = self._steps(way + lane, tail)
             goes_on = step["next"] >= 0
             rows, step, way = rows[goes_on], step[goes_on], way[goes_on] + step["shift"][goes_on]
@@ -207,7 +218,11 @@ class RowCheck:
             lane = self._own_lanes(step["next"])
             if wrong := self._wrong_places(rows, lane, way):
                 return wrong
-        return _of(rows[0], "way", "does not end")
+            past_way, past_lane = past_way[goes_on], past_lane[goes_on]
+            repeats = (way == past_way) & (lane == past_lane)
+            if repeats.any():
+                return _of(rows[np.argmax(repeats)], "way", "does not end")
+        return ""
 
     def _steps(self, at: Numbers, tail: NDArray[np.void] | None) -> NDArray[np.void]:
         steps = self._travel.steps

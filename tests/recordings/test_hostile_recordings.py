@@ -136,7 +136,7 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (changed(FRAMES, "signals", [-7]), "signals|phase"),
     (changed(FRAMES, "ghosts", [[1], [2], [3]]), "ghosts of 3 zones"),
     (changed(FRAMES, "episode", None), "has empty fields"),
-    (changed(VEHICLES, "x", 1e300), r"x = 1e\+300, which is not a number up to"),
+    (changed(VEHICLES, "x", 1e300), r"x = 1e\+300, which is no allowed number up to"),
     (changed(VEHICLES, "y", float("nan")), "y = nan"),
     (changed(VEHICLES, "length", 3e38), "length = 3.0"),
     (changed(VEHICLES, "width", -1.0), "width = -1"),
