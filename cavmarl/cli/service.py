@@ -18,7 +18,6 @@ from cavmarl.cli.output import (
     SERVICE,
     Episodes,
     JsonPath,
-    Policies,
     Repeats,
     about,
     flag,
@@ -167,10 +166,25 @@ def grant(
         out.write_text(f"{secret}\n", encoding="utf-8")
 
 
-@with_world()
+@with_world(is_here=False)
 def submit(
     world: WorldSpec,
-    policy: Policies = None,
+    env: Annotated[
+        str,
+        typer.Argument(
+            metavar="ENV", help="Name of an environment that the service and its nodes have."
+        ),
+    ],
+    policy: Annotated[
+        list[str] | None,
+        about(
+            "Driver to evaluate: the name of one that the service and its nodes have. Repeat the "
+            "option to compare drivers with the first one [default: idm].",
+            "--policy",
+            "-p",
+            metavar="POLICY",
+        ),
+    ] = None,
     episodes: Episodes = 32,
     repeats: Repeats = 1,
     wait_s: Annotated[

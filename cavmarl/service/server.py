@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import uvicorn
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.core.private_files import check_private
+from cavmarl.core.request_heads import BoundedHeads
 from cavmarl.core.server_address import is_loopback, listen, shown_host
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
@@ -23,8 +22,6 @@ from cavmarl.service.rate_limit import RateLimit
 
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700
-MAX_HEAD_BYTES = 16 * 1024
-HEAD_S = 10.0  # time limit for receiving the head of a request
 SERVER_HEADER: list[tuple[str, str]] = [("server", "cavmarl")]
 
 
@@ -132,44 +129,3 @@ def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
         ws="none",
         proxy_headers=False,
     )
-
-
-class BoundedHeads(HttpToolsProtocol):
-    """HTTP that closes connections with long or slow request heads; the parser accepts these."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self._begin_head()
-
-    def data_received(self, data: bytes) -> None:
-        super().data_received(data)
-        if self._late is None:  # the head is complete
-            return
-        self._head_bytes += len(data)
-        if self._head_bytes > MAX_HEAD_BYTES:
-            self.transport.close()
-
-    def on_message_begin(self) -> None:
-        super().on_message_begin()
-        self._end_head()
-        self._begin_head()
-
-    def on_headers_complete(self) -> None:
-        self._end_head()
-        super().on_headers_complete()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._end_head()
-        super().connection_lost(exc)
-
-    def _begin_head(self) -> None:
-        self._head_bytes = 0
-        self._late = self.loop.call_later(HEAD_S, self.transport.close)
-
-    def _end_head(self) -> None:
-        if self._late is not None:
-            self._late.cancel()
-            self._late = None
-
-    _late: asyncio.TimerHandle | None = None
-    _head_bytes = 0
