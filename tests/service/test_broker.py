@@ -439,3 +439,14 @@ def test_requests_of_one_caller_have_a_rate(fleet: Fleet) -> None:
     limit.take("bob")
     fleet.now_s += 0.5
     limit.take("ada")
+
+
+def test_a_pause_saves_up_one_burst_at_most(fleet: Fleet) -> None:
+    limit = RateLimit(2.0, 3.0, lambda: fleet.now_s)
+    limit.take("ada")
+    fleet.now_s += 3600.0
+    for _ in range(3):
+        limit.take("ada")
+    assert not limit.has("ada")
+    with pytest.raises(ServiceError, match="2 requests per second"):
+        limit.take("ada")

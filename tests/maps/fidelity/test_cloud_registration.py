@@ -70,6 +70,16 @@ def test_distances_equal_brute_force_and_have_a_direction() -> None:
     assert sum(bin["points"] for bin in histogram(apart.min(axis=1))) == 1000
 
 
+def test_the_trimmed_rmse_leaves_out_points_that_have_no_partner() -> None:
+    reference = street(4000)
+    # One point of eleven is 30 m above the street, as leaves that only one of the scans has.
+    leaves = reference[:400] + np.array([0.0, 0.0, 30.0])
+    found = align(np.vstack([reference, leaves]), Target(reference))
+    assert found.converged
+    assert found.trimmed_rmse_m < 1e-3
+    assert np.sqrt(np.mean(found.distance_m**2)) > 30.0 / 11.0
+
+
 def test_other_places_do_not_converge() -> None:
     rng = np.random.default_rng(6)
     ball = rng.normal(size=(1000, 3))
