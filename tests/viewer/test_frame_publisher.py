@@ -48,7 +48,7 @@ class World:
 
 def test_twenty_frames_and_five_details_a_second() -> None:
     world = World(has_events=False)
-    for now_s in (10.0, 10.04, 10.06, 10.12, 10.18, 10.21, 10.24, 10.3, 10.44, 10.45):
+    for now_s in (10.0, 10.04, 10.06, 10.12, 10.18, 10.21, 10.24, 10.3, 10.46, 10.47):
         world.publish(now_s)
     assert world.frames == [1, 3, 4, 5, 7, 8, 9]
     assert world.publisher.published == 7
@@ -63,7 +63,7 @@ def test_a_world_that_stands_is_shown_again_when_a_page_asks_for_more() -> None:
     world.audience.wishes = Wishes(1, frozenset({7, 8}), frozenset({8}), (2,))
     world.publish(10.15, is_new=False)
     assert world.frames == [1, 3]
-    assert world.details == [(1, 7, False), (3, 7, False), (3, 8, True)]
+    assert sorted(world.details) == [(1, 7, False), (3, 7, False), (3, 8, True)]
     assert world.ghosts == [False, True]
     world.clock.is_paused = True
     world.publish(10.25, is_new=False)
