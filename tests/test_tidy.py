@@ -14,7 +14,14 @@ from pathlib import Path
 import pytest
 
 from tests.support.code_bounds import PackageCode, counted_parameters, has_untyped_arguments
-from tests.support.cpu_time import ARGUED_S, argued, costs_of_files, known_costs, rare_tests
+from tests.support.cpu_time import (
+    ARGUED_S,
+    argued,
+    costs_of_files,
+    is_due,
+    known_costs,
+    rare_tests,
+)
 from tests.support.references import Package
 from tests.support.tiers import ALONE_FILES, is_needed
 
@@ -224,6 +231,18 @@ def test_expensive_tests_are_slow_unless_they_are_argued_for() -> None:
     assert rare_tests(costs, costs, frozenset({"c"})) == {"a[3]"}
     assert rare_tests(costs, costs, frozenset({"a[*]"})) == {"c"}
     assert rare_tests([*costs, "b[3]"], costs | {"b[3]": 0.5}) == {"a[3]", "b[3]", "c"}
+
+
+def test_slow_tests_come_up_in_turn_unless_they_take_too_long() -> None:
+    names = [f"tests/a.py::test[{number}]" for number in range(3000)]
+    costs = {names[0]: 30.1, names[1]: 29.9}
+    for first in (0, 7):
+        turns = [
+            [name for name in names if is_due(name, turn, costs)]
+            for turn in range(first, first + 30)
+        ]
+        assert sorted(name for turn in turns for name in turn) == sorted(names[1:]), "once each"
+        assert 50 < min(map(len, turns)) <= max(map(len, turns)) < 150
 
 
 def test_long_files_come_first_and_small_tiers_read_only_their_own() -> None:

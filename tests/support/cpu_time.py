@@ -9,6 +9,7 @@ Seconds of processor say the same on a busy machine as on a quiet one; seconds o
 from __future__ import annotations
 
 import os
+import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
@@ -19,12 +20,14 @@ from typing import Any
 import psutil
 import pytest
 
-__all__ = ["CpuTimes", "argued", "costs_of_files", "known_costs", "rare_tests"]
+__all__ = ["CpuTimes", "argued", "costs_of_files", "is_due", "known_costs", "rare_tests"]
 
 LISTED_AT_END_S = 2.0  # a test that costs more is listed at the end of a run
 ARGUED_S = 2.0  # one that costs more is slow, but for those of the file of argued tests
 LISTED_S = 0.5  # a test that costs less is not in the file of costs
 OFTEN_S = 1.5  # of a test's variants, so many seconds are in every run, and one of them at least
+LONG_S = 30.0  # a test that costs more is in `make soak` alone
+TURNS = 30  # runs of `make rotation` until each other slow test has come up
 CHEAP_S = 0.05  # what one costs that is not in the file of costs
 COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
 ARGUED = COSTS.with_name("argued.txt")
@@ -65,6 +68,14 @@ def rare_tests(
         else:
             spent[test] = spent.get(test, 0.0) + cost_s
     return rare
+
+
+def is_due(name: str, turn: int, costs: Mapping[str, float]) -> bool:
+    """Return whether `make rotation` runs a slow test in a turn: one of `TURNS` in a row.
+
+    The variants of a file come up in different turns, so that no turn has all of an expensive file.
+    """
+    return costs.get(name, 0.0) <= LONG_S and zlib.crc32(name.encode()) % TURNS == turn % TURNS
 
 
 def costs_of_files(names: Iterable[str], costs: Mapping[str, float]) -> dict[str, float]:
