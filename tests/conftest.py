@@ -18,6 +18,7 @@ from tests.support.cpu_time import (
     costs_of_files,
     is_due,
     known_costs,
+    long_tests,
     rare_tests,
 )
 from tests.support.tiers import ProcessWatch, TimeLimit, is_needed, mark
@@ -25,9 +26,7 @@ from tests.support.tiers import ProcessWatch, TimeLimit, is_needed, mark
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option of `make rotation`."""
-    told = (
-        f"of the slow tests, run those of this turn of {TURNS}; each is in one of {TURNS} in a row"
-    )
+    told = f"run only those slow tests that come up in this turn; each does in {TURNS} turns"
     parser.addoption("--turn", type=int, help=told)
 
 
@@ -69,7 +68,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.slow)
     if config.option.turn is not None:
         slow = {item.nodeid for item in items if any(item.iter_markers("slow"))}
-        due = {name for name in slow if is_due(name, config.option.turn, known_costs())}
+        due = {name for name in slow if is_due(name, config.option.turn, long_tests())}
         config.hook.pytest_deselected(items=[item for item in items if item.nodeid in slow - due])
         items[:] = [item for item in items if item.nodeid not in slow - due]
     if hasattr(config, "workerinput") and not config.pluginmanager.has_plugin("time_limit"):

@@ -103,7 +103,7 @@ def test_the_limit_is_two_and_a_half_spacings_of_the_coarser_cloud(
 
 
 def test_an_alignment_that_still_moves_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cloud_registration, "_STAGES", 1)
+    monkeypatch.setattr(cloud_registration, "STAGES", 1)
     cloud = street(4000)
     found = align(moved(cloud, KNOWN), Target(cloud))
     assert found.stages == 1
