@@ -96,6 +96,20 @@ def test_a_world_that_no_node_could_hold_is_refused(
     assert "at most 200000" in answer.json()["detail"]
 
 
+def test_vehicles_that_pages_may_insert_need_room_in_a_node_too(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path / "store.sqlite")
+    keys: dict[str, Any] = {"environment": "merge", "agents": 5, "background": 0, "num_envs": 1000}
+    for insertions in (195, 196):
+        overrides = {"population.insertions": insertions}
+        body = ConfigurationBody(**keys, overrides=overrides)
+        if insertions == 195:
+            add_configuration(fleet.log, fleet.client, body)
+            continue
+        with pytest.raises(ServiceError, match="201000 vehicles in 1000 worlds: at most 200000"):
+            add_configuration(fleet.log, fleet.client, body)
+    fleet.close()
+
+
 def test_an_identity_has_so_many_configurations_at_most(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path / "store.sqlite")
     fleet.log.state.configurations_of[fleet.client.id] = MOST_CONFIGURATIONS - 1
