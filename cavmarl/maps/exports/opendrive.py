@@ -88,7 +88,7 @@ def carla_document(source: Path, network: RoadNetwork) -> str:
         _convert(source, draft, None)
         root = _mended(draft, read_provenance(source))
     fit_to_carla(root, origin_of(network))
-    document = _HEAD + tostring(root, "utf-8") + b"\n"
+    document: bytes = _HEAD + tostring(root, "utf-8") + b"\n"
     try:
         kept.parent.mkdir(parents=True, exist_ok=True)
         write_whole(kept, document)

@@ -90,9 +90,7 @@ def _widen(road: Element, signal: Element) -> None:
     for validity in signal.findall("validity"):
         signal.remove(validity)
     if numbers:
-        signal.append(
-            Element("validity", fromLane=str(min(numbers)), toLane=str(max(numbers)))
-        )
+        signal.append(Element("validity", fromLane=str(min(numbers)), toLane=str(max(numbers))))
 
 
 def _add_controller(

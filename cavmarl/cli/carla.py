@@ -1,0 +1,46 @@
+"""`cavmarl carla`: lets programs for CARLA use a world."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+from rich.console import Console
+
+from cavmarl.cli.output import SERVICE, about, flag, with_world
+from cavmarl.config.world_spec import WorldSpec
+
+if TYPE_CHECKING:
+    from cavmarl.cosim.carla import CarlaServer
+
+
+@with_world("agents", "background", "seed", "settings")
+def carla(
+    world: WorldSpec,
+    port: Annotated[
+        int,
+        about("Port of the calls; streams have the next port.", metavar="N", panel=SERVICE),
+    ] = 2000,
+    host: Annotated[
+        str, about("Address to listen at.", metavar="HOST", panel=SERVICE)
+    ] = "127.0.0.1",
+    any_host: Annotated[
+        bool,
+        flag(
+            "Allow an address that other machines can reach. The protocol has no login.",
+            panel=SERVICE,
+        ),
+    ] = False,
+    client_version: Annotated[
+        str, about("Version of the clients: 0.9.15, 0.9.16 or 0.10.0.", metavar="VERSION")
+    ] = "0.9.16",
+) -> None:
+    """Let programs for CARLA use a world, through CARLA's own client, until interrupted."""
+    from cavmarl.cosim.carla import serve
+
+    console = Console()
+
+    def tell(server: CarlaServer) -> None:
+        map_path = server.session.map.path
+        console.print(f"{map_path} at {host}:{server.port}, for client {client_version}")
+
+    serve(world, port=port, host=host, any_host=any_host, client=client_version, told=tell)

@@ -1,0 +1,8 @@
+"""A server to which CARLA's own client connects: calls, snapshots, actors and sensors.
+
+`serve` runs a world; docs/tutorials/carla_client.md shows a client.
+"""
+
+from cavmarl.cosim.carla.carla_server import CarlaServer, serve
+
+__all__ = ["CarlaServer", "serve"]
