@@ -29,7 +29,7 @@ from cavmarl.cosim.carla.call_table import (
     refuse,
 )
 from cavmarl.cosim.carla.carla_actors import CarlaActor
-from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose
+from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose, relative
 from cavmarl.cosim.carla.carla_records import packed_actor, packed_box
 from cavmarl.cosim.carla.carla_session import CarlaSession
 from cavmarl.cosim.carla.vehicle_controls import (
@@ -145,17 +145,10 @@ def _move(session: CarlaSession, actor: CarlaActor, there: CarlaPose) -> None:
         session.external.place(actor.vehicle, there, np.zeros(3))
     elif actor.parent:
         parent = session.actors.find(actor.parent, "set_actor_transform")
-        actor.local = _relative(session.actors.pose_of(parent), there)
+        actor.local = relative(session.actors.pose_of(parent), there)
         session.actors.move_attached(actor)
     else:
         actor.pose = there
-
-
-def _relative(outer: CarlaPose, inner: CarlaPose) -> CarlaPose:
-    """Return a pose relative to another one, for poses that differ by yaw and place only."""
-    turned = CarlaPose(0.0, 0.0, 0.0, yaw=-outer.yaw)
-    shifted = CarlaPose(inner.x - outer.x, inner.y - outer.y, inner.z - outer.z, *inner[3:])
-    return compose(turned, shifted)
 
 
 @call(

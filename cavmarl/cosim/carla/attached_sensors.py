@@ -11,12 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import EVENT_COLLIDED
-from cavmarl.cosim.carla.call_arguments import Refused
+from cavmarl.cosim.carla.attached_imaging import (
+    DepthCameraSensor,
+    InstanceCameraSensor,
+    LidarSensor,
+    RadarSensor,
+    RgbCameraSensor,
+    SemanticCameraSensor,
+    SemanticLidarSensor,
+)
 from cavmarl.cosim.carla.carla_actors import CarlaActor
 from cavmarl.cosim.carla.carla_geometry import axes_of
 from cavmarl.cosim.carla.carla_records import packed_actor
 from cavmarl.cosim.carla.carla_streams import StreamHub
 from cavmarl.cosim.carla.rpc_messages import pack
+from cavmarl.cosim.carla.sensor_settings import SensorContext, SensorSettings
 
 if TYPE_CHECKING:
     from cavmarl.cosim.carla.carla_session import CarlaSession
@@ -32,7 +41,7 @@ class AttachedSensor(Protocol):
 
     kind: ClassVar[int]  # number of the sensor in the client's registry
 
-    def sense(self, session: CarlaSession, actor: CarlaActor, elapsed_s: float) -> bytes | None:
+    def sense(self, context: SensorContext, actor: CarlaActor, elapsed_s: float) -> bytes | None:
         """Return the body of a frame, or None if there is nothing to report.
 
         `elapsed_s`: time since the last sample, or since the last tick.
@@ -40,48 +49,20 @@ class AttachedSensor(Protocol):
         ...
 
 
-class Settings:
-    """The attributes of a sensor, as numbers; raises Refused for values of other kinds."""
-
-    def __init__(self, actor: CarlaActor) -> None:
-        self._actor = actor
-
-    def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float:
-        written = self._actor.attribute(name)
-        try:
-            value = float(written)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise Refused(
-                f"{self._actor.type_id}: {name} = {written!r}: must be a number from {low:g} to "
-                f"{high:g}"
-            )
-        return value
-
-    def whole(self, name: str, low: int, high: int) -> int:
-        return int(self.number(name, low, high))
-
-    def generator(self) -> np.random.Generator:
-        """Return the random numbers of a sensor."""
-        seed = self.whole("noise_seed", 0, 1 << 31)
-        return np.random.default_rng([seed, self._actor.number])
-
-
 class GnssSensor:
     """Latitude, longitude and altitude."""
 
     kind: ClassVar[int] = 4
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SensorSettings) -> None:
         names = ("lat", "lon", "alt")
         self._bias = np.array([settings.number(f"noise_{name}_bias") for name in names])
         self._noise = np.array([settings.number(f"noise_{name}_stddev", 0.0) for name in names])
         self._random = settings.generator()
 
-    def sense(self, session: CarlaSession, actor: CarlaActor, elapsed_s: float) -> bytes:
+    def sense(self, context: SensorContext, actor: CarlaActor, elapsed_s: float) -> bytes:
         pose = actor.pose
-        measured = np.array([*session.map.geolocation(pose.x, pose.y), pose.z])
+        measured = np.array([*context.session.map.geolocation(pose.x, pose.y), pose.z])
         return pack((measured + self._bias + self._noise * self._random.normal(size=3)).tolist())
 
 
@@ -90,7 +71,7 @@ class ImuSensor:
 
     kind: ClassVar[int] = 5
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SensorSettings) -> None:
         def per_axis(name: str, low: float = -math.inf) -> NDArray[np.float64]:
             return np.array([settings.number(f"noise_{name}_{axis}", low) for axis in "xyz"])
 
@@ -98,10 +79,11 @@ class ImuSensor:
         self._gyro_noise, self._gyro_bias = per_axis("gyro_stddev", 0.0), per_axis("gyro_bias")
         self._random = settings.generator()
 
-    def sense(self, session: CarlaSession, actor: CarlaActor, elapsed_s: float) -> bytes:
+    def sense(self, context: SensorContext, actor: CarlaActor, elapsed_s: float) -> bytes:
         force, spin = np.array([0.0, 0.0, GRAVITY_MPS2]), np.zeros(3)
-        parent = session.actors.actors.get(actor.parent)
-        state = None if parent is None else session.actors.state_of(parent)
+        actors = context.session.actors
+        parent = actors.actors.get(actor.parent)
+        state = None if parent is None else actors.state_of(parent)
         if state is not None:
             force += state["acceleration"]
             spin += np.radians(state["spin"])
@@ -117,10 +99,11 @@ class CollisionSensor:
 
     kind: ClassVar[int] = 0
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SensorSettings) -> None:
         pass
 
-    def sense(self, session: CarlaSession, actor: CarlaActor, elapsed_s: float) -> bytes | None:
+    def sense(self, context: SensorContext, actor: CarlaActor, elapsed_s: float) -> bytes | None:
+        session = context.session
         parent = session.actors.actors.get(actor.parent)
         if parent is None or parent.vehicle < 0:
             return None
@@ -153,11 +136,12 @@ class ObstacleSensor:
 
     kind: ClassVar[int] = 7
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SensorSettings) -> None:
         self._distance_m = settings.number("distance", 0.0, 1000.0)
         self._radius_m = settings.number("hit_radius", 0.0, 100.0)
 
-    def sense(self, session: CarlaSession, actor: CarlaActor, elapsed_s: float) -> bytes | None:
+    def sense(self, context: SensorContext, actor: CarlaActor, elapsed_s: float) -> bytes | None:
+        session = context.session
         parent = session.actors.actors.get(actor.parent)
         states = session.actors.vehicle_states
         if parent is None or not len(states):
@@ -182,9 +166,16 @@ class ObstacleSensor:
         return pack([packed_actor(parent, version), other, max(0.0, float(gaps[nearest]))])
 
 
-Make = Callable[[Settings], AttachedSensor]
+Make = Callable[[SensorSettings], AttachedSensor]
 
 _SENSORS: dict[str, Make] = {
+    "sensor.camera.rgb": RgbCameraSensor,
+    "sensor.camera.depth": DepthCameraSensor,
+    "sensor.camera.semantic_segmentation": SemanticCameraSensor,
+    "sensor.camera.instance_segmentation": InstanceCameraSensor,
+    "sensor.lidar.ray_cast": LidarSensor,
+    "sensor.lidar.ray_cast_semantic": SemanticLidarSensor,
+    "sensor.other.radar": RadarSensor,
     "sensor.other.collision": CollisionSensor,
     "sensor.other.gnss": GnssSensor,
     "sensor.other.imu": ImuSensor,
@@ -205,9 +196,10 @@ class _Mounted:
 
 
 class SensorSuite:
-    """All sensors of an episode. `streams`: where clients listen."""
+    """All sensors of a session. `streams`: where clients listen."""
 
-    def __init__(self, streams: StreamHub) -> None:
+    def __init__(self, session: CarlaSession, streams: StreamHub) -> None:
+        self._context = SensorContext(session)
         self._streams = streams
         self._mounted: dict[int, _Mounted] = {}
         self._next_stream = _FIRST_STREAM
@@ -216,7 +208,7 @@ class SensorSuite:
         """Mount the sensor of a new actor; raise Refused if an attribute is invalid."""
         if actor.type_id in _OF_THE_CLIENT:
             return
-        settings = Settings(actor)
+        settings = SensorSettings(actor)
         every_s = settings.number("sensor_tick", 0.0, 1e6)
         sensor = _SENSORS[actor.type_id](settings)
         self._mounted[actor.number] = _Mounted(actor, sensor, self._next_stream, every_s)
@@ -229,14 +221,15 @@ class SensorSuite:
         if mounted is not None:
             self._streams.end(mounted.stream)
 
-    def sense(self, session: CarlaSession) -> Iterator[tuple[int, CarlaActor, int, bytes]]:
+    def sense(self) -> Iterator[tuple[int, CarlaActor, int, bytes]]:
         """Yield stream, actor, kind and body of each frame that is due and wanted."""
+        session = self._context.session
         for mounted in list(self._mounted.values()):
             now_s = session.time_s
             if now_s + _SOON_S < mounted.due_s or not self._streams.is_wanted(mounted.stream):
                 continue
             last_s = now_s - session.delta_s if mounted.last_s is None else mounted.last_s
             mounted.last_s, mounted.due_s = now_s, max(mounted.due_s + mounted.every_s, now_s)
-            body = mounted.sensor.sense(session, mounted.actor, now_s - last_s)
+            body = mounted.sensor.sense(self._context, mounted.actor, now_s - last_s)
             if body is not None:
                 yield mounted.stream, mounted.actor, mounted.sensor.kind, body

@@ -72,11 +72,21 @@ def axes_of(pose: CarlaPose) -> Matrix:
 def compose(outer: CarlaPose, inner: CarlaPose) -> CarlaPose:
     """Return a pose that is given relative to `outer`, in the frame of `outer`."""
     turn = axes_of(outer)
-    x, y, z = (turn @ inner.place + outer.place).tolist()
-    both = turn @ axes_of(inner)
-    pitch = math.asin(min(1.0, max(-1.0, both[2, 0])))
-    yaw = math.atan2(both[1, 0], both[0, 0])
-    roll = math.atan2(-both[2, 1], both[2, 2])
+    return _pose_of(turn @ inner.place + outer.place, turn @ axes_of(inner))
+
+
+def relative(outer: CarlaPose, inner: CarlaPose) -> CarlaPose:
+    """Return `inner` relative to `outer`; the inverse of `compose`."""
+    turn = axes_of(outer).T
+    shift = np.array(inner.place) - outer.place
+    return _pose_of(turn @ shift, turn @ axes_of(inner))
+
+
+def _pose_of(place: Matrix, axes: Matrix) -> CarlaPose:
+    x, y, z = place.tolist()
+    pitch = math.asin(min(1.0, max(-1.0, axes[2, 0])))
+    yaw = math.atan2(axes[1, 0], axes[0, 0])
+    roll = math.atan2(-axes[2, 1], axes[2, 2])
     return CarlaPose(x, y, z, *map(math.degrees, (pitch, yaw, roll)))
 
 

@@ -100,7 +100,7 @@ class CarlaSession:
         self.world: HostedWorld = source.load("", step_s)
         self.external: ExternalVehicles = NoExternalVehicles()
         self.actors = ActorTable(self.world, 1)
-        self.sensors = SensorSuite(streams)
+        self.sensors = SensorSuite(self, streams)
         self._map_changed = True
         self._told: set[str] = set()
 
@@ -137,7 +137,7 @@ class CarlaSession:
             body = snapshot_body(self.episode, self.delta_s, self._map_changed, states)
             self._map_changed = False
             self.streams.send(EPISODE_STREAM, head, body, keep)
-        for stream, actor, kind, body in self.sensors.sense(self):
+        for stream, actor, kind, body in self.sensors.sense():
             head = frame_head(kind, self.frame, self.time_s, actor.pose)
             self.streams.send(stream, head, body, keep)
 
