@@ -35,8 +35,8 @@ from cavmarl.cosim.carla.carla_session import CarlaSession
 from cavmarl.cosim.carla.vehicle_controls import (
     FULL_STEER_RAD,
     AckermannControl,
+    CarlaControl,
     Control,
-    VehicleControl,
 )
 
 _MAX_ATTRIBUTES = 256
@@ -161,7 +161,7 @@ def _move(session: CarlaSession, actor: CarlaActor, there: CarlaPose) -> None:
 def apply_control_to_vehicle(
     caller: Caller, session: CarlaSession, number: int, given: tuple[Any, ...]
 ) -> None:
-    _drive(caller, session, number, VehicleControl(*given), "apply_control_to_vehicle")
+    _drive(caller, session, number, CarlaControl(*given), "apply_control_to_vehicle")
 
 
 @call(

@@ -295,7 +295,7 @@ class _CameraSensor:
         self._head = struct.pack("<IIf", width, height, fov)
 
     def sense(self, context: SensorContext, actor: CarlaActor, elapsed_s: float) -> bytes:
-        carrier = context.carrier_of(actor)
+        carrier = context.hidden_carrier_of(actor)
         picture = context.surroundings.take_picture(self._lens, actor.pose, carrier)
         pixels = np.full((self._lens.height, self._lens.width, 4), 255, np.uint8)
         self.fill(context, picture, pixels)

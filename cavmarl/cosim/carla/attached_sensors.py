@@ -221,6 +221,24 @@ class SensorSuite:
         if mounted is not None:
             self._streams.end(mounted.stream)
 
+    def last_collisions(self, actor: CarlaActor) -> Iterator[tuple[int, CarlaActor, int, bytes]]:
+        """Yield frames, as `sense`, of a vehicle that leaves the world after a collision.
+
+        The other vehicle is the nearest one.
+        """
+        session = self._context.session
+        states = session.actors.vehicle_states
+        own = session.actors.state_of(actor)
+        assert own is not None
+        apart = np.linalg.norm(states["place"] - own["place"], axis=1)
+        apart[states["id"] == actor.number] = np.inf
+        other = session.actors.vehicles[int(apart.argmin())]
+        body = collision_body(session, actor, other)
+        for mounted in self._mounted.values():
+            is_own = mounted.actor.parent == actor.number
+            if is_own and isinstance(mounted.sensor, CollisionSensor) and body is not None:
+                yield mounted.stream, mounted.actor, mounted.sensor.kind, body
+
     def sense(self) -> Iterator[tuple[int, CarlaActor, int, bytes]]:
         """Yield stream, actor, kind and body of each frame that is due and wanted."""
         session = self._context.session
@@ -228,8 +246,11 @@ class SensorSuite:
             now_s = session.time_s
             if now_s + _SOON_S < mounted.due_s or not self._streams.is_wanted(mounted.stream):
                 continue
-            last_s = now_s - session.delta_s if mounted.last_s is None else mounted.last_s
-            mounted.last_s, mounted.due_s = now_s, max(mounted.due_s + mounted.every_s, now_s)
-            body = mounted.sensor.sense(self._context, mounted.actor, now_s - last_s)
+            if mounted.last_s is None:
+                mounted.last_s, mounted.due_s = now_s - session.delta_s, now_s
+            elapsed_s = now_s - mounted.last_s
+            mounted.last_s = now_s
+            mounted.due_s = max(mounted.due_s + mounted.every_s, now_s)
+            body = mounted.sensor.sense(self._context, mounted.actor, elapsed_s)
             if body is not None:
                 yield mounted.stream, mounted.actor, mounted.sensor.kind, body

@@ -28,7 +28,7 @@ from cavmarl.cosim.carla.vehicle_controls import (
     FULL_STEER_RAD,
     THROTTLE_MPS2,
     AckermannControl,
-    VehicleControl,
+    CarlaControl,
 )
 from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.sensors.kernels.panorama import (
@@ -177,6 +177,10 @@ class ActorTable:
             return actor.pose
         return CarlaPose(*state["place"].tolist(), *state["turn"].tolist())
 
+    def of_agent(self, agent: int) -> CarlaActor | None:
+        """Return the actor of an agent's vehicle, as of the last `take`."""
+        return next((actor for actor in self._listed if actor.agent == agent), None)
+
     def attached(self) -> Iterator[CarlaActor]:
         """Yield sensors and controllers."""
         for actor in self.actors.values():
@@ -321,8 +325,8 @@ class ActorTable:
             states["light_state"] = np.where(at, lights["light_state"], 2)
 
     @staticmethod
-    def _write_control(state: np.void, control: VehicleControl | AckermannControl | None) -> None:
-        if isinstance(control, VehicleControl):
+    def _write_control(state: np.void, control: CarlaControl | AckermannControl | None) -> None:
+        if isinstance(control, CarlaControl):
             state["throttle"], state["steer"], state["brake"] = control[:3]
             state["hand_brake"], state["reverse"], state["manual_gear"] = control[3:6]
             state["gear"] = control.gear if control.manual_gear_shift else 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,10 +119,14 @@ class CarlaSession:
 
         `actions`: actions of agents that no client drives; None: the built-in driver's.
         """
-        for _ in range(max(1, round(self.delta_s / self.world.step_s))):
-            self.world.step(actions)
         self.frame += 1
         self.time_s += self.delta_s
+        for _ in range(max(1, round(self.delta_s / self.world.step_s))):
+            self.world.step(actions)
+            for agent in self.world.collided:
+                actor = self.actors.of_agent(agent)
+                if actor is not None:
+                    self._send(self.sensors.last_collisions(actor))
         for actor in self.actors.take(self.world, self.time_s):
             self._forget(actor)
         self.publish()
@@ -137,9 +141,12 @@ class CarlaSession:
             body = snapshot_body(self.episode, self.delta_s, self._map_changed, states)
             self._map_changed = False
             self.streams.send(EPISODE_STREAM, head, body, keep)
-        for stream, actor, kind, body in self.sensors.sense():
+        self._send(self.sensors.sense())
+
+    def _send(self, frames: Iterable[tuple[int, CarlaActor, int, bytes]]) -> None:
+        for stream, actor, kind, body in frames:
             head = frame_head(kind, self.frame, self.time_s, actor.pose)
-            self.streams.send(stream, head, body, keep)
+            self.streams.send(stream, head, body, self.settings.synchronous)
 
     def change_settings(self, settings: EpisodeSettings) -> None:
         """Apply settings; a step length that does not fit the world restarts the world.

@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from cavmarl.config.registry import entries
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.records.codes import EVENT_COLLIDED
 from cavmarl.cosim.carla.carla_map import CarlaMap, make_carla_map
-from cavmarl.cosim.carla.vehicle_controls import FULL_STEER_RAD, Control, action_of
+from cavmarl.cosim.carla.vehicle_controls import Control, action_of
 from cavmarl.cosim.time_master import TimeMaster
 from cavmarl.engine.world_setup import find_map
+from cavmarl.env.drawn_worlds import vehicles_that_ended
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.maps.exports.opendrive import carla_document
 from cavmarl.maps.exports.opendrive_carla import origin_of
@@ -37,7 +39,7 @@ _DIGITS = 6  # clients send step lengths as float32
 SERVED_WORLD: dict[str, Any] = {
     "population.mode": "respawn",
     "action.kind": "continuous",
-    "action.steering_rad": round(FULL_STEER_RAD, 2) - 0.02,
+    "action.steering_rad": 1.2,  # the most that is allowed; full steer is a little more
     "action.acceleration_mps2": 8.0,
 }
 
@@ -100,6 +102,13 @@ class HostedWorld:
         if len(driven) < len(env.agents):
             chosen = {**(env.suggest_actions() if actions is None else actions), **driven}
         self.master.step(chosen)
+
+    @property
+    def collided(self) -> list[int]:
+        """Agents whose vehicle has left the world after a collision in the last step."""
+        ended = vehicles_that_ended(self.env.worlds.arrays, 0)
+        found: list[int] = ended["agent"][ended["events"] & EVENT_COLLIDED > 0].tolist()
+        return found
 
     def _driven(self) -> dict[str, NDArray[np.float32]]:
         """Return the actions of the agents that clients drive."""

@@ -64,6 +64,14 @@ class SensorContext:
         parent = self.session.actors.actors.get(actor.parent)
         return -1 if parent is None else parent.vehicle
 
+    def hidden_carrier_of(self, actor: CarlaActor) -> int:
+        """Return the carrier of a camera that is in or above its body, which hides it, or -1."""
+        parent = self.session.actors.actors.get(actor.parent)
+        if parent is None or actor.local is None:
+            return -1
+        apart = np.abs(actor.local.place[:2])
+        return parent.vehicle if (apart <= parent.half_m[:2]).all() else -1
+
     def numbers_of(self, vehicles: NDArray[np.int64]) -> NDArray[np.uint32]:
         """Return the actors' numbers of vehicles' ids; 0 for ids without an actor."""
         ids, places = np.unique(vehicles, return_inverse=True)

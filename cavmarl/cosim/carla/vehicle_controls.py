@@ -18,7 +18,7 @@ _DRAG_PER_S = 0.02
 _ACKERMANN_PER_S = 2.0  # acceleration per m/s of difference to the target speed
 
 
-class VehicleControl(NamedTuple):
+class CarlaControl(NamedTuple):
     """`carla.VehicleControl`."""
 
     throttle: float = 0.0
@@ -40,7 +40,7 @@ class AckermannControl(NamedTuple):
     jerk: float
 
 
-Control = VehicleControl | AckermannControl
+Control = CarlaControl | AckermannControl
 
 
 def motion_of(control: Control, speed_mps: float) -> tuple[float, float]:
@@ -63,9 +63,9 @@ def action_of(control: Control, speed_mps: float, config: ActionConfig) -> NDArr
     return np.clip(pair, -1.0, 1.0).astype(np.float32)
 
 
-def control_shown(acceleration: float, angle_rad: float) -> VehicleControl:
+def control_shown(acceleration: float, angle_rad: float) -> CarlaControl:
     """Return the control that clients see of a vehicle that no client drives."""
-    return VehicleControl(
+    return CarlaControl(
         throttle=min(max(acceleration / THROTTLE_MPS2, 0.0), 1.0),
         steer=min(max(-angle_rad / FULL_STEER_RAD, -1.0), 1.0),
         brake=min(max(-acceleration / BRAKE_MPS2, 0.0), 1.0),
