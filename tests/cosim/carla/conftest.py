@@ -1,7 +1,8 @@
 """Servers for CARLA's clients, in this process and on ports, and programs with the official client.
 
-The client can abort its process, so programs with it run in a process of their own. Its Python is
-`CAVMARL_CARLA_PYTHON`, or this one if it has the package `carla`.
+The client can abort its process, so programs with it run in a process of their own. The Python of
+client 0.9.16 is `CAVMARL_CARLA_PYTHON`, or this one if it has the package `carla`. Those of other
+versions are `CAVMARL_CARLA_PYTHON_0_9_15` (package `carla-0-9-15`) and `..._0_10_0`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any
 
@@ -21,6 +23,7 @@ from cavmarl.config.world_spec import WorldSpec
 from cavmarl.cosim.carla.call_table import Caller, answer
 from cavmarl.cosim.carla.carla_server import CarlaServer
 from cavmarl.cosim.carla.carla_session import CarlaSession
+from cavmarl.cosim.carla.carla_versions import DEFAULT_VERSION
 from cavmarl.cosim.carla.hosted_world import LoadedWorlds
 
 Call = Callable[..., Any]
@@ -59,11 +62,11 @@ def call(session: CarlaSession) -> Call:
     return send
 
 
-@pytest.fixture(scope="module")
-def port() -> Iterator[int]:
-    """The port of a server that runs in a thread."""
+@contextmanager
+def running_server(**options: Any) -> Iterator[int]:
+    """Run a server in a thread; yield its port."""
     over = threading.Event()
-    with make_server() as server:
+    with make_server(**options) as server:
         thread = threading.Thread(target=server.run, args=(over.is_set,), daemon=True)
         thread.start()
         yield server.port
@@ -72,13 +75,24 @@ def port() -> Iterator[int]:
         assert not thread.is_alive()
 
 
-def client_python() -> str:
+@pytest.fixture(scope="module")
+def port() -> Iterator[int]:
+    """The port of a server for client 0.9.16."""
+    with running_server() as found:
+        yield found
+
+
+def client_python(version: str) -> str:
     """Return a Python that has the official client; skip the test if there is none."""
-    found = os.environ.get("CAVMARL_CARLA_PYTHON")
+    is_default = version == DEFAULT_VERSION
+    name = "CAVMARL_CARLA_PYTHON" + ("" if is_default else f"_{version.replace('.', '_')}")
+    found = os.environ.get(name)
     if found:
         return found
-    if find_spec("carla") is None:
-        pytest.skip("CARLA's client is not installed: set CAVMARL_CARLA_PYTHON, or install carla")
+    if not is_default or find_spec("carla") is None:
+        pytest.skip(
+            f"CARLA's client {version} is not installed: set {name} to a Python that has it"
+        )
     return sys.executable
 
 
@@ -92,10 +106,10 @@ found = {}
 _END = "\nprint('FOUND' + json.dumps(found), flush=True)\n"
 
 
-def run_client(port: int, program: str) -> dict[str, Any]:
+def run_client(port: int, program: str, version: str = DEFAULT_VERSION) -> dict[str, Any]:
     """Run a program with `client` and `world`; return what it has put into `found`."""
     done = subprocess.run(
-        [client_python(), "-c", _START + program + _END, str(port)],
+        [client_python(version), "-c", _START + program + _END, str(port)],
         capture_output=True,
         text=True,
         timeout=120,

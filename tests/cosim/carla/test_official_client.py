@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.cosim.carla.conftest import run_client
+from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS
+from tests.cosim.carla.conftest import run_client, running_server
 
 SYNCHRONOUS = """
 settings = world.get_settings()
@@ -257,3 +258,50 @@ found["frames"] = [frames[1] - frames[0], frames[2] - frames[1]]
     )
     assert found["synchronous"]
     assert found["frames"] == [1, 1]
+
+
+@pytest.mark.parametrize("version", ["0.9.15", "0.10.0"])
+def test_other_versions_of_the_client_use_the_world(version: str) -> None:
+    program = (
+        SYNCHRONOUS
+        + """
+agent = next(one for one in world.get_actors().filter("vehicle.*")
+             if one.attributes["role_name"] == "car_1")
+library = world.get_blueprint_library()
+found["blueprints"] = len(library)
+found["colour"] = library.find("vehicle.tesla.model3").get_attribute("color").recommended_values[0]
+camera = library.find("sensor.camera.rgb")
+camera.set_attribute("image_size_x", "32")
+camera.set_attribute("image_size_y", "16")
+where = carla.Transform(carla.Location(x=1.0, z=1.5))
+mounted = world.spawn_actor(camera, where, attach_to=agent)
+frames = queue.Queue()
+mounted.listen(frames.put)
+batch = carla.command.SpawnActor(library.find("sensor.other.imu"), where, agent)
+answer = client.apply_batch_sync([batch, carla.command.DestroyActor(10**6)], False)
+found["batch"] = [bool(one.error) for one in answer]
+import time
+time.sleep(0.5)
+for step in range(80):
+    agent.apply_control(carla.VehicleControl(brake=1.0))
+    frame = world.tick()
+picture = frames.get(timeout=10.0)
+found["picture"] = [picture.width, picture.height]
+found["speed"] = agent.get_velocity().length()
+found["box"] = agent.bounding_box.extent.x
+lights = world.get_actors().filter("traffic.traffic_light")
+found["lights"] = sorted({str(light.state) for light in lights})
+mounted.stop()
+mounted.destroy()
+"""
+        + FREE
+    )
+    with running_server(client=version) as port:
+        found = run_client(port, program, version)
+    assert found["blueprints"] == len(BLUEPRINTS)
+    assert found["colour"] == "17,37,103"
+    assert found["batch"] == [False, True]
+    assert found["picture"] == [32, 16]
+    assert found["speed"] < 0.01
+    assert found["box"] == 2.5
+    assert {"Red", "Green"} <= set(found["lights"])
