@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.cosim.carla.call_arguments import (
-    Refused,
+    CallRefused,
     actor_id,
     anything,
     flag,
@@ -141,7 +141,7 @@ def set_walker_state(
 def _move(session: CarlaSession, actor: CarlaActor, there: CarlaPose) -> None:
     if actor.vehicle >= 0:
         if not session.external.owns(actor.vehicle):
-            raise Refused(_WORLDS)
+            raise CallRefused(_WORLDS)
         session.external.place(actor.vehicle, there, np.zeros(3))
     elif actor.parent:
         parent = session.actors.find(actor.parent, "set_actor_transform")
@@ -186,9 +186,9 @@ def _drive(caller: Caller, session: CarlaSession, number: int, control: Control,
     elif actor.vehicle >= 0 and session.external.owns(actor.vehicle):
         session.external.control(actor.vehicle, control)
     elif actor.is_vehicle:
-        raise Refused("the built-in driver drives this vehicle; only agents can be controlled")
+        raise CallRefused("the built-in driver drives this vehicle; only agents can be controlled")
     else:
-        raise Refused(f"{actor.type_id} is not a vehicle")
+        raise CallRefused(f"{actor.type_id} is not a vehicle")
 
 
 @call("get_actor_bounding_box", actor_id)
@@ -239,7 +239,7 @@ def get_vehicle_light_states(caller: Caller, session: CarlaSession) -> list[Any]
 @call("get_physics_control", actor_id, note="typical values, except the positions of the wheels")
 def get_physics_control(caller: Caller, session: CarlaSession, number: int) -> list[Any]:
     if not session.version.has_wheel_physics:
-        raise Refused("the physics of vehicles of CARLA 0.10 are not available")
+        raise CallRefused("the physics of vehicles of CARLA 0.10 are not available")
     here = session.actors.pose_of(session.actors.find(number, "get_physics_control"))
     wheels = []
     for ahead, right, steer in _WHEELS_CM:
@@ -269,7 +269,7 @@ def _vehicle_state(session: CarlaSession, number: int, name: str) -> np.void:
     actor = session.actors.find(number, name)
     state = session.actors.state_of(actor)
     if state is None or not actor.is_vehicle:
-        raise Refused(f"{actor.type_id} is not a vehicle")
+        raise CallRefused(f"{actor.type_id} is not a vehicle")
     return state
 
 
@@ -277,7 +277,7 @@ def _vehicle_state(session: CarlaSession, number: int, name: str) -> np.void:
 def get_group_traffic_lights(caller: Caller, session: CarlaSession, number: int) -> list[int]:
     ids = session.actors.lights["id"].tolist()
     if number not in ids:
-        raise Refused(f"actor {number} is not a traffic light")
+        raise CallRefused(f"actor {number} is not a traffic light")
     approaches = session.map.approaches
     signal = approaches[ids.index(number)].signal
     return [one for one, each in zip(ids, approaches, strict=True) if each.signal == signal]

@@ -205,7 +205,7 @@ class SensorSuite:
         self._next_stream = _FIRST_STREAM
 
     def add(self, actor: CarlaActor) -> None:
-        """Mount the sensor of a new actor; raise Refused if an attribute is invalid."""
+        """Mount the sensor of a new actor; raise CallRefused if an attribute is invalid."""
         if actor.type_id in _OF_THE_CLIENT:
             return
         settings = SensorSettings(actor)

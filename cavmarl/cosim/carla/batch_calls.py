@@ -8,7 +8,7 @@ from typing import Any
 from cavmarl.core.errors import CavmarlError
 from cavmarl.cosim.carla.actor_calls import description, spawn
 from cavmarl.cosim.carla.call_arguments import (
-    Refused,
+    CallRefused,
     actor_id,
     flag,
     listed,
@@ -48,7 +48,7 @@ def _command(value: Any) -> tuple[int, list[Any]]:
     match value:
         case [[int(index), list(body)]]:
             return index, body
-    raise Refused(f"{shown(value)} is not a command")
+    raise CallRefused(f"{shown(value)} is not a command")
 
 
 @call(
@@ -70,7 +70,7 @@ def apply_batch(
 def _answer(caller: Caller, session: CarlaSession, index: int, body: list[Any]) -> list[Any]:
     try:
         return [[1, _carry_out(caller, session, index, body)]]
-    except (Refused, CavmarlError) as problem:
+    except (CallRefused, CavmarlError) as problem:
         session.tell(f"{caller.name}: apply_batch: {problem}")
         return [[0, [str(problem)]]]
 
@@ -81,19 +81,19 @@ def _carry_out(
     """Carry out a command; return its actor. `spawned`: the actor that 0 stands for."""
     if index == _SPAWN:
         if spawned:
-            raise Refused("a spawn command after a spawn command")
+            raise CallRefused("a spawn command after a spawn command")
         return _spawn(caller, session, body)
     if index == _CONSOLE:
-        raise Refused("there is no console")
+        raise CallRefused("there is no console")
     if not body:
-        raise Refused("a command without an actor")
+        raise CallRefused("a command without an actor")
     number = actor_id(body[0]) or spawned
     if index == _DESTROY:
         session.destroy(number)
         return number
     name = _CALL_OF_COMMAND.get(index)
     if name is None:
-        raise Refused(f"there is no command {index}")
+        raise CallRefused(f"there is no command {index}")
     # A command has a bare number of lamps where the call has a record.
     rest = [[body[1]]] if index == _LIGHTS and len(body) == 2 else body[1:]
     CALLS[name].carry_out(caller, session, [number, *rest])
@@ -102,14 +102,14 @@ def _carry_out(
 
 def _spawn(caller: Caller, session: CarlaSession, body: list[Any]) -> int:
     if not body:
-        raise Refused("a spawn command without fields")
+        raise CallRefused("a spawn command without fields")
     *fields, after = body
     what, there, parent = record_of(description, pose, _parent)(fields)
     actor = spawn(session, what, there, parent)
     for index, following in listed(_command, most=MAX_COMMANDS)(after):
         try:
             _carry_out(caller, session, index, following, actor.number)
-        except (Refused, CavmarlError) as problem:
+        except (CallRefused, CavmarlError) as problem:
             session.tell(f"{caller.name}: apply_batch: after a spawn: {problem}")
     return actor.number
 
@@ -121,4 +121,4 @@ def _parent(value: Any) -> int:
             return 0
         case [True, int(number)]:
             return actor_id(number)
-    raise Refused(f"{shown(value)} is not an optional actor")
+    raise CallRefused(f"{shown(value)} is not an optional actor")

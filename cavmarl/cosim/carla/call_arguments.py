@@ -18,38 +18,38 @@ _MAX_ID = (1 << 32) - 1
 _SHOWN = 60
 
 
-class Refused(Exception):
+class CallRefused(Exception):
     """A call that cannot be carried out; the client gets the message as an error."""
 
 
 def number(value: Any) -> float:
     """Return a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise Refused(f"{shown(value)} is not a finite number")
+        raise CallRefused(f"{shown(value)} is not a finite number")
     return float(value)
 
 
 def whole(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
-        raise Refused(f"{shown(value)} is not a whole number")
+        raise CallRefused(f"{shown(value)} is not a whole number")
     return value
 
 
 def actor_id(value: Any) -> int:
     if not 0 <= whole(value) <= _MAX_ID:
-        raise Refused(f"{shown(value)} is not the id of an actor")
+        raise CallRefused(f"{shown(value)} is not the id of an actor")
     return int(value)
 
 
 def flag(value: Any) -> bool:
     if not isinstance(value, bool):
-        raise Refused(f"{shown(value)} is not true or false")
+        raise CallRefused(f"{shown(value)} is not true or false")
     return value
 
 
 def text(value: Any) -> str:
     if not isinstance(value, str):
-        raise Refused(f"{shown(value)} is not a text")
+        raise CallRefused(f"{shown(value)} is not a text")
     return value
 
 
@@ -63,9 +63,9 @@ def listed(check: Check, most: int = 1 << 16) -> Check:
 
     def checked(value: Any) -> list[Any]:
         if not isinstance(value, list):
-            raise Refused(f"{shown(value)} is not a list")
+            raise CallRefused(f"{shown(value)} is not a list")
         if len(value) > most:
-            raise Refused(f"a list of {len(value)} elements is too long; {most} are allowed")
+            raise CallRefused(f"a list of {len(value)} elements is too long; {most} are allowed")
         return [check(one) for one in value]
 
     return checked
@@ -77,7 +77,7 @@ def record_of(*checks: Check, required: int | None = None) -> Check:
 
     def checked(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, list) or len(value) < fewest:
-            raise Refused(f"{shown(value)} is not a list of at least {fewest} fields")
+            raise CallRefused(f"{shown(value)} is not a list of at least {fewest} fields")
         return tuple(check(one) for check, one in zip(checks, value, strict=False))
 
     return checked
@@ -92,14 +92,14 @@ def optional(check: Check) -> Check:
                 return None
             case [True, one]:
                 return check(one)
-        raise Refused(f"{shown(value)} is not an optional value")
+        raise CallRefused(f"{shown(value)} is not an optional value")
 
     return checked
 
 
 def coordinate(value: Any) -> float:
     if abs(number(value)) > FARTHEST_M:
-        raise Refused(f"{shown(value)} is beyond {FARTHEST_M:g} m")
+        raise CallRefused(f"{shown(value)} is beyond {FARTHEST_M:g} m")
     return float(value)
 
 

@@ -8,7 +8,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from cavmarl.core.errors import CavmarlError
-from cavmarl.cosim.carla.call_arguments import Check, Refused
+from cavmarl.cosim.carla.call_arguments import CallRefused, Check
 from cavmarl.cosim.carla.rpc_messages import (
     failed_nothing,
     failed_value,
@@ -45,8 +45,9 @@ class ClientCall:
     Attributes:
         checks: checks of the arguments.
         required: number of arguments that must be there; other versions add or omit some.
-        act: called with the caller, the session and the checked arguments.
-        note: what is special, for the reference page.
+        act: called with the caller, the session and the checked arguments; None: the call
+            returns `constant`.
+        note: what is special, for the reference page; of a refused call, the reason.
     """
 
     name: str
@@ -54,25 +55,28 @@ class ClientCall:
     required: int
     returns: Returns
     effect: Effect
-    act: Callable[..., Any]
+    act: Callable[..., Any] | None = None
+    constant: Any = None
     note: str = ""
 
     def carry_out(self, caller: Caller, session: CarlaSession, arguments: list[Any]) -> Any:
         """Check the arguments and return the value of the call.
 
-        Raises Refused: the number or the type of arguments is wrong, or the call is refused.
+        Raises CallRefused: the number or the type of arguments is wrong, or the call is refused.
         """
         given = len(arguments)
         if not self.required <= given <= len(self.checks):
             wanted = f"{self.required}"
             if self.required != len(self.checks):
                 wanted += f" to {len(self.checks)}"
-            raise Refused(f"{self.name}: {given} arguments; {wanted} are expected")
+            raise CallRefused(f"{self.name}: {given} arguments; {wanted} are expected")
         try:
             checked = [check(one) for check, one in zip(self.checks, arguments, strict=False)]
-        except Refused as problem:
-            raise Refused(f"{self.name}: {problem}") from None
-        return self.act(caller, session, *checked)
+        except CallRefused as problem:
+            raise CallRefused(f"{self.name}: {problem}") from None
+        if self.effect is Effect.REFUSED:
+            raise CallRefused(self.note)
+        return self.constant if self.act is None else self.act(caller, session, *checked)
 
 
 class Caller:
@@ -98,7 +102,7 @@ def call(
 
     def add(handler: Handler) -> Handler:
         fewest = len(checks) if required is None else required
-        CALLS[name] = ClientCall(name, checks, fewest, returns, effect, handler, note)
+        CALLS[name] = ClientCall(name, checks, fewest, returns, effect, handler, note=note)
         return handler
 
     return add
@@ -107,8 +111,8 @@ def call(
 def accept(*names: str, checks: tuple[Check, ...], note: str = "") -> None:
     """Add calls that return nothing and have no effect."""
     for name in names:
-        call(name, *checks, returns=Returns.NOTHING, effect=Effect.ACCEPTED, note=note)(
-            lambda caller, session, *arguments: None
+        CALLS[name] = ClientCall(
+            name, checks, len(checks), Returns.NOTHING, Effect.ACCEPTED, note=note
         )
 
 
@@ -117,8 +121,8 @@ def answer_constant(
 ) -> None:
     """Add calls that always return the same value."""
     for name in names:
-        call(name, *checks, effect=Effect.ACCEPTED, note=note)(
-            lambda caller, session, *arguments: value
+        CALLS[name] = ClientCall(
+            name, checks, len(checks), Returns.VALUE, Effect.ACCEPTED, constant=value, note=note
         )
 
 
@@ -126,12 +130,8 @@ def refuse(
     *names: str, checks: tuple[Check, ...], because: str, returns: Returns = Returns.NOTHING
 ) -> None:
     """Add calls that are refused with a reason."""
-
-    def act(caller: Caller, session: CarlaSession, *arguments: Any) -> None:
-        raise Refused(because)
-
     for name in names:
-        call(name, *checks, returns=returns, effect=Effect.REFUSED, note=because)(act)
+        CALLS[name] = ClientCall(name, checks, len(checks), returns, Effect.REFUSED, note=because)
 
 
 def answer(
@@ -148,7 +148,7 @@ def answer(
         )
     try:
         value = known.carry_out(caller, session, arguments)
-    except (Refused, CavmarlError) as problem:
+    except (CallRefused, CavmarlError) as problem:
         message = str(problem)
         session.tell(f"{caller.name}: {name}: {message}")
         failed = failed_nothing if known.returns is Returns.NOTHING else failed_value

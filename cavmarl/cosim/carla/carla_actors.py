@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN
-from cavmarl.cosim.carla.call_arguments import Refused
+from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_blueprints import BLUEPRINT_OF_CLASS, BLUEPRINTS
 from cavmarl.cosim.carla.carla_geometry import ZERO, CarlaPose, Vector, compose
 from cavmarl.cosim.carla.carla_map import CarlaMap
@@ -142,10 +142,10 @@ class ActorTable:
         return actor
 
     def find(self, number: int, call: str) -> CarlaActor:
-        """Return an actor; raise Refused, with CARLA's text, if there is none."""
+        """Return an actor; raise CallRefused, with CARLA's text, if there is none."""
         actor = self.actors.get(number)
         if actor is None:
-            raise Refused(
+            raise CallRefused(
                 f"Responding error from function {call}: Actor could not be found in the registry. "
                 f"Actor Id: {number}"
             )

@@ -1,7 +1,7 @@
 """CARLA's frame: x east, y south, z up, left-handed; yaw clockwise seen from above, in degrees.
 
 Pitch is positive upwards, roll is positive with the right side down. Rotations are applied in the
-order roll, pitch, yaw, as `carla.Transform.get_matrix` returns them. Angles of records of cavmarl
+order roll, pitch, yaw, as CARLA's transforms returns them. Angles of records of cavmarl
 are in rad, counter-clockwise, in a right-handed frame with y north.
 """
 

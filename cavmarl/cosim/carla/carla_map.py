@@ -46,7 +46,7 @@ _BOX_BEFORE_LINE_M = 2.0  # centre of the trigger volume, before the stop line
 _SPHERE_M = 6378137.0 * 0.9996  # radius with which the client 0.9.16 projects places
 
 
-class Approach(NamedTuple):
+class LightApproach(NamedTuple):
     """A traffic light: the lanes of an edge that one signal controls."""
 
     signal_id: str  # id of its signal in the OpenDRIVE document
@@ -82,7 +82,7 @@ class CarlaMap:
     document: str
     network: RoadNetwork
     spawn_points: tuple[CarlaPose, ...]
-    approaches: tuple[Approach, ...]
+    approaches: tuple[LightApproach, ...]
     states: NDArray[np.uint8]
     approach_of_lane: NDArray[np.int32]
     times_s: NDArray[np.float32]
@@ -152,11 +152,11 @@ def _spawn_points(network: RoadNetwork) -> list[CarlaPose]:
     return found
 
 
-def _approaches(network: RoadNetwork, known: set[str]) -> tuple[Approach, ...]:
+def _approaches(network: RoadNetwork, known: set[str]) -> tuple[LightApproach, ...]:
     """Return the approaches whose signal is in the document, in order of signal and edge."""
     links = network.links[network.links["signal"] >= 0]
     edges = network.lanes["edge"][links["from_lane"]]
-    found: list[Approach] = []
+    found: list[LightApproach] = []
     poles: dict[int, int] = {}
     for signal, edge in sorted(set(zip(links["signal"].tolist(), edges.tolist(), strict=True))):
         own = links[(links["signal"] == signal) & (edges == edge)]
@@ -168,7 +168,7 @@ def _approaches(network: RoadNetwork, known: set[str]) -> tuple[Approach, ...]:
         lanes = tuple(sorted(set(own["from_lane"].tolist())))
         pose, half_width_m = _stop_line(network, lanes)
         pole = poles[signal] = poles.get(signal, -1) + 1
-        found.append(Approach(ids[0], signal, indices, lanes, pose, half_width_m, pole))
+        found.append(LightApproach(ids[0], signal, indices, lanes, pose, half_width_m, pole))
     return tuple(found)
 
 
@@ -180,7 +180,7 @@ def _stop_line(network: RoadNetwork, lanes: tuple[int, ...]) -> tuple[CarlaPose,
     return across, 0.5 * float(network.lanes["width_m"][list(lanes)].sum())
 
 
-def _states(network: RoadNetwork, approaches: tuple[Approach, ...]) -> NDArray[np.uint8]:
+def _states(network: RoadNetwork, approaches: tuple[LightApproach, ...]) -> NDArray[np.uint8]:
     found = np.full((len(approaches), len(network.phases)), OFF, np.uint8)
     for program in network.programs:
         first = int(program["first_phase"])
@@ -199,7 +199,7 @@ def _joint_state(states: NDArray[np.uint8]) -> int:
     return next(state for state in (RED, YELLOW, GREEN, OFF) if (states == state).any())
 
 
-def _times_s(network: RoadNetwork, approaches: tuple[Approach, ...]) -> NDArray[np.float32]:
+def _times_s(network: RoadNetwork, approaches: tuple[LightApproach, ...]) -> NDArray[np.float32]:
     found = np.zeros((len(approaches), 3), np.float32)
     states = _states(network, approaches)
     for number, approach in enumerate(approaches):

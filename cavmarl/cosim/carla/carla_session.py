@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cavmarl.cosim.carla.attached_sensors import SensorSuite
-from cavmarl.cosim.carla.call_arguments import Refused
+from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_actors import ActorTable, CarlaActor
 from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, Blueprint
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose
@@ -32,7 +32,7 @@ _WEATHER = [0.0] * 12 + [0.0331, 0.0]
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """`carla.WorldSettings`; `others`: the fields without effect, as they were sent."""
+    """CARLA's `WorldSettings`; `others`: the fields without effect, as they were sent."""
 
     synchronous: bool = False
     no_rendering: bool = False
@@ -184,15 +184,15 @@ class CarlaSession:
     ) -> CarlaActor:
         """Add an actor; `pose` is relative to the parent, if there is one.
 
-        Raises Refused: there is no such blueprint, parent or room.
+        Raises CallRefused: there is no such blueprint, parent or room.
         """
         blueprint = BLUEPRINTS.get(type_id)
         if blueprint is None:
-            raise Refused(f"actor definition not found: {type_id}")
+            raise CallRefused(f"actor definition not found: {type_id}")
         if sum(1 for _ in self.actors.attached()) >= self.limits.max_actors:
-            raise Refused(f"{self.limits.max_actors} actors are spawned; destroy some first")
+            raise CallRefused(f"{self.limits.max_actors} actors are spawned; destroy some first")
         if parent and parent not in self.actors.actors:
-            raise Refused("unable to attach actor: parent actor not found")
+            raise CallRefused("unable to attach actor: parent actor not found")
         if type_id.startswith(("sensor.", "controller.")):
             return self._attach(blueprint, attributes, pose, parent)
         there = compose(self.actors.pose_of(self.actors.actors[parent]), pose) if parent else pose
@@ -217,21 +217,21 @@ class CarlaSession:
         )
         try:
             self.sensors.add(actor)
-        except Refused:
+        except CallRefused:
             self.actors.remove(actor.number)
             raise
         self.actors.move_attached(actor)
         return actor
 
     def destroy(self, number: int) -> None:
-        """Remove an actor that a client has spawned; raise Refused for other actors."""
+        """Remove an actor that a client has spawned; raise CallRefused for other actors."""
         actor = self.actors.actors.get(number)
         if actor is None:
-            raise Refused("unable to destroy actor: not found")
+            raise CallRefused("unable to destroy actor: not found")
         if actor.vehicle >= 0 and self.external.owns(actor.vehicle):
             self.external.destroy(actor.vehicle)
         elif not actor.type_id.startswith(("sensor.", "controller.")):
-            raise Refused(f"unable to destroy actor: {actor.type_id} belongs to the world")
+            raise CallRefused(f"unable to destroy actor: {actor.type_id} belongs to the world")
         for one in self.actors.remove(number):
             self._forget(one)
 

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from cavmarl.cosim.carla.call_arguments import (
-    Refused,
+    CallRefused,
     actor_id,
     anything,
     flag,
@@ -48,7 +48,7 @@ _NO_RECORDER = (
 
 def port(value: Any) -> int:
     if not 0 <= whole(value) <= _MAX_PORT:
-        raise Refused(f"{value} is not a port")
+        raise CallRefused(f"{value} is not a port")
     return int(value)
 
 
@@ -82,7 +82,7 @@ def set_episode_settings(caller: Caller, session: CarlaSession, given: tuple[Any
     if delta_s is not None and delta_s == 0.0:
         delta_s = None  # the same as a variable step
     if delta_s is not None and not _SHORTEST_S <= delta_s <= _LONGEST_S:
-        raise Refused(
+        raise CallRefused(
             f"fixed_delta_seconds = {delta_s:g}: must be from {_SHORTEST_S:g} to {_LONGEST_S:g}"
         )
     kept = session.settings.others
@@ -194,7 +194,7 @@ def add_traffic_manager_running(
 ) -> bool:
     host, at = manager
     if len(session.managers) >= _MAX_MANAGERS:
-        raise Refused(f"{_MAX_MANAGERS} traffic managers are running")
+        raise CallRefused(f"{_MAX_MANAGERS} traffic managers are running")
     is_new = at not in session.managers
     session.managers.setdefault(at, host)
     return is_new

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cosim.carla.call_arguments import Refused
+from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_geometry import CarlaPose
 from cavmarl.cosim.carla.vehicle_controls import Control
 
@@ -27,7 +27,10 @@ class ExternalVehicles(Protocol):
     """
 
     def spawn(self, body: ExternalBody) -> int:
-        """Add a body at once; return its id. Raises Refused: the place is occupied, or no room."""
+        """Add a body at once and return its id.
+
+        Raises CallRefused: the place is occupied, or there is no room.
+        """
         ...
 
     def destroy(self, vehicle: int) -> None: ...
@@ -49,16 +52,16 @@ class NoExternalVehicles:
     """The vehicles of a world without room for any."""
 
     def spawn(self, body: ExternalBody) -> int:
-        raise Refused(f"{body.type_id}: no room: population.external is 0")
+        raise CallRefused(f"{body.type_id}: no room: population.external is 0")
 
     def destroy(self, vehicle: int) -> None:
-        raise Refused(f"vehicle {vehicle} was not spawned by a client")
+        raise CallRefused(f"vehicle {vehicle} was not spawned by a client")
 
     def place(self, vehicle: int, pose: CarlaPose, velocity: NDArray[np.float64]) -> None:
-        raise Refused(f"vehicle {vehicle} was not spawned by a client")
+        raise CallRefused(f"vehicle {vehicle} was not spawned by a client")
 
     def control(self, vehicle: int, control: Control) -> None:
-        raise Refused(f"vehicle {vehicle} was not spawned by a client")
+        raise CallRefused(f"vehicle {vehicle} was not spawned by a client")
 
     def owns(self, vehicle: int) -> bool:
         return False

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cosim.carla.call_arguments import Refused
+from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_actors import CarlaActor
 from cavmarl.cosim.carla.sensed_surroundings import Surroundings
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class SensorSettings:
-    """The attributes of a sensor as numbers. Raises Refused for other values."""
+    """The attributes of a sensor as numbers. Raises CallRefused for other values."""
 
     def __init__(self, actor: CarlaActor) -> None:
         self._actor = actor
@@ -29,7 +29,7 @@ class SensorSettings:
         except ValueError:
             value = math.nan
         if not (low <= value <= high and math.isfinite(value)):
-            raise Refused(
+            raise CallRefused(
                 f"{self._actor.type_id}: {name} = {written!r}: must be a number from {low:g} to "
                 f"{high:g}"
             )

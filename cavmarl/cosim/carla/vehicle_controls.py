@@ -19,7 +19,7 @@ _ACKERMANN_PER_S = 2.0  # acceleration per m/s of difference to the target speed
 
 
 class CarlaControl(NamedTuple):
-    """`carla.VehicleControl`."""
+    """CARLA's `VehicleControl`."""
 
     throttle: float = 0.0
     steer: float = 0.0  # positive to the right
@@ -31,7 +31,7 @@ class CarlaControl(NamedTuple):
 
 
 class AckermannControl(NamedTuple):
-    """`carla.VehicleAckermannControl`."""
+    """CARLA's `VehicleAckermannControl`."""
 
     steer: float  # rad, positive to the right
     steer_speed: float  # rad/s; 0: as fast as possible
