@@ -334,13 +334,9 @@ refuse(
     because=_KINEMATIC,
 )
 refuse("set_wheel_steer_direction", checks=(actor_id, whole, number), because=_KINEMATIC)
-refuse(
-    "enable_carsim",
-    "use_carsim_road",
-    "enable_chrono_physics",
-    checks=(anything,) * 6,
-    because=_KINEMATIC,
-)
+refuse("enable_carsim", checks=(actor_id, text), because=_KINEMATIC)
+refuse("use_carsim_road", checks=(actor_id, flag), because=_KINEMATIC)
+refuse("enable_chrono_physics", checks=(actor_id, *[anything] * 6), because=_KINEMATIC)
 refuse(
     "apply_control_to_walker",
     checks=(actor_id, walker_control),

@@ -150,7 +150,7 @@ def answer(
         value = known.carry_out(caller, session, arguments)
     except (CallRefused, CavmarlError) as problem:
         message = str(problem)
-        session.tell(f"{caller.name}: {name}: {message}")
+        session.tell(f"{caller.name}: {name}: {message.removeprefix(f'{name}: ')}")
         failed = failed_nothing if known.returns is Returns.NOTHING else failed_value
         return None, failed(message)
     if known.returns is Returns.BARE:

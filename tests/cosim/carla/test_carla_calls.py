@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.call_table import CALLS, Caller, Returns, answer
-from cavmarl.cosim.carla.carla_session import CarlaSession
-from tests.cosim.carla.conftest import Call
+from cavmarl.cosim.carla.carla_geometry import CarlaPose
+from cavmarl.cosim.carla.carla_session import CarlaSession, SessionLimits
+from tests.cosim.carla.conftest import Call, make_server
 
 POSE = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
 CAR = [1, "vehicle.tesla.model3", [["role_name", 4, "hero"]]]
@@ -97,6 +99,15 @@ def test_a_sensor_with_an_invalid_attribute_is_not_spawned(
     with pytest.raises(RuntimeError, match="channels = 'many': must be a number from 1 to 512"):
         call("spawn_actor", what, POSE)
     assert len(session.actors.actors) == before
+
+
+def test_the_number_of_sensors_is_limited() -> None:
+    with make_server(limits=SessionLimits(max_actors=2)) as server:
+        session = server.session
+        for _ in range(2):
+            session.spawn("sensor.other.imu", {}, CarlaPose(0.0, 0.0, 0.0))
+        with pytest.raises(CallRefused, match="2 actors are spawned; destroy some first"):
+            session.spawn("sensor.other.imu", {}, CarlaPose(0.0, 0.0, 0.0))
 
 
 def test_vehicles_of_the_world_are_not_moved_or_destroyed(

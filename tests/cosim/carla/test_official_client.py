@@ -260,6 +260,96 @@ found["frames"] = [frames[1] - frames[0], frames[2] - frames[1]]
     assert found["frames"] == [1, 1]
 
 
+def test_it_reads_the_answer_of_each_of_its_methods(port: int) -> None:
+    """A wrong answer is `std::bad_cast`; a refused call has a reason, or no answer at all."""
+    found = run_client(
+        port,
+        SYNCHRONOUS
+        + """
+agent = next(one for one in world.get_actors().filter("vehicle.*")
+             if one.attributes["role_name"] == "car_0")
+light = world.get_actors().filter("traffic.traffic_light")[0]
+road_map = world.get_map()
+here, there = carla.Location(10.0, 10.0, 5.0), carla.Transform()
+vector = carla.Vector3D(1.0, 0.0, 0.0)
+library = world.get_blueprint_library()
+vehicle = library.find("vehicle.audi.tt")
+do = carla.command
+methods = [
+    lambda: world.get_lightmanager().get_all_lights(),
+    lambda: world.get_environment_objects(carla.CityObjectLabel.Any),
+    lambda: world.get_level_bbs(carla.CityObjectLabel.TrafficLight),
+    lambda: world.get_names_of_all_objects(),
+    lambda: world.ground_projection(here, 10.0).location.z,
+    lambda: world.cast_ray(here, carla.Location(10.0, 10.0, -5.0)),
+    lambda: world.get_random_location_from_navigation(),
+    lambda: world.get_vehicles_light_states(),
+    lambda: world.freeze_all_traffic_lights(True),
+    lambda: world.reset_all_traffic_lights(),
+    lambda: world.load_map_layer(carla.MapLayer.All),
+    lambda: world.enable_environment_objects([1], False),
+    lambda: world.get_traffic_light_from_opendrive_id(light.get_opendrive_id()).id,
+    lambda: world.get_traffic_lights_from_waypoint(road_map.get_waypoint(here), 100.0),
+    lambda: world.debug.draw_box(carla.BoundingBox(here, vector), carla.Rotation()),
+    lambda: world.debug.draw_string(here, "text"),
+    lambda: agent.get_physics_control().wheels,
+    lambda: agent.apply_physics_control(agent.get_physics_control()),
+    lambda: agent.get_wheel_steer_angle(carla.VehicleWheelLocation.FL_Wheel),
+    lambda: agent.get_light_state(),
+    lambda: agent.get_telemetry_data().wheels,
+    lambda: agent.get_ackermann_controller_settings(),
+    lambda: agent.apply_ackermann_control(carla.VehicleAckermannControl(speed=5.0)),
+    lambda: agent.open_door(carla.VehicleDoor.FL),
+    lambda: agent.get_failure_state(),
+    lambda: agent.add_impulse(vector),
+    lambda: agent.add_torque(vector),
+    lambda: agent.enable_constant_velocity(vector),
+    lambda: agent.set_target_velocity(vector),
+    lambda: agent.set_simulate_physics(True),
+    lambda: agent.set_collisions(True),
+    lambda: agent.get_component_world_transform("root").location.x,
+    lambda: agent.get_bone_names(),
+    lambda: agent.get_socket_names(),
+    lambda: agent.set_transform(there),
+    lambda: agent.enable_chrono_physics(1, 0.1, "", "", "", ""),
+    lambda: light.set_state(carla.TrafficLightState.Green),
+    lambda: light.get_group_traffic_lights(),
+    lambda: light.get_light_boxes(),
+    lambda: light.get_affected_lane_waypoints(),
+    lambda: client.set_replayer_time_factor(1.0),
+    lambda: client.stop_recorder(),
+    lambda: client.get_required_files("", False),
+    lambda: client.apply_batch([do.ApplyVehicleControl(agent.id, carla.VehicleControl())]),
+    lambda: world.get_spectator().set_transform(there),
+    lambda: client.start_recorder("file.log"),
+    lambda: client.replay_file("file.log", 0.0, 0.0, 0),
+]
+found["errors"] = []
+for method in methods:
+    try:
+        method()
+    except RuntimeError as error:
+        found["errors"].append(str(error))
+commands = [
+    do.ApplyVehicleControl(agent.id, carla.VehicleControl()),
+    do.SetVehicleLightState(agent.id, carla.VehicleLightState.All),
+    do.SetSimulatePhysics(agent.id, True),
+    do.ApplyTransform(agent.id, there),
+    do.SpawnActor(vehicle, there).then(do.SetAutopilot(do.FutureActor, False)),
+    do.DestroyActor(agent.id),
+]
+found["batch"] = [one.error for one in client.apply_batch_sync(commands, True)]
+"""
+        + FREE,
+    )
+    assert len(found["errors"]) == 2
+    assert all("CARLA's recorder is not available" in one for one in found["errors"])
+    assert found["batch"][:3] == ["", "", ""]
+    assert "vehicles of the world move by themselves" in found["batch"][3]
+    assert "no room" in found["batch"][4]
+    assert "belongs to the world" in found["batch"][5]
+
+
 @pytest.mark.parametrize("version", ["0.9.15", "0.10.0"])
 def test_other_versions_of_the_client_use_the_world(version: str) -> None:
     program = (
