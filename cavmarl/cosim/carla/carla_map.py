@@ -7,10 +7,11 @@ Its state is green only if all movements from these lanes are green.
 from __future__ import annotations
 
 import math
-import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import defusedxml.ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
@@ -121,7 +122,9 @@ def make_carla_map(
     """
     if len(network.maps) > 1:
         raise MapError(f"{name}: {len(network.maps)} maps; a server for CARLA's clients has one")
-    approaches = _approaches(network, set(re.findall(r'<signal id="([^"]*)"', document)))
+    root = defusedxml.ElementTree.fromstring(document.encode(), forbid_dtd=True)
+    ids = {signal.get("name", ""): signal.get("id", "") for signal in root.iter("signal")}
+    approaches = _approaches(network, ids)
     at_end = np.full(len(network.lanes), -1, np.int32)
     for number, approach in enumerate(approaches):
         at_end[list(approach.lanes)] = number
@@ -152,8 +155,11 @@ def _spawn_points(network: RoadNetwork) -> list[CarlaPose]:
     return found
 
 
-def _approaches(network: RoadNetwork, known: set[str]) -> tuple[LightApproach, ...]:
-    """Return the approaches whose signal is in the document, in order of signal and edge."""
+def _approaches(network: RoadNetwork, known: Mapping[str, str]) -> tuple[LightApproach, ...]:
+    """Return the approaches whose signal is in the document, in order of signal and edge.
+
+    `known`: ids of the signals in the document, by the ids that netconvert has given.
+    """
     links = network.links[network.links["signal"] >= 0]
     edges = network.lanes["edge"][links["from_lane"]]
     found: list[LightApproach] = []
@@ -162,7 +168,7 @@ def _approaches(network: RoadNetwork, known: set[str]) -> tuple[LightApproach, .
         own = links[(links["signal"] == signal) & (edges == edge)]
         indices = tuple(sorted(set(own["signal_index"].tolist())))
         name = network.signal_ids[signal]
-        ids = [one for index in indices if (one := f"{name}_{index}") in known]
+        ids = [known[one] for index in indices if (one := f"{name}_{index}") in known]
         if not ids:
             continue
         lanes = tuple(sorted(set(own["from_lane"].tolist())))

@@ -1,7 +1,8 @@
 """Changes an OpenDRIVE export into what CARLA and its client programs read.
 
 CARLA's programs look for traffic lights of one type, with one signal on each approach, and find the
-lights of a junction by its controllers. CARLA 0.9.16 reads the header of OpenDRIVE 1.4.
+lights of a junction by its controllers. Snapshots have room for short ids of signals only; the name
+of a signal is the id that netconvert has given. CARLA 0.9.16 reads the header of OpenDRIVE 1.4.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from cavmarl.roads.network import RoadNetwork
 
 LIGHT_TYPE = "1000001"
 DEFAULT_ORIGIN = (48.0, 11.0)  # latitude and longitude of (0, 0) on a map without a georeference
+MAX_ID_BYTES = 31
 _MINOR = "4"
 _TRAFFIC_LIGHTS = ("1000001", "1000011")  # with and without a light for pedestrians or turns
 
@@ -44,23 +46,31 @@ def fit_to_carla(root: Element, origin: tuple[float, float]) -> None:
         for controller in root.iterfind("controller")
         for control in controller
     }
-    dropped: set[str] = set()
+    new_ids: dict[str, str] = {}
     for road in root.iterfind("road"):
+        has_cars = any(lane.get("type") == "driving" for lane in road.iter("lane"))
         seen: set[str] = set()
         for signals in road.iterfind("signals"):
             for signal in _traffic_lights(signals):
                 signal_id, orientation = signal.get("id", ""), signal.get("orientation", "")
-                _add_controller(road, orientation, junctions, controllers.get(signal_id, ""))
-                if orientation in seen:
+                if orientation in seen or not has_cars:
                     signals.remove(signal)
-                    dropped.add(signal_id)
-                else:
-                    seen.add(orientation)
-                    _widen(road, signal)
-    for controller in root.iterfind("controller"):
+                    continue
+                seen.add(orientation)
+                _add_controller(road, orientation, junctions, controllers.get(signal_id, ""))
+                _widen(road, signal)
+                new_ids[signal_id] = _short_id(signal_id, len(new_ids))
+                signal.set("name", signal_id)
+                signal.set("id", new_ids[signal_id])
+    for controller in root.findall("controller"):
         for control in controller.findall("control"):
-            if control.get("signalId", "") in dropped:
+            signal_id = control.get("signalId", "")
+            if signal_id in new_ids:
+                control.set("signalId", new_ids[signal_id])
+            else:
                 controller.remove(control)
+        if len(controller) == 0:
+            root.remove(controller)
     header = root.find("header")
     if header is not None:
         header.set("revMinor", _MINOR)
@@ -79,6 +89,11 @@ def _traffic_lights(signals: Element) -> Iterator[Element]:
     for signal in signals.findall("signal"):
         if signal.get("dynamic") == "yes" and signal.get("type") in _TRAFFIC_LIGHTS:
             yield signal
+
+
+def _short_id(signal_id: str, number: int) -> str:
+    """Return an id that fits a snapshot; ids of joined junctions are long."""
+    return signal_id if len(signal_id.encode()) <= MAX_ID_BYTES else f"light_{number}"
 
 
 def _widen(road: Element, signal: Element) -> None:

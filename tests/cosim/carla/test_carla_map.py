@@ -12,7 +12,12 @@ import pytest
 from cavmarl.cosim.carla.carla_map import GREEN, OFF, RED, YELLOW, CarlaMap, make_carla_map
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.exports.opendrive import carla_document, write_opendrive
-from cavmarl.maps.exports.opendrive_carla import DEFAULT_ORIGIN, LIGHT_TYPE, origin_of
+from cavmarl.maps.exports.opendrive_carla import (
+    DEFAULT_ORIGIN,
+    LIGHT_TYPE,
+    fit_to_carla,
+    origin_of,
+)
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 
@@ -49,6 +54,26 @@ def test_each_junction_names_its_controller(root: Element) -> None:
     assert named == controlled
     known = {str(one.get("id")) for one in root.iter("signal")}
     assert {str(one.get("signalId")) for one in root.iterfind("controller/control")} == known
+
+
+def test_long_ids_of_signals_are_replaced() -> None:
+    long = "cluster_" + "1234567890_" * 4 + "7"
+    root = fromstring(
+        '<OpenDRIVE><road id="1"><link><successor elementType="junction" elementId="9"/></link>'
+        '<lanes><laneSection><right><lane id="-1" type="driving"/></right></laneSection></lanes>'
+        f'<signals><signal id="{long}" orientation="+" dynamic="yes" type="1000011"/></signals>'
+        '</road><road id="2"><lanes><laneSection><right><lane id="-1" type="tram"/></right>'
+        '</laneSection></lanes><signals><signal id="tram_0" orientation="+" dynamic="yes" '
+        'type="1000011"/></signals></road>'
+        f'<controller id="c"><control signalId="{long}"/><control signalId="tram_0"/></controller>'
+        '<controller id="t"><control signalId="tram_0"/></controller><junction id="9"/></OpenDRIVE>'
+    )
+    fit_to_carla(root, DEFAULT_ORIGIN)
+    (signal,) = root.iter("signal")
+    assert (signal.get("id"), signal.get("name")) == ("light_0", long)
+    assert [one.get("signalId") for one in root.iter("control")] == ["light_0"]
+    assert [one.get("id") for one in root.iterfind("controller")] == ["c"]
+    assert [one.get("id") for one in root.iterfind("junction/controller")] == ["c"]
 
 
 def test_the_header_has_a_place_on_the_earth(root: Element) -> None:
