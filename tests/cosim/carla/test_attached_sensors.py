@@ -16,37 +16,36 @@ from cavmarl.cosim.carla.attached_imaging import SEMANTIC_POINT
 from cavmarl.cosim.carla.carla_actors import CarlaActor
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, axes_of, compose, relative
 from cavmarl.cosim.carla.carla_session import CarlaSession
-from cavmarl.cosim.carla.carla_streams import StreamHub
+from cavmarl.cosim.carla.vehicle_controls import FULL_STEER_RAD, CarlaControl
+from tests.cosim.carla.conftest import make_server
 
 ROOF = CarlaPose(0.0, 0.0, 2.0)
 
 
-class Recorder(StreamHub):
+class Recorder:
     """Keeps the frames of all streams."""
 
     def __init__(self) -> None:
-        super().__init__(0)
         self.frames: dict[int, list[tuple[bytes, bytes]]] = {}
 
-    def is_wanted(self, stream: int) -> bool:
-        return True
-
-    def send(self, stream: int, head: bytes, body: bytes, keep: bool) -> None:
+    def keep(self, stream: int, head: bytes, body: bytes, keep: bool) -> None:
         self.frames.setdefault(stream, []).append((head, body))
 
 
 @pytest.fixture
 def recorder(session: CarlaSession, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recorder]:
-    found = Recorder()
-    monkeypatch.setattr(session, "streams", found)
-    monkeypatch.setattr("cavmarl.cosim.carla.carla_streams.StreamHub.is_wanted", lambda *_: True)
-    monkeypatch.setattr(
-        "cavmarl.cosim.carla.carla_streams.StreamHub.send",
-        lambda hub, stream, head, body, keep: found.send(stream, head, body, keep),
-    )
-    yield found
+    yield recorded(monkeypatch)
     for actor in list(session.actors.attached()):
         session.destroy(actor.number)
+
+
+def recorded(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    """Record the frames of all servers of this process."""
+    found = Recorder()
+    hub = "cavmarl.cosim.carla.carla_streams.StreamHub"
+    monkeypatch.setattr(f"{hub}.is_wanted", lambda *_: True)
+    monkeypatch.setattr(f"{hub}.send", lambda _, *frame: found.keep(*frame))
+    return found
 
 
 def ego(session: CarlaSession) -> CarlaActor:
@@ -187,3 +186,28 @@ def test_sensors_leave_with_their_vehicle(session: CarlaSession, recorder: Recor
     gone = session.actors.remove(parent.number)
     assert attached in gone
     session.load("", False)
+
+
+def test_a_collision_is_reported_with_the_last_frame_of_its_vehicle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = recorded(monkeypatch)
+    with make_server(agents=1, background=150) as server:
+        session = server.session
+        agent = session.actors.of_agent(0)
+        assert agent is not None
+        sensor = session.spawn("sensor.other.collision", {}, ROOF, agent.number)
+        full_steer = FULL_STEER_RAD / session.world.env.config.action.steering_rad
+        for _ in range(1000):
+            steer = -float(session.world.env.suggest_actions()["car_0"][1]) / full_steer
+            session.world.controls[0] = CarlaControl(throttle=0.7, steer=steer)
+            session.tick()
+            if stream_of(sensor) in found.frames:
+                break
+        ((head, body),) = found.frames[stream_of(sensor)]
+        assert struct.unpack_from("<QQ", head) == (0, session.frame)
+        own, other, impulse = msgpack.unpackb(body)
+        assert own[0] == agent.number
+        assert other[0] != agent.number
+        assert len(impulse) == 3
+        assert agent.number not in session.actors.actors
