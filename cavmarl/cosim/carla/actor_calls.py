@@ -142,7 +142,7 @@ def _move(session: CarlaSession, actor: CarlaActor, there: CarlaPose) -> None:
     if actor.vehicle >= 0:
         if not session.external.owns(actor.vehicle):
             raise CallRefused(_WORLDS)
-        session.external.place(actor.vehicle, there, np.zeros(3))
+        session.external.place(actor.vehicle, there)
     elif actor.parent:
         parent = session.actors.find(actor.parent, "set_actor_transform")
         actor.local = relative(session.actors.pose_of(parent), there)

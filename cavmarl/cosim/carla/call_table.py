@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -18,6 +19,8 @@ from cavmarl.cosim.carla.rpc_messages import (
 
 if TYPE_CHECKING:
     from cavmarl.cosim.carla.carla_session import CarlaSession
+
+log = logging.getLogger("cavmarl.carla")
 
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
@@ -137,7 +140,7 @@ def refuse(
 def answer(
     caller: Caller, session: CarlaSession, name: str, arguments: list[Any]
 ) -> tuple[str | None, Any]:
-    """Return error and result of a call. A fault of the client is logged and never raised."""
+    """Return error and result of a call. Faults are logged and never raised."""
     known = CALLS.get(name)
     if known is None:
         session.tell(f"{caller.name}: no call {name[:80]!r}")
@@ -151,8 +154,12 @@ def answer(
     except (CallRefused, CavmarlError) as problem:
         message = str(problem)
         session.tell(f"{caller.name}: {name}: {message.removeprefix(f'{name}: ')}")
-        failed = failed_nothing if known.returns is Returns.NOTHING else failed_value
-        return None, failed(message)
-    if known.returns is Returns.BARE:
-        return None, value
-    return None, nothing_answer() if known.returns is Returns.NOTHING else value_answer(value)
+    except Exception as problem:  # a fault of the server must not end the other clients' world
+        log.exception("%s: %s", caller.name, name)
+        message = f"internal error in {name}: {problem!r}"
+    else:
+        if known.returns is Returns.BARE:
+            return None, value
+        return None, nothing_answer() if known.returns is Returns.NOTHING else value_answer(value)
+    failed = failed_nothing if known.returns is Returns.NOTHING else failed_value
+    return None, failed(message)

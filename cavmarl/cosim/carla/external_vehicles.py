@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_geometry import CarlaPose
 from cavmarl.cosim.carla.vehicle_controls import Control
@@ -35,8 +32,8 @@ class ExternalVehicles(Protocol):
 
     def destroy(self, vehicle: int) -> None: ...
 
-    def place(self, vehicle: int, pose: CarlaPose, velocity: NDArray[np.float64]) -> None:
-        """Move a body as a puppet, with a velocity in m/s in CARLA's frame."""
+    def place(self, vehicle: int, pose: CarlaPose) -> None:
+        """Move a body as a puppet; its velocity follows from its places."""
         ...
 
     def control(self, vehicle: int, control: Control) -> None:
@@ -57,7 +54,7 @@ class NoExternalVehicles:
     def destroy(self, vehicle: int) -> None:
         raise CallRefused(f"vehicle {vehicle} was not spawned by a client")
 
-    def place(self, vehicle: int, pose: CarlaPose, velocity: NDArray[np.float64]) -> None:
+    def place(self, vehicle: int, pose: CarlaPose) -> None:
         raise CallRefused(f"vehicle {vehicle} was not spawned by a client")
 
     def control(self, vehicle: int, control: Control) -> None:

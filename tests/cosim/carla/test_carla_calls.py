@@ -53,6 +53,18 @@ def test_an_unknown_call_has_the_error_of_rpclib(session: CarlaSession) -> None:
     assert result is None
 
 
+def test_a_fault_of_the_server_is_an_answer_and_a_log_line(
+    session: CarlaSession,
+    call: Call,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(session.actors, "spectator", None)
+    with pytest.raises(RuntimeError, match="internal error in get_spectator: AttributeError"):
+        call("get_spectator")
+    assert "get_spectator" in caplog.text
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e7])
 def test_poses_outside_of_the_world_are_refused(
     session: CarlaSession, call: Call, value: float
