@@ -21,6 +21,7 @@ from cavmarl.cosim.carla.attached_imaging import (
     SemanticLidarSensor,
 )
 from cavmarl.cosim.carla.carla_actors import CarlaActor
+from cavmarl.cosim.carla.carla_geodesy import geolocation
 from cavmarl.cosim.carla.carla_geometry import axes_of
 from cavmarl.cosim.carla.carla_records import packed_actor
 from cavmarl.cosim.carla.carla_streams import StreamHub
@@ -62,7 +63,9 @@ class GnssSensor:
 
     def sense(self, context: SensorContext, actor: CarlaActor, elapsed_s: float) -> bytes:
         pose = actor.pose
-        measured = np.array([*context.session.map.geolocation(pose.x, pose.y), pose.z])
+        session = context.session
+        degrees = geolocation(session.map.origin, pose.x, pose.y, session.version.is_mercator)
+        measured = np.array([*degrees, pose.z])
         return pack((measured + self._bias + self._noise * self._random.normal(size=3)).tolist())
 
 

@@ -44,7 +44,6 @@ _FIRST_SPAWN_M = 15.0  # from the start of a longer lane
 _SHORTEST_M = 12.0  # a shorter lane has no spawn point
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 _BOX_BEFORE_LINE_M = 2.0  # centre of the trigger volume, before the stop line
-_SPHERE_M = 6378137.0 * 0.9996  # radius with which the client 0.9.16 projects places
 
 
 class LightApproach(NamedTuple):
@@ -99,18 +98,6 @@ class CarlaMap:
         signals = [approach.signal for approach in self.approaches]
         found: NDArray[np.uint8] = self.states[np.arange(len(signals)), phases[signals]]
         return found
-
-    def geolocation(self, x: float, y: float) -> tuple[float, float]:
-        """Return latitude and longitude of a place in CARLA's frame, as the client computes them.
-
-        The client 0.9.16 lets the latitude grow with y, that is, to the south.
-        """
-        latitude, longitude = map(math.radians, self.origin)
-        along = y / _SPHERE_M + latitude
-        across = x / _SPHERE_M
-        north = math.asin(math.sin(along) / math.cosh(across))
-        east = longitude + math.atan2(math.sinh(across), math.cos(along))
-        return math.degrees(north), math.degrees(east)
 
 
 def make_carla_map(

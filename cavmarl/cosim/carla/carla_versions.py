@@ -19,14 +19,15 @@ class ClientVersion(NamedTuple):
     box_has_actor: bool  # a bounding box has a fourth field
     spawn_has_socket: bool  # a spawn command has an attachment and a socket
     has_wheel_physics: bool  # the layout of `VehiclePhysicsControl` is that of 0.9
+    is_mercator: bool  # how places are projected; see `carla_geodesy`
 
 
 CLIENT_VERSIONS = {
     version.name: version
     for version in (
-        ClientVersion("0.9.15", 16, 0, False, False, True),
-        ClientVersion("0.9.16", 17, 1, True, True, True),
-        ClientVersion("0.10.0", 16, 0, False, False, False),
+        ClientVersion("0.9.15", 16, 0, False, False, True, True),
+        ClientVersion("0.9.16", 17, 1, True, True, True, False),
+        ClientVersion("0.10.0", 16, 0, False, False, False, True),
     )
 }
 DEFAULT_VERSION = "0.9.16"

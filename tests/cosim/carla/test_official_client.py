@@ -367,6 +367,9 @@ where = carla.Transform(carla.Location(x=1.0, z=1.5))
 mounted = world.spawn_actor(camera, where, attach_to=agent)
 frames = queue.Queue()
 mounted.listen(frames.put)
+gnss = world.spawn_actor(library.find("sensor.other.gnss"), where, attach_to=agent)
+fixes = queue.Queue()
+gnss.listen(fixes.put)
 batch = carla.command.SpawnActor(library.find("sensor.other.imu"), where, agent)
 answer = client.apply_batch_sync([batch, carla.command.DestroyActor(10**6)], False)
 found["batch"] = [bool(one.error) for one in answer]
@@ -377,12 +380,16 @@ for step in range(80):
     frame = world.tick()
 picture = frames.get(timeout=10.0)
 found["picture"] = [picture.width, picture.height]
+fix = fixes.get(timeout=10.0)
+place = world.get_map().transform_to_geolocation(fix.transform.location)
+found["apart"] = [fix.latitude - place.latitude, fix.longitude - place.longitude]
 found["speed"] = agent.get_velocity().length()
 found["box"] = agent.bounding_box.extent.x
 lights = world.get_actors().filter("traffic.traffic_light")
 found["lights"] = sorted({str(light.state) for light in lights})
-mounted.stop()
-mounted.destroy()
+for sensor in (mounted, gnss):
+    sensor.stop()
+    sensor.destroy()
 """
         + FREE
     )
@@ -392,6 +399,7 @@ mounted.destroy()
     assert found["colour"] == "17,37,103"
     assert found["batch"] == [False, True]
     assert found["picture"] == [32, 16]
+    assert found["apart"] == pytest.approx([0.0, 0.0], abs=1e-8)
     assert found["speed"] < 0.01
     assert found["box"] == 2.5
     assert {"Red", "Green"} <= set(found["lights"])
