@@ -11,7 +11,6 @@ import asyncio
 import logging
 import socket
 import struct
-from collections.abc import Callable
 
 log = logging.getLogger("cavmarl.carla")
 
@@ -20,7 +19,6 @@ _STREAM = struct.Struct("<I")
 _TOKEN = struct.Struct("<IHBB16x")
 _TCP, _HOST_NOT_SET = 1, 0  # protocol, and kind of address: the client uses the host of the RPC
 _WAITING_BYTES = 1 << 20  # a client with more bytes gets no frames while the world runs freely
-TOKEN_BYTES = _TOKEN.size
 
 
 class StreamHub:
@@ -133,6 +131,3 @@ def without_delay(transport: asyncio.Transport) -> None:
     """Send small messages at once."""
     connection = transport.get_extra_info("socket")
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-
-Connect = Callable[[], asyncio.Protocol]

@@ -231,7 +231,11 @@ class LoadedWorlds:
         }
         keywords = {**spec.keywords, "overrides": overrides}
         env = parallel_env(spec.env, **keywords)
-        world = HostedWorld(env, _map_of(env, find_map(spec.env), shown), spec.seed)
+        try:
+            world = HostedWorld(env, _map_of(env, find_map(spec.env), shown), spec.seed)
+        except BaseException:
+            env.close()
+            raise
         self._close_env()
         self._env, self._spec, self._name = env, spec, shown
         return world

@@ -61,13 +61,3 @@ def action_of(control: Control, speed_mps: float, config: ActionConfig) -> NDArr
     acceleration, angle = motion_of(control, speed_mps)
     pair = [acceleration / config.acceleration_mps2, angle / config.steering_rad]
     return np.clip(pair, -1.0, 1.0).astype(np.float32)
-
-
-def control_shown(acceleration: float, angle_rad: float) -> CarlaControl:
-    """Return the control that clients see of a vehicle that no client drives."""
-    return CarlaControl(
-        throttle=min(max(acceleration / THROTTLE_MPS2, 0.0), 1.0),
-        steer=min(max(-angle_rad / FULL_STEER_RAD, -1.0), 1.0),
-        brake=min(max(-acceleration / BRAKE_MPS2, 0.0), 1.0),
-        gear=1,
-    )
