@@ -27,7 +27,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.engine.component import Component
 from cavmarl.handoff.division import ZonedShards
-from cavmarl.shards.row_check import MOST
+from cavmarl.shards.row_check import LEAST_FACTOR, MOST
 from cavmarl.shards.state import Use, names_of
 from cavmarl.traffic.departure_queue import DEPARTURE
 from cavmarl.traffic.native import NativeTraffic
@@ -35,6 +35,7 @@ from cavmarl.traffic.native import NativeTraffic
 Array = NDArray[Any]
 
 _LARGEST = 1e12
+_MOST_TICKS = 1 << 40  # a thousand years in ticks of 30 ms
 _CODES = {
     "lane_code": (LANE_BEST, LANE_GIVEN),
     "pos_code": (POS_GIVEN, POS_LAST),
@@ -153,12 +154,23 @@ class StateForm(NamedTuple):
             ends = roads.phases["first_state"][phases] + roads.signals["num_links"]
             if (ends > len(roads.phase_states)).any():
                 return "signal_phase names a phase of another signal"
+        if (named["ticks"] > _MOST_TICKS).any():
+            return f"ticks is above {_MOST_TICKS}"
         if controllers.size:
             programs = roads.programs[roads.programs["controller"] >= 0]
             own = programs[np.argsort(programs["controller"])]
             first, phase = own["first_phase"], controllers["phase"]
             if ((phase != 0) & ((phase < first) | (phase >= first + own["num_phases"]))).any():
                 return "a controller has a phase of another program"
+            # A check is due at least every `longest_ms`, and those due before this tick are done.
+            now_ms = np.floor(named["ticks"] * self.traffic.dt * 1e3)[:, np.newaxis]
+            tick_ms = np.ceil(self.traffic.dt * 1e3)
+            longest_ms = 1000 + max(roads.phases["min_ms"].max(), roads.phases["max_ms"].max())
+            due_ms, since_ms = controllers["next_ms"], controllers["since_ms"]
+            if ((due_ms < now_ms - tick_ms) | (due_ms > now_ms + tick_ms + longest_ms)).any():
+                return "a controller has a check at an impossible time"
+            if ((since_ms < 0) | (since_ms > now_ms + tick_ms)).any():
+                return "a controller has a phase that begins at an impossible time"
         if np.isnan(named["detected_s"]).any() or not np.isfinite(named["pending"]).all():
             return "detected_s or pending is not a number"
         for name, least in (
@@ -191,6 +203,20 @@ class StateForm(NamedTuple):
             next_id = named["next_id"][w]
             if (rows["id"] >= next_id).any() or (waiting["id"] >= next_id).any():
                 return f"world {w} has vehicles whose ids are not assigned yet"
+            times = [rows[name] for name in ("tick", "departed", "last_change")]
+            if any((time > named["ticks"][w]).any() for time in times):
+                return f"world {w} has a vehicle with a time in the future"
+            due = named["next_order"][w] if self.traffic.sumo is None else MOST
+            if (rows["order"] >= due).any() or (waiting["order"] >= due).any():
+                return f"world {w} has a vehicle that is not due yet"
+            if (np.diff(waiting["id"]) <= 0).any() or np.isin(waiting["id"], rows["id"]).any():
+                return f"world {w} has two vehicles with one id"
+            agents = np.concatenate([rows["agent"], waiting["agent"]])
+            agents = agents[agents >= 0]
+            if len(np.unique(agents)) < len(agents):
+                return f"world {w} has two vehicles of one agent"
+            if (waiting["speed_factor"] < LEAST_FACTOR).any():
+                return f"world {w} has a vehicle in the queue that never drives"
             check = self.division.row_check
             # SUMO numbers vehicles as they enter, so their number is unknown.
             numbers = num_orders if self.traffic.sumo is None else MOST

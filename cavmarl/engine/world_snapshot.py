@@ -216,7 +216,7 @@ def _shifted(
 def _stacked(shares: Sequence[Array]) -> Array:
     """Stack arrays of one world each. Shorter arrays are padded with zeros."""
     if shares[0].ndim < 2:
-        return np.concatenate(shares)
+        return np.concatenate(shares, dtype=shares[0].dtype)  # keeps padding in records
     longest = max(share.shape[1] for share in shares)
     stacked = np.zeros((len(shares), longest, *shares[0].shape[2:]), dtype=shares[0].dtype)
     for row, share in zip(stacked, shares, strict=True):

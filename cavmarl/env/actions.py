@@ -76,6 +76,14 @@ class ActionDecoder:
     def memory(self, memory: tuple[NDArray[Any], ...]) -> None:
         self._last, self.clipped, self.held, self.ignored = memory
 
+    def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
+        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        last, *counts = memory
+        if any((count < 0).any() for count in counts):
+            return "a count of tolerated actions is negative"
+        low, high = (-1.0, 1.0) if self._continuous else (0, self._config.choices - 1)
+        return "" if ((last >= low) & (last <= high)).all() else "a last action is out of range"
+
     def tolerated(self, world: int = 0) -> dict[str, int]:
         """Return how many actions of a world's episode were tolerated, by key of traffic_stats."""
         return {

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.shards.shard import Commands
-from cavmarl.v2x.v2x_messages import cause_code
+from cavmarl.v2x.v2x_messages import CAUSES, cause_code
 
 
 class DeclaredEvents:
@@ -30,6 +30,14 @@ class DeclaredEvents:
     def memory(self, causes: NDArray[np.int32]) -> None:
         self._causes[:] = causes
         self._are_any = bool(causes.any())
+
+    def wrong(self, causes: NDArray[np.int32]) -> str:
+        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        if not self._enabled and causes.any():
+            return "events are declared in worlds without messages"
+        return (
+            "" if np.isin(causes, (0, *CAUSES.values())).all() else "an event has an unknown code"
+        )
 
     def declare(self, world: int, agent: int, cause: str) -> None:
         if not self._enabled:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -54,6 +55,26 @@ class Insertions:
     @memory.setter
     def memory(self, memory: tuple[NDArray[Any], ...]) -> None:
         self._rows[:], self._waiting[:], self._used[:], self._barriers[:] = memory
+
+    def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
+        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        rows, waiting, used, barriers = memory
+        lanes = self._network.lanes
+        if ((waiting < 0) | (waiting > used) | (used > self._most)).any():
+            return "the number of insertions is out of range"
+        if ((barriers < -1) | (barriers >= len(lanes))).any():
+            return "a barrier stands on a lane that does not exist"
+        is_waiting = np.arange(self._most) < waiting[:, np.newaxis]
+        if (rows[~is_waiting] != (INSERT_NONE, INSERT_NONE, INSERT_NONE)).any():
+            return "an insertion is not counted"
+        kind, lane, position_m = rows[is_waiting].T
+        if not np.isin(kind, (INSERT_VEHICLE, INSERT_BARRIER, INSERT_OPEN)).all():
+            return "an insertion has an unknown kind"
+        if not np.isin(lane, np.arange(len(lanes))).all():
+            return "an insertion is on a lane that does not exist"
+        if not ((position_m >= 0.0) & (position_m <= lanes["length_m"][lane.astype(int)])).all():
+            return "an insertion is beside its lane"
+        return ""
 
     def vehicle(self, world: int, lane: str, position_m: float) -> None:
         """Let a car enter on a lane, with its front bumper at a given position.

@@ -55,6 +55,14 @@ def load_session(session: StepSession, mask: NDArray[np.bool_], saved: bytes) ->
             "the saved state belongs to other worlds, or to another number of worlds: make the "
             "environment with the arguments that it had when it was saved"
         )
+    _, causes, *rest = arrays
+    if wrong := (
+        session.events.wrong(causes)
+        or session.insertions.wrong(rest[:4])
+        or session.decoder.wrong(rest[4:8])
+        or ("a world has a negative size" if (sizes < 0).any() else "")
+    ):
+        raise ConfigError(f"the saved state is damaged: {wrong}; save again")
     contents = np.split(joined, np.cumsum(sizes)[:-1])
     session.worlds.load_worlds([one.tobytes() for one in contents])
     for array, before in zip(memory, arrays, strict=True):

@@ -23,8 +23,8 @@ from cavmarl.traffic.native import NativeTraffic
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
+LEAST_FACTOR = 1e-6  # of desired speeds; a vehicle of a smaller one never gets anywhere
 _LARGEST = 1e12  # limit of all numbers in metres or seconds
-_LONGEST_WAY = 200_000  # lanes
 _ENDLESS = ("to_go", "step_to_go")  # fields that are infinite without a route
 _FLOATS = tuple(name for name in VEHICLE.names or () if VEHICLE[name].kind == "f")
 _INT32 = tuple(name for name in VEHICLE.names or () if VEHICLE[name] == np.int32)
@@ -117,9 +117,11 @@ class RowCheck:
         floats = np.stack([rows[name] for name in _FLOATS], axis=1)
         usual = np.abs(floats) <= _LARGEST
         usual[:, _ENDLESS_COLUMNS] |= floats[:, _ENDLESS_COLUMNS] == np.inf
+        usual[:, _POSITIVE_COLUMNS] &= floats[:, _POSITIVE_COLUMNS] >= 0.0
+        usual[:, _FLOATS.index("speed_factor")] &= rows["speed_factor"] >= LEAST_FACTOR
         if not usual.all():
             row, column = np.argwhere(~usual)[0].tolist()
-            return _of(rows[row], _FLOATS[column], f"is not a number up to ±{_LARGEST:g}")
+            return _of(rows[row], _FLOATS[column], f"is no allowed number up to ±{_LARGEST:g}")
         radii_m = 0.5 * _diagonals_m(rows)
         sizes = np.stack([rows["length"], rows["width"], rows["height"]])
         wrong = (sizes <= 0.0).any(axis=0) | (radii_m > self._radius_m)
@@ -175,9 +177,11 @@ class RowCheck:
         if self._is_moved:  # after the load, SUMO sends the routes again
             follow &= at < travel.num_fixed
         rows, lane, way = rows[follow], lane[follow], way[follow]
-        for _ in range(_LONGEST_WAY):
-            if not len(rows):
-                return ""
+        past_way, past_lane, num_steps = way, lane, 0
+        while len(rows):
+            if num_steps & (num_steps - 1) == 0:
+                past_way, past_lane = way, lane
+            num_steps += 1
             step = self._steps(way + lane, tail)
             goes_on = step["next"] >= 0
             rows, step, way = rows[goes_on], step[goes_on], way[goes_on] + step["shift"][goes_on]
@@ -186,7 +190,11 @@ class RowCheck:
             lane = self._own_lanes(step["next"])
             if wrong := self._wrong_places(rows, lane, way):
                 return wrong
-        return _of(rows[0], "way", "does not end")
+            past_way, past_lane = past_way[goes_on], past_lane[goes_on]
+            repeats = (way == past_way) & (lane == past_lane)
+            if repeats.any():
+                return _of(rows[np.argmax(repeats)], "way", "does not end")
+        return ""
 
     def _steps(self, at: Numbers, tail: NDArray[np.void] | None) -> NDArray[np.void]:
         steps = self._travel.steps
@@ -210,6 +218,8 @@ class RowCheck:
         return np.where(lanes["internal"][lane], behind, lane).astype(np.int64)
 
 
+_POSITIVE = ("s", "wait_s", "stopped_s", "distance_m", "free_s", "step_jerk")
+_POSITIVE_COLUMNS = [_FLOATS.index(name) for name in _POSITIVE]
 _ENDLESS_COLUMNS = [_FLOATS.index(name) for name in _ENDLESS]
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.parallel.state.world_bytes import to_bytes
 
 WORLDS, HORIZON = 2, 15
 
@@ -77,3 +81,48 @@ def test_invalid_saves_and_loads_are_refused() -> None:
     for damaged in (saved[:-1], saved[:50] + b"x" + saved[51:], b""):
         with pytest.raises(ConfigError, match="the saved state is damaged"):
             vec.load_state(damaged)
+
+
+def forged(vec: CavVectorEnv, saved: bytes, place: int, value: float) -> bytes:
+    """A saved state with another value in a place of its first arrays, and the right checksum."""
+    arrays = [array.copy() for array in saved_arrays(vec, saved)]
+    arrays[place].flat[0] = value
+    content = to_bytes(arrays)
+    return hashlib.sha256(content).digest() + content
+
+
+def saved_arrays(vec: CavVectorEnv, saved: bytes) -> list[NDArray[Any]]:
+    file, found = BytesIO(saved[32:]), []
+    while file.tell() < len(saved) - 32:
+        found.append(np.lib.format.read_array(file))
+    return found
+
+
+MASK, CAUSES, INSERTED, WAITING, USED, BARRIERS, LAST, CLIPPED = range(8)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (CAUSES, 3, "events are declared in worlds without messages"),
+        (INSERTED, 9.0, "an insertion has an unknown kind"),
+        (WAITING, -1, "the number of insertions is out of range"),
+        (WAITING, 3, "the number of insertions is out of range"),
+        (WAITING, 0, "an insertion is not counted"),
+        (USED, 99, "the number of insertions is out of range"),
+        (BARRIERS, 1 << 30, "a barrier stands on a lane that does not exist"),
+        (LAST, 1.5, "a last action is out of range"),
+        (LAST, np.nan, "a last action is out of range"),
+        (CLIPPED, -1, "a count of tolerated actions is negative"),
+    ],
+)
+def test_values_beside_the_worlds(place: int, value: float, message: str) -> None:
+    vec = make(overrides={"population.insertions": 3})
+    vec.reset(seed=0)
+    lane = next(name for name in vec.network.lane_ids if not name.startswith(":"))
+    vec.insert_vehicle(lane, 1.0)
+    saved = vec.save_state()
+    vec.load_state(saved)
+    with pytest.raises(ConfigError, match=message):
+        vec.load_state(forged(vec, saved, place, value))
+    assert vec.save_state() == saved

@@ -49,13 +49,17 @@ ROW = {
     "transfer": (1,),
     "tick": (-1,),
     "x": (np.nan, np.inf, 1e30),
-    "s": (np.nan, -np.inf),
+    "s": (np.nan, -np.inf, -1.0),
     "speed": (np.nan,),
     "heading": (np.inf,),
     "to_go": (np.nan,),
     "length": (0.0, -1.0, 100.0, np.nan),
     "height": (30.0,),
+    "speed_factor": (0.0, -1.0),
+    "wait_s": (-1.0,),
+    "distance_m": (-1.0,),
 }
+LATER = {"tick": (MANY,), "departed": (MANY,), "last_change": (MANY,)}  # than the world's tick
 WAITING = {
     "lane": (-1, MANY),
     "vtype": (-1, 1),
@@ -69,7 +73,7 @@ WAITING = {
     "pos_code": (-1, 6),
     "speed_code": (-1, 7),
     "pos": (np.nan,),
-    "speed_factor": (np.inf,),
+    "speed_factor": (np.inf, 0.0),
 }
 
 
@@ -89,12 +93,17 @@ def _worlds(vec: CavVectorEnv) -> LocalWorlds:
 def _refused(vec: CavVectorEnv, forge: Forge) -> None:
     """Expect the refusal of the present state with a change by `forge`."""
     worlds = _worlds(vec)
-    before = [array.copy() for array in worlds.save()]
-    forged = [array.copy() for array in before]
-    forge(forged)
+    before = _forged(worlds, lambda state: None)
+    forged = _forged(worlds, forge)
     with pytest.raises(ConfigError, match="state"):
         worlds.load(forged)
     assert _same(worlds.save(), before)
+
+
+def _forged(worlds: LocalWorlds, forge: Forge) -> State:
+    forged = [array.copy() for array in worlds.save()]
+    forge(forged)
+    return forged
 
 
 def _same(one: State, other: State) -> bool:
@@ -114,7 +123,7 @@ def _index(state: State, dtype: np.dtype[Any], last: bool = False) -> int:
 
 def test_rows_with_an_index_out_of_range(make: Make) -> None:
     vec = _busy(make)
-    for name, values in ROW.items():
+    for name, values in (ROW | LATER).items():
         for value in values:
 
             def forge(state: State, name: str = name, value: float = value) -> None:
@@ -169,6 +178,22 @@ def test_two_vehicles_that_are_one(make: Make) -> None:
 
     vec = _busy(make)
     _refused(vec, twice("id"))
+    worlds = _worlds(vec)
+    while not (worlds.simulation.departures.num_queue > 0).any():
+        vec.step(vec.suggest_actions())
+    world = int(np.argmax(worlds.simulation.departures.num_queue > 0))
+    driving = int(worlds.simulation.vehicles(world)["id"][0])
+
+    def enters_twice(state: State) -> None:
+        state[_index(state, DEPARTURE)]["id"][world, 0] = driving
+
+    _refused(vec, enters_twice)
+    agent = int(worlds.simulation.vehicles(world)["agent"].max())
+
+    def drives_twice(state: State) -> None:
+        state[_index(state, DEPARTURE)]["agent"][world, 0] = agent
+
+    _refused(vec, drives_twice)
 
 
 def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
@@ -204,6 +229,18 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
     place = next(n for n, saved in enumerate(worlds.save()) if saved is controllers)
     assert controllers.size
     _refused(vec, lambda state: state[place]["phase"].fill(MANY))
+    now_ms = int(simulation.ticks()[0] * simulation.config.clock.sim_dt_s * 1e3)
+    # Checks that are overdue would all be made in the next tick, one by one.
+    for name, value in (("next_ms", 0), ("next_ms", 1 << 40), ("since_ms", now_ms + 9_000)):
+
+        def mistime(state: State, name: str = name, value: int = value) -> None:
+            state[place][name] = value
+
+        _refused(vec, mistime)
+    ticks = next(
+        n for n, array in enumerate(worlds.save()) if array is simulation.shards[0].worlds.ticks
+    )
+    _refused(vec, lambda state: state[ticks].fill(1 << 62))
     words = len(worlds.save()) - 2 * 2 - 2
     rng = np.random.default_rng(0)
     size = worlds.save()[words].shape[1]
@@ -230,7 +267,8 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
         worlds.load(before)
 
 
-def test_found_routes_out_of_range(make: Make, tmp_path: Path) -> None:
+def _with_demand(make: Make, tmp_path: Path) -> CavVectorEnv:
+    """Two worlds whose vehicles look for faster routes."""
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
         "traffic.demand": [str(path) for path in files],
@@ -239,14 +277,19 @@ def test_found_routes_out_of_range(make: Make, tmp_path: Path) -> None:
         "horizon_s": 600.0,
         "population.mode": "respawn",
     }
-    vec = make(str(make_map(tmp_path)), agents=1, background=0, overrides=overrides)
+    vec = make(str(make_map(tmp_path)), num_envs=2, agents=1, background=0, overrides=overrides)
     vec.reset(seed=1)
-    worlds = _worlds(vec)
     for step in range(400):
         vec.step(vec.suggest_actions())
         if step % 40 == 39:
-            worlds.load([array.copy() for array in worlds.save()])
+            vec.load_state(vec.save_state())
     assert vec.traffic_stats()["rerouted"] > 0
+    return vec
+
+
+def test_found_routes_out_of_range(make: Make, tmp_path: Path) -> None:
+    vec = _with_demand(make, tmp_path)
+    worlds = _worlds(vec)
     steps = next(n for n, a in enumerate(worlds.save()) if "turnarounds" in (a.dtype.names or ()))
     for name, value in (("next", MANY), ("next", -2), ("link", MANY), ("link", -2)):
 
@@ -254,6 +297,12 @@ def test_found_routes_out_of_range(make: Make, tmp_path: Path) -> None:
             state[steps][name] = value
 
         _refused(vec, forge)
+
+    def circle(state: State) -> None:
+        state[steps]["next"] = state[steps]["shift"] = 0
+
+    with pytest.raises(ConfigError, match="does not end"):
+        worlds.load(_forged(worlds, circle))
 
 
 def test_messages_with_missing_reports(make: Make) -> None:
@@ -306,3 +355,42 @@ def test_a_vehicle_that_changes_its_zone(make: Make) -> None:
             forged[name] = value
             with pytest.raises(MessageError):
                 codec.unpack(codec.pack(forged, 0, 0, tick), vehicle, tick, rows.copy(), 0, 0)
+
+
+def test_a_departure_that_comes_back(make: Make, tmp_path: Path) -> None:
+    vec = _with_demand(make, tmp_path)
+    worlds = _worlds(vec)
+    place = next(
+        n
+        for n, array in enumerate(worlds.save())
+        if array is worlds.simulation.departures.next_order
+    )
+    assert (worlds.save()[place] > 3).all()
+    _refused(vec, lambda state: state[place].fill(1))
+
+
+@pytest.mark.parametrize("at", [b"'shape': (2,", b"'descr': '<i8'", b"'fortran_order': False"])
+def test_headers_that_do_not_fit_their_bytes(at: bytes) -> None:
+    like = [np.arange(8).reshape(2, 4)]
+    content = to_bytes(like)
+    assert at in content
+    changes = (
+        b"'shape': (9" + b"9" * 13 + b",",
+        b"'shape': ((((2,",
+        b"'descr': '|O8'",
+        b"'descr': '<c8'",
+        b"'fortran_order': True ",
+    )
+    for change in changes:
+        if change[:9] == at[:9]:
+            with pytest.raises(ConfigError, match="other arrays"):
+                from_bytes(content.replace(at, change), like)
+
+
+def test_flags_that_are_neither_true_nor_false() -> None:
+    like = [np.ones(5, dtype=np.bool_)]
+    content = bytearray(to_bytes(like))
+    assert from_bytes(content, like)[0].all()
+    content[-1] = 7
+    with pytest.raises(ConfigError, match="neither true nor false"):
+        from_bytes(content, like)

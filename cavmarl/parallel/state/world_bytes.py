@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from io import BytesIO
+from math import prod
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,9 @@ from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.state.state_image import Image
 
 Array = NDArray[Any]
+
+# NumPy parses headers as Python literals.
+_UNREADABLE = (ValueError, TypeError, SyntaxError, TokenError, OverflowError, RecursionError)
 
 
 def to_bytes(arrays: Sequence[Array]) -> bytes:
@@ -44,18 +49,36 @@ def from_bytes(content: bytes | bytearray | memoryview, like: Sequence[Array]) -
     file, found = BytesIO(content), []
     try:
         for other in like:
-            array = np.lib.format.read_array(file, allow_pickle=False)
+            array = _read(file, len(content))
             if array.dtype != other.dtype or array.ndim != other.ndim:
                 raise ValueError(f"{array.dtype} for {other.dtype}")
             found.append(array.astype(other.dtype, copy=False))
         if file.read(1):
             raise ValueError("there are more arrays")
-    except ValueError as error:
+    except _UNREADABLE as error:
         raise ConfigError(
             "the state is one of other worlds, or of another version of cavmarl, which has "
             f"other arrays ({error}): use the environment and the version that saved it"
         ) from error
     return found
+
+
+def _read(file: BytesIO, end: int) -> Array:
+    """Read the next array. Its header may claim any shape, so it is compared with the bytes left.
+
+    Raises one of `_UNREADABLE`.
+    """
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError("an array has another header")
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    count = prod(shape)
+    if is_fortran or dtype.hasobject or count < 0 or count * dtype.itemsize > end - file.tell():
+        raise ValueError(f"an array of {dtype} and the shape {shape}")
+    array = np.empty(shape, dtype)
+    file.readinto(array.reshape(-1).view(np.uint8).data)
+    if dtype == np.bool_ and (array.view(np.uint8) > 1).any():
+        raise ValueError("a flag is neither true nor false")
+    return array
 
 
 class SavedWorlds:
