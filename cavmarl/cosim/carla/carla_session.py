@@ -21,7 +21,12 @@ from cavmarl.cosim.carla.external_vehicles import (
     ExternalVehicles,
     NoExternalVehicles,
 )
-from cavmarl.cosim.carla.hosted_world import STEP_S, HostedWorld, WorldSource
+from cavmarl.cosim.carla.hosted_world import (
+    STEP_S,
+    EndedVehicle,
+    HostedWorld,
+    WorldSource,
+)
 
 log = logging.getLogger("cavmarl.carla")
 
@@ -122,15 +127,22 @@ class CarlaSession:
         self.frame += 1
         self.time_s += self.delta_s
         for _ in range(max(1, round(self.delta_s / self.world.step_s))):
-            self.world.step(actions)
-            for agent in self.world.collided:
-                actor = self.actors.of_agent(agent)
-                if actor is not None:
-                    self._send(self.sensors.last_collisions(actor))
+            for ended in self.world.step(actions):
+                self._tell_end(ended)
         for actor in self.actors.take(self.world, self.time_s):
             self._forget(actor)
         self.publish()
         return self.frame
+
+    def _tell_end(self, ended: EndedVehicle) -> None:
+        """Log why a vehicle that a client drives has left, and report its collision."""
+        actor = self.actors.of_agent(ended.agent)
+        if actor is None:
+            return
+        if ended.was_driven:
+            log.warning("actor %d (car_%d) leaves: %s", actor.number, ended.agent, ended.reason)
+        if ended.has_collided:
+            self._send(self.sensors.last_collisions(actor))
 
     def publish(self) -> None:
         """Send the snapshot of the present frame, then the frames of sensors."""

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.config.registry import entries
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
-from cavmarl.core.records.codes import EVENT_COLLIDED
+from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED, EVENT_OFF_ROAD
 from cavmarl.cosim.carla.carla_map import CarlaMap, make_carla_map
 from cavmarl.cosim.carla.vehicle_controls import Control, action_of
 from cavmarl.cosim.time_master import TimeMaster
@@ -41,7 +41,29 @@ SERVED_WORLD: dict[str, Any] = {
     "action.kind": "continuous",
     "action.steering_rad": 1.2,  # the most that is allowed; full steer is a little more
     "action.acceleration_mps2": 8.0,
+    "traffic.endless": True,  # a vehicle that a client drives does not vanish at a goal
+    "traffic.trip_horizon": 0.0,
 }
+
+
+class EndedVehicle(NamedTuple):
+    """An agent's vehicle that has left the world."""
+
+    agent: int
+    events: int  # EVENT_* bits: why it has left
+    was_driven: bool  # by a client
+
+    @property
+    def has_collided(self) -> bool:
+        return bool(self.events & EVENT_COLLIDED)
+
+    @property
+    def reason(self) -> str:
+        if self.has_collided:
+            return "it has collided"
+        if self.events & EVENT_OFF_ROAD:
+            return "it is off the road"
+        return "it has reached its goal" if self.events & EVENT_ARRIVED else "its trip is over"
 
 
 class HostedWorld:
@@ -87,28 +109,28 @@ class HostedWorld:
         """PHASE rows of the signals."""
         return self.simulation.signal_phases(0)
 
-    def step(self, actions: Mapping[str, Any] | None = None) -> None:
+    def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
         """Advance the world by one step, or begin the next episode if this one is over.
 
         `actions`: actions of agents that no client drives; None: the built-in driver's.
+
+        Returns the agents' vehicles that have left the world.
         """
         env = self.env
         if not env.agents:
             self.controls.clear()
             self.master.reset()
-            return
+            return []
         driven = self._driven()
         chosen = dict(driven)
         if len(driven) < len(env.agents):
             chosen = {**(env.suggest_actions() if actions is None else actions), **driven}
         self.master.step(chosen)
-
-    @property
-    def collided(self) -> list[int]:
-        """Agents whose vehicle has left the world after a collision in the last step."""
-        ended = vehicles_that_ended(self.env.worlds.arrays, 0)
-        found: list[int] = ended["agent"][ended["events"] & EVENT_COLLIDED > 0].tolist()
-        return found
+        ended = vehicles_that_ended(env.worlds.arrays, 0)
+        return [
+            EndedVehicle(agent, events, self.controls.pop(agent, None) is not None)
+            for agent, events in ended.tolist()
+        ]
 
     def _driven(self) -> dict[str, NDArray[np.float32]]:
         """Return the actions of the agents that clients drive."""
@@ -122,7 +144,13 @@ class HostedWorld:
             control = self.controls.get(agent)
             name = self.env.possible_agents[agent]
             if control is not None and name in present:
-                found[name] = action_of(control, float(rows["speed"][row]), self.env.config.action)
+                wheelbase_m = float(self.simulation.types["wheelbase"][rows["vtype"][row]])
+                found[name] = action_of(
+                    control,
+                    float(rows["speed"][row]),
+                    wheelbase_m / float(rows["length"][row]),
+                    self.env.config.action,
+                )
         return found
 
     def release(self) -> None:

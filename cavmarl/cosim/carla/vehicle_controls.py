@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from cavmarl.config.action import ActionConfig
 
 FULL_STEER_RAD = math.radians(70.0)  # angle of the front wheels at steer = 1
+WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles; agents' axles can be farther apart
 THROTTLE_MPS2 = 4.5  # acceleration at throttle = 1
 BRAKE_MPS2 = 8.0  # deceleration at brake = 1
 _ROLLING_MPS2 = 0.2  # deceleration without throttle, and its growth with the speed
 _DRAG_PER_S = 0.02
+_LARGEST_SINE = 0.99
 _ACKERMANN_PER_S = 2.0  # acceleration per m/s of difference to the target speed
 
 
@@ -56,8 +58,25 @@ def motion_of(control: Control, speed_mps: float) -> tuple[float, float]:
     return acceleration, -FULL_STEER_RAD * min(max(control.steer, -1.0), 1.0)
 
 
-def action_of(control: Control, speed_mps: float, config: ActionConfig) -> NDArray[np.float32]:
-    """Return the continuous action of an agent that moves as a control demands."""
+def action_of(
+    control: Control, speed_mps: float, axles_apart: float, config: ActionConfig
+) -> NDArray[np.float32]:
+    """Return the continuous action of an agent that moves as a control demands.
+
+    `axles_apart`: wheelbase of the agent's vehicle as a share of its length.
+    """
     acceleration, angle = motion_of(control, speed_mps)
+    angle = same_turn(angle, axles_apart / WHEELBASE_SHARE)
     pair = [acceleration / config.acceleration_mps2, angle / config.steering_rad]
     return np.clip(pair, -1.0, 1.0).astype(np.float32)
+
+
+def same_turn(angle_rad: float, times_wheelbase: float) -> float:
+    """Return the wheel angle that turns a longer vehicle as fast as `angle_rad` turns this one.
+
+    Both are kinematic bicycles, see `driving.kernels.motion.bicycle`. The result is below a right
+    angle; a longer vehicle cannot follow each turn.
+    """
+    slip = math.atan(0.5 * math.tan(angle_rad))
+    sine = min(max(times_wheelbase * math.sin(slip), -_LARGEST_SINE), _LARGEST_SINE)
+    return math.atan(2.0 * math.tan(math.asin(sine)))

@@ -17,7 +17,12 @@ from cavmarl.cosim.carla.carla_actors import CarlaActor
 from cavmarl.cosim.carla.carla_geodesy import geolocation
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, axes_of, compose, relative
 from cavmarl.cosim.carla.carla_session import CarlaSession
-from cavmarl.cosim.carla.vehicle_controls import FULL_STEER_RAD, CarlaControl
+from cavmarl.cosim.carla.vehicle_controls import (
+    FULL_STEER_RAD,
+    WHEELBASE_SHARE,
+    CarlaControl,
+    same_turn,
+)
 from tests.cosim.carla.conftest import make_server
 
 ROOF = CarlaPose(0.0, 0.0, 2.0)
@@ -199,9 +204,11 @@ def test_a_collision_is_reported_with_the_last_frame_of_its_vehicle(
         agent = session.actors.of_agent(0)
         assert agent is not None
         sensor = session.spawn("sensor.other.collision", {}, ROOF, agent.number)
-        full_steer = FULL_STEER_RAD / session.world.env.config.action.steering_rad
+        steering_rad = session.world.env.config.action.steering_rad
         for _ in range(1000):
-            steer = -float(session.world.env.suggest_actions()["car_0"][1]) / full_steer
+            # The axles of an agent are a length apart, those of CARLA's vehicles are closer.
+            angle = steering_rad * float(session.world.env.suggest_actions()["car_0"][1])
+            steer = -same_turn(angle, WHEELBASE_SHARE) / FULL_STEER_RAD
             session.world.controls[0] = CarlaControl(throttle=0.7, steer=steer)
             session.tick()
             if stream_of(sensor) in found.frames:

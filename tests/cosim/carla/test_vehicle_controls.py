@@ -15,7 +15,9 @@ from cavmarl.cosim.carla.vehicle_controls import (
     CarlaControl,
     action_of,
     motion_of,
+    same_turn,
 )
+from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 
 
 def test_throttle_accelerates_and_brakes_slow_down() -> None:
@@ -43,7 +45,18 @@ def test_an_ackermann_control_approaches_its_speed() -> None:
 
 def test_actions_are_within_the_bounds_of_the_agent() -> None:
     config = ActionConfig(acceleration_mps2=5.0, steering_rad=0.5)
-    pair = action_of(CarlaControl(brake=1.0, steer=-1.0), 10.0, config)
+    pair = action_of(CarlaControl(brake=1.0, steer=-1.0), 10.0, 0.6, config)
     assert pair.tolist() == [-1.0, 1.0]
-    steer = math.degrees(float(action_of(CarlaControl(steer=0.1), 0.0, config)[1]) * 0.5)
+    steer = math.degrees(float(action_of(CarlaControl(steer=0.1), 0.0, 0.6, config)[1]) * 0.5)
     assert steer == pytest.approx(-7.0, abs=1e-4)
+
+
+def test_a_longer_vehicle_turns_as_fast() -> None:
+    for angle in (-1.0, 0.05, 0.6):
+        longer = same_turn(angle, 1.4)
+        yaw_rates = [
+            bicycle_step(0.0, 0.0, 0.0, 5.0, 0.0, steering, wheelbase_m, 0.05)[4]
+            for steering, wheelbase_m in ((angle, 3.0), (longer, 4.2))
+        ]
+        assert yaw_rates[0] == pytest.approx(yaw_rates[1])
+    assert same_turn(1.2, 3.0) < 0.5 * math.pi
