@@ -62,7 +62,7 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 120_000
+PACKAGE_LINES = 120_300
 REACHABLE_LINES = 76_300  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
