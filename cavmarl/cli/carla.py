@@ -33,14 +33,41 @@ def carla(
     client_version: Annotated[
         str, about("Version of the clients: 0.9.15, 0.9.16 or 0.10.0.", metavar="VERSION")
     ] = "0.9.16",
+    max_clients: Annotated[
+        int, about("Number of clients at a time.", metavar="N", panel=SERVICE)
+    ] = 64,
+    max_actors: Annotated[
+        int, about("Number of actors that clients may spawn.", metavar="N", panel=SERVICE)
+    ] = 1024,
+    max_message_mb: Annotated[
+        int, about("Size of a message of a client.", metavar="MB", panel=SERVICE)
+    ] = 64,
+    max_unsent_mb: Annotated[
+        int,
+        about("Data that may wait for a client that does not read.", metavar="MB", panel=SERVICE),
+    ] = 64,
 ) -> None:
     """Let programs for CARLA use a world, through CARLA's own client, until interrupted."""
-    from cavmarl.cosim.carla import serve
+    from cavmarl.cosim.carla import SessionLimits, serve
 
     console = Console()
+    limits = SessionLimits(
+        max_message=max_message_mb << 20,
+        max_clients=max_clients,
+        max_actors=max_actors,
+        max_unsent=max_unsent_mb << 20,
+    )
 
     def tell(server: CarlaServer) -> None:
         map_path = server.session.map.path
         console.print(f"{map_path} at {host}:{server.port}, for client {client_version}")
 
-    serve(world, port=port, host=host, any_host=any_host, client=client_version, told=tell)
+    serve(
+        world,
+        port=port,
+        host=host,
+        any_host=any_host,
+        client=client_version,
+        limits=limits,
+        told=tell,
+    )

@@ -32,6 +32,7 @@ def test_it_listens_until_it_is_interrupted() -> None:
         (["--host", "0.0.0.0"], "no login; set any_host"),
         (["--client-version", "0.8"], "client version '0.8': must be one of 0.9.15"),
         (["--port", "70000"], "port = 70000: must be from 0 to 65534"),
+        (["--max-clients", "0"], "max_clients = 0: must be at least 1"),
         (["--set", "action.kind=discrete"], "set action.kind = continuous"),
     ],
 )

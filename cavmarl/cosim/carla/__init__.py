@@ -4,5 +4,6 @@
 """
 
 from cavmarl.cosim.carla.carla_server import CarlaServer, serve
+from cavmarl.cosim.carla.carla_session import SessionLimits
 
-__all__ = ["CarlaServer", "serve"]
+__all__ = ["CarlaServer", "SessionLimits", "serve"]

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from cavmarl.core.errors import ConfigError
 from cavmarl.cosim.carla.attached_sensors import SensorSuite
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_actors import ActorTable, CarlaActor
@@ -58,12 +59,19 @@ class SessionLimits:
         max_clients: number of RPC connections.
         max_actors: actors that clients have spawned.
         max_unsent: bytes that wait for a client that does not read.
+
+    Raises ConfigError: a limit is not above 0.
     """
 
     max_message: int = 1 << 26
     max_clients: int = 64
     max_actors: int = 1024
     max_unsent: int = 1 << 26
+
+    def __post_init__(self) -> None:
+        for name, limit in vars(self).items():
+            if limit < 1:
+                raise ConfigError(f"{name} = {limit}: must be at least 1")
 
 
 DEFAULT_LIMITS = SessionLimits()
