@@ -6,6 +6,8 @@ In a divided world, they are bit for bit those of the undivided one.
 from __future__ import annotations
 
 import math
+import os
+import signal
 from contextlib import closing
 from typing import Any
 
@@ -15,6 +17,7 @@ import pytest
 from cavmarl import ActionError, CapacityError, CavEnv, ConfigError, make_vec, parallel_env
 from cavmarl.core.errors import EpisodeError
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_EXTERNAL
+from cavmarl.core.records.external_records import EXTERNAL
 from cavmarl.core.records.rows import LOST_M
 
 ROOM = {"population.external": 4}
@@ -71,13 +74,16 @@ def act(env: Any, step: int) -> None:
         env.pose_external(0, middle_x, middle_y, 0.3, z=0.2, pitch=0.1)
 
 
-def hashes(**more: Any) -> list[str]:
+def hashes(kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
     with closing(parallel_env("grid4x4", agents=3, background=20, overrides=ROOM, **more)) as env:
         env.reset(seed=2)
         found = []
         for step in range(45):
             act(env, step)
-            advance(env)
+            actions = env.suggest_actions()
+            if step in kill_at:
+                os.kill(env.worlds.worker_pids[1], signal.SIGKILL)
+            env.step(actions)
             if step % 4 == 3:
                 found.append(env.state_hash())
         return found
@@ -90,9 +96,16 @@ def test_a_divided_world_equals_the_undivided_one() -> None:
     assert hashes(zones=4, workers=2) == undivided
 
 
+@pytest.mark.filterwarnings("ignore:workers = ")
+def test_a_worker_that_dies_is_followed() -> None:
+    assert hashes(zones=4, workers=2, kill_at=(5, 21, 29)) == hashes()
+
+
 @pytest.mark.slow
 def test_over_nodes_it_is_the_same_too() -> None:
-    assert hashes(zones=2, nodes=2) == hashes()
+    undivided = hashes()
+    assert hashes(zones=2, nodes=2) == undivided
+    assert hashes(zones=3, nodes=2, kill_at=(24,)) == undivided
 
 
 def test_room_alone_changes_no_vehicle() -> None:
@@ -278,3 +291,33 @@ def test_saved_states_include_external_vehicles_and_waiting_commands() -> None:
     wanted, saved = finished(0, None, 1)
     assert finished(24, saved, 1)[0] == wanted
     assert finished(24, saved, 2)[0] == wanted
+
+
+def test_a_session_with_forged_commands_is_refused() -> None:
+    with closing(make_vec("ring", agents=1, background=8, overrides=ROOM)) as vec:
+        vec.reset(seed=1)
+        vec.spawn_external(*place_on(vec, 0))
+        told, is_used = vec._session.external.memory
+        for name, value, message in (
+            ("kind", 7.0, "unknown kind"),
+            ("x", math.nan, "invalid x"),
+            ("vtype", 99.0, "unknown type"),
+            ("length", 0.0, "has no size"),
+            ("length", 90.0, "larger than all types"),
+        ):
+            forged = told.copy()
+            forged.view(EXTERNAL)[name][0, 0] = value
+            assert message in vec._session.external.wrong((forged, is_used)), name
+        assert vec._session.external.wrong((told, is_used)) == ""
+
+
+def test_a_session_that_expects_a_missing_vehicle_cannot_step() -> None:
+    with closing(make_vec("ring", agents=1, background=8, overrides=ROOM)) as vec:
+        vec.reset(seed=1)
+        told, is_used = vec._session.external.memory
+        vec._session.external.memory = told, ~is_used
+        vec.drive_external(2, 1.0, 0.0)
+        before = vec.state_hash(0)
+        with pytest.raises(ActionError, match="external vehicle 2: it does not exist"):
+            vec.step(vec.suggest_actions())
+        assert vec.state_hash(0) == before
