@@ -28,7 +28,7 @@ class PopulationConfig(Section, key="population"):
         insertions: number of vehicles that may be inserted into a world during an episode
             (`insert_vehicle`, `close_road`); memory is reserved for them.
         external: number of vehicles that the caller may pose or drive in a world at the same time
-            (`spawn_external`); memory is reserved for them.
+            (`ExternalCommands`); memory is reserved for them.
     """
 
     mode: Literal["closed", "open", "respawn"] = "closed"

@@ -1,4 +1,4 @@
-"""Commands to vehicles that the caller poses or drives, held until the next step."""
+"""`ExternalCommands`: vehicles that the caller poses or drives."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ _KINDS = (EXTERNAL_POSED, EXTERNAL_DRIVEN, EXTERNAL_REMOVED)
 
 
 class ExternalCommands:
-    """Commands for W worlds with room for E = `population.external` vehicles each.
+    """The vehicles of the caller in W worlds, at most E = `population.external` in each.
+
+    Commands to them are held until the next step.
 
     Args:
         config: configuration of the worlds.
@@ -86,16 +88,43 @@ class ExternalCommands:
 
     def spawn(
         self,
-        world: int,
-        pose: tuple[float, float, float | None, float, float | None, float | None],
-        vtype: str,
-        size_m: tuple[float, float, float] | None,
+        x: float,
+        y: float,
+        heading: float,
+        *,
+        z: float | None = None,
+        vtype: str = "car",
+        size_m: tuple[float, float, float] | None = None,
+        speed: float = 0.0,
+        world: int = 0,
     ) -> int:
-        """Let a vehicle enter, and return its slot; see `WorldsEnvironment.spawn_external`."""
+        """Let a vehicle enter a world in the next step.
+
+        It stands at its place until `pose` or `drive` moves it. All other vehicles and sensors see
+        it. It has no route, and leaves at the end of the episode.
+
+        Args:
+            x: of its centre, in m.
+            y: of its centre, in m.
+            heading: in rad, counter-clockwise from east.
+            z: height of the ground below its centre, in m; None: of the lane.
+            vtype: `car`, `truck` or `bus`.
+            size_m: length, width and height, at most those of a bus; None: of its type.
+            speed: in m/s along its heading, negative backwards.
+            world: number of the world.
+
+        Returns:
+            The vehicle's slot, by which the other methods name it.
+
+        Raises:
+            ActionError: the place is occupied or outside of the map, or an argument is invalid.
+            CapacityError: the world already has `population.external` such vehicles.
+            ConfigError: `population.external` is 0.
+        """
         self._check_world(world)
         told = np.zeros(1, dtype=EXTERNAL)[0]
         told["kind"] = EXTERNAL_POSED
-        self._set_pose(told, pose)
+        self._set_pose(told, (x, y, z, heading, None, speed))
         simulation = self._present()
         rows = simulation.type_rows
         if vtype not in rows:
@@ -123,19 +152,57 @@ class ExternalCommands:
 
     def pose(
         self,
-        world: int,
         slot: int,
-        pose: tuple[float, float, float | None, float, float | None, float | None],
+        x: float,
+        y: float,
+        heading: float,
+        *,
+        z: float | None = None,
+        pitch: float | None = None,
+        speed: float | None = None,
+        world: int = 0,
     ) -> None:
-        """Move a vehicle to a pose; see `WorldsEnvironment.pose_external`."""
+        """Move a vehicle to a pose, which it reaches at the end of the next step.
+
+        A pose that is farther than a vehicle drives at 60 m/s is a jump: the vehicle leaves, and
+        enters at the pose with a new id.
+
+        Args:
+            slot: result of `spawn`.
+            x: of its centre, in m.
+            y: of its centre, in m.
+            heading: in rad, counter-clockwise from east.
+            z: height of the ground below its centre, in m; None: of the lane.
+            pitch: in rad, positive uphill; None: the slope of the lane.
+            speed: in m/s along its heading; None: the speed of the move.
+            world: number of the world.
+
+        Raises:
+            ActionError: there is no such vehicle, the pose is outside of the map, or an argument
+                is invalid.
+            ConfigError: `population.external` is 0.
+        """
         told = self._of(world, slot)
         given = told.copy()
-        self._set_pose(given, pose)
+        self._set_pose(given, (x, y, z, heading, pitch, speed))
         given["kind"] = EXTERNAL_POSED
         self._told[world, slot] = given
 
-    def drive(self, world: int, slot: int, throttle_mps2: float, steering_rad: float) -> None:
-        """Drive a vehicle; see `WorldsEnvironment.drive_external`."""
+    def drive(self, slot: int, throttle_mps2: float, steering_rad: float, world: int = 0) -> None:
+        """Drive a vehicle from the next step on, until the next command to it.
+
+        It moves as an agent's vehicle, within the limits of `action` and of its type.
+
+        Args:
+            slot: result of `spawn`.
+            throttle_mps2: acceleration; negative brakes, to a standstill at most.
+            steering_rad: angle of the front wheels, positive to the left.
+            world: number of the world.
+
+        Raises:
+            ActionError: there is no such vehicle, or an argument is invalid.
+            ConfigError: `population.external` is 0.
+        """
         told = self._of(world, slot)
         for name, value in (("throttle_mps2", throttle_mps2), ("steering_rad", steering_rad)):
             if not math.isfinite(value):
@@ -143,12 +210,27 @@ class ExternalCommands:
         told["kind"] = EXTERNAL_DRIVEN
         told["throttle"], told["steering"] = throttle_mps2, steering_rad
 
-    def remove(self, world: int, slot: int) -> None:
-        """Remove a vehicle; see `WorldsEnvironment.remove_external`."""
+    def remove(self, slot: int, world: int = 0) -> None:
+        """Remove a vehicle in the next step; it does not count as arrived.
+
+        Raises:
+            ActionError: there is no such vehicle.
+            ConfigError: `population.external` is 0.
+        """
         told = self._of(world, slot)
         told.fill(np.zeros((), dtype=EXTERNAL))
         if self._is_used[world, slot]:
             told["kind"] = EXTERNAL_REMOVED
+
+    def ids(self, world: int = 0) -> NDArray[np.int64]:
+        """Return the vehicle id (E,) of each slot; -1: no vehicle, or not before the next step.
+
+        Raises:
+            ConfigError: `population.external` is 0.
+        """
+        self._check_world(world)
+        ids: NDArray[np.int64] = self._present().external.ids[world].copy()
+        return ids
 
     def add_to(self, commands: Commands) -> Commands:
         """Return the commands with the waiting ones, which are held until `clear`."""
@@ -187,7 +269,7 @@ class ExternalCommands:
                 return told
         raise ActionError(
             f"world {world}, external vehicle {slot}: there is no such vehicle; give a number that "
-            "spawn_external has returned in this episode"
+            "spawn has returned in this episode"
         )
 
     def _set_pose(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.recorded_worlds import Record
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_copies import OwnWorlds
@@ -80,6 +81,16 @@ class WorldsEnvironment(OwnWorlds):
         """Whether `reset` has been called, so that the worlds have a state."""
         return self._session.is_ready
 
+    @property
+    def external(self) -> ExternalCommands:
+        """The vehicles that the caller poses or drives; see `population.external`.
+
+        Raises:
+            EpisodeError: before the first reset.
+        """
+        self._session.refuse_idle("external")
+        return self._session.external
+
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
         """Let a car enter a world in the next step, or as soon as there is a safe gap.
 
@@ -133,119 +144,6 @@ class WorldsEnvironment(OwnWorlds):
     def closed_roads(self, world: int = 0) -> tuple[str, ...]:
         """Return the ids of closed roads, including roads that close in the next step."""
         return self._session.insertions.closed(world)
-
-    def spawn_external(
-        self,
-        x: float,
-        y: float,
-        heading: float,
-        *,
-        z: float | None = None,
-        vtype: str = "car",
-        size_m: tuple[float, float, float] | None = None,
-        speed: float = 0.0,
-        world: int = 0,
-    ) -> int:
-        """Let a vehicle enter a world in the next step, to be posed or driven by the caller.
-
-        It stands at its place until `pose_external` or `drive_external` moves it. All other
-        vehicles and sensors see it. It has no route, and leaves at the end of the episode.
-
-        Args:
-            x: of its centre, in m.
-            y: of its centre, in m.
-            heading: in rad, counter-clockwise from east.
-            z: of its centre on the ground, in m; None: the height of the lane.
-            vtype: `car`, `truck` or `bus`.
-            size_m: length, width and height, at most those of a bus; None: of its type.
-            speed: in m/s along its heading, negative backwards.
-            world: number of the world.
-
-        Returns:
-            The number of the vehicle among those of the caller, for the other methods.
-
-        Raises:
-            ActionError: the place is occupied or outside of the map, or an argument is invalid.
-            CapacityError: the world already has `population.external` such vehicles.
-            ConfigError: `population.external` is 0.
-            EpisodeError: before the first reset.
-        """
-        self._session.refuse_idle("spawn_external()")
-        pose = (x, y, z, heading, None, speed)
-        return self._session.external.spawn(world, pose, vtype, size_m)
-
-    def pose_external(
-        self,
-        slot: int,
-        x: float,
-        y: float,
-        heading: float,
-        *,
-        z: float | None = None,
-        pitch: float | None = None,
-        speed: float | None = None,
-        world: int = 0,
-    ) -> None:
-        """Move a vehicle of the caller in the next step to a pose, which it reaches at its end.
-
-        A pose that is farther than a vehicle drives at 60 m/s is a jump: the vehicle leaves, and
-        enters at the pose with a new id.
-
-        Args:
-            slot: the number from `spawn_external`.
-            x: of its centre, in m.
-            y: of its centre, in m.
-            heading: in rad, counter-clockwise from east.
-            z: of its centre on the ground, in m; None: the height of the lane.
-            pitch: in rad, positive uphill; None: the slope of the lane.
-            speed: in m/s along its heading; None: the speed of the move.
-            world: number of the world.
-
-        Raises:
-            ActionError: there is no such vehicle, the pose is outside of the map, or an argument
-                is invalid.
-            ConfigError: `population.external` is 0.
-        """
-        self._session.external.pose(world, slot, (x, y, z, heading, pitch, speed))
-
-    def drive_external(
-        self, slot: int, throttle_mps2: float, steering_rad: float, world: int = 0
-    ) -> None:
-        """Drive a vehicle of the caller from the next step on, until the next command to it.
-
-        It moves as an agent's vehicle, within the limits of `action` and of its type.
-
-        Args:
-            slot: the number from `spawn_external`.
-            throttle_mps2: acceleration; negative brakes, to a standstill at most.
-            steering_rad: angle of the front wheels, positive to the left.
-            world: number of the world.
-
-        Raises:
-            ActionError: there is no such vehicle, or an argument is invalid.
-            ConfigError: `population.external` is 0.
-        """
-        self._session.external.drive(world, slot, throttle_mps2, steering_rad)
-
-    def remove_external(self, slot: int, world: int = 0) -> None:
-        """Remove a vehicle of the caller in the next step; it does not count as arrived.
-
-        Raises:
-            ActionError: there is no such vehicle.
-            ConfigError: `population.external` is 0.
-        """
-        self._session.external.remove(world, slot)
-
-    def external_ids(self, world: int = 0) -> NDArray[np.int64]:
-        """Return the ids (E,) of the caller's vehicles by their numbers; -1: none.
-
-        Raises:
-            ConfigError: `population.external` is 0.
-            EpisodeError: before the first reset.
-        """
-        self._session.refuse_idle("external_ids()")
-        ids: NDArray[np.int64] = self._session.present().external.ids[world].copy()
-        return ids
 
     def world_frames(self, chosen: Sequence[int] = (0,), ghosts: bool = False) -> list[WorldFrame]:
         """Return the visible state of some worlds now; see `engine.world_frame.WorldFrame`.

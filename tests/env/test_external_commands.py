@@ -17,7 +17,6 @@ import pytest
 from cavmarl import ActionError, CapacityError, CavEnv, ConfigError, make_vec, parallel_env
 from cavmarl.core.errors import EpisodeError
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_EXTERNAL
-from cavmarl.core.records.external_records import EXTERNAL
 from cavmarl.core.records.rows import LOST_M
 
 ROOM = {"population.external": 4}
@@ -36,7 +35,7 @@ def place_on(env: Any, k: int, along_m: float = 0.0) -> tuple[float, float, floa
 
 def row_of(env: CavEnv, slot: int) -> np.void:
     rows = env.simulation.vehicles(0)
-    row: np.void = rows[rows["id"] == env.external_ids()[slot]][0]
+    row: np.void = rows[rows["id"] == env.external.ids()[slot]][0]
     return row
 
 
@@ -50,28 +49,28 @@ def act(env: Any, step: int) -> None:
     min_x, min_y, max_x, max_y = env.network.extent_m
     middle_x, middle_y = 0.5 * (min_x + max_x), 0.5 * (min_y + max_y)
     if step == 1:
-        assert env.spawn_external(middle_x - 20.0, middle_y + 7.0, 0.0, speed=15.0) == 0
-        assert env.spawn_external(middle_x + 3.0, middle_y - 15.0, math.pi / 2, vtype="bus") == 1
-        assert env.spawn_external(*place_on(env, 3, 12.0), speed=8.0) == 2
-        env.drive_external(0, 1.0, 0.0)
+        assert env.external.spawn(middle_x - 20.0, middle_y + 7.0, 0.0, speed=15.0) == 0
+        assert env.external.spawn(middle_x + 3.0, middle_y - 15.0, math.pi / 2, vtype="bus") == 1
+        assert env.external.spawn(*place_on(env, 3, 12.0), speed=8.0) == 2
+        env.external.drive(0, 1.0, 0.0)
     if step == 4:
-        env.drive_external(2, -0.5, 0.02)
+        env.external.drive(2, -0.5, 0.02)
     if 2 < step < 20:
-        env.pose_external(1, middle_x + 3.0, middle_y - 15.0 + 2.0 * step, math.pi / 2)
+        env.external.pose(1, middle_x + 3.0, middle_y - 15.0 + 2.0 * step, math.pi / 2)
     if step == 20:
         x, y, heading = place_on(env, 0, 10.0)
-        env.pose_external(1, x, y, heading, speed=3.0)
+        env.external.pose(1, x, y, heading, speed=3.0)
     if step == 24:
         x, y, heading = place_on(env, -1, 10.0)
-        env.pose_external(1, x, y, heading)
-        env.drive_external(0, 0.5, -0.1)
+        env.external.pose(1, x, y, heading)
+        env.external.drive(0, 0.5, -0.1)
     if step == 28:
-        env.remove_external(2)
-        env.drive_external(1, 1.5, 0.0)
+        env.external.remove(2)
+        env.external.drive(1, 1.5, 0.0)
     if step == 30:
-        assert env.spawn_external(*place_on(env, 5, 20.0), size_m=(2.0, 0.7, 1.5)) == 2
+        assert env.external.spawn(*place_on(env, 5, 20.0), size_m=(2.0, 0.7, 1.5)) == 2
     if step == 34:
-        env.pose_external(0, middle_x, middle_y, 0.3, z=0.2, pitch=0.1)
+        env.external.pose(0, middle_x, middle_y, 0.3, z=0.2, pitch=0.1)
 
 
 def hashes(kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
@@ -128,8 +127,8 @@ def ring(**more: Any) -> CavEnv:
 def test_a_vehicle_stands_where_it_enters_until_it_is_driven() -> None:
     with closing(ring()) as env:
         x, y, heading = place_on(env, 0)
-        slot = env.spawn_external(x, y, heading)
-        assert (env.external_ids() == -1).all()
+        slot = env.external.spawn(x, y, heading)
+        assert (env.external.ids() == -1).all()
         advance(env)
         row = row_of(env, slot)
         assert (row["driver"], row["x"], row["y"], row["heading"]) == (
@@ -137,14 +136,14 @@ def test_a_vehicle_stands_where_it_enters_until_it_is_driven() -> None:
         )  # fmt: skip
         assert row["speed"] == 0.0
         assert abs(row["d"]) < 0.01
-        env.drive_external(slot, 2.0, 0.0)
+        env.external.drive(slot, 2.0, 0.0)
         advance(env, 10)
         row = row_of(env, slot)
         seconds = 10 * env.step_s
         assert row["speed"] == pytest.approx(2.0 * seconds)
         assert math.hypot(row["x"] - x, row["y"] - y) == pytest.approx(seconds**2, abs=0.2)
         assert row["accel"] == pytest.approx(2.0)
-        env.drive_external(slot, -4.0, 0.0)
+        env.external.drive(slot, -4.0, 0.0)
         advance(env, 10)
         assert row_of(env, slot)["speed"] == 0.0
 
@@ -152,11 +151,11 @@ def test_a_vehicle_stands_where_it_enters_until_it_is_driven() -> None:
 def test_a_posed_vehicle_reaches_its_pose_at_the_end_of_the_step() -> None:
     with closing(ring()) as env:
         x, y, heading = place_on(env, 0)
-        slot = env.spawn_external(x, y, heading)
+        slot = env.external.spawn(x, y, heading)
         advance(env)
-        vehicle = env.external_ids()[slot]
+        vehicle = env.external.ids()[slot]
         ahead = x + math.cos(heading), y + math.sin(heading)
-        env.pose_external(slot, *ahead, heading, pitch=0.02, z=0.3)
+        env.external.pose(slot, *ahead, heading, pitch=0.02, z=0.3)
         advance(env)
         row = row_of(env, slot)
         assert (row["id"], row["x"], row["y"], row["pitch"], row["z"]) == (
@@ -171,17 +170,17 @@ def test_a_posed_vehicle_reaches_its_pose_at_the_end_of_the_step() -> None:
 def test_a_jump_is_a_new_vehicle_and_no_trip() -> None:
     with closing(ring()) as env:
         before = env.traffic_stats()
-        slot = env.spawn_external(*place_on(env, 0))
+        slot = env.external.spawn(*place_on(env, 0))
         advance(env)
-        first = env.external_ids()[slot]
+        first = env.external.ids()[slot]
         x, y, heading = place_on(env, 2)
-        env.pose_external(slot, x, y, heading)
+        env.external.pose(slot, x, y, heading)
         advance(env)
-        assert env.external_ids()[slot] > first
+        assert env.external.ids()[slot] > first
         assert (row_of(env, slot)["x"], row_of(env, slot)["y"]) == (x, y)
-        env.remove_external(slot)
+        env.external.remove(slot)
         advance(env)
-        assert (env.external_ids() == -1).all()
+        assert (env.external.ids() == -1).all()
         assert DRIVER_EXTERNAL not in env.simulation.vehicles(0)["driver"]
         after = env.traffic_stats()
         for name in ("arrived", "removed", "departed", "running"):
@@ -195,7 +194,7 @@ def test_drivers_stop_behind_a_vehicle_on_their_lane_and_pass_one_beside_the_roa
             x, y, heading = place_on(env, 0)
             x += aside_m * math.sin(-heading)
             y += aside_m * math.cos(heading)
-            slot = env.spawn_external(x, y, heading)
+            slot = env.external.spawn(x, y, heading)
             advance(env, 50)
             row, rows = row_of(env, slot), env.simulation.vehicles(0)
             assert (row["hit"], abs(row["d"]) > LOST_M) == (-1, aside_m > 0.0)
@@ -206,11 +205,11 @@ def test_drivers_stop_behind_a_vehicle_on_their_lane_and_pass_one_beside_the_roa
 
 def test_a_touch_counts_for_both() -> None:
     with closing(ring()) as env:
-        slot = env.spawn_external(*place_on(env, 0))
+        slot = env.external.spawn(*place_on(env, 0))
         advance(env)
         agent = env.simulation.vehicles(0)
         agent = agent[agent["agent"] == 0][0]
-        env.pose_external(slot, float(agent["x"]), float(agent["y"]), float(agent["heading"]))
+        env.external.pose(slot, float(agent["x"]), float(agent["y"]), float(agent["heading"]))
         advance(env, 2)
         assert row_of(env, slot)["hit"] == agent["id"]
 
@@ -219,54 +218,54 @@ def test_invalid_commands_are_refused_with_a_fix() -> None:
     with closing(parallel_env("ring", agents=1, background=8)) as env:
         env.reset(seed=0)
         with pytest.raises(ConfigError, match=r"set population\.external"):
-            env.spawn_external(0.0, 0.0, 0.0)
-        with pytest.raises(ConfigError, match=r"population\.external = 0"):
-            env.external_ids()
+            env.external.spawn(0.0, 0.0, 0.0)
+        with pytest.raises(ConfigError, match=r"set population\.external"):
+            env.external.ids()
     with closing(parallel_env("ring", agents=1, background=8, overrides=ROOM)) as env:
         with pytest.raises(EpisodeError, match="before reset"):
-            env.spawn_external(0.0, 0.0, 0.0)
+            env.external.spawn(0.0, 0.0, 0.0)
         env.reset(seed=1)
         x, y, heading = place_on(env, 0)
         with pytest.raises(ActionError, match="outside of the map"):
-            env.spawn_external(x + 10_000.0, y, heading)
+            env.external.spawn(x + 10_000.0, y, heading)
         with pytest.raises(ActionError, match="must be a finite number"):
-            env.spawn_external(math.nan, y, heading)
+            env.external.spawn(math.nan, y, heading)
         with pytest.raises(ActionError, match="must be one of car, truck, bus"):
-            env.spawn_external(x, y, heading, vtype="tank")
+            env.external.spawn(x, y, heading, vtype="tank")
         with pytest.raises(ActionError, match="at most those of a bus"):
-            env.spawn_external(x, y, heading, size_m=(30.0, 2.0, 2.0))
+            env.external.spawn(x, y, heading, size_m=(30.0, 2.0, 2.0))
         with pytest.raises(ActionError, match="must be from -60 to 60"):
-            env.spawn_external(x, y, heading, speed=70.0)
+            env.external.spawn(x, y, heading, speed=70.0)
         with pytest.raises(ActionError, match="must be from 0 to 0"):
-            env.spawn_external(x, y, heading, world=1)
-        slot = env.spawn_external(x, y, heading)
+            env.external.spawn(x, y, heading, world=1)
+        slot = env.external.spawn(x, y, heading)
         with pytest.raises(ActionError, match="occupied"):
-            env.spawn_external(x + 0.5, y, heading)
+            env.external.spawn(x + 0.5, y, heading)
         advance(env)
         with pytest.raises(ActionError, match="occupied"):
-            env.spawn_external(x + 0.5, y, heading)
+            env.external.spawn(x + 0.5, y, heading)
         with pytest.raises(ActionError, match="must be a finite number"):
-            env.drive_external(slot, math.inf, 0.0)
+            env.external.drive(slot, math.inf, 0.0)
         for call in (
-            lambda: env.drive_external(slot + 1, 0.0, 0.0),
-            lambda: env.pose_external(-1, x, y, heading),
-            lambda: env.remove_external(4),
+            lambda: env.external.drive(slot + 1, 0.0, 0.0),
+            lambda: env.external.pose(-1, x, y, heading),
+            lambda: env.external.remove(4),
         ):
             with pytest.raises(ActionError, match="there is no such vehicle"):
                 call()
-        env.remove_external(slot)
+        env.external.remove(slot)
         with pytest.raises(ActionError, match="there is no such vehicle"):
-            env.drive_external(slot, 0.0, 0.0)
-        slots = [env.spawn_external(*place_on(env, k)) for k in (0, 1, 2)]
+            env.external.drive(slot, 0.0, 0.0)
+        slots = [env.external.spawn(*place_on(env, k)) for k in (0, 1, 2)]
         assert slot not in slots
         with pytest.raises(CapacityError, match=r"population\.external are in use"):
-            env.spawn_external(*place_on(env, 3))
+            env.external.spawn(*place_on(env, 3))
         advance(env)
-        env.spawn_external(*place_on(env, 3))
+        env.external.spawn(*place_on(env, 3))
         env.reset(seed=1)
         with pytest.raises(ActionError, match="there is no such vehicle"):
-            env.drive_external(slots[0], 0.0, 0.0)
-        assert env.spawn_external(x, y, heading) == 0
+            env.external.drive(slots[0], 0.0, 0.0)
+        assert env.external.spawn(x, y, heading) == 0
     with pytest.raises(ConfigError, match=r"population\.external = 3: .*needs a single map"):
         parallel_env("cities", overrides={"population.external": 3})
 
@@ -291,33 +290,3 @@ def test_saved_states_include_external_vehicles_and_waiting_commands() -> None:
     wanted, saved = finished(0, None, 1)
     assert finished(24, saved, 1)[0] == wanted
     assert finished(24, saved, 2)[0] == wanted
-
-
-def test_a_session_with_forged_commands_is_refused() -> None:
-    with closing(make_vec("ring", agents=1, background=8, overrides=ROOM)) as vec:
-        vec.reset(seed=1)
-        vec.spawn_external(*place_on(vec, 0))
-        told, is_used = vec._session.external.memory
-        for name, value, message in (
-            ("kind", 7.0, "unknown kind"),
-            ("x", math.nan, "invalid x"),
-            ("vtype", 99.0, "unknown type"),
-            ("length", 0.0, "has no size"),
-            ("length", 90.0, "larger than all types"),
-        ):
-            forged = told.copy()
-            forged.view(EXTERNAL)[name][0, 0] = value
-            assert message in vec._session.external.wrong((forged, is_used)), name
-        assert vec._session.external.wrong((told, is_used)) == ""
-
-
-def test_a_session_that_expects_a_missing_vehicle_cannot_step() -> None:
-    with closing(make_vec("ring", agents=1, background=8, overrides=ROOM)) as vec:
-        vec.reset(seed=1)
-        told, is_used = vec._session.external.memory
-        vec._session.external.memory = told, ~is_used
-        vec.drive_external(2, 1.0, 0.0)
-        before = vec.state_hash(0)
-        with pytest.raises(ActionError, match="external vehicle 2: it does not exist"):
-            vec.step(vec.suggest_actions())
-        assert vec.state_hash(0) == before

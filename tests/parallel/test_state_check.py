@@ -306,9 +306,9 @@ def test_external_vehicles_and_slots_that_do_not_match(make: Make) -> None:
     vec = make("grid4x4", num_envs=2, zones=2, overrides={"population.external": 3})
     vec.reset(seed=1)
     min_x, min_y, _, _ = vec.network.extent_m
-    slots = [vec.spawn_external(min_x + 50.0, min_y + 20.0 * k, 0.0, world=1) for k in range(2)]
+    slots = [vec.external.spawn(min_x + 50.0, min_y + 20.0 * k, 0.0, world=1) for k in range(2)]
     vec.step(vec.suggest_actions())
-    ids = vec.external_ids(world=1)
+    ids = vec.external.ids(world=1)
     arrays = _worlds(vec).save()
     (at,) = [n for n, array in enumerate(arrays) if _content(array) == _content(ids_of(vec))]
     for value in (-2, MANY, int(ids[1])):
