@@ -249,6 +249,11 @@ class EnvConfig(Section, key=""):
             f"traffic.source = {source}: SUMO only runs vehicles of its demand; leave the key out",
         )
         self.need(
+            "population.external",
+            self.population.external == 0,
+            f"traffic.source = {source}: SUMO would not see such vehicles; leave the key out",
+        )
+        self.need(
             "scenario.name",
             not self.scenario.name,
             f"traffic.source = {source}: scenarios need native traffic; leave the key out",

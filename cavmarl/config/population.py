@@ -27,6 +27,8 @@ class PopulationConfig(Section, key="population"):
             k modulo the length of the list.
         insertions: number of vehicles that may be inserted into a world during an episode
             (`insert_vehicle`, `close_road`); memory is reserved for them.
+        external: number of vehicles that the caller may pose or drive in a world at the same time
+            (`ExternalCommands`); memory is reserved for them.
     """
 
     mode: Literal["closed", "open", "respawn"] = "closed"
@@ -35,6 +37,7 @@ class PopulationConfig(Section, key="population"):
     budget: int | None = None
     types: tuple[Literal["car", "truck", "bus"], ...] = ("car",)
     insertions: Annotated[int, Whole(0, 10_000)] = 0
+    external: Annotated[int, Whole(0, 10_000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

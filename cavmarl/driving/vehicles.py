@@ -79,7 +79,9 @@ VEHICLE = np.dtype(
         # vehicles, the current FRAME
         ("goal", np.int32),
         ("leg", np.int32),  # number of previous routes
-        ("order", np.int32),  # DEPARTURE row of the demand file; -1: made by the generator
+        # DEPARTURE row of the demand file, or slot of a vehicle of the caller; -1: made by the
+        # generator
+        ("order", np.int32),
         ("departed", np.int64),  # tick of insertion
         ("due", np.int64),  # tick at which an agent's trip is cut off; -1: none
         # ownership and transfer

@@ -18,7 +18,12 @@ from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import compiling_all, prepare_kernels
 from cavmarl.engine.compiled_step import CompiledStep, compiled_step
 from cavmarl.engine.shared_outputs import SharedOutputs
-from cavmarl.engine.simulation_setup import add_coordinators, add_sumo, call_rare_kernels
+from cavmarl.engine.simulation_setup import (
+    add_coordinators,
+    add_external,
+    add_sumo,
+    call_rare_kernels,
+)
 from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
 from cavmarl.engine.v2x_component import without_network
 from cavmarl.engine.world_views import WorldViews
@@ -87,6 +92,7 @@ class Simulation(WorldViews):
             with compiling_all(), without_network(tick.attached):
                 self._call_every_kernel()
         add_sumo(tick, demand, network)
+        add_external(tick)
         self.transfers = add_coordinators(tick, config, network, runs)
         self.zones.let_zones_change(network, config.zones)
 

@@ -17,6 +17,7 @@ from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, SharedState
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    DRIVER_EXTERNAL,
     LANE_BEST,
     LANE_GIVEN,
     POS_GIVEN,
@@ -26,6 +27,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.engine.component import Component
+from cavmarl.engine.external_component import ExternalComponent
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shards.row_check import LEAST_FACTOR, MOST
@@ -113,6 +115,7 @@ class StateForm(NamedTuple):
             or self._wrong_common(named)
             or self._wrong_attached(fixed[len(fixed) - self._num_attached :])
             or self._wrong_vehicles(named, queue, rerouting, vehicles)
+            or self._wrong_external(fixed[len(fixed) - self._num_attached :], vehicles)
         )
 
     @property
@@ -125,6 +128,20 @@ class StateForm(NamedTuple):
             number = sum(1 for _ in part.arrays())
             if wrong := part.wrong(arrays[at : at + number]):
                 return wrong
+            at += number
+        return ""
+
+    def _wrong_external(self, arrays: Sequence[Array], vehicles: Sequence[Array]) -> str:
+        """Check that the external vehicles are those of the slots."""
+        zones, at = self.division.count, 0
+        for part in self.attached:
+            number = sum(1 for _ in part.arrays())
+            if isinstance(part, ExternalComponent):
+                _, ids = arrays[at : at + number]
+                for w, own in enumerate(ids):
+                    rows = np.concatenate(vehicles[w * zones : (w + 1) * zones])
+                    if wrong := part.wrong_rows(own, rows):
+                        return f"world {w}: {wrong}"
             at += number
         return ""
 
@@ -204,7 +221,8 @@ class StateForm(NamedTuple):
             if any((time > named["ticks"][w]).any() for time in times):
                 return f"world {w} has a vehicle with a time in the future"
             due = named["next_order"][w] if self.traffic.sumo is None else MOST
-            if (rows["order"] >= due).any() or (waiting["order"] >= due).any():
+            ordered = rows["order"][rows["driver"] != DRIVER_EXTERNAL]
+            if (ordered >= due).any() or (waiting["order"] >= due).any():
                 return f"world {w} has a vehicle that is not due yet"
             if (np.diff(waiting["id"]) <= 0).any() or np.isin(waiting["id"], rows["id"]).any():
                 return f"world {w} has two vehicles with one id"

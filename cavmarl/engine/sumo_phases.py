@@ -12,6 +12,7 @@ from cavmarl.engine.step_trace import MIRROR, SUMO
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 
 if TYPE_CHECKING:
+    from cavmarl.engine.peers import Peers
     from cavmarl.engine.tick import Tick
 
 
@@ -41,6 +42,10 @@ class GlobalTraffic(Protocol):
         """Add the vehicles that have entered in the other simulator."""
         ...
 
+    def running(self, peers: Peers) -> NDArray[np.int64]:
+        """Return how many places (W,) of each world are taken or reserved."""
+        ...
+
     def switch_signals(self, tick: Tick) -> None:
         """Switch the signals to the present tick."""
         ...
@@ -66,6 +71,10 @@ class NoSumo:
 
     def let_in(self, tick: Tick) -> None:
         """Do nothing: there are no other vehicles."""
+
+    def running(self, peers: Peers) -> NDArray[np.int64]:
+        """Return the number of vehicles of each world (W,)."""
+        return peers.running()
 
     def switch_signals(self, tick: Tick) -> None:
         """Read the detectors of all zones, then switch the signals once."""
@@ -123,6 +132,10 @@ class SumoPhases:
             sumo.order(departures, worlds)
         elif sumo.let_in(departures, worlds, tick.peers.running()):
             tick.admit()
+
+    def running(self, peers: Peers) -> NDArray[np.int64]:
+        """Return the number of vehicles of each world (W,)."""
+        return peers.running()
 
     def switch_signals(self, tick: Tick) -> None:
         """Copy the states of SUMO's signals."""

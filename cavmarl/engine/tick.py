@@ -178,7 +178,7 @@ class Tick:
         self.executor.propose(traffic.demand, departures)
         peers.share_proposals(departures)
         if any(departures.num_passing.tolist()):
-            traffic.accept(departures, worlds, peers.running())
+            traffic.accept(departures, worlds, self.sumo.running(peers))
             self.admit()
 
     def admit(self) -> None:

@@ -240,6 +240,7 @@ def _refuse_single_map_keys(config: EnvConfig) -> None:
         "traffic.destinations": config.traffic.destinations,
         "scenario.name": config.scenario.name,
         "population.insertions": config.population.insertions,
+        "population.external": config.population.external,
         "zones.layout": config.zones.layout not in ZONE_LAYOUTS and config.zones.layout,
     }
     for key, value in named.items():

@@ -12,6 +12,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.arrays import DepartureQueue, Outputs, TripTables, Worlds
 from cavmarl.engine.component import Component
+from cavmarl.engine.external_component import ExternalComponent
 from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
@@ -94,6 +95,21 @@ class WorldViews:
     def types(self) -> NDArray[np.void]:
         """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
         return self._shard.travel.types
+
+    @property
+    def type_rows(self) -> dict[str, int]:
+        """VTYPE rows of the types of agents' and of the caller's vehicles, by name."""
+        return self._tick.traffic.type_rows
+
+    @property
+    def external(self) -> ExternalComponent:
+        """The slots of the vehicles that the caller poses or drives."""
+        for part in self._tick.attached:
+            if isinstance(part, ExternalComponent):
+                return part
+        raise ConfigError(
+            "population.external = 0: there is no room for vehicles of the caller; set it higher"
+        )
 
     @property
     def travel(self) -> TripTables:

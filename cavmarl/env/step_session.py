@@ -18,6 +18,7 @@ from cavmarl.engine.world_frame import WorldFrame, frame_of
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
+from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
@@ -30,9 +31,10 @@ from cavmarl.shards.shard import Commands
 class StepSession:
     """The running worlds of one environment.
 
-    A step takes decoded actions, declared events and insertions. After each reset and step, the
-    session records the worlds and calls its watchers. A copy or a pickle of a session has its own
-    worlds, which continue bit for bit; it has no recording and no watchers.
+    A step takes decoded actions and the waiting inputs: declared events, insertions and commands to
+    external vehicles. After each reset and step, the session records the worlds and calls its
+    watchers. A copy or a pickle of a session has its own worlds, which continue bit for bit; it has
+    no recording and no watchers.
 
     Args:
         worlds: the worlds to step.
@@ -45,6 +47,7 @@ class StepSession:
         decoder: decodes actions into commands.
         events: the events that agents have declared for the next step.
         insertions: vehicles and barriers for the next step.
+        external: commands for the next step to vehicles that the caller poses or drives.
         is_ready: whether `reset` has been called.
         simulated_s: wall time of all steps of the worlds so far.
     """
@@ -60,6 +63,7 @@ class StepSession:
         self.decoder = ActionDecoder(config.action, num_worlds, self.agents, commands)
         self.events = DeclaredEvents(config, num_worlds)
         self.insertions = Insertions(config, worlds.world.network, num_worlds)
+        self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
         self.is_ready = False
         self._is_closed = False
         self.simulated_s = 0.0
@@ -99,16 +103,20 @@ class StepSession:
     def step(self, commands: Commands) -> None:
         """Step the worlds with all waiting inputs. If the step fails, the inputs keep waiting."""
         began = time.perf_counter()
-        self.worlds.step(self.insertions.add_to(self.events.add_to(commands)))
-        self.events.clear()
-        self.insertions.clear()
+        waiting = (self.events, self.insertions, self.external)
+        for part in waiting:
+            commands = part.add_to(commands)
+        self.worlds.step(commands)
+        for part in waiting:
+            part.clear()
         self.simulated_s += time.perf_counter() - began
         self._notify()
 
     def forget(self, chosen: NDArray[np.bool_]) -> None:
-        """Drop the last actions and the insertions of the chosen worlds (W,) after an episode."""
+        """Drop the last actions and the waiting inputs of the chosen worlds (W,)."""
         self.decoder.forget(chosen)
         self.insertions.forget(chosen)
+        self.external.forget(chosen)
 
     def refuse_unready(self, call: str) -> None:
         """Raise an EpisodeError that names a call if there has been no reset yet."""
@@ -226,13 +234,19 @@ class StepSession:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Objects that refer to arrays of the worlds are created again.
-        memory = self.decoder.memory, self.events.memory, self.insertions.memory
+        inputs = self.events.memory, self.insertions.memory, self.external.memory
+        memory = self.decoder.memory, *inputs
         kept = self.is_ready, self.simulated_s, self._first_seed
-        return _restored_session, (self.worlds, self._in_place), (kept, memory)
+        return (
+            _restored_session,
+            (self.worlds, self._in_place),
+            (kept, memory),
+        )
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         (self.is_ready, self.simulated_s, self._first_seed), memory = state
-        self.decoder.memory, self.events.memory, self.insertions.memory = memory
+        self.decoder.memory, self.events.memory, *memory = memory
+        self.insertions.memory, self.external.memory = memory
 
 
 def _restored_session(worlds: SteppedWorlds, in_place: bool) -> StepSession:

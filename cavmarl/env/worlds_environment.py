@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.recorded_worlds import Record
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_copies import OwnWorlds
@@ -79,6 +80,16 @@ class WorldsEnvironment(OwnWorlds):
     def is_ready(self) -> bool:
         """Whether `reset` has been called, so that the worlds have a state."""
         return self._session.is_ready
+
+    @property
+    def external(self) -> ExternalCommands:
+        """The vehicles that the caller poses or drives; see `population.external`.
+
+        Raises:
+            EpisodeError: before the first reset.
+        """
+        self._session.refuse_idle("external")
+        return self._session.external
 
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
         """Let a car enter a world in the next step, or as soon as there is a safe gap.

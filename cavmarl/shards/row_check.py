@@ -16,6 +16,7 @@ from cavmarl.core.records.codes import (
     AUTHORITATIVE,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    DRIVER_EXTERNAL,
     DRIVER_SUMO,
     HOLD_EXIT_BLOCKED,
 )
@@ -96,6 +97,7 @@ class RowCheck:
         none = np.zeros(0, dtype=np.int32)
         self._step_lanes = none if traffic.schedule is None else traffic.schedule.step_lanes
         self._is_moved = traffic.sumo is not None
+        self._num_external, self._nowhere = traffic.population.external, traffic.nowhere
         num_lanes, num_links = len(roads.lanes), len(roads.links)
         self._num_lanes = num_lanes
         self._num_goals, self._plan_steps = len(traffic.plans), traffic.plans.size
@@ -109,7 +111,9 @@ class RowCheck:
             "link": range(-1, num_links),
             "stopped_at": range(-1, num_links),
             "vtype": range(len(travel.types)),
-            "driver": range(DRIVER_BACKGROUND, DRIVER_SUMO + 1),
+            "driver": range(
+                DRIVER_BACKGROUND, 1 + (DRIVER_EXTERNAL if self._num_external else DRIVER_SUMO)
+            ),
             "agent": range(-1, num_agents),
             "goal": range(-1, goals),
             "stop": range(-1, 1 + len(travel.stops)),
@@ -164,10 +168,11 @@ class RowCheck:
         detours = self._num_goals
         if travel.first_detour:
             detours = (travel.num_fixed - travel.first_detour) // self._num_lanes
-        low = np.array([-1, 0, 0, -1])
-        high = np.array([detours, self._num_goals, len(travel.scripts.frames), 0])
+        low = np.array([-1, 0, 0, -1, -1])
+        high = np.array([detours, self._num_goals, len(travel.scripts.frames), 0, 0])
         wrong = (rows["goal"] < low[driver]) | (rows["goal"] >= high[driver])
         wrong |= (driver == DRIVER_AGENT) & (rows["agent"] < 0)
+        wrong |= (driver == DRIVER_EXTERNAL) & (rows["way"] != self._nowhere)
         wrong |= rows["stop"] > rows["stops_end"]
         if not wrong.any():
             return ""
@@ -180,7 +185,10 @@ class RowCheck:
         ):
             if len(np.unique(numbers)) < len(numbers):
                 return f"two vehicles have the same {name}"
-        wrong = (rows["id"] < 0) | (rows["tick"] < 0) | (rows["order"] >= num_orders)
+        is_external = rows["driver"] == DRIVER_EXTERNAL
+        end = np.where(is_external, self._num_external, num_orders)
+        wrong = (rows["id"] < 0) | (rows["tick"] < 0) | (rows["order"] >= end)
+        wrong |= is_external & (rows["order"] < 0)
         if not wrong.any():
             return ""
         return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id or tick is invalid")

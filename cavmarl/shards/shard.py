@@ -26,6 +26,7 @@ from cavmarl.core.records.arrays import (
     Worlds,
     ZoneState,
 )
+from cavmarl.core.records.external_records import EXTERNAL_FIELDS
 from cavmarl.driving.kernels.junctions.approach import APPROACH
 from cavmarl.driving.kernels.lanes.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
@@ -65,6 +66,9 @@ class Commands:
     # (W, I, 3) INSERT_* code, LANE and position in m of inserted vehicles; (0, 0, 3): insertions
     # are not configured
     inserted: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    # (W, E, K) EXTERNAL, new commands to vehicles that the caller poses or drives; (0, 0, K): there
+    # is no room for such vehicles
+    external: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, EXTERNAL_FIELDS)))
 
 
 COMMANDS = tuple(entry.name for entry in fields(Commands))

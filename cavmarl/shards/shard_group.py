@@ -100,7 +100,7 @@ class ShardGroup:
         self.departure_calls(departures).leave()
 
     def dismiss(self, departures: DepartureQueue) -> None:
-        """Move vehicles of the next rows that SUMO has removed to the departure queue."""
+        """Move vehicles of the next rows that SUMO or the caller removes to the departure queue."""
         self.departure_calls(departures).dismiss()
 
     def gather(self, touching_m: float, border_m: float) -> None:

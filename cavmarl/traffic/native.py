@@ -21,7 +21,7 @@ from cavmarl.core.records.arrays import Demand, DepartureQueue, TripTables, Worl
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
-from cavmarl.driving.vehicle_types import agent_types, generated_types
+from cavmarl.driving.vehicle_types import AGENT_TYPES, agent_types, generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
@@ -220,31 +220,39 @@ class NativeTraffic:
 
     @property
     def _other_types(self) -> list[str]:
-        """Names of the types of agents' vehicles, without the car."""
-        return [name for name in dict.fromkeys(self.population.types) if name != "car"]
+        """Names of the types of agents' and of the caller's vehicles, without the car."""
+        names = [*self.population.types, *(AGENT_TYPES if self.population.external else ())]
+        return [name for name in dict.fromkeys(names) if name != "car"]
+
+    @cached_property
+    def type_rows(self) -> dict[str, int]:
+        """VTYPE rows of the types of agents' and of the caller's vehicles, by name."""
+        first = len(self.travel.types) - len(self._other_types)
+        return {"car": 0} | {name: first + k for k, name in enumerate(self._other_types)}
 
     @cached_property
     def _agent_type_rows(self) -> NDArray[np.int32]:
         """VTYPE row of each agent's type, repeated in order."""
-        first = len(self.travel.types) - len(self._other_types)
-        names = {"car": 0} | {name: first + k for k, name in enumerate(self._other_types)}
-        return np.array([names[name] for name in self.population.types], dtype=np.int32)
+        rows = self.type_rows
+        return np.array([rows[name] for name in self.population.types], dtype=np.int32)
 
     @cached_property
     def _travel_of_others(self) -> TripTables:
         types = generated_types(model_code(self.traffic.model))
         steps = self.plans.reshape(-1)
+        nowhere = self._nowhere_steps
         if self.sumo is not None:
             return self._travel_of_sumo(self.sumo, types, steps)
         scripts = NO_SCRIPTS if self.cast is None else self.cast.scripts
         actors = types[:0] if self.cast is None else self.cast.types
         if self.file is None or self.schedule is None:
             types = np.concatenate([types, actors])
+            steps = np.concatenate([steps, nowhere]) if len(nowhere) else steps
             stops, num_fixed = self._barrier_stops, len(steps)
             steps = self._with_slots(steps)
             return TripTables(types, steps, stops, 0, 0.0, VIEW_M, VIEW_M, num_fixed, scripts)
         types = np.concatenate([types, self.file.types, actors])
-        steps = np.concatenate([steps, self.schedule.steps])
+        steps = np.concatenate([steps, self.schedule.steps, nowhere])
         num_fixed = len(steps)
         steps = self._with_slots(steps)
         first_detour = self.plans.size + self.schedule.first_detour
@@ -260,6 +268,19 @@ class NativeTraffic:
             num_fixed=num_fixed,
             scripts=scripts,
         )
+
+    @property
+    def nowhere(self) -> int:
+        """The way of the vehicles that the caller poses or drives; its steps lead nowhere."""
+        return self.plans.size + (0 if self.schedule is None else len(self.schedule.steps))
+
+    @property
+    def _nowhere_steps(self) -> NDArray[np.void]:
+        """PLAN (L,) that end every way; empty without vehicles of the caller."""
+        steps = np.zeros(len(self.network.lanes) if self.population.external else 0, dtype=PLAN)
+        steps["next"] = steps["link"] = -1
+        steps["to_go"] = np.inf
+        return steps
 
     def _with_slots(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
         """Return the table of ways, with room for ways found at run time if vehicles reroute."""
@@ -309,7 +330,7 @@ class NativeTraffic:
         `VIEW_M`: IDM reacts to any leader, and agents may drive at any speed.
         """
         own = self.population
-        if self.file is None or own.agents + own.background + own.insertions > 0:
+        if self.file is None or own.agents + own.background + own.insertions + own.external > 0:
             return VIEW_M
         fast_mps = FAST_FACTOR * float(self.network.lanes["speed_mps"].max())
         return max(
@@ -328,7 +349,7 @@ class NativeTraffic:
         number = seekers(schedule, self.capacity, self.horizon_s)
         if number == 0:
             return None
-        first_step = self.plans.size + len(schedule.steps)
+        first_step = self.nowhere + len(self._nowhere_steps)
         return way_slots(self.network.lanes, schedule.longest, first_step, self.num_worlds, number)
 
     @property
@@ -530,7 +551,7 @@ def _capacity(
     horizon_s: float,
 ) -> int:
     """Return the smaller of the number of ordered vehicles and the number that fit on the map."""
-    own = population.agents + population.background + population.insertions
+    own = population.agents + population.background + population.insertions + population.external
     if schedule is None or not len(schedule.demand.types):
         return own
     shortest = float(schedule.demand.types["length"].min())

@@ -12,6 +12,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    DRIVER_EXTERNAL,
     DRIVER_SCRIPTED,
     DRIVER_SUMO,
 )
@@ -31,6 +32,7 @@ DRIVERS = {
     DRIVER_AGENT: "agent",
     DRIVER_SCRIPTED: "script",
     DRIVER_SUMO: "SUMO",
+    DRIVER_EXTERNAL: "external",
 }
 MOST_NUMBERS = 400  # largest number of observed values to show
 ZONE_MARGIN_M = 50.0  # margin around the map up to which zones are drawn

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ConfigError, EpisodeError
+from cavmarl.core.errors import ActionError, ConfigError, EpisodeError
+from cavmarl.core.records.external_records import EXTERNAL
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.parallel.state.world_bytes import to_bytes
 
@@ -83,10 +84,10 @@ def test_invalid_saves_and_loads_are_refused() -> None:
             vec.load_state(damaged)
 
 
-def forged(vec: CavVectorEnv, saved: bytes, place: int, value: float) -> bytes:
-    """A saved state with another value in a place of its first arrays, and the right checksum."""
+def forged(vec: CavVectorEnv, saved: bytes, place: int, value: float, item: int = 0) -> bytes:
+    """A saved state with another value in an item of one of its first arrays, and its checksum."""
     arrays = [array.copy() for array in saved_arrays(vec, saved)]
-    arrays[place].flat[0] = value
+    arrays[place].flat[item] = value
     content = to_bytes(arrays)
     return hashlib.sha256(content).digest() + content
 
@@ -126,3 +127,45 @@ def test_values_beside_the_worlds(place: int, value: float, message: str) -> Non
     with pytest.raises(ConfigError, match=message):
         vec.load_state(forged(vec, saved, place, value))
     assert vec.save_state() == saved
+
+
+EXTERNAL_COMMANDS, EXTERNAL_USED = 10, 11
+
+
+def with_external(**arguments: Any) -> tuple[CavVectorEnv, bytes]:
+    """Worlds in which a vehicle of the caller waits, and their state."""
+    vec = make(overrides={"population.external": 3}, **arguments)
+    vec.reset(seed=0)
+    min_x, min_y, _, _ = vec.network.extent_m
+    assert vec.external.spawn(min_x, min_y, 0.0) == 0
+    return vec, vec.save_state()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("kind", 7.0, "unknown kind"),
+        ("x", np.nan, "invalid x"),
+        ("speed", np.inf, "invalid speed"),
+        ("vtype", 99.0, "unknown type"),
+        ("length", 0.0, "has no size"),
+        ("length", 90.0, "larger than all types"),
+    ],
+)
+def test_waiting_commands_to_external_vehicles(name: str, value: float, message: str) -> None:
+    vec, saved = with_external()
+    item = (EXTERNAL.names or ()).index(name)
+    with pytest.raises(ConfigError, match=message):
+        vec.load_state(forged(vec, saved, EXTERNAL_COMMANDS, value, item))
+    vec.load_state(saved)
+    assert vec.save_state() == saved
+
+
+def test_a_command_to_a_vehicle_that_only_the_session_knows() -> None:
+    vec, saved = with_external()
+    vec.load_state(forged(vec, saved, EXTERNAL_USED, True, item=2))
+    vec.external.drive(2, 1.0, 0.0)
+    before = vec.state_hash(0)
+    with pytest.raises(ActionError, match="external vehicle 2: it does not exist"):
+        vec.step(vec.suggest_actions())
+    assert vec.state_hash(0) == before

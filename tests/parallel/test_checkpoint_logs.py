@@ -74,6 +74,7 @@ def commands_like(entry: Commands, value: int) -> Commands:
         np.full_like(entry.meta_actions, value),
         np.full_like(entry.declared, value),
         np.full_like(entry.inserted, value),
+        np.full_like(entry.external, value),
     )
 
 

@@ -10,6 +10,7 @@ DRIVER_SCRIPTED = 2  # moves by its script: pedestrians, vehicles of scenarios
 # VTYPE["vclass"] of pedestrians; the classes of vehicles are positions in network.VEHICLE_CLASSES
 CLASS_PEDESTRIAN = 9
 DRIVER_SUMO = 3  # moved by SUMO, copied to the rows
+DRIVER_EXTERNAL = 4  # posed or driven by the caller, see `records.external_records`
 
 # VTYPE["model"]: the car-following models, a file each in driving/kernels/models
 MODEL_KRAUSS = 0

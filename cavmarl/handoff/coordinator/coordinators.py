@@ -222,4 +222,6 @@ def _digest(commands: Commands, w: int) -> bytes:
         digest.update(commands.declared[w].tobytes())
     if commands.inserted.any():
         digest.update(commands.inserted[w].tobytes())
+    if commands.external.any():
+        digest.update(commands.external[w].tobytes())
     return digest.digest()

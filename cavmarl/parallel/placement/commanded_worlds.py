@@ -111,6 +111,7 @@ class CommandedWorlds(ABC):
             arrays.meta_actions[:] = commands.meta_actions
         arrays.declared[:] = commands.declared if commands.declared.size else 0
         arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
+        arrays.external[:] = commands.external if commands.external.size else 0
         self._command(Task.STEP)
         self._steps += 1
 

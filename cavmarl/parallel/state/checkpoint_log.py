@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
+from cavmarl.core.records.external_records import EXTERNAL_FIELDS
 from cavmarl.parallel.memory.shared_memory import Layout, Segment, arrays_in, size_of
 from cavmarl.parallel.state.state_image import Arrays, Image
 from cavmarl.parallel.state.sumo_log import FIRST_LOG_BYTES, KeptLog
@@ -118,5 +119,12 @@ def _layout(config: EnvConfig, num_worlds: int) -> Layout:
     worlds: tuple[int, ...] = (2 * STEPS, num_worlds)
     agents = (*worlds, config.population.num_ids)
     inserted = (*worlds, config.population.insertions, 3)
-    kinds = (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents), ("<f8", inserted))
+    external = (*worlds, config.population.external, EXTERNAL_FIELDS)
+    kinds = (
+        ("<f8", (*agents, 2)),
+        ("<i8", agents),
+        ("<i4", agents),
+        ("<f8", inserted),
+        ("<f8", external),
+    )
     return dict(zip(COMMANDS, kinds, strict=True))

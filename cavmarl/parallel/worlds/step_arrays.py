@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.config.env import EnvConfig
+from cavmarl.core.records.external_records import EXTERNAL_FIELDS
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import flat_observation_space, state_space
 from cavmarl.engine.world_setup import World
@@ -43,10 +44,11 @@ class StepArrays(NamedTuple):
     ticks: NDArray[np.int64]  # (W,) since each world's reset
     episode_over: NDArray[np.bool_]  # (W,) worlds that were reset, or will be in the next step
     chosen: NDArray[np.bool_]  # (W,) worlds to reset
-    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next three
+    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next four
     meta_actions: NDArray[np.int64]  # (W, A)
     declared: NDArray[np.int32]  # (W, A)
     inserted: NDArray[np.float64]  # (W, I, 3)
+    external: NDArray[np.float64]  # (W, E, K)
     suggested: NDArray[np.float64]  # (W, A, 2) actions of the built-in driver
     states: NDArray[np.float32]  # (W, S) global states at the last request
     frames: Frames  # of mounted sensors
@@ -87,6 +89,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "meta_actions": ("<i8", agents),
         "declared": ("<i4", agents),
         "inserted": ("<f8", (num_worlds, config.population.insertions, 3)),
+        "external": ("<f8", (num_worlds, config.population.external, EXTERNAL_FIELDS)),
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
         **frame_layout(config, num_worlds),

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.step_arrays import StepArrays
-from cavmarl.shards.shard import Commands
+from cavmarl.shards.shard import COMMANDS, Commands
 
 
 class Task(IntEnum):
@@ -58,7 +58,7 @@ class WorldTask(NamedTuple):
 
 def commands_of(arrays: StepArrays) -> Commands:
     """Return the commands of the agents in the next step, as views."""
-    return Commands(arrays.controls, arrays.meta_actions, arrays.declared, arrays.inserted)
+    return Commands(*(getattr(arrays, name) for name in COMMANDS))
 
 
 def _step(worlds: LocalWorlds) -> None:

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import DepartureQueue, Worlds, ZoneState
-from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, DRIVER_SUMO
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    DRIVER_EXTERNAL,
+    DRIVER_SUMO,
+)
 from cavmarl.rewards.kernels.reward import credit
 from cavmarl.roads.kernels.signal_phases import detect
 from cavmarl.sensors.kernels.frame_stacks import fill_stacks
@@ -29,8 +34,9 @@ def leave_background(departures: DepartureQueue, worlds: Worlds) -> None:
 
 @kernel
 def dismiss(departures: DepartureQueue, worlds: Worlds) -> None:
-    """Move vehicles of the next rows that SUMO has removed to the departure queue."""
+    """Move vehicles of the next rows that SUMO or the caller removes to the departure queue."""
     leave(departures, worlds, worlds.next_rows, DRIVER_SUMO, 0)
+    leave(departures, worlds, worlds.next_rows, DRIVER_EXTERNAL, 0)
 
 
 @kernel

@@ -1,0 +1,35 @@
+"""`EXTERNAL`: commands to vehicles that the caller poses or drives."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# EXTERNAL["kind"]
+EXTERNAL_NONE = 0.0  # no new command; in the state: no vehicle
+EXTERNAL_POSED = 1.0  # at the given pose at the end of the step
+EXTERNAL_DRIVEN = 2.0  # kinematic bicycle, driven by throttle and steering
+EXTERNAL_REMOVED = 3.0
+
+# All fields are float64, so that commands are plain arrays (W, E, K) between processes. A vehicle
+# enters with the first command of its slot, at the pose of that command and with its body.
+EXTERNAL = np.dtype(
+    [
+        (name, np.float64)
+        for name in (
+            "kind",  # EXTERNAL_*
+            "x",  # m, of the centre
+            "y",
+            "z",  # m; NaN: the height of the lane
+            "heading",  # rad
+            "pitch",  # rad; NaN: the slope of the lane
+            "speed",  # m/s along the heading; NaN: of the move to the pose
+            "throttle",  # m/s², of a driven vehicle
+            "steering",  # rad, of a driven vehicle
+            "vtype",  # VTYPE row
+            "length",  # m
+            "width",
+            "height",
+        )
+    ]
+)
+EXTERNAL_FIELDS = len(EXTERNAL.names or ())

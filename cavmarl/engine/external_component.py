@@ -1,0 +1,226 @@
+"""Vehicles that the caller poses or drives: their commands and ids, and their part of a tick."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import specialized
+from cavmarl.core.errors import ActionError
+from cavmarl.core.records.codes import DRIVER_EXTERNAL
+from cavmarl.core.records.external_records import (
+    EXTERNAL,
+    EXTERNAL_DRIVEN,
+    EXTERNAL_FIELDS,
+    EXTERNAL_NONE,
+    EXTERNAL_POSED,
+    EXTERNAL_REMOVED,
+)
+from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
+from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.engine.peers import Peers
+from cavmarl.engine.sumo_phases import NoSumo
+from cavmarl.shards.row_check import MOST_IDS
+from cavmarl.shards.shard import Commands
+from cavmarl.traffic.kernels.external_rows import add_external, move_external
+
+if TYPE_CHECKING:
+    from cavmarl.engine.component import ComponentContext
+    from cavmarl.engine.tick import Tick
+
+_POSE = ("x", "y", "z", "heading", "pitch", "speed")
+_CONTROLS = ("throttle", "steering")
+_LARGEST = 1e12
+
+
+class ExternalComponent:
+    """A `Component` with the slots of the vehicles that the caller poses or drives.
+
+    A slot keeps its last command. All processes of a world have the same slots.
+
+    Attributes:
+        ids: (W, E) id of each slot's vehicle; -1: none.
+        leaving: (W, E) slots whose vehicles leave in this tick.
+        coming: (W, E) slots whose vehicles enter in this tick.
+        has_news: whether this is the first tick of a step with new commands.
+    """
+
+    reads_all: tuple[str, ...] = ()
+
+    def __init__(self, host: ComponentContext) -> None:
+        shape = (host.num_worlds, host.config.population.external)
+        self._held = host.zeros((*shape, EXTERNAL_FIELDS))
+        self.ids: NDArray[np.int64] = host.zeros(shape, dtype=np.int64)
+        self.ids[:] = -1
+        self.leaving = np.zeros(shape, dtype=np.bool_)
+        self.coming = np.zeros(shape, dtype=np.bool_)
+        self.has_news = False
+        self._ticks = host.shards[0].worlds.ticks
+        self._ticks_per_step = host.config.clock.ticks_per_step
+        self._types = host.travel.types
+
+    @property
+    def held(self) -> NDArray[np.void]:
+        """EXTERNAL (W, E): the present command of each slot."""
+        return records_of(self._held)
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None:
+        """Empty the slots of the chosen worlds (W,)."""
+        self._held[chosen] = EXTERNAL_NONE
+        self.ids[chosen] = -1
+
+    def begin(self, commands: Commands) -> None:
+        """Take the commands of a step in its first tick."""
+        self.leaving[:] = self.coming[:] = self.has_news = False
+        if not commands.external.size or self._ticks.item(0) % self._ticks_per_step:
+            return
+        told, held = records_of(commands.external), self.held
+        held["speed"][held["kind"] == EXTERNAL_POSED] = np.nan  # such vehicles are at their poses
+        self.has_news = bool(told["kind"].any())
+        if not self.has_news:
+            return
+        is_held = held["kind"] != EXTERNAL_NONE
+        is_posed, is_driven = told["kind"] == EXTERNAL_POSED, told["kind"] == EXTERNAL_DRIVEN
+        self.coming[:] = (is_posed | is_driven) & ~is_held
+        if (told["length"][self.coming] <= 0.0).any():
+            w, slot = np.argwhere(self.coming & (told["length"] <= 0.0))[0].tolist()
+            raise ActionError(
+                f"world {w}, external vehicle {slot}: it does not exist; spawn it first"
+            )
+        self.leaving[:] = (told["kind"] == EXTERNAL_REMOVED) & is_held
+        held[self.coming] = told[self.coming]
+        for changed, names in ((is_posed & is_held, _POSE), (is_driven & is_held, _CONTROLS)):
+            for name in ("kind", *names):
+                held[name][changed] = told[name][changed]
+        held[self.leaving] = np.zeros((), dtype=EXTERNAL)
+
+    def end(self) -> None:
+        """Do nothing: `ExternalPhases` moves the vehicles."""
+
+    def arrays(self) -> Iterator[NDArray[Any]]:
+        """Return the commands and the ids of all slots."""
+        return iter((self._held, self.ids))
+
+    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
+        """Return what is wrong with saved arrays; empty if nothing."""
+        held, ids = records_of(saved[0]), saved[1]
+        is_held = held["kind"] != EXTERNAL_NONE
+        if ((ids < -1) | (ids >= MOST_IDS) | ((ids >= 0) != is_held)).any():
+            return "an external vehicle has an invalid id"
+        kinds = EXTERNAL_POSED, EXTERNAL_DRIVEN
+        held = held[is_held]
+        return wrong_commands(held, kinds) or wrong_bodies(held, self._types)
+
+    def wrong_rows(self, ids: NDArray[np.int64], rows: NDArray[np.void]) -> str:
+        """Return what is wrong with the ids (E,) of a world's slots and its rows VEHICLE (n,)."""
+        rows = rows[rows["driver"] == DRIVER_EXTERNAL]
+        found = np.full(len(ids), -1)
+        found[rows["order"]] = rows["id"]
+        if len(rows) != np.count_nonzero(ids >= 0) or (found != ids).any():
+            return "external vehicles and their slots do not match"
+        return ""
+
+
+class ExternalPhases(NoSumo):
+    """The phases of a tick in worlds with vehicles that the caller poses or drives."""
+
+    def __init__(self, part: ExternalComponent, tick: Tick) -> None:
+        self._part = part
+        self._taken = np.zeros(len(part.ids), dtype=np.int64)
+        self._move_external = specialized(move_external)
+        self._add_external = specialized(add_external)
+        self._blank = blank_vehicle()
+        self._roads, self._grid = tick.shards[0].roads, tick.shards[0].lane_grid
+        config = tick.shards[0].config
+        self._dt, self._ticks_per_step = config.clock.sim_dt_s, config.clock.ticks_per_step
+        self._limits = config.action.acceleration_mps2, config.action.steering_rad
+
+    def follow(self, tick: Tick) -> None:
+        """Move the vehicles. A vehicle leaves if it is removed, or to enter again at a far pose."""
+        part, departures = self._part, tick.departures
+        # A pose that is farther than any vehicle drives in a step is a jump.
+        reach_m = MAX_SPEED_MPS * self._dt * self._ticks_per_step if part.has_news else math.inf
+        gone = self._move_external(
+            self._roads,
+            tick.traffic.travel,
+            self._grid,
+            part.held,
+            part.leaving,
+            tick.division.zoned,
+            tick.division.next_side,
+            tick.worlds.ticks,
+            self._ticks_per_step,
+            reach_m,
+            *self._limits,
+            self._dt,
+        )
+        if not part.has_news:
+            return
+        if gone:
+            tick.executor.dismiss(departures)
+            tick.coordination.left(departures)
+        tick.peers.share_leavers(departures)
+        for w, num in enumerate(departures.num_passing.tolist()):
+            slots = departures.passing["order"][w, :num]
+            part.ids[w, slots] = -1
+            part.coming[w, slots] = ~part.leaving[w, slots]
+        departures.num_passing[:] = 0  # these vehicles have made no trips
+
+    def let_in(self, tick: Tick) -> None:
+        """Add the vehicles that enter."""
+        part = self._part
+        tick.finish_phase()
+        self._taken[:] = tick.peers.running() + np.count_nonzero(part.ids < 0, axis=1)
+        if not part.coming.any():
+            return
+        self._add_external(
+            self._roads,
+            self._grid,
+            part.held,
+            part.coming,
+            part.ids,
+            self._blank,
+            tick.traffic.nowhere,
+            tick.departures,
+            tick.worlds.ticks,
+            tick.worlds.keys,
+        )
+        tick.admit()
+
+    def running(self, peers: Peers) -> NDArray[np.int64]:
+        """Return the number (W,) of other vehicles and of slots, as all slots are reserved."""
+        return self._taken
+
+
+def records_of(commands: NDArray[np.float64]) -> NDArray[np.void]:
+    """Return commands (W, E, K) as EXTERNAL (W, E), a view."""
+    return commands.view(EXTERNAL)[..., 0]
+
+
+def wrong_commands(told: NDArray[np.void], kinds: Sequence[float]) -> str:
+    """Return what is wrong with the kinds and the numbers of commands EXTERNAL (n,)."""
+    if not np.isin(told["kind"], kinds).all():
+        return "a command to an external vehicle has an unknown kind"
+    for name in EXTERNAL.names or ():
+        usual = np.abs(told[name]) <= _LARGEST
+        if name in ("z", "pitch", "speed"):
+            usual |= np.isnan(told[name])
+        if not usual.all():
+            return f"an external vehicle has an invalid {name}"
+    return ""
+
+
+def wrong_bodies(told: NDArray[np.void], types: NDArray[np.void]) -> str:
+    """Return what is wrong with the types and the sizes of commands EXTERNAL (n,)."""
+    if not np.isin(told["vtype"], np.arange(len(types))).all():
+        return "an external vehicle has an unknown type"
+    radius_m = float(np.hypot(types["length"], types["width"]).max())
+    sizes = np.stack([told["length"], told["width"], told["height"]])
+    wrong = (sizes <= 0.0).any(axis=0) | (told["height"] > types["height"].max())
+    if (wrong | (np.hypot(told["length"], told["width"]) > radius_m)).any():
+        return "an external vehicle is larger than all types, or has no size"
+    return ""
