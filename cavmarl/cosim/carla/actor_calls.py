@@ -65,7 +65,9 @@ def get_actors_by_id(caller: Caller, session: CarlaSession, ids: list[int]) -> l
     return [packed_actor(actors[one], session.version) for one in ids if one in actors]
 
 
-@call("spawn_actor", description, pose, note="sensors; vehicles and walkers need room")
+@call(
+    "spawn_actor", description, pose, note="vehicles and sensors; a vehicle enters in the next tick"
+)
 def spawn_actor(
     caller: Caller, session: CarlaSession, what: tuple[Any, ...], there: CarlaPose
 ) -> list[Any]:
@@ -139,10 +141,10 @@ def set_walker_state(
 
 
 def _move(session: CarlaSession, actor: CarlaActor, there: CarlaPose) -> None:
-    if actor.vehicle >= 0:
-        if not session.external.owns(actor.vehicle):
-            raise CallRefused(_WORLDS)
-        session.external.place(actor.vehicle, there)
+    if actor.slot >= 0:
+        session.world.external.place(actor.slot, there)
+    elif actor.vehicle >= 0:
+        raise CallRefused(_WORLDS)
     elif actor.parent:
         parent = session.actors.find(actor.parent, "set_actor_transform")
         actor.local = relative(session.actors.pose_of(parent), there)
@@ -183,8 +185,8 @@ def _drive(caller: Caller, session: CarlaSession, number: int, control: Control,
     if actor.agent >= 0:
         session.world.controls[actor.agent] = control
         caller.agents.add(actor.agent)
-    elif actor.vehicle >= 0 and session.external.owns(actor.vehicle):
-        session.external.control(actor.vehicle, control)
+    elif actor.slot >= 0:
+        session.world.external.control(actor.slot, control)
     elif actor.is_vehicle:
         raise CallRefused("the built-in driver drives this vehicle; only agents can be controlled")
     else:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN
 from cavmarl.cosim.carla.call_arguments import CallRefused
-from cavmarl.cosim.carla.carla_blueprints import BLUEPRINT_OF_CLASS, BLUEPRINTS
+from cavmarl.cosim.carla.carla_blueprints import BLUEPRINT_OF_CLASS, BLUEPRINTS, Blueprint
 from cavmarl.cosim.carla.carla_geometry import ZERO, CarlaPose, Vector, compose
 from cavmarl.cosim.carla.carla_map import CarlaMap
 from cavmarl.cosim.carla.carla_snapshots import (
@@ -54,6 +54,9 @@ TAG_OF_CLASS = {
     BICYCLE: 19,
     PEDESTRIAN: 12,
 }
+TAG_OF_BASE = {
+    "car": 14, "van": 14, "truck": 15, "bus": 16, "motorcycle": 18, "bicycle": 19,
+}  # fmt: skip
 _CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestrian"}
 
 
@@ -68,6 +71,7 @@ class CarlaActor:
         centre, half_m: the bounding box in the actor's frame.
         vehicle: id of the row of a vehicle or walker; -1: none.
         agent: index of the agent that the vehicle belongs to; -1: none.
+        slot: number of a vehicle that a client has spawned, see `ExternalVehicles`; -1: no such.
     """
 
     number: int
@@ -83,6 +87,7 @@ class CarlaActor:
     velocity: Vector = ZERO
     vehicle: int = -1
     agent: int = -1
+    slot: int = -1
     lights: int = 0
 
     @property
@@ -181,6 +186,31 @@ class ActorTable:
         """Return the actor of an agent's vehicle, as of the last `take`."""
         return next((actor for actor in self._listed if actor.agent == agent), None)
 
+    def spawned(self) -> Iterator[CarlaActor]:
+        """Yield what clients have spawned."""
+        yield from self.attached()
+        yield from (actor for actor in self.actors.values() if actor.slot >= 0)
+
+    def add_spawned(
+        self,
+        blueprint: Blueprint,
+        attributes: dict[str, str],
+        pose: CarlaPose,
+        slot: int,
+        size_m: tuple[float, float, float],
+    ) -> CarlaActor:
+        """Add a vehicle that enters in the next tick."""
+        length, width, height = size_m
+        return self.add(
+            blueprint.type_id,
+            pose,
+            attributes=dict(attributes),
+            centre=(0.0, 0.0, 0.5 * height),
+            half_m=(0.5 * length, 0.5 * width, 0.5 * height),
+            tags=bytes([TAG_OF_BASE[blueprint.default("base_type")]]),
+            slot=slot,
+        )
+
     def attached(self) -> Iterator[CarlaActor]:
         """Yield sensors and controllers."""
         for actor in self.actors.values():
@@ -249,6 +279,16 @@ class ActorTable:
         """List the actors of the rows; return those whose vehicle has left."""
         present = set(rows["id"].tolist())
         gone: list[CarlaActor] = []
+        ids = world.external.ids()
+        for actor in [one for one in self.actors.values() if one.slot >= 0]:
+            vehicle = ids.get(actor.slot, -1)
+            if actor.vehicle != vehicle:  # it has entered, or has jumped
+                self._by_vehicle.pop(actor.vehicle, None)
+                actor.vehicle = vehicle
+                if vehicle >= 0:
+                    self._by_vehicle[vehicle] = actor
+            if actor.slot not in ids:
+                gone += self.remove(actor.number)
         for vehicle in [one for one in self._by_vehicle if one not in present]:
             gone += self.remove(self._by_vehicle[vehicle].number)
         self._listed = [
@@ -308,6 +348,9 @@ class ActorTable:
         self._write_lanes(world, rows)
         for k in np.flatnonzero(rows["agent"] >= 0).tolist():
             self._write_control(states[k], world.controls.get(int(rows["agent"][k])))
+        for k, actor in enumerate(self._listed):
+            if actor.slot >= 0:
+                self._write_control(states[k], world.external.controls.get(actor.slot))
         self._write_walkers(ahead, speed)
 
     def _write_lanes(self, world: HostedWorld, rows: NDArray[np.void]) -> None:

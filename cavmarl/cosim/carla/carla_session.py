@@ -17,11 +17,7 @@ from cavmarl.cosim.carla.carla_map import CarlaMap
 from cavmarl.cosim.carla.carla_snapshots import frame_head, snapshot_body
 from cavmarl.cosim.carla.carla_streams import EPISODE_STREAM, StreamHub
 from cavmarl.cosim.carla.carla_versions import ClientVersion
-from cavmarl.cosim.carla.external_vehicles import (
-    ExternalBody,
-    ExternalVehicles,
-    NoExternalVehicles,
-)
+from cavmarl.cosim.carla.external_vehicles import ExternalBody
 from cavmarl.cosim.carla.hosted_world import (
     STEP_S,
     EndedVehicle,
@@ -111,7 +107,6 @@ class CarlaSession:
         self.time_s = 0.0
         self.first_step_s = step_s
         self.world: HostedWorld = source.load("", step_s)
-        self.external: ExternalVehicles = NoExternalVehicles()
         self.actors = ActorTable(self.world, 1)
         self.sensors = SensorSuite(self, streams)
         self._map_changed = True
@@ -196,7 +191,6 @@ class CarlaSession:
         for actor in list(self.actors.attached()):
             self.sensors.remove(actor)
         self.world = world
-        self.external = NoExternalVehicles()
         self.actors = ActorTable(world, self.actors.next_number)
 
     def spawn(
@@ -209,21 +203,19 @@ class CarlaSession:
         blueprint = BLUEPRINTS.get(type_id)
         if blueprint is None:
             raise CallRefused(f"actor definition not found: {type_id}")
-        if sum(1 for _ in self.actors.attached()) >= self.limits.max_actors:
+        if sum(1 for _ in self.actors.spawned()) >= self.limits.max_actors:
             raise CallRefused(f"{self.limits.max_actors} actors are spawned; destroy some first")
         if parent and parent not in self.actors.actors:
             raise CallRefused("unable to attach actor: parent actor not found")
         if type_id.startswith(("sensor.", "controller.")):
             return self._attach(blueprint, attributes, pose, parent)
         there = compose(self.actors.pose_of(self.actors.actors[parent]), pose) if parent else pose
-        vehicle = self.external.spawn(ExternalBody(type_id, there, blueprint.size_m))
-        for actor in self.actors.take(self.world, self.time_s):
-            self._forget(actor)
-        spawned = self.actors.of_vehicle(vehicle)
-        assert spawned is not None
-        spawned.type_id = type_id
-        spawned.attributes = dict(attributes)
-        return spawned
+        if not type_id.startswith("vehicle."):
+            raise CallRefused(f"{type_id}: only vehicles and sensors can be spawned")
+        base_type = blueprint.default("base_type")
+        body = ExternalBody(type_id, base_type, there, blueprint.size_m)
+        slot, size_m = self.world.external.spawn(body)
+        return self.actors.add_spawned(blueprint, attributes, there, slot, size_m)
 
     def _attach(
         self, blueprint: Blueprint, attributes: dict[str, str], pose: CarlaPose, parent: int
@@ -248,8 +240,8 @@ class CarlaSession:
         actor = self.actors.actors.get(number)
         if actor is None:
             raise CallRefused("unable to destroy actor: not found")
-        if actor.vehicle >= 0 and self.external.owns(actor.vehicle):
-            self.external.destroy(actor.vehicle)
+        if actor.slot >= 0:
+            self.world.external.destroy(actor.slot)
         elif not actor.type_id.startswith(("sensor.", "controller.")):
             raise CallRefused(f"unable to destroy actor: {actor.type_id} belongs to the world")
         for one in self.actors.remove(number):

@@ -1,64 +1,136 @@
-"""`ExternalVehicles`: the vehicles and walkers that clients spawn into a world."""
+"""`ExternalVehicles`: the vehicles that clients spawn into a world.
+
+They are external vehicles of the environment, so drivers, sensors and contacts see them, and they
+are part of the world's state. They enter in the next step.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+import math
+from typing import NamedTuple
 
+from cavmarl.core.errors import ActionError, CavmarlError
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_geometry import CarlaPose
-from cavmarl.cosim.carla.vehicle_controls import Control
+from cavmarl.cosim.carla.vehicle_controls import WHEELBASE_SHARE, Control, motion_of, same_turn
+from cavmarl.env.parallel import CavEnv
+
+_OCCUPIED = "Spawn failed because of collision at spawn position"  # CARLA's text
+_VTYPE_OF_BASE = {"truck": "truck", "bus": "bus"}  # all others are cars
 
 
 class ExternalBody(NamedTuple):
-    """A vehicle or a walker to spawn."""
+    """A vehicle to spawn."""
 
     type_id: str  # of its blueprint
+    base_type: str  # CARLA's attribute: car, van, truck, bus, motorcycle, bicycle
     pose: CarlaPose
     size_m: tuple[float, float, float]  # length, width, height
 
 
-class ExternalVehicles(Protocol):
-    """Vehicles in a world that a client owns; their rows belong to the world's state.
+class ExternalVehicles:
+    """The vehicles of clients in the one world of an environment, by their slots.
 
-    A vehicle is named by its id in the rows of the world.
+    Attributes:
+        controls: the last control of each vehicle that a client drives.
     """
 
-    def spawn(self, body: ExternalBody) -> int:
-        """Add a body at once and return its id.
+    def __init__(self, env: CavEnv) -> None:
+        self._env = env
+        self._vtypes: dict[int, str] = {}
+        self._lengths_m: dict[int, float] = {}
+        self.controls: dict[int, Control] = {}
+        self._posed: set[int] = set()  # in the next step, instead of driving
 
-        Raises CallRefused: the place is occupied, or there is no room.
+    def spawn(self, body: ExternalBody) -> tuple[int, tuple[float, float, float]]:
+        """Let a vehicle enter in the next step, on the ground; return its slot and its size.
+
+        A vehicle has at most the size of the largest type of the world.
+
+        Raises CallRefused: the place is occupied or outside of the map, or there is no room.
         """
-        ...
+        simulation = self._env.simulation
+        vtype = _VTYPE_OF_BASE.get(body.base_type, "car")
+        length, width, height = (
+            min(size, float(simulation.types[name].max()))
+            for size, name in zip(body.size_m, ("length", "width", "height"), strict=True)
+        )
+        pose = body.pose
+        try:
+            slot = self._env.external.spawn(
+                pose.x,
+                -pose.y,
+                -math.radians(pose.yaw),
+                vtype=vtype,
+                size_m=(length, width, height),
+            )
+        except ActionError as error:
+            if "occupied" in str(error):
+                raise CallRefused(_OCCUPIED) from error
+            raise CallRefused(f"{body.type_id}: {error}") from error
+        except CavmarlError as error:
+            raise CallRefused(f"{body.type_id}: {error}") from error
+        self._vtypes[slot], self._lengths_m[slot] = vtype, length
+        return slot, (length, width, height)
 
-    def destroy(self, vehicle: int) -> None: ...
+    def destroy(self, slot: int) -> None:
+        """Remove a vehicle in the next step."""
+        self._env.external.remove(slot)
+        self._drop(slot)
 
-    def place(self, vehicle: int, pose: CarlaPose) -> None:
-        """Move a body as a puppet; its velocity follows from its places."""
-        ...
+    def place(self, slot: int, pose: CarlaPose) -> None:
+        """Move a vehicle to a pose, which it reaches in the next step.
 
-    def control(self, vehicle: int, control: Control) -> None:
+        Raises CallRefused: the pose is outside of the map.
+        """
+        try:
+            self._env.external.pose(
+                slot,
+                pose.x,
+                -pose.y,
+                -math.radians(pose.yaw),
+                z=pose.z,
+                pitch=math.radians(pose.pitch),
+            )
+        except CavmarlError as error:
+            raise CallRefused(str(error)) from error
+        self._posed.add(slot)
+
+    def control(self, slot: int, control: Control) -> None:
         """Drive a vehicle from the next tick on."""
-        ...
+        self.controls[slot] = control
 
-    def owns(self, vehicle: int) -> bool:
-        """Return whether a client has spawned this vehicle."""
-        ...
+    def ids(self) -> dict[int, int]:
+        """Return the vehicle id of each slot in use; -1: the vehicle has not entered yet."""
+        if not self._vtypes:
+            return {}
+        ids = self._env.external.ids()
+        return {slot: int(ids[slot]) for slot in self._vtypes}
 
+    def act(self) -> None:
+        """Give the controls to the environment, for the next step."""
+        if not self.controls:
+            self._posed.clear()
+            return
+        simulation, ids = self._env.simulation, self.ids()
+        rows = simulation.vehicles(0)
+        speed_of = dict(zip(rows["id"].tolist(), rows["speed"].tolist(), strict=True))
+        for slot, control in self.controls.items():
+            if slot in self._posed:
+                continue
+            vtype = simulation.type_rows[self._vtypes[slot]]
+            axles_apart = float(simulation.types["wheelbase"][vtype]) / self._lengths_m[slot]
+            acceleration, angle = motion_of(control, speed_of.get(ids[slot], 0.0))
+            self._env.external.drive(
+                slot, acceleration, same_turn(angle, axles_apart / WHEELBASE_SHARE)
+            )
+        self._posed.clear()
 
-class NoExternalVehicles:
-    """The vehicles of a world without room for any."""
+    def forget(self) -> None:
+        """Forget all vehicles, after the end of an episode."""
+        for slot in list(self._vtypes):
+            self._drop(slot)
 
-    def spawn(self, body: ExternalBody) -> int:
-        raise CallRefused(f"{body.type_id}: no room: population.external is 0")
-
-    def destroy(self, vehicle: int) -> None:
-        raise CallRefused(f"vehicle {vehicle} was not spawned by a client")
-
-    def place(self, vehicle: int, pose: CarlaPose) -> None:
-        raise CallRefused(f"vehicle {vehicle} was not spawned by a client")
-
-    def control(self, vehicle: int, control: Control) -> None:
-        raise CallRefused(f"vehicle {vehicle} was not spawned by a client")
-
-    def owns(self, vehicle: int) -> bool:
-        return False
+    def _drop(self, slot: int) -> None:
+        del self._vtypes[slot], self._lengths_m[slot]
+        self.controls.pop(slot, None)

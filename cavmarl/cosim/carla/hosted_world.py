@@ -20,6 +20,7 @@ from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED, EVENT_OFF_ROAD
 from cavmarl.cosim.carla.carla_map import CarlaMap, make_carla_map
+from cavmarl.cosim.carla.external_vehicles import ExternalVehicles
 from cavmarl.cosim.carla.vehicle_controls import Control, action_of
 from cavmarl.cosim.time_master import TimeMaster
 from cavmarl.engine.world_setup import find_map
@@ -43,6 +44,7 @@ SERVED_WORLD: dict[str, Any] = {
     "action.acceleration_mps2": 8.0,
     "traffic.endless": True,  # a vehicle that a client drives does not vanish at a goal
     "traffic.trip_horizon": 0.0,
+    "population.external": 64,
 }
 
 
@@ -76,6 +78,7 @@ class HostedWorld:
 
     Attributes:
         controls: the clients' controls, by the index of the agent that they drive.
+        external: the vehicles that clients have spawned.
 
     Raises:
         ConfigError: the actions are not continuous, or other processes run the world.
@@ -91,6 +94,7 @@ class HostedWorld:
         self.simulation = env.simulation
         self.env, self.map = env, carla_map
         self.controls: dict[int, Control] = {}
+        self.external = ExternalVehicles(env)
         self.master = TimeMaster(env)
         if not env.is_ready:
             self.master.reset(seed)
@@ -118,9 +122,9 @@ class HostedWorld:
         """
         env = self.env
         if not env.agents:
-            self.controls.clear()
-            self.master.reset()
+            self.reset()
             return []
+        self.external.act()
         driven = self._driven()
         chosen = dict(driven)
         if len(driven) < len(env.agents):
@@ -152,6 +156,12 @@ class HostedWorld:
                     self.env.config.action,
                 )
         return found
+
+    def reset(self) -> None:
+        """Begin the next episode, without the vehicles of clients."""
+        self.controls.clear()
+        self.external.forget()
+        self.master.reset()
 
     def release(self) -> None:
         """Release the environment, which keeps its state."""
@@ -214,8 +224,7 @@ class GivenWorld:
         if self._world is None:
             self._world = HostedWorld(self._env, self._map)
         else:
-            self._world.controls.clear()
-            self._world.master.reset()
+            self._world.reset()
         return self._world
 
     def take_map(self, document: str) -> None:
