@@ -24,6 +24,8 @@ CALLS := build/kernel_calls
 SIDE_BY_SIDE := --dist loadfile --no-loadscope-reorder
 # Three on two cores: while one waits for a process that it has started, two others work.
 THREE := -n 3 $(SIDE_BY_SIDE)
+# The day, counted from 1970: it chooses which slow tests run.
+TURN ?= $(shell expr $$(date +%s) / 86400)
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log follower
@@ -31,7 +33,7 @@ FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test quick emulated ray check bench bounds soak model fuzz oldest libraries maps rules lock sbom audit kernels wheel record pictures docs clean
+.PHONY: help demo test quick emulated ray check bench bounds rotation soak model fuzz oldest libraries maps rules lock sbom audit kernels wheel record pictures docs clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -78,6 +80,10 @@ bounds: $(READY) ## the tests with every index of the kernels checked
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python $(KERNELS)
 	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest $(THREE) -m "not slow and not alone and not ray"
 	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "alone and not slow"
+
+rotation: $(READY) ## a thirtieth of the slow tests, another one each day; TURN=7
+	$(BIN)/pytest -n 2 --dist load --turn $(TURN) -m "slow and not alone and not ray"
+	$(BIN)/pytest --turn $(TURN) -m "alone and slow" || test $$? -eq 5  # 5: none is due
 
 soak: $(READY) ## the slow tests: long episodes, memory, the wheel
 	$(BIN)/pytest -m slow

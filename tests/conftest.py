@@ -11,8 +11,29 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.support.cpu_time import CpuTimes, argued, costs_of_files, known_costs, rare_tests
+from tests.support.cpu_time import (
+    TURNS,
+    CpuTimes,
+    argued,
+    costs_of_files,
+    is_due,
+    known_costs,
+    long_tests,
+    rare_tests,
+)
 from tests.support.tiers import ProcessWatch, TimeLimit, is_needed, mark
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option of `make rotation`."""
+    told = f"run only those slow tests that come up in this turn; each does in {TURNS} turns"
+    parser.addoption("--turn", type=int, help=told)
+
+
+def pytest_report_header(config: pytest.Config) -> str | None:
+    """Name the turn of the slow tests."""
+    turn = config.option.turn
+    return None if turn is None else f"slow tests: part {turn % TURNS + 1} of {TURNS}"
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -45,6 +66,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         mark(item)
         if item.nodeid in rare:
             item.add_marker(pytest.mark.slow)
+    if config.option.turn is not None:
+        slow = {item.nodeid for item in items if any(item.iter_markers("slow"))}
+        due = {name for name in slow if is_due(name, config.option.turn, long_tests())}
+        config.hook.pytest_deselected(items=[item for item in items if item.nodeid in slow - due])
+        items[:] = [item for item in items if item.nodeid not in slow - due]
     if hasattr(config, "workerinput") and not config.pluginmanager.has_plugin("time_limit"):
         often = (item.nodeid for item in items if not any(item.iter_markers("slow")))
         costs = costs_of_files(often, known_costs())

@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 from cavmarl.cli import (
     baseline,
     bench,
+    carla,
     demand,
     demo,
     evaluate,
@@ -216,6 +217,14 @@ add_command(
     "follow",
     follow.follow,
     "cavmarl follow town --at 7100 --secret-file world.secret --vehicles car_0,car_1",
+    panel=COSIM,
+)
+add_command(
+    app,
+    "carla",
+    carla.carla,
+    "cavmarl carla grid4x4 --port 2000",
+    "cavmarl carla town --agents 20 --client-version 0.10.0",
     panel=COSIM,
 )
 add_command(

@@ -15,12 +15,14 @@ from cavmarl.cli.output import (
     PAGE_EXTRAS,
     Agents,
     Background,
+    Imports,
     JsonPath,
     MapName,
     Seed,
     about,
     grid,
     make_folder,
+    parse_settings,
     write_json,
 )
 from cavmarl.core.errors import ConfigError, require_all
@@ -38,6 +40,7 @@ def baseline(
     agents: Agents = None,
     background: Background = None,
     seed: Seed = 0,
+    imports: Imports = None,
     out: Annotated[
         Path | None,
         about(
@@ -75,6 +78,7 @@ def baseline(
             episodes=episodes,
             seed=seed,
             progress=show,
+            overrides=parse_settings(None, imports),
         )
     drivers = baseline_drivers(found)
     rows = [

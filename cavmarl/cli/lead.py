@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -29,6 +28,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, FollowerError
+from cavmarl.core.private_files import check_private, write_private
 
 if TYPE_CHECKING:
     from cavmarl.cosim.followers.followed_world import FollowedWorld
@@ -59,8 +59,8 @@ def read_secret(path: Path | None, may_make: bool = False) -> str:
         return ""
     try:
         if may_make and not path.exists():
-            with open(path, "x", opener=partial(os.open, mode=0o600), encoding="ascii") as file:
-                file.write(token_hex(32) + "\n")
+            write_private(path, token_hex(32) + "\n")
+        check_private("--secret-file", path)
         secret = path.read_text("utf-8").strip()
     except (OSError, UnicodeError) as error:
         raise ConfigError(f"--secret-file {path}: {error}") from error

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from cavmarl.cli.output import Environment, JsonPath, about_file, grid, write_json
+from cavmarl.cli.output import Environment, JsonPath, about_file, flag, grid, write_json
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import in_stages
 from cavmarl.engine.world_setup import find_map
@@ -28,6 +28,9 @@ def export(
     opendrive: Annotated[
         Path | None, about_file("Write OpenDRIVE, and check it by reading it back.")
     ] = None,
+    carla: Annotated[
+        bool, flag("Write OpenDRIVE as CARLA's programs read it: one signal per approach.")
+    ] = False,
     lanelet2: Annotated[
         Path | None, about_file("Write Lanelet2 (.osm), and check it by reading it back.")
     ] = None,
@@ -40,6 +43,8 @@ def export(
     """
     if opendrive is None and lanelet2 is None and geojson is None:
         raise ConfigError("the format is missing: give --opendrive, --lanelet2 or --geojson")
+    if carla and opendrive is None:
+        raise ConfigError("--carla goes with --opendrive; add --opendrive FILE")
     console = Console()
     document: dict[str, Any] = {}
     sound = True
@@ -50,7 +55,7 @@ def export(
         path = find_map(env)
         network = load_network(path)
         if opendrive is not None:
-            trip = write_opendrive(path, opendrive, told=told)
+            trip = write_opendrive(path, opendrive, told=told, for_carla=carla)
             _show(console, opendrive, trip)
             sound = trip.same
             document["opendrive"] = trip.to_dict()

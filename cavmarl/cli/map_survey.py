@@ -9,7 +9,17 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from cavmarl.cli.output import Environment, JsonPath, Seed, about, about_file, grid, write_json
+from cavmarl.cli.output import (
+    Environment,
+    Imports,
+    JsonPath,
+    Seed,
+    about,
+    about_file,
+    grid,
+    parse_settings,
+    write_json,
+)
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import counting
 from cavmarl.maps.fidelity.cloud_files import Cloud, write_cloud
@@ -28,6 +38,7 @@ def survey(
         int, about("Number of vehicles, each in its own world.", metavar="N", min=1, max=64)
     ] = 4,
     seed: Seed = 0,
+    imports: Imports = None,
     buildings: Annotated[
         str | None,
         about("Buildings: osm, or a file beside the map (key map.buildings).", metavar="SOURCE"),
@@ -51,7 +62,8 @@ def survey(
 
     if out.suffix.lower() not in (".ply", ".csv"):
         raise ConfigError(f"--out {out}: must end in .ply or .csv")
-    overrides: dict[str, Any] = {"rig": SURVEY_RIG, "clock.ctrl_dt_s": _TICK_S}
+    overrides: dict[str, Any] = parse_settings(None, imports)
+    overrides |= {"rig": SURVEY_RIG, "clock.ctrl_dt_s": _TICK_S}
     if buildings is not None:
         overrides["map.buildings"] = buildings
     console = Console()

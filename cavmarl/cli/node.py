@@ -19,7 +19,7 @@ from cavmarl.cli.output import (
     about,
     flag,
 )
-from cavmarl.cli.service import Authority, Certificate, Key, SecretFile, read_secret
+from cavmarl.cli.service import Authority, Certificate, Key, PlainHttp, SecretFile, read_secret
 from cavmarl.core.errors import ConfigError, WorkerError, require
 
 AGAIN_S = 0.5  # between two attempts while no caller listens
@@ -106,6 +106,7 @@ def node(
     certificate: Certificate = None,
     key: Key = None,
     authority: Authority = None,
+    plain_http: PlainHttp = False,
 ) -> None:
     """Host zones of a world until its caller ends, or work for a coordination service.
 
@@ -139,6 +140,7 @@ def node(
         certificate=certificate,
         key=key,
         authority=None if authority is None else str(authority),
+        allow_plain_http=plain_http,
     )
     host_node(options, typer.echo)
 

@@ -302,15 +302,19 @@ def check_extras(
     require_all(modules)
 
 
-def with_world(*names: str) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
+def with_world(
+    *names: str, is_here: bool = True
+) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
     """Return a decorator for commands that take a `world: WorldSpec`.
 
     The command line gets the options from which the WorldSpec is made instead: ENV, --import and
     the options called `names`, by default all of them. A parameter of the function with the name
     of such an option replaces that option, and the function receives its value, too.
+
+    `is_here`: whether the world is made in this process; otherwise there is no --import.
     """
     chosen = names or ("agents", "background", "seed", "settings", "sensors_of")
-    return partial(_with_world, ("env", *chosen, "imports"))
+    return partial(_with_world, ("env", *chosen, *(("imports",) if is_here else ())))
 
 
 def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callable[..., Made]:
@@ -338,7 +342,7 @@ def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callabl
     def program(**options: Any) -> Made:
         keys = {name: options[name] for name in names if name not in ("settings", "imports")}
         env = keys.pop("env") or ""
-        overrides = parse_settings(options["settings"], options["imports"])
+        overrides = parse_settings(options["settings"], options.get("imports"))
         spec = WorldSpec.of(env, overrides=overrides, **keys)
         return command(spec, **{name: options[name] for name in own})
 

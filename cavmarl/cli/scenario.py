@@ -19,6 +19,7 @@ from cavmarl.cli.output import (
     VIDEO_EXTRAS,
     WINDOW_EXTRAS,
     WORLD,
+    Imports,
     JsonPath,
     Zones,
     about,
@@ -26,6 +27,7 @@ from cavmarl.cli.output import (
     add_command,
     check_extras,
     number,
+    parse_settings,
     with_world,
     write_json,
 )
@@ -156,6 +158,7 @@ def sweep(
         str, about("Density of other traffic: none, low or high.", metavar="DENSITY")
     ] = "none",
     agents: Annotated[int, about("Number of agents in each world.", metavar="N", min=1)] = 1,
+    imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
     """Test two drivers in many scenarios and maps.
@@ -170,6 +173,7 @@ def sweep(
     rows = []
     chosen, maps = names or scenario_names(), map_names or ["grid4x4"]
     keys: dict[str, Any] = {"passes": passes, "fails": fails, "density": density, "agents": agents}
+    keys["overrides"] = parse_settings(None, imports)
     with counting(Console(), "scenarios") as told:
         found = []
         for row in sweep_scenarios(chosen, maps, range(seeds), **keys):

@@ -18,7 +18,6 @@ from cavmarl.cli.output import (
     SERVICE,
     Episodes,
     JsonPath,
-    Policies,
     Repeats,
     about,
     flag,
@@ -30,6 +29,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, ServiceError, require
+from cavmarl.core.private_files import check_private, write_private
 from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -57,6 +57,14 @@ Authority = Annotated[
     about(
         "Certificate of the authority that signed the certificate of the service.",
         metavar="FILE",
+        panel=SERVICE,
+    ),
+]
+PlainHttp = Annotated[
+    bool,
+    flag(
+        "Send secrets to other machines without TLS, too, in a network that you trust.",
+        "--plain-http",
         panel=SERVICE,
     ),
 ]
@@ -137,16 +145,46 @@ def grant(
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
+    plain_http: PlainHttp = False,
+    out: Annotated[
+        Path | None,
+        about(
+            "New file for the secret, which only you can read [default: print it].",
+            metavar="FILE",
+            panel=OUTPUT,
+        ),
+    ] = None,
 ) -> None:
-    """Create an identity and print its secret, which is not shown again."""
-    with connect(service, secret_file, authority) as client:
-        _print(client.post("/identities", {"name": name, "role": role})["secret"])
+    """Create an identity and its secret, which is not shown again."""
+    with connect(service, secret_file, authority, plain_http) as client:
+        if out is not None:
+            _write_secret(out, "")  # before the identity exists: its secret is shown only once
+        secret = client.post("/identities", {"name": name, "role": role})["secret"]
+    if out is None:
+        _print(secret)
+    else:
+        out.write_text(f"{secret}\n", encoding="utf-8")
 
 
-@with_world()
+@with_world(is_here=False)
 def submit(
     world: WorldSpec,
-    policy: Policies = None,
+    env: Annotated[
+        str,
+        typer.Argument(
+            metavar="ENV", help="Name of an environment that the service and its nodes have."
+        ),
+    ],
+    policy: Annotated[
+        list[str] | None,
+        about(
+            "Driver to evaluate: the name of one that the service and its nodes have. Repeat the "
+            "option to compare drivers with the first one [default: idm].",
+            "--policy",
+            "-p",
+            metavar="POLICY",
+        ),
+    ] = None,
     episodes: Episodes = 32,
     repeats: Repeats = 1,
     wait_s: Annotated[
@@ -160,6 +198,7 @@ def submit(
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
+    plain_http: PlainHttp = False,
     json_path: JsonPath = None,
 ) -> None:
     """Evaluate drivers on a node of the service, and show the results."""
@@ -169,7 +208,7 @@ def submit(
     console = Console()
     keys = {**world.keywords, "seed": world.seed, "overrides": dict(world.overrides)}
     del keys["max_cycles"]
-    with connect(service, secret_file, authority) as client:
+    with connect(service, secret_file, authority, plain_http) as client:
         job = client.submit(
             world.env, policies=policy or ["idm"], episodes=episodes, repeats=repeats,
             wait_s=wait_s, **keys,
@@ -201,6 +240,7 @@ def nodes(
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
+    plain_http: PlainHttp = False,
     drain: Annotated[
         str | None, about("Drain this node: it accepts no new sessions.", metavar="NODE")
     ] = None,
@@ -210,7 +250,7 @@ def nodes(
     json_path: JsonPath = None,
 ) -> None:
     """Show the nodes of a service with state, load, LoadScore and sessions."""
-    with connect(service, secret_file, authority) as client:
+    with connect(service, secret_file, authority, plain_http) as client:
         for name, word in ((drain, "drain"), (resume, "resume")):
             if name is not None:
                 client.post(f"/nodes/{name}/{word}")
@@ -238,10 +278,11 @@ def sessions(
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
+    plain_http: PlainHttp = False,
     json_path: JsonPath = None,
 ) -> None:
     """Show the sessions and jobs that you may see, or open the page of one session."""
-    with connect(service, secret_file, authority) as client:
+    with connect(service, secret_file, authority, plain_http) as client:
         if page is not None:
             told = client.take_up(page).page()
             _print(f"viewer: {told['address']}")
@@ -271,9 +312,10 @@ def events(
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
+    plain_http: PlainHttp = False,
 ) -> None:
     """Print the event log of a service as JSON, one event per line."""
-    with connect(service, secret_file, authority) as client:
+    with connect(service, secret_file, authority, plain_http) as client:
         if follow:
             for event in client.follow(after):
                 if subject in (None, event["subject"]):
@@ -314,13 +356,16 @@ def manifest(
     write_json(json_path, document)
 
 
-def connect(service: str, secret_file: Path | None, authority: Path | None) -> Client:
+def connect(
+    service: str, secret_file: Path | None, authority: Path | None, plain_http: bool = False
+) -> Client:
     """Return a client that is authenticated with the user's secret."""
     require("httpx", "service")
     from cavmarl.client import Client
 
     verify = str(authority) if authority else True
-    return Client(service, read_secret(secret_file), verify=verify)
+    secret = read_secret(secret_file)
+    return Client(service, secret, verify=verify, allow_plain_http=plain_http)
 
 
 def read_secret(secret_file: Path | None) -> str:
@@ -330,6 +375,7 @@ def read_secret(secret_file: Path | None) -> str:
     """
     if secret_file is not None:
         try:
+            check_private("--secret-file", secret_file)
             return secret_file.read_text(encoding="utf-8").strip()
         except OSError as error:
             raise ServiceError(
@@ -342,6 +388,13 @@ def read_secret(secret_file: Path | None) -> str:
             "prints the secret of the admin, `cavmarl grant NAME` creates others"
         )
     return secret
+
+
+def _write_secret(path: Path, text: str) -> None:
+    try:
+        write_private(path, text)
+    except OSError as error:
+        raise ServiceError(f"--out {path}: {error.strerror}; give a new file") from error
 
 
 def _state(node: dict[str, Any]) -> str:

@@ -14,6 +14,7 @@ from cavmarl.cli.evaluate import report_cell
 from cavmarl.cli.output import (
     OUTPUT,
     Episodes,
+    Imports,
     JsonPath,
     Policies,
     Repeats,
@@ -21,6 +22,7 @@ from cavmarl.cli.output import (
     about,
     grid,
     make_folder,
+    parse_settings,
     write_json,
 )
 from cavmarl.config.registry import find_settings
@@ -44,6 +46,7 @@ def suite(
     episodes: Episodes = 4,
     repeats: Repeats = 5,
     seed: Seed = 0,
+    imports: Imports = None,
     out: Annotated[
         Path,
         about("Folder for the results, with one folder per world.", metavar="DIR", panel=OUTPUT),
@@ -70,6 +73,7 @@ def suite(
             episodes=episodes,
             repeats=repeats,
             seed=seed,
+            overrides=parse_settings(None, imports),
             began=lambda world: told(places[world.label], len(worlds)),
         )
     console.print(_table(reports))

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from cavmarl.cli.listing import sentence_about
 from cavmarl.cli.output import (
+    Imports,
     JsonPath,
     about,
     add_command,
@@ -72,6 +73,7 @@ def verify(
     name: Annotated[
         str, typer.Argument(metavar="DRIVER", help="Name or folder of a trained driver.")
     ],
+    imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
     """Repeat the recorded evaluation of a driver.

@@ -15,6 +15,7 @@ import httpx
 from cavmarl.client.service_protocol import Ask, Flow, Rest, ServiceFlows, Told, check
 from cavmarl.client.world_protocol import RECOVERY_S, WorldFlows
 from cavmarl.core.errors import ServiceError
+from cavmarl.core.server_address import is_loopback
 
 T = TypeVar("T")
 TIMEOUT = httpx.Timeout(300.0, connect=5.0)  # the first world may compile kernels
@@ -40,15 +41,25 @@ def _write(files: dict[str, bytes], folder: str | Path) -> Path:
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
-        if Path(name).name != name:
-            raise ServiceError(
-                f"result {name!r}: is not a file name; the server is not a cavmarl service"
-            )
         (path / name).write_bytes(content)
     return path
 
 
-def _request(http: httpx.Client | httpx.AsyncClient, ask: Ask) -> httpx.Request:
+def _request(
+    http: httpx.Client | httpx.AsyncClient, ask: Ask, allow_plain_http: bool
+) -> httpx.Request:
+    """Return a request.
+
+    Raises:
+        ServiceError: its secret or token could be read on the way to another machine.
+    """
+    url = httpx.URL(ask.url)
+    if url.scheme != "https" and not is_loopback(url.host) and not allow_plain_http:
+        raise ServiceError(
+            f"{url.scheme}://{url.netloc.decode()}: is another machine, and without TLS the secret "
+            "can be read on the way: use https://, or allow_plain_http=True (--plain-http) in a "
+            "network that you trust"
+        )
     headers = {"Authorization": f"Bearer {ask.token}"} if ask.token else {}
     if ask.key:
         headers["Idempotency-Key"] = ask.key
@@ -73,10 +84,14 @@ class Client:
         secret: of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
         verify: certificate file of the authority that signed the service's certificate; True
             accepts the authorities that the system trusts.
+        allow_plain_http: send the secret and tokens to other machines without TLS, too.
     """
 
-    def __init__(self, url: str, secret: str, *, verify: str | bool = True) -> None:
+    def __init__(
+        self, url: str, secret: str, *, verify: str | bool = True, allow_plain_http: bool = False
+    ) -> None:
         self._http = httpx.Client(timeout=TIMEOUT, verify=_trust(verify))
+        self._allow_plain_http = allow_plain_http
         self.flows = ServiceFlows(url, secret)
 
     def open(
@@ -168,7 +183,7 @@ class Client:
         """Yield events as they happen, until the service ends."""
         url, token = f"{self.flows.url}/v1/events/stream", self.run(self.flows.token())
         ask = Ask("GET", url, params={"after": after}, token=token)
-        answer = self._http.send(_request(self._http, ask), stream=True)
+        answer = self._http.send(self._request(ask), stream=True)
         try:
             if not answer.is_success:
                 answer.read()
@@ -202,7 +217,10 @@ class Client:
         if isinstance(step, Rest):
             time.sleep(step.time_s)
             return None
-        return self._http.send(_request(self._http, step))
+        return self._http.send(self._request(step))
+
+    def _request(self, ask: Ask) -> httpx.Request:
+        return _request(self._http, ask, self._allow_plain_http)
 
     def close(self) -> None:
         """Close the connections."""
@@ -265,8 +283,11 @@ class RemoteWorld:
 class AsyncClient:
     """A client with coroutines. Tasks may share it, but each world belongs to one task."""
 
-    def __init__(self, url: str, secret: str, *, verify: str | bool = True) -> None:
+    def __init__(
+        self, url: str, secret: str, *, verify: str | bool = True, allow_plain_http: bool = False
+    ) -> None:
         self._http = httpx.AsyncClient(timeout=TIMEOUT, verify=_trust(verify))
+        self._allow_plain_http = allow_plain_http
         self.flows = ServiceFlows(url, secret)
 
     async def open(
@@ -324,7 +345,7 @@ class AsyncClient:
         """Like `Client.follow`."""
         url, token = f"{self.flows.url}/v1/events/stream", await self.run(self.flows.token())
         ask = Ask("GET", url, params={"after": after}, token=token)
-        answer = await self._http.send(_request(self._http, ask), stream=True)
+        answer = await self._http.send(self._request(ask), stream=True)
         try:
             if not answer.is_success:
                 await answer.aread()
@@ -356,7 +377,10 @@ class AsyncClient:
         if isinstance(step, Rest):
             await asyncio.sleep(step.time_s)
             return None
-        return await self._http.send(_request(self._http, step))
+        return await self._http.send(self._request(step))
+
+    def _request(self, ask: Ask) -> httpx.Request:
+        return _request(self._http, ask, self._allow_plain_http)
 
     async def close(self) -> None:
         """Close the connections."""

@@ -6,6 +6,7 @@ asynchronous client share it.
 
 from __future__ import annotations
 
+import re
 import secrets
 import time
 from collections.abc import Callable, Generator, Mapping
@@ -20,6 +21,7 @@ RENEW_BEFORE_S = 60.0  # time before its expiry at which a token is renewed
 AGAIN_S = 0.2  # time between two attempts
 PAGE = 1000  # maximum number of events in one answer
 RETRIED_S = 10.0  # how long a request is repeated after a lost answer
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
 class Ask(NamedTuple):
@@ -118,9 +120,8 @@ class ServiceFlows:
     ) -> Flow[str]:
         """Submit a job and return its id."""
         found = yield from self.add_configuration(environment, keys)
-        return str(
-            (yield from self.post_once("/jobs", {"configuration": found, **job}, RETRIED_S))["id"]
-        )
+        body = {"configuration": found, **job}
+        return plain_name((yield from self.post_once("/jobs", body, RETRIED_S))["id"])
 
     def wait(
         self, job: str, timeout_s: float, told: Told = lambda _: None, poll_s: float = 0.25
@@ -144,7 +145,7 @@ class ServiceFlows:
         """Return the files of a job by name."""
         found = yield from self.get(f"/sessions/{job}")
         files = {}
-        for name in found["results"]:
+        for name in map(plain_name, found["results"]):
             answer = yield from self.ask("GET", f"/jobs/{job}/results/{name}")
             files[name] = answer.content
         return files
@@ -166,6 +167,18 @@ class ServiceFlows:
         found = answer.json()
         self._token = found["access_token"]
         self._until_s = time.monotonic() + found["expires_in"] - RENEW_BEFORE_S
+
+
+def plain_name(name: Any) -> str:
+    """Return the name of a result or a job; refuse a name that could lead out of a folder.
+
+    Raises:
+        ServiceError: it does not consist of letters, digits, `_`, `.` and `-`, after a letter or
+            digit.
+    """
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise ServiceError(f"{name!r}: is not a name; the server is not a cavmarl service")
+    return name
 
 
 def check(answer: httpx.Response) -> None:

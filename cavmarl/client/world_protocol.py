@@ -23,7 +23,7 @@ from cavmarl.core.errors import ActionError, ServiceError
 
 RECOVERY_S = 60.0
 RETRY_S = 1.0
-_FOUND_ELSEWHERE = ("lost", "bad-token", "superseded")
+_FOUND_ELSEWHERE = ("lost", "bad-token", "superseded", "unreachable")
 SAVED_HEADER = "cavmarl-saved"
 
 Arrays = dict[str, NDArray[Any]]

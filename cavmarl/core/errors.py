@@ -181,12 +181,19 @@ class WorkerDeathError(WorkerError):
         causes: cause of each death.
     """
 
-    def __init__(self, worker: int, part: str, order: int, what: str, causes: list[str]) -> None:
+    def __init__(
+        self,
+        worker: int,
+        part: str,
+        order: int,
+        what: str,
+        causes: list[str],
+        cure: str = "SIGKILL comes from a user, or from the system if memory runs out; processes "
+        "print to standard error; backend='local' runs the same worlds in this process",
+    ) -> None:
         super().__init__(
             f"worker {worker} ({part}) could not do its {what} (order {order}): {len(causes)} "
-            f"processes died ({', '.join(causes)}). SIGKILL comes from a user, or from the "
-            "system if memory runs out; processes print to standard error; "
-            "backend='local' runs the same worlds in this process"
+            f"processes died ({', '.join(causes)}). {cure}"
         )
         self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)
 

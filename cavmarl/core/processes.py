@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -48,21 +49,55 @@ def die_with_parent() -> None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
 
 
+def limit_memory(most_bytes: int) -> None:
+    """Limit the memory that this process and its children may each allocate; Linux only."""
+    if _LIBC is not None:
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        most = most_bytes if hard == resource.RLIM_INFINITY else min(most_bytes, hard)
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+
+
+def occupy_standard_descriptors() -> None:
+    """Open the null device for each of standard input, output and error that is closed.
+
+    Otherwise a new descriptor gets such a number, and a child process that should inherit it gets
+    its own standard input instead.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            # It takes the lowest number that is free, which is this one.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+
+
 # Runs in a new interpreter: with threads, code between fork and exec may hang.
 _WRAPPER = """
-import ctypes, os, signal, sys
+import ctypes, os, resource, signal, sys
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 ctypes.CDLL(None).prctl(int(sys.argv[1]), int(sys.argv[2]), 0, 0, 0)
+if int(sys.argv[4]):
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    most = int(sys.argv[4]) if hard == resource.RLIM_INFINITY else min(int(sys.argv[4]), hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+for number in range(3):
+    try:
+        os.fstat(number)
+    except OSError:
+        os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
 if os.getppid() == int(sys.argv[3]):
-    os.execv(sys.argv[4], sys.argv[4:])
+    os.execv(sys.argv[5], sys.argv[5:])
 """
 
 
-def dying_with_parent(command: Sequence[str]) -> list[str]:
-    """Return a command that runs `command`, a path with arguments, and ends with this process."""
+def dying_with_parent(command: Sequence[str], most_bytes: int = 0) -> list[str]:
+    """Return a command that runs `command`, a path with arguments, and ends with this process.
+
+    `most_bytes`: memory that the command and its children may each allocate, Linux only; 0: any.
+    """
     if sys.platform != "linux":
         return list(command)
-    numbers = (_PR_SET_PDEATHSIG, int(signal.SIGKILL), os.getpid())
+    numbers = (_PR_SET_PDEATHSIG, int(signal.SIGKILL), os.getpid(), most_bytes)
     return [sys.executable, "-I", "-S", "-c", _WRAPPER, *map(str, numbers), *command]
 
 

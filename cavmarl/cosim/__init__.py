@@ -1,4 +1,4 @@
-"""Lock-step with other processes: the time master, followers over a socket, a reference stack.
+"""Lock-step with other processes: the time master, followers, a reference stack, CARLA's clients.
 
 Depends on `env`; `cli` starts both ends.
 """

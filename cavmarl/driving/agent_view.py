@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,15 +140,25 @@ class RegisteredFunction:
             fits = answers.shape == (len(view.own), self._size)
         else:
             each = [np.atleast_1d(self._numbers(self._function(one))) for one in view.single()]
-            fits = all(one.shape == (self._size,) for one in each)
-            answers = np.stack(each) if fits else each[0]
-        if not fits or not np.isfinite(answers).all():
-            raise RegisteredFunctionError(
-                f"registered function '{self._name}' returned {answers[:4].tolist()} for vehicles "
-                f"{view.own['id'][:4].tolist()}; it must return {self._size} finite number(s) per "
-                "agent"
+            odd = [one for one in each if one.shape != (self._size,)]
+            fits, answers = not odd, odd[0] if odd else np.stack(each)
+        if not fits:
+            self._refuse(f"{answers.tolist()!r:.200}")
+        wrong = np.argwhere(~np.isfinite(answers))
+        if len(wrong):
+            agent, place = wrong[0].tolist()
+            own = view.own[agent]
+            which = f" as number {place}" if self._size > 1 else ""
+            self._refuse(
+                f"{answers[agent, place]}{which} for agent {own['agent']} (vehicle {own['id']})"
             )
         return answers
+
+    def _refuse(self, what: str) -> NoReturn:
+        raise RegisteredFunctionError(
+            f"registered function '{self._name}' returned {what}; it must return {self._size} "
+            "finite number(s) per agent"
+        )
 
     def _numbers(self, answer: Any) -> NDArray[np.float32]:
         """Return an answer as an array; raise RegisteredFunctionError if it has no numbers."""
@@ -158,10 +168,7 @@ class RegisteredFunction:
                 return found.astype(np.float32)
         except (TypeError, ValueError):  # rows of different lengths, for example
             pass
-        raise RegisteredFunctionError(
-            f"registered function '{self._name}' returned {answer!r:.200}; it must return "
-            f"{self._size} finite number(s) per agent"
-        )
+        self._refuse(f"{answer!r:.200}")
 
     def _check_order(self, view: BatchView, numbers: NDArray[np.float32]) -> None:
         """Compare the values with those for vehicles and agents in another order, and alone."""

@@ -121,10 +121,11 @@ class Simulation(WorldViews):
         agents = self.config.population.agents
         seated = self.outputs.present[chosen].sum(axis=1)
         if self.config.population.mode == "closed" and (seated < agents).any():
+            fewer = self._tick.traffic.placed_agents
             raise CapacityError(
                 f"population.agents = {agents}: the map '{self.network.name}' has free places for "
-                f"{int(seated.min())}; use fewer agents, or population.mode = open or respawn, "
-                "where further agents wait until there is room"
+                f"{int(seated.min())}; set it (agents=N, --agents N) to {fewer} or less, or "
+                "population.mode = open or respawn, where further agents wait for room"
             )
 
     def _populate(self, chosen: NDArray[np.bool_]) -> None:

@@ -29,6 +29,7 @@ from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.engine.component import Component
 from cavmarl.engine.external_component import ExternalComponent
 from cavmarl.handoff.division import ZonedShards
+from cavmarl.roads.network import RoadNetwork
 from cavmarl.shards.row_check import LEAST_FACTOR, MOST
 from cavmarl.shards.state import Use, names_of
 from cavmarl.traffic.departure_queue import DEPARTURE
@@ -164,13 +165,9 @@ class StateForm(NamedTuple):
 
     def _wrong_common(self, named: dict[str, Array]) -> str:
         roads = self.roads
-        phases, controllers = named["signal_phase"], named["controllers"]
-        if _outside(phases, 0, max(len(roads.phases), 1)):
-            return "signal_phase names a phase that does not exist"
-        if phases.size:
-            ends = roads.phases["first_state"][phases] + roads.signals["num_links"]
-            if (ends > len(roads.phase_states)).any():
-                return "signal_phase names a phase of another signal"
+        controllers = named["controllers"]
+        if wrong := wrong_phases(named["signal_phase"], roads):
+            return wrong
         if (named["ticks"] > _MOST_TICKS).any():
             return f"ticks is above {_MOST_TICKS}"
         if controllers.size:
@@ -243,6 +240,17 @@ class StateForm(NamedTuple):
             if wrong:
                 return f"world {w}: {wrong}"
         return ""
+
+
+def wrong_phases(phases: NDArray[np.int32], roads: RoadArrays | RoadNetwork) -> str:
+    """Return what is wrong with the present phases (…, num_signals); empty if nothing."""
+    if _outside(phases, 0, max(len(roads.phases), 1)):
+        return "signal_phase names a phase that does not exist"
+    if phases.size:
+        ends = roads.phases["first_state"][phases] + roads.signals["num_links"]
+        if (ends > len(roads.phase_states)).any():
+            return "signal_phase names a phase of another signal"
+    return ""
 
 
 def _as_vehicles(waiting: NDArray[np.void]) -> NDArray[np.void]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
@@ -29,6 +30,7 @@ from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import conversion_notes, map_file
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.default_horizon import horizon_of
+from cavmarl.roads.held_signals import held_signals_note
 from cavmarl.roads.joined_maps import join
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import map_name, source_hash
@@ -149,7 +151,15 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     buildings = resolve_buildings(config, base_dir)
     if buildings is not None:
         network = with_buildings(network, buildings)
-    return with_programs(network, _program_files(config, base_dir), config.map.program)
+    network = with_programs(network, _program_files(config, base_dir), config.map.program)
+    if note := held_signals_note(network):
+        _warn_once(network.name, network.source_hash, note)
+    return network
+
+
+@cache
+def _warn_once(name: str, source_hash: str, note: str) -> None:
+    log.warning("%s: %s", name, note)
 
 
 def _demand_files(config: EnvConfig, base_dir: Path) -> list[Path]:

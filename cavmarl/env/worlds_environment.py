@@ -110,10 +110,12 @@ class WorldsEnvironment(OwnWorlds):
         self._session.insertions.vehicle(world, lane, position_m)
 
     def close_road(self, edge: str, world: int = 0) -> None:
-        """Close a road from the next step on, until it is opened or the episode is over.
+        """Close the car lanes of a road, until it is opened or the episode is over.
 
-        A standing car closes each lane at its start, as soon as there is a safe gap. Each of these
-        cars counts in `population.insertions`. Other vehicles wait, or take another route.
+        From the next step on, a standing car closes each lane that is open to cars at its start,
+        as soon as there is a safe gap. Other lanes, such as bus lanes without cars, stay open. Each
+        of these cars counts in `population.insertions`. Vehicles on the road drive on. Vehicles
+        before it wait; demand vehicles with a rerouting device may take another route.
 
         Args:
             edge: id of a road.

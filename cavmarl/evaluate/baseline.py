@@ -49,6 +49,7 @@ def run_baseline(
     episodes: int = 6,
     seed: int = 0,
     progress: Progress | None = None,
+    overrides: Mapping[str, Any] | None = None,
 ) -> dict[str, EvaluationReport]:
     """Evaluate `random_actions`, `idm` and a trained driver in traffic, and `idm` alone.
 
@@ -62,16 +63,15 @@ def run_baseline(
             64.
         seed: of the episodes.
         progress: as in `evaluate`.
+        overrides: values of further keys of the environment.
 
     Raises the errors of `evaluate`, for example for a map that cannot be driven.
     """
     config, base_dir = load_config(where)
     maps = [str(path) for path in resolve_maps(config, base_dir)]
-    overrides = {"map.source": maps[0] if len(maps) == 1 else maps}
-    busy = WorldSpec(
-        env=RULES, agents=agents, background=background, seed=seed, overrides=overrides
-    )
-    empty = WorldSpec(env=RULES, agents=1, background=0, seed=seed, overrides=overrides)
+    keys = {**(overrides or {}), "map.source": maps[0] if len(maps) == 1 else maps}
+    busy = WorldSpec(env=RULES, agents=agents, background=background, seed=seed, overrides=keys)
+    empty = WorldSpec(env=RULES, agents=1, background=0, seed=seed, overrides=keys)
     drivers = {Path(name).name: name for name in ("random_actions", "idm", policy)}
     alone = min(64, 8 * episodes)
     return {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,15 +84,19 @@ def run_suite(
     repeats: int,
     seed: int,
     began: Callable[[SuiteWorld], None],
+    overrides: Mapping[str, object] | None = None,
 ) -> dict[str, EvaluationReport]:
     """Evaluate the policies in every world, each in its own folder in `out`.
 
     If the suite sets the number of agents, trips that end are replaced (respawn), so that the
-    number stays the same. `began` is called before each world. Policies, episodes, repeats and seed
+    number stays the same. `began` is called before each world. `overrides` are values of further
+    keys of every world. Policies, episodes, repeats and seed
     are as in `evaluate`.
     """
     reports = {}
-    keys: dict[str, object] = {} if suite.agents is None else {"population.mode": "respawn"}
+    keys: dict[str, object] = dict(overrides or {})
+    if suite.agents is not None:
+        keys["population.mode"] = "respawn"
     if suite.horizon_s is not None:
         keys["horizon_s"] = suite.horizon_s
     for world in worlds:

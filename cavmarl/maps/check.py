@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.maps.components import strong_components
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.default_horizon import horizon_of
+from cavmarl.roads.held_signals import held_signals, held_signals_note
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
@@ -58,6 +59,7 @@ class MapReport:
     # phases, delay-based and NEMA programs run with their stated durations, and limits of single
     # links are ignored
     programs_simplified: tuple[str, ...]
+    signals_held: tuple[str, ...]  # signals that show red for 1,000 s or more in one phase
     self_loops: tuple[str, ...]  # edges that end where they begin
     steep_lanes: tuple[str, ...]  # lanes that climb more than 15 %, the steepest first
     speed_outliers: tuple[str, ...]  # lanes with a speed limit below 1 or above 70 m/s
@@ -118,8 +120,9 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
         connected_share=share,
         horizon_s=horizon_of(network),
         **findings,
+        signals_held=held_signals(network),
         problems=tuple(cars.problems()),
-        notes=tuple(_notes(network.notes, findings, share, grade)),
+        notes=tuple(_notes(network, findings, share, grade)),
     )
 
 
@@ -232,9 +235,9 @@ def _lanes_never_green(network: RoadNetwork) -> tuple[str, ...]:
 
 
 def _notes(
-    of_map: tuple[str, ...], findings: dict[str, tuple[str, ...]], share: float, grade: float
+    network: RoadNetwork, findings: dict[str, tuple[str, ...]], share: float, grade: float
 ) -> list[str]:
-    notes = list(of_map)
+    notes = [*network.notes, *filter(None, [held_signals_note(network)])]
     if share < _WELL_CONNECTED:
         notes.append(
             f"only {share:.0%} of the edges are in the largest connected part: trips from other "

@@ -26,6 +26,7 @@ from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, rai
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument
 from cavmarl.maps.netconvert_process import (
+    MEMORY_LIMIT,
     TIME_LIMIT,
     BuildLog,
     Cures,
@@ -368,6 +369,8 @@ class _Build:
         cures = Cures(
             f"crop the map (cavmarl map build {self.source} --bbox …) or allow more time "
             f"(--timeout-s, or {TIME_LIMIT})",
+            f"crop the map (cavmarl map build {self.source} --bbox …) or allow more memory "
+            f"({MEMORY_LIMIT}, in bytes)",
             "keep an area with roads: --bbox WEST,SOUTH,EAST,NORTH, "
             + ("in degrees" if self.kind == "osm" else "in metres")
             if self.bbox is not None

@@ -16,6 +16,9 @@ from cavmarl.roads.sumo_net.xml_source import limit
 
 MAX_NETCONVERT_S = 600
 TIME_LIMIT = "CAVMARL_MAX_NETCONVERT_S"  # environment variable that changes this limit
+MAX_NETCONVERT_BYTES = 1 << 33
+MEMORY_LIMIT = "CAVMARL_MAX_NETCONVERT_BYTES"  # environment variable that changes this limit
+_OUT_OF_MEMORY = "bad_alloc"
 _SHOWN_LINES = 10
 _QUOTED = re.compile(r"'[^']*'")
 _NUMBERED = re.compile(r"\S*\d\S*")
@@ -57,23 +60,25 @@ class Cures:
     """Advice for error messages."""
 
     too_long: str = f"allow more time ({TIME_LIMIT})"
+    too_large: str = f"allow more memory ({MEMORY_LIMIT}, in bytes)"
     refused: str = "repair the source"
 
 
 def run_netconvert(
     arguments: Sequence[str], source: Path, timeout_s: float | None, cures: Cures = Cures()
 ) -> BuildLog:
-    """Run netconvert of the `eclipse-sumo` wheel.
+    """Run netconvert of the `eclipse-sumo` wheel, with `CAVMARL_MAX_NETCONVERT_BYTES` of memory.
 
     `source`: the map file, for messages. `timeout_s`: time limit; None: `CAVMARL_MAX_NETCONVERT_S`,
     or 600 s. `cures`: advice for messages.
 
     Raises:
-        ConfigError: the environment variable is not a whole number above 0.
-        MapError: netconvert fails or takes too long.
+        ConfigError: an environment variable is not a whole number above 0.
+        MapError: netconvert fails, takes too long, or needs too much memory.
         MissingExtraError: netconvert is not installed.
     """
     timeout_s = limit(TIME_LIMIT, MAX_NETCONVERT_S) if timeout_s is None else timeout_s
+    most_bytes = limit(MEMORY_LIMIT, MAX_NETCONVERT_BYTES)
     home = sumo_home()
     command = [str(home / "bin" / "netconvert"), *arguments]
     command += ["--verbose", "--aggregate-warnings=1000000", "--xml-validation=never"]
@@ -81,7 +86,7 @@ def run_netconvert(
     own = {"SUMO_HOME": str(home), "PROJ_DATA": projections, "PROJ_LIB": projections}
     try:
         done = subprocess.run(
-            dying_with_parent(command),
+            dying_with_parent(command, most_bytes),
             capture_output=True,
             text=True,
             errors="replace",
@@ -94,6 +99,11 @@ def run_netconvert(
             f"{source}: netconvert took longer than {timeout_s:g} s: {cures.too_long}"
         ) from error
     log = BuildLog(done.stdout, done.stderr)
+    if done.returncode != 0 and _OUT_OF_MEMORY in done.stderr:
+        raise MapError(
+            f"{source}: netconvert needs more than {most_bytes / 2**30:g} GiB of memory: "
+            f"{cures.too_large}"
+        )
     if done.returncode != 0:
         raise MapError(
             f"{source}: netconvert failed (exit code {done.returncode}):\n"

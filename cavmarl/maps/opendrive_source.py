@@ -9,16 +9,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, SubElement, tostring
+from xml.sax.handler import ContentHandler
 
 from defusedxml.common import DefusedXmlException
 
 from cavmarl.core.errors import MapError
 from cavmarl.maps.provenance import RoadDefaults
 from cavmarl.maps.traffic_sides import Side
-from cavmarl.roads.sumo_net.xml_source import read_tree
+from cavmarl.roads.sumo_net.xml_source import limit, read_tree, read_xml
 
 NO_LIMIT_MPS = 142.0 / 3.6  # as netconvert reads `maxspeed=none` of OSM
 WALKING_MPS = 5.0 / 3.6  # lower limits are more likely a wrong unit
+MAX_GEOMETRY_M = 100_000
+LENGTH_LIMIT = "CAVMARL_MAX_GEOMETRY_M"  # environment variable that changes this limit
 LEAST_PART_M = 1.0  # netconvert makes an edge of each part of a road with its own limit
 
 _UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6, "kph": 1.0 / 3.6, "mph": 0.44704}
@@ -72,6 +75,7 @@ class OpenDriveSource:
             self.root = read_tree(self.path)
         except (ParseError, DefusedXmlException, ValueError, OSError) as error:
             raise MapError(f"{self.path}: cannot be read ({error}): export it again") from error
+        self._refuse_endless()
         self._set_lane_types()
         self._set_limits()
 
@@ -132,6 +136,23 @@ class OpenDriveSource:
         for validity in self.root.iter("validity"):
             _negate(validity, "fromLane")
             _negate(validity, "toLane")
+
+    def _refuse_endless(self) -> None:
+        """Raise MapError for a geometry so long that netconvert would fill the memory with it."""
+        most_m = limit(LENGTH_LIMIT, MAX_GEOMETRY_M)
+        number = 0
+        for road in self.root.iter("road"):
+            for geometry in road.iterfind("planView/geometry"):
+                length_m = self._number(geometry, "length", math.inf)
+                if abs(length_m) > most_m:
+                    lines = _GeometryLines()
+                    read_xml(self.path, lines)
+                    raise MapError(
+                        f"{self.path}:{lines.found[number]}: road '{road.get('id')}' has a "
+                        f"geometry of {geometry.get('length')} m: at most {most_m} m are allowed: "
+                        f"repair its length, or set {LENGTH_LIMIT}"
+                    )
+                number += 1
 
     def _roads(self) -> Iterator[Element]:
         """Yield the roads outside of junctions, where netconvert makes its own paths."""
@@ -202,8 +223,8 @@ class OpenDriveSource:
                     continue
                 for speed in records:
                     lane.remove(speed)
-                for at, limit in parts:
-                    value = usual if limit is None else limit
+                for at, given in parts:
+                    value = usual if given is None else given
                     words = {"sOffset": f"{at - begin:.6g}", "max": f"{value:.6g}", "unit": "m/s"}
                     SubElement(lane, "speed", words)
                 self.changed = True
@@ -233,13 +254,37 @@ class OpenDriveSource:
         self.counts[_INVALID] += 1
         return None
 
-    def _number(self, element: Element, key: str) -> float:
-        """Return a position or length in m; netconvert reports those that it cannot read."""
+    def _number(self, element: Element, key: str, endless: float = 0.0) -> float:
+        """Return a position or length in m; netconvert reports those that it cannot read.
+
+        `endless`: returned for numbers that are not finite.
+        """
         try:
             value = float(element.get(key, "0"))
         except ValueError:
             return 0.0
-        return value if math.isfinite(value) else 0.0
+        return value if math.isfinite(value) else endless
+
+
+class _GeometryLines(ContentHandler):
+    """Finds the line of each geometry of a road's reference line.
+
+    Attributes:
+        found: the lines, in the order of the document.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[int] = []
+        self._open: list[str] = []
+
+    def startElement(self, name: str, attrs: object) -> None:
+        if [*self._open[-2:], name] == ["road", "planView", "geometry"]:
+            self.found.append(self._locator.getLineNumber())  # type: ignore[attr-defined]
+        self._open.append(name)
+
+    def endElement(self, name: str) -> None:
+        self._open.pop()
 
 
 def _negate(element: Element, key: str) -> None:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
-from cavmarl.recordings.recording_format import arrow, damaged
+from cavmarl.recordings.part_files import MOST_BYTES, damaged
+from cavmarl.recordings.recording_format import arrow
 
 KINDS = ("observations", "samples", "messages")
 
@@ -79,28 +80,44 @@ def extra_table(parts: Sequence[ExtraRows], dtype: np.dtype[Any]) -> Any:
     return pa.table(columns)
 
 
-def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArray[np.void]]:
-    """Return (episodes (n,), rows (n,)) of a table.
+def extra_schema(dtype: np.dtype[Any]) -> Any:
+    """Return the Arrow schema of a table of rows of a dtype."""
+    pa = arrow()
+    fields = [("episode", pa.int32())]
+    for name in dtype.names or ():
+        base, count = dtype[name].base, int(np.prod(dtype[name].shape))
+        if base.kind == "O":
+            fields.append((name, pa.string()))
+        elif not dtype[name].shape:
+            fields.append((name, pa.from_numpy_dtype(base)))
+        elif base == np.float32:
+            fields.append((name, pa.list_(pa.float32(), count)))
+        else:
+            fields.append((name, pa.binary(base.itemsize * count)))
+    return pa.schema(fields)
 
-    Raises RecordingError: the table has another dtype.
+
+def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArray[np.void]]:
+    """Return (episodes (n,), rows (n,)) of a table of `extra_schema`.
+
+    Raises RecordingError: the rows need too much memory.
     """
+    if table.num_rows * dtype.itemsize > MOST_BYTES:
+        raise damaged(path, f"it has {table.num_rows} rows of {dtype.itemsize} bytes")
     rows = np.zeros(table.num_rows, dtype)
-    try:
-        for name in dtype.names or ():
-            column = table.column(name).combine_chunks()
-            base, shape = dtype[name].base, (len(rows), *dtype[name].shape)
-            if base.kind == "O":
-                rows[name] = column.to_pylist()
-            elif len(shape) == 1:
-                rows[name] = column.to_numpy(zero_copy_only=False)
-            elif base == np.float32:
-                flat = column.flatten().to_numpy(zero_copy_only=False)
-                rows[name] = flat.reshape(shape)
-            else:
-                rows[name] = np.frombuffer(b"".join(column.to_pylist()), base).reshape(shape)
-        return table.column("episode").to_numpy(), rows
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise damaged(path, str(error)) from error
+    for name in dtype.names or ():
+        column = table.column(name).combine_chunks()
+        base, shape = dtype[name].base, (len(rows), *dtype[name].shape)
+        if base.kind == "O":
+            rows[name] = column.to_pylist()
+        elif len(shape) == 1:
+            rows[name] = column.to_numpy(zero_copy_only=False)
+        elif base == np.float32:
+            flat = column.flatten().to_numpy(zero_copy_only=False)
+            rows[name] = flat.reshape(shape)
+        else:
+            rows[name] = np.frombuffer(b"".join(column.to_pylist()), base).reshape(shape)
+    return table.column("episode").to_numpy(), rows
 
 
 def take_rows(extras: Mapping[str, NDArray[np.void]], episode: int, tick: int) -> Any:

@@ -13,23 +13,28 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import RecordingError
 from cavmarl.engine.world_frame import WorldFrame
-from cavmarl.recordings.extra_tables import extra_rows
+from cavmarl.recordings.extra_tables import extra_rows, extra_schema
+from cavmarl.recordings.frame_check import wrong_on_map
+from cavmarl.recordings.part_files import damaged, read_file, read_table
 from cavmarl.recordings.recording_format import (
     HEAD_FILE,
     NETWORK_FILE,
     RecordedEvent,
     RecordedFrame,
     RecordingHead,
-    damaged,
     dtype_of,
+    event_schema,
     events_of,
+    frame_schema,
     frames_of,
-    read_table,
+    vehicle_schema,
 )
 from cavmarl.roads.cache import network_layout, unpack_network
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.network_check import wrong_network
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
+MOST_DIGITS = 9  # of the number of a world
 _INDEX = np.dtype([("episode", "<i4"), ("tick", "<i8"), ("part", "<i4"), ("row", "<i4")])
 
 
@@ -102,7 +107,7 @@ class Recording:
         """
         path, info = self.path / NETWORK_FILE, self.head.network
         try:
-            content = path.read_bytes()
+            content = read_file(path)
         except OSError as error:
             raise RecordingError(
                 f"{path}: the recording has no map ({error.strerror or error}); put the "
@@ -113,14 +118,31 @@ class Recording:
                 f"{path}: the map has layout {info['layout']}, but this version reads "
                 f"{network_layout()}; use the version of cavmarl that wrote it"
             )
-        whole = hashlib.sha256(content).hexdigest() == info["sha256"]
-        network = unpack_network(content, info["name"], info["source_sha256"]) if whole else None
+        damage = RecordingError(
+            f"{path}: is damaged, or not the map named in {HEAD_FILE}; put the file "
+            "back, from another recording of the same map if need be"
+        )
+        if hashlib.sha256(content).hexdigest() != info["sha256"]:
+            raise damage
+        try:
+            network = unpack_network(content, info["name"], info["source_sha256"])
+            wrong = "" if network is None else wrong_network(network)
+        except Exception as error:
+            raise damage from error
         if network is None:
-            raise RecordingError(
-                f"{path}: is damaged, or not the map named in {HEAD_FILE}; put the file "
-                "back, from another recording of the same map if need be"
-            )
+            raise damage
+        if wrong:
+            raise RecordingError(f"{path}: is damaged ({wrong}); get the recording again")
         return network
+
+    def check_on_map(self, frame: WorldFrame) -> None:
+        """Check that a frame can be drawn on the map.
+
+        Raises:
+            RecordingError: its signals are not those of the map, or the map is missing or damaged.
+        """
+        if wrong := wrong_on_map(frame, self.network):
+            raise RecordingError(f"{self.path}: does not fit its map ({wrong}); get it again")
 
     def episodes(self, world: int = 0) -> list[int]:
         """Return the indices of a world's episodes, from 0."""
@@ -167,7 +189,7 @@ class Recording:
         """Yield the events of a world, in order; raises as `frames`."""
         for frames in self._paths(world):
             path = frames.parent.parent / "events" / frames.name
-            yield from events_of(path, read_table(path))
+            yield from events_of(read_table(path, event_schema()))
 
     @property
     def extras(self) -> list[str]:
@@ -215,7 +237,7 @@ class Recording:
         path = frames.parent.parent / table / frames.name
         kept = self._kept_extras.get(table)
         if kept is None or kept[0] != path:
-            kept = path, extra_rows(path, read_table(path), dtype)
+            kept = path, extra_rows(path, read_table(path, extra_schema(dtype)), dtype)
             self._kept_extras[table] = kept
         found: tuple[Any, NDArray[np.void]] = kept[1]
         return found
@@ -231,14 +253,17 @@ class Recording:
         if world not in self._indices:
             rows = [np.zeros(0, _INDEX)]
             for part, path in enumerate(self._paths(world)):
-                table = read_table(path)
+                table = read_table(path, frame_schema())
                 one = np.zeros(table.num_rows, _INDEX)
-                try:
-                    for name in ("episode", "tick"):
-                        one[name] = table.column(name).to_numpy()
-                except (KeyError, ValueError) as error:
-                    raise damaged(path, str(error)) from error
+                for name in ("episode", "tick"):
+                    one[name] = table.column(name).to_numpy()
                 one["part"], one["row"] = part, np.arange(len(one))
+                last = rows[-1][-1:]
+                moments = np.concatenate([last, one])[["episode", "tick"]]
+                if not (np.sort(moments) == moments).all() or len(np.unique(moments)) < len(
+                    moments
+                ):
+                    raise damaged(path, "its frames are not in order")
                 rows.append(one)
             self._indices[world] = np.concatenate(rows)
         return self._indices[world]
@@ -246,13 +271,20 @@ class Recording:
     def _read(self, path: Path, world: int) -> list[RecordedFrame]:
         """Return the frames of a part; the last part is cached."""
         if self._kept[0] != path:
-            vehicles = read_table(path.parent.parent / "vehicles" / path.name)
-            self._kept = path, frames_of(path, world, read_table(path), vehicles)
+            vehicles = read_table(path.parent.parent / "vehicles" / path.name, vehicle_schema())
+            frames = read_table(path, frame_schema())
+            self._kept = path, frames_of(path, world, frames, vehicles, self.partition.count)
         return self._kept[1]
 
 
+def _is_in_order(index: NDArray[np.void]) -> bool:
+    episodes, ticks = np.diff(index["episode"]), np.diff(index["tick"])
+    return bool(((episodes > 0) | (episodes == 0) & (ticks > 0)).all())
+
+
 def _number(text: str) -> int | None:
-    return int(text) if text.isascii() and text.isdecimal() else None
+    is_number = text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS
+    return int(text) if is_number else None
 
 
 def _parts_of(folder: Path) -> list[Path]:

@@ -14,8 +14,10 @@ written last and commits the part; other files of a part without it are ignored.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import chain, pairwise, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +28,8 @@ from cavmarl.core.errors import RecordingError, require
 from cavmarl.engine.kernels.seen_rows import split_rows
 from cavmarl.engine.world_frame import ENDED, SEEN, FrameEvent, WorldFrame
 from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.recordings.frame_check import MOST_SECONDS, wrong_frames
+from cavmarl.recordings.part_files import damaged, read_file
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 FORMAT_VERSION = 2
@@ -45,6 +49,18 @@ _OPTIONS: dict[str, Any] = {
     "write_page_checksum": True,  # detects damaged files when they are read
 }
 
+
+MOST_LETTERS = 1000  # of a name in the head
+MOST_SHOWN = 100
+MOST_ROW_BYTES = 1 << 28  # of a table of samples
+SHORTEST_S, LONGEST_S = 1e-4, 1e3  # of a tick or step
+_EXTRA = re.compile(r"observations|v2x|handovers|samples-[^/\\\x00]{1,200}")
+_WHOSE = ("tick", "agent", "vehicle")
+_NEEDED = {
+    "observations": (*_WHOSE, "reward", "terms", "values"),
+    "samples": (*_WHOSE, "data", "stamp_s", "lost"),
+}
+_ARRAYS = ("terms", "values", "data")
 
 Columns = Sequence[Sequence[Any]]  # name, dtype and shape of each column, as in JSON
 
@@ -87,6 +103,47 @@ class RecordingHead:
         low_x, low_y, high_x, high_y = self.bounds
         return ZonePartition((low_x, low_y, high_x, high_y), np.array(self.rects))
 
+    def wrong(self) -> str:
+        """Return what is wrong with a head that was read; empty if nothing. Raises any error."""
+        self.partition  # noqa: B018 - refuses zones that are none
+        texts = [self.network[key] for key in ("name", "source_sha256", "layout", "sha256")]
+        texts += [self.environment, self.status, *self.terms, *chain(*self.features)]
+        if not all(isinstance(text, str) and len(text) <= MOST_LETTERS for text in texts):
+            return f"a text is no text, or longer than {MOST_LETTERS} letters"
+        if not all(text.isprintable() for text in texts):
+            return "a text has letters that cannot be printed"
+        if not 0.0 <= float(self.halo_m) <= MOST_SECONDS:
+            return f"halo_m is {self.halo_m}"
+        for name, seconds in (("sim_dt_s", self.sim_dt_s), ("step_s", self.step_s)):
+            if not SHORTEST_S <= float(seconds) <= LONGEST_S:
+                return f"{name} is {seconds}, not from {SHORTEST_S:g} to {LONGEST_S:g}"
+        if not np.isfinite([*self.bounds, *np.ravel(self.rects)]).all():
+            return "a zone has no finite bounds"
+        if "world" not in self.manifest:
+            return "the manifest has no world"
+        return next(filter(None, starmap(self._wrong_extra, self.extras.items())), "")
+
+    def _wrong_extra(self, name: str, columns: Columns) -> str:
+        dtype = dtype_of(columns)
+        if not _EXTRA.fullmatch(name):
+            return f"no table is called {name[:MOST_SHOWN]!r}"
+        if any(dtype[column].base.kind not in "biufO" for column in dtype.names or ()):
+            return f"table {name} has a column that is neither numbers nor texts"
+        needed = [*_NEEDED.get(name.partition("-")[0], ("tick",))]
+        if missing := [column for column in needed if column not in (dtype.names or ())]:
+            return f"table {name} has no column {missing[0]}"
+        if any(dtype[column].shape for column in needed if column not in _ARRAYS):
+            return f"table {name} has a list where it should have a number"
+        if dtype.itemsize > MOST_ROW_BYTES:
+            return f"table {name} has rows of {dtype.itemsize} bytes"
+        if name == "observations":
+            terms, values = dtype["terms"].shape, dtype["values"].shape
+            if terms != (len(self.terms),) or len(values) != 1 or values[0] < len(self.features):
+                return "the terms or features are not those of the observations"
+            if any(len(pair) != 2 for pair in self.features):
+                return "a feature has no sensor or no name"
+        return ""
+
     def closed(self) -> RecordingHead:
         return replace(self, status="closed")
 
@@ -98,7 +155,7 @@ class RecordingHead:
         """Read `recording.json`; raises RecordingError: missing, damaged or of another version."""
         path = folder / HEAD_FILE
         try:
-            document = json.loads(path.read_text(encoding="utf-8"))
+            document = json.loads(read_file(path).decode())
         except FileNotFoundError:
             kind = "an empty folder" if folder.is_dir() else "no folder"
             raise RecordingError(
@@ -119,11 +176,8 @@ class RecordingHead:
             )
         try:
             head = cls(**document)
-            head.partition  # noqa: B018 - refuses zones that are none
-            list(map(dtype_of, head.extras.values()))
-            hash((head.network["sha256"], head.network["name"], head.network["source_sha256"]))
-            if not (head.sim_dt_s > 0.0 and head.step_s > 0.0 and "world" in head.manifest):
-                raise ValueError("a key is missing")
+            if wrong := head.wrong():
+                raise ValueError(wrong)
         except Exception as error:
             raise RecordingError(
                 f"{path}: is damaged ({error}); restore it, or record the run again"
@@ -161,32 +215,6 @@ def write_table(table: Any) -> bytes:
     return bytes(sink.getvalue())
 
 
-def read_table(path: Path) -> Any:
-    """Read the table in a part's file.
-
-    Raises:
-        RecordingError: the file is missing or damaged.
-    """
-    parquet = require("pyarrow.parquet", "record")
-    try:
-        return parquet.read_table(path, page_checksum_verification=True, partitioning=None)
-    except FileNotFoundError:
-        raise RecordingError(
-            f"{path}: is missing, although its part was committed; restore it, or remove the files "
-            "with that name and the later ones to read the earlier parts"
-        ) from None
-    except (OSError, ValueError, KeyError) as error:  # pyarrow's errors are derived from these
-        raise damaged(path, str(error)) from error
-
-
-def damaged(path: Path, why: str) -> RecordingError:
-    """Return the error for a damaged file."""
-    return RecordingError(
-        f"{path}: is damaged ({why}); restore it, or remove the files with that name and the later "
-        "ones to read the earlier parts"
-    )
-
-
 def vehicle_table(frames: Sequence[RecordedFrame]) -> Any:
     pa = arrow()
     counts = [len(one.frame.vehicles) for one in frames]
@@ -195,10 +223,18 @@ def vehicle_table(frames: Sequence[RecordedFrame]) -> Any:
         "tick": np.repeat(np.array([one.frame.tick for one in frames], np.int64), counts),
     }
     columns |= _columns_of(np.concatenate([one.frame.vehicles.view(np.uint8) for one in frames]))
-    arrays = {name: pa.array(column) for name, column in columns.items()}
+    arrays = [pa.array(column) for column in columns.values()]
+    return pa.Table.from_arrays(arrays, schema=vehicle_schema())
+
+
+def vehicle_schema() -> Any:
+    pa = arrow()
+    kinds = {"episode": np.dtype(np.int32), "tick": np.dtype(np.int64)}
+    kinds |= {name: SEEN[name] for name in SEEN.names or ()}
     # A null-free schema writes no null bits, which would take a third of the time.
-    fields = [pa.field(name, array.type, nullable=False) for name, array in arrays.items()]
-    return pa.Table.from_arrays(list(arrays.values()), schema=pa.schema(fields))
+    return pa.schema(
+        [pa.field(name, pa.from_numpy_dtype(kind), nullable=False) for name, kind in kinds.items()]
+    )
 
 
 def _columns_of(raw: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
@@ -215,12 +251,12 @@ def _columns_of(raw: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     }
 
 
-def frame_table(frames: Sequence[RecordedFrame]) -> Any:
+def frame_schema() -> Any:
     pa = arrow()
     kinds = (pa.int64(), pa.int32(), pa.int32(), pa.string())
     transfer = pa.struct(list(zip(TransferInFlight._fields, kinds, strict=True)))
     ended = pa.struct([("agent", pa.int32()), ("events", pa.int32())])
-    schema = pa.schema(
+    return pa.schema(
         [
             ("episode", pa.int32()),
             ("tick", pa.int64()),
@@ -233,6 +269,9 @@ def frame_table(frames: Sequence[RecordedFrame]) -> Any:
             ("asked", pa.list_(pa.struct([("kind", pa.string()), ("detail", pa.string())]))),
         ]
     )
+
+
+def frame_table(frames: Sequence[RecordedFrame]) -> Any:
     rows = [
         {
             "episode": episode,
@@ -247,20 +286,26 @@ def frame_table(frames: Sequence[RecordedFrame]) -> Any:
         }
         for episode, frame in frames
     ]
-    return pa.Table.from_pylist(rows, schema=schema)
+    return arrow().Table.from_pylist(rows, schema=frame_schema())
+
+
+def event_schema() -> Any:
+    pa = arrow()
+    kinds = [pa.int32(), pa.int64(), pa.string(), pa.int64(), pa.int32(), pa.string()]
+    return pa.schema(list(zip(("episode", *FrameEvent._fields), kinds, strict=True)))
 
 
 def event_table(events: Iterable[RecordedEvent]) -> Any:
-    pa = arrow()
-    kinds = [pa.int32(), pa.int64(), pa.string(), pa.int64(), pa.int32(), pa.string()]
-    schema = pa.schema(list(zip(("episode", *FrameEvent._fields), kinds, strict=True)))
+    pa, schema = arrow(), event_schema()
     rows = [(episode, *event) for episode, event in events]
-    columns = list(zip(*rows, strict=True)) or [()] * len(kinds)
-    arrays = [pa.array(column, kind) for column, kind in zip(columns, kinds, strict=True)]
+    columns = list(zip(*rows, strict=True)) or [()] * len(schema)
+    arrays = [pa.array(column, kind) for column, kind in zip(columns, schema.types, strict=True)]
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def frames_of(path: Path, world: int, table: Any, vehicles: Any) -> list[RecordedFrame]:
+def frames_of(
+    path: Path, world: int, table: Any, vehicles: Any, num_zones: int
+) -> list[RecordedFrame]:
     """Return the frames of a part, from its tables `frames` and `vehicles`.
 
     Args:
@@ -268,50 +313,61 @@ def frames_of(path: Path, world: int, table: Any, vehicles: Any) -> list[Recorde
         world: index of the world.
         table: its `frames`.
         vehicles: its `vehicles`.
+        num_zones: number of zones of the recording.
 
     Raises:
-        RecordingError: a column is missing or of another type, or the tables do not belong
-            together.
+        RecordingError: the tables do not belong together, or a row is invalid.
     """
-    try:
-        rows = np.empty(vehicles.num_rows, dtype=SEEN)
-        for name in SEEN.names or ():
-            rows[name] = vehicles.column(name).to_numpy()
-        ticks = vehicles.column("tick").to_numpy()
-        found = table.to_pylist()
-        counts = np.array([row["num_vehicles"] for row in found], dtype=np.int64)
-        named = np.repeat(np.array([row["tick"] for row in found], dtype=np.int64), counts)
-        if not np.array_equal(ticks, named):
-            raise ValueError("its vehicles have other ticks")
-        ends = np.cumsum(counts)
-        return [
-            RecordedFrame(row["episode"], _frame(world, row, rows[end - count : end].copy()))
-            for row, count, end in zip(found, counts.tolist(), ends.tolist(), strict=True)
-        ]
-    except (KeyError, TypeError, ValueError) as error:
-        raise damaged(path, str(error)) from error
+    counts = table.column("num_vehicles").to_numpy().astype(np.int64)
+    if (counts < 0).any() or counts.sum() != vehicles.num_rows:
+        raise damaged(path, f"num_vehicles does not add up to {vehicles.num_rows} vehicles")
+    moments = {name: table.column(name).to_numpy() for name in ("episode", "tick", "time_s")}
+    for name in ("episode", "tick"):
+        named = np.repeat(moments[name], counts)
+        if not np.array_equal(vehicles.column(name).to_numpy(), named):
+            raise damaged(path, f"its vehicles have other {name}s")
+    rows = np.empty(vehicles.num_rows, dtype=SEEN)
+    for name in SEEN.names or ():
+        rows[name] = vehicles.column(name).to_numpy()
+    lists = {
+        "signals": _lists_of(table.column("signals"), np.int32),
+        "ghosts": _lists_of(table.column("ghosts"), np.int64),
+    }
+    records = {name: table.column(name).to_pylist() for name in ("transfers", "ended", "asked")}
+    frames = []
+    ends = np.cumsum(counts).tolist()
+    for k, (count, end) in enumerate(zip(counts.tolist(), ends, strict=True)):
+        ended = [(one["agent"], one["events"]) for one in records["ended"][k]]
+        frame = WorldFrame(
+            world,
+            int(moments["tick"][k]),
+            float(moments["time_s"][k]),
+            rows[end - count : end].copy(),
+            lists["signals"][k],
+            tuple(TransferInFlight(**transfer) for transfer in records["transfers"][k]),
+            tuple(lists["ghosts"][k]),
+            np.array(ended, dtype=ENDED),
+            tuple((one["kind"], one["detail"]) for one in records["asked"][k]),
+        )
+        frames.append(RecordedFrame(int(moments["episode"][k]), frame))
+    if wrong := wrong_frames(frames, rows, num_zones):
+        raise damaged(path, wrong)
+    return frames
 
 
-def _frame(world: int, row: Mapping[str, Any], vehicles: NDArray[np.void]) -> WorldFrame:
-    ended = [(end["agent"], end["events"]) for end in row["ended"]]
-    return WorldFrame(
-        world,
-        row["tick"],
-        row["time_s"],
-        vehicles,
-        np.array(row["signals"], dtype=np.int32),
-        tuple(TransferInFlight(**transfer) for transfer in row["transfers"]),
-        tuple(np.array(ids, dtype=np.int64) for ids in row["ghosts"]),
-        np.array(ended, dtype=ENDED),
-        tuple((one["kind"], one["detail"]) for one in row["asked"]),
-    )
+def _lists_of(column: Any, kind: type[np.generic]) -> list[Any]:
+    """Return the lists of a column, and lists of lists, with numbers as arrays."""
+    array = arrow().concat_arrays(column.chunks or [arrow().array([], column.type)])
+    offsets = array.offsets.to_numpy().tolist()
+    if arrow().types.is_list(array.values.type):
+        values: Any = _lists_of(arrow().chunked_array([array.values]), kind)
+    else:
+        values = array.values.to_numpy().astype(kind)
+    return [values[start:end] for start, end in pairwise(offsets)]
 
 
-def events_of(path: Path, table: Any) -> list[RecordedEvent]:
-    """Return the events of a part; raises as `frames_of`."""
-    try:
-        columns = [table.column(name).to_pylist() for name in ("episode", *FrameEvent._fields)]
-    except KeyError as error:
-        raise damaged(path, str(error)) from error
+def events_of(table: Any) -> list[RecordedEvent]:
+    """Return the events of a part."""
+    columns = [table.column(name).to_pylist() for name in ("episode", *FrameEvent._fields)]
     rows = zip(*columns, strict=True)
     return [RecordedEvent(episode, FrameEvent(*event)) for episode, *event in rows]

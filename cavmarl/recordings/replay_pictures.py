@@ -28,11 +28,11 @@ class ReplayPictures:
     Raises:
         ConfigError: there is no zone with that index.
         MissingExtraError: pygame-ce is not installed.
-        RecordingError: the map is missing.
+        RecordingError: the map is missing or damaged, or a frame does not fit it.
     """
 
     def __init__(self, recording: Recording, ghosts_of: int | None = None) -> None:
-        head = recording.head
+        self._recording, head = recording, recording.head
         self._partition, self._halo_m = head.partition, head.halo_m
         self._title = head.environment
         self._ghosts_of = ghosts_of
@@ -55,6 +55,7 @@ class ReplayPictures:
         self._renderer.close()
 
     def _draw(self, frame: WorldFrame) -> Any:
+        self._recording.check_on_map(frame)
         view = None
         if self._partition.count > 1:
             owners = frame.vehicles["zone"].astype(np.int64)

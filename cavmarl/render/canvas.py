@@ -169,6 +169,8 @@ def stamp(target: Surface, parts: Sequence[Part]) -> None:
     height = math.ceil(max(corner[1] for corner in corners)) + 1 - top
     if not target.get_rect().colliderect((left, top, width, height)):
         return
+    if width * height > target.get_width() * target.get_height():  # a body larger than the picture
+        left, top, width, height = target.get_rect().clip((left, top, width, height))
     large = blank((width * STAMP_DETAIL, height * STAMP_DETAIL), transparent=True)
     for color, polygon in parts:
         pygame.draw.polygon(

@@ -31,6 +31,9 @@ ACCESS_S = 900.0
 REFRESH_S = 8 * 3600.0
 KEYS_KEPT = 2  # keys whose tokens are accepted: the current and the previous one
 MOST_VERIFIED = 10_000
+STATE_S = 3600.0  # validity of the signature of a state; longer than clocks are apart
+
+Admit = Callable[[str], None]
 
 
 class Access:
@@ -90,14 +93,22 @@ class Access:
             keys.append({**found, "kid": number, "alg": ALGORITHM, "use": "sig"})
         return {"keys": keys}
 
-    def exchange(self, secret: str) -> dict[str, Any]:
-        """Return tokens for a secret."""
-        return self._tokens(self._by_secret(secret))
+    def exchange(self, secret: str, admit: Admit = lambda _: None) -> dict[str, Any]:
+        """Return tokens for a secret.
 
-    def refresh(self, refresh_token: str) -> dict[str, Any]:
-        """Return new tokens for an unused refresh token."""
+        Args:
+            secret: as `add_identity` returned it.
+            admit: called with the id of its identity before anything is done; it may raise.
+        """
+        identity = self._by_secret(secret)
+        admit(identity.id)
+        return self._tokens(identity)
+
+    def refresh(self, refresh_token: str, admit: Admit = lambda _: None) -> dict[str, Any]:
+        """Return new tokens for an unused refresh token; `admit` is that of `exchange`."""
         claims = self._verify(refresh_token, "refresh")
         identity = self._identity(claims["sub"])
+        admit(identity.id)
         if claims["jti"] in identity.used:  # a used token means that it, or its answer, was stolen
             self._log.record("identity.withdrawn", identity.id)
             raise problem(
@@ -133,6 +144,17 @@ class Access:
             {"sub": session.id, "aud": f"node:{session.node}", "inc": session.incarnation,
              "cfg": session.configuration, "use": "session"},
             lease_s,
+        )  # fmt: skip
+
+    def state_token(self, session: SessionRecord, number: int, content: bytes) -> str:
+        """Return the service's signature of a saved state, for the node of its session alone.
+
+        Nodes check it with the public keys. With a shared key, each node could sign, too.
+        """
+        return self._sign(
+            {"sub": session.id, "aud": f"node:{session.node}", "number": number,
+             "sha256": hashlib.sha256(content).hexdigest(), "use": "state"},
+            STATE_S,
         )  # fmt: skip
 
     def _tokens(self, identity: IdentityRecord) -> dict[str, Any]:

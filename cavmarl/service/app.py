@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.auth import Service, rule_of
-from cavmarl.service.problem_json import answer, serve_routes
+from cavmarl.service.problem_json import FAULT, answer, serve_routes
 from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_metrics import ServiceMetrics
 
@@ -26,6 +26,7 @@ MAX_BODY_BYTES = 256 * 1024
 MAX_CONTENT_BYTES = 64 * 1024 * 1024  # maximum size of a saved state or of a file of results
 _CONTENT = re.compile(r"/v1/(sessions/[^/]+/state|jobs/[^/]+/results/[^/]+)")
 MAX_PATH_BYTES = 1024
+MAX_SECRET_BYTES = 64 * 1024  # of the body of POST /v1/token, which needs no token
 NO_TELEMETRY: TelemetryConfig = {  # do not export telemetry, whatever the environment configures
     "tracing": False,
     "metrics": False,
@@ -113,7 +114,9 @@ class GuardedRequests:
             return
         until_s = asyncio.get_running_loop().time() + BODY_S
         is_content = scope["method"] == "PUT" and _CONTENT.fullmatch(scope["path"])
-        left = self._content_bytes if is_content else self._body_bytes
+        is_secret = scope["path"] == "/v1/token"
+        usual = MAX_SECRET_BYTES if is_secret else self._body_bytes
+        left = self._content_bytes if is_content else usual
         is_read = False
 
         async def receive_in_time() -> Message:
@@ -140,4 +143,8 @@ class GuardedRequests:
             refusal = answer("bad-body", f"the path is longer than {MAX_PATH_BYTES} bytes")
             await refusal(scope, receive, send_with_headers)
             return
-        await self._app(scope, receive_in_time, send_with_headers)
+        try:
+            await self._app(scope, receive_in_time, send_with_headers)
+        except Exception as error:
+            if scope.get(FAULT) is not error:  # otherwise it was logged and answered
+                raise

@@ -27,7 +27,7 @@ from cavmarl.service.node_selection import (
     overloads,
     score_of,
 )
-from cavmarl.service.request_bodies import BeatBody, NodeBody, TransfersBody
+from cavmarl.service.request_bodies import MOST_WORLDS, BeatBody, NodeBody, TransfersBody
 from cavmarl.service.service_records import (
     SESSION_OVER,
     IdentityRecord,
@@ -36,6 +36,7 @@ from cavmarl.service.service_records import (
 )
 from cavmarl.service.zone_nodes import ZoneNodes
 
+MOST_RESULTS = 256  # files of one job
 SHOWN_EXCLUSIONS = 10  # maximum number of excluded nodes that an event lists
 MOST_SCORES = 100  # maximum number of LoadScores that a node gets for its pages
 
@@ -341,13 +342,13 @@ class Broker:
         """Store the state of a world after a number of commands."""
         if number < session.saved_number:
             raise problem("conflict", f"command {session.saved_number} is stored already")
-        before, sha256 = session.saved_blob, self.log.keep(content)
+        sha256 = self.log.keep(content)
         self._tell(session, "saved", {"number": number, "sha256": sha256, "bytes": len(content)})
-        if before != sha256:
-            self._drop(before)
 
     def hand_over(self, session: SessionRecord, body: TransfersBody) -> None:
         """Record vehicles that have changed zone, and vehicles whose change is prepared."""
+        if any((world := row[0]) >= MOST_WORLDS for row in body.transfers):
+            raise problem("refused", f"transfers: world {world} is not below {MOST_WORLDS}")
         if body.transfers:
             data = {"number": body.at, "transfers": body.transfers}
             self._tell(session, "handed_over", data)
@@ -355,6 +356,8 @@ class Broker:
 
     def add_result(self, session: SessionRecord, name: str, content: bytes) -> None:
         """Store a file that a job has produced."""
+        if name not in session.results and len(session.results) >= MOST_RESULTS:
+            raise problem("too-many", f"{MOST_RESULTS} results of a job are kept")
         sha256 = self.log.keep(content)
         self._tell(session, "result", {"name": name, "sha256": sha256, "bytes": len(content)})
 
@@ -421,13 +424,11 @@ class Broker:
             live.hosted.discard(session.id)
             live.muted.discard(session.id)
             live.refresh()
-        blob = session.saved_blob
         self.zone_nodes.end(session)
         self.prepared.pop(session.id, None)
         data = {"message": message}
         self.log.record(f"session.{word}", session.id, data, actor=actor, owner=session.owner)
         self._touched[session.id] = self._clock_s()
-        self._drop(blob)
 
     def _fail(self, session: SessionRecord, message: str) -> None:
         self._end(session, "failed", "service", message)
@@ -435,15 +436,6 @@ class Broker:
     def _forget(self, session: SessionRecord) -> None:
         self._tell(session, "forgotten", {})
         del self._touched[session.id]
-        for sha256 in session.results.values():
-            self._drop(sha256)
-
-    def _drop(self, sha256: str | None) -> None:
-        """Delete content unless another session refers to it."""
-        for one in self.log.state.sessions.values():
-            if sha256 == one.saved_blob or sha256 in one.results.values():
-                return
-        self.log.drop(sha256)
 
     def _empty(self, name: str) -> None:
         live = self.live[name]

@@ -103,10 +103,7 @@ def _check(document: dict[str, Any]) -> None:
         raise problem("refused", str(error)) from error
     population = config.population
     vehicles = document["num_envs"] * (
-        population.num_ids
-        + population.background
-        + population.insertions
-        + population.external
+        population.num_ids + population.background + population.insertions + population.external
     )
     if vehicles > MOST_VEHICLES:
         raise problem(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from cavmarl.core.errors import ServiceError
 
 PROBLEM_TYPE = "application/problem+json"
@@ -33,12 +35,17 @@ PROBLEMS = {
     "stale-beat": (409, "the heartbeat is older than the last one: increase its number"),
     "superseded": (409, "a newer process of the node has registered: this process must end"),
     "lost": (410, "the session is not on this node: resolve it again"),
+    "damaged": (410, "stored content was changed, or a state cannot be used: open another session"),
     "too-large": (413, "the body is larger than the limit"),
     "too-many": (429, "too many requests: wait for the time in Retry-After"),
-    "broken": (500, "the service has an internal error; its log has the traceback"),
+    "broken": (500, "the service has an internal error; its log has the place"),
     "paused": (503, "a page has paused the session: repeat the request after Retry-After"),
     "no-node": (503, "no node can accept the request now: repeat it after Retry-After"),
+    "unreachable": (503, "the node cannot reach the service: repeat the request after Retry-After"),
 }
+
+# An absolute path with at least two parts, except the paths of routes and of URLs.
+_PATH = re.compile(r"(?<![\w.~:/-])/(?!v1/)(?:[^\s/'\",:;()\[\]]+/)+([^\s/'\",:;()\[\]]*)")
 
 
 def problem(name: str, detail: str, retry_s: float | None = None) -> ServiceError:
@@ -46,3 +53,8 @@ def problem(name: str, detail: str, retry_s: float | None = None) -> ServiceErro
     error = ServiceError(detail, PROBLEMS[name][0], name)
     error.retry_s = retry_s
     return error
+
+
+def without_folders(text: str) -> str:
+    """Return a text for clients: of absolute paths, it keeps the name of the file only."""
+    return _PATH.sub(r"\1", text)

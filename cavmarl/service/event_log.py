@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import hmac
+import json
 import time
 from collections.abc import Callable
 from typing import Any
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.event_store import EventStore, digest_of
+from cavmarl.service.error_names import problem
+from cavmarl.service.event_store import EventStore, SignedHead, digest_of
 from cavmarl.service.service_records import Infrastructure, LogEvent
 
 SERVICE = "service"
+_Batch = tuple[list[LogEvent], dict[str, bytes], set[str], SignedHead | None]
 
 
 class EventLog:
@@ -39,14 +43,26 @@ class EventLog:
         self._digest = ""
         self._lines: list[LogEvent] = []
         self._blobs: dict[str, bytes] = {}
-        self._gone: list[str] = []
+        self._gone: set[str] = set()
         self._in_flight: dict[str, bytes] = {}  # content that is being written
         self._writing = asyncio.Lock()
         self.durable = 0  # sequence number of the last event on disk
         for line in store.read_checked():
-            self.state.apply(line)
+            try:
+                self.state.apply(line)
+            except Exception as error:
+                raise ServiceError(
+                    f"store {store.where}: event {line.sequence} contradicts earlier ones "
+                    f"({error!r}): the log was modified; restore an older copy"
+                ) from error
             self.sequence, self._digest = line.sequence, line.digest
         self.durable = self.sequence
+        self.state.take_unused()  # it was deleted with the events that made it unused
+        if store.head() != self._signed_head():
+            raise ServiceError(
+                f"store {store.where}: its signed head is not that of its events: the log was "
+                "modified; restore an older copy"
+            )
 
     def record(
         self,
@@ -65,44 +81,64 @@ class EventLog:
         self.state.apply(line)
         self.sequence, self._digest = number, line.digest
         self._lines.append(line)
+        self._gone |= self.state.take_unused()
         return line
 
     def keep(self, content: bytes) -> str:
         """Store content together with the events that name it, and return its hash."""
         sha256 = hashlib.sha256(content).hexdigest()
         self._blobs[sha256] = content
-        if sha256 in self._gone:
-            self._gone.remove(sha256)
+        self._gone.discard(sha256)
         return sha256
 
-    def drop(self, sha256: str | None) -> None:
-        """Delete content that no event needs any more."""
-        if sha256 is not None:
-            self._gone.append(sha256)
-
     def content(self, sha256: str) -> bytes:
-        """Return stored content by its hash."""
-        kept = self._blobs.get(sha256) or self._in_flight.get(sha256)
-        found = kept or self.store.blob(sha256)
+        """Return stored content by its hash.
+
+        Raises:
+            ServiceError: the content is missing or was changed.
+        """
+        found = self._blobs.get(sha256, self._in_flight.get(sha256))
         if found is None:
-            raise ServiceError(f"content {sha256[:12]}… is missing: the store is damaged")
+            found = self.store.blob(sha256)
+        if found is None or hashlib.sha256(found).hexdigest() != sha256:
+            what = "is missing" if found is None else "does not have its hash"
+            raise problem("damaged", f"content {sha256[:12]}… {what}: the store was changed")
         return found
 
     def flush(self) -> None:
         """Write all pending events."""
         self._write(*self._take())
 
-    def _take(self) -> tuple[list[LogEvent], dict[str, bytes], list[str]]:
-        """Return the events and content to write; call it in the thread that records events."""
-        taken = self._lines, self._blobs, self._gone
-        self._lines, self._blobs, self._gone, self._in_flight = [], {}, [], taken[1]
+    def _take(self) -> _Batch:
+        """Return what is to be written; call it in the thread that records events."""
+        taken = self._lines, self._blobs, self._gone, self._signed_head()
+        self._lines, self._blobs, self._gone, self._in_flight = [], {}, set(), taken[1]
         return taken
 
-    def _write(self, lines: list[LogEvent], blobs: dict[str, bytes], gone: list[str]) -> None:
+    def _signed_head(self) -> SignedHead | None:
+        """Return the head of all events so far."""
+        if not self.sequence:
+            return None
+        if not self.state.keys:
+            raise ServiceError(
+                f"store {self.store.where}: has no signing key: the log was modified"
+            )
+        key, pem = next(reversed(self.state.keys.items()))
+        content = json.dumps(["head of the log", self.sequence, self._digest, key])
+        seal = hmac.digest(pem.encode(), content.encode(), "sha256").hex()
+        return SignedHead(self.sequence, self._digest, key, seal)
+
+    def _write(
+        self,
+        lines: list[LogEvent],
+        blobs: dict[str, bytes],
+        gone: set[str],
+        head: SignedHead | None,
+    ) -> None:
         if not (lines or blobs or gone):
             return
         try:
-            self.store.append(lines, blobs, gone)
+            self.store.append(lines, blobs, gone, head)
         except ServiceError:
             self.is_broken = True  # memory is ahead of the disk: the service must be restarted
             raise

@@ -10,10 +10,10 @@ import hashlib
 import json
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from sqlalchemy import (
     BigInteger,
@@ -36,10 +36,11 @@ from sqlalchemy import (
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
-from cavmarl.core.errors import ServiceError, require
+from cavmarl.core.errors import CavmarlError, ServiceError, require
+from cavmarl.core.private_files import check_private
 from cavmarl.service.service_records import LogEvent
 
-SCHEMA = "cavmarl.service/1"
+SCHEMA = "cavmarl.service/2"
 _LOCK_KEY = 0x6361766D  # key of PostgreSQL's advisory lock
 _PAGE = 1000
 
@@ -68,6 +69,23 @@ _BLOBS = Table(
     Column("sha256", String(64), primary_key=True),
     Column("content", LargeBinary, nullable=False),
 )
+_HEAD = Table(
+    "head",
+    _METADATA,
+    Column("sequence", BigInteger, primary_key=True, autoincrement=False),
+    Column("digest", String(64), nullable=False),
+    Column("key", String(64), nullable=False),
+    Column("seal", String(64), nullable=False),
+)
+
+
+class SignedHead(NamedTuple):
+    """The end of the log, sealed with the service's key."""
+
+    sequence: int  # number of events
+    digest: str  # of the last event
+    key: str  # id of the key
+    seal: str  # HMAC-SHA256 of the other fields
 
 
 def digest_of(before: str, line: LogEvent) -> str:
@@ -84,7 +102,8 @@ class EventStore:
 
     Raises:
             ServiceError: the store cannot be opened, is in use by another service, or has another
-            version.
+                version.
+            ConfigError: other users can read its file.
     """
 
     def __init__(self, where: str | Path) -> None:
@@ -117,9 +136,13 @@ class EventStore:
             raise
 
     def append(
-        self, lines: Sequence[LogEvent], blobs: dict[str, bytes], gone: Sequence[str] = ()
+        self,
+        lines: Sequence[LogEvent],
+        blobs: dict[str, bytes],
+        gone: Collection[str] = (),
+        head: SignedHead | None = None,
     ) -> None:
-        """Write lines and content, and delete the content `gone`, in one transaction.
+        """Write lines, content and the head, and delete the content `gone`, in one transaction.
 
         Raises:
             ServiceError: the store cannot be written; nothing was changed.
@@ -133,6 +156,9 @@ class EventStore:
                     if self._connection.execute(there).scalar() is None:
                         row = {"sha256": sha256, "content": content}
                         self._connection.execute(insert(_BLOBS), row)
+                if head is not None:
+                    self._connection.execute(delete(_HEAD))
+                    self._connection.execute(insert(_HEAD), head._asdict())
                 if gone:
                     self._connection.execute(delete(_BLOBS).where(_BLOBS.c.sha256.in_(gone)))
         except SQLAlchemyError as error:
@@ -177,7 +203,13 @@ class EventStore:
         query = select(_BLOBS.c.content).where(_BLOBS.c.sha256 == sha256)
         with self._guard, self._connection.begin():
             found = self._connection.execute(query).scalar()
-        return None if found is None else bytes(found)
+        return found if isinstance(found, bytes) else None
+
+    def head(self) -> SignedHead | None:
+        """Return the head that was written with the last line."""
+        with self._guard, self._connection.begin():
+            row = self._connection.execute(select(_HEAD)).one_or_none()
+        return None if row is None else SignedHead(**row._asdict())
 
     def read_checked(self) -> Iterator[LogEvent]:
         """Return all lines after checking the chain of their digests.
@@ -186,7 +218,7 @@ class EventStore:
             ServiceError: a line was changed, removed or inserted.
         """
         last = ""
-        for count, line in enumerate(self.read(), start=1):
+        for count, line in enumerate(self._read_valid(), start=1):
             if line.sequence != count or line.digest != digest_of(last, line):
                 raise ServiceError(
                     f"store {self.where}: event {line.sequence} does not follow from the "
@@ -194,6 +226,15 @@ class EventStore:
                 )
             last = line.digest
             yield line
+
+    def _read_valid(self) -> Iterator[LogEvent]:
+        try:
+            yield from self.read()
+        except (SQLAlchemyError, TypeError, ValueError) as error:
+            raise ServiceError(
+                f"store {self.where}: an event cannot be read ({error}): the log was modified; "
+                "restore an older copy"
+            ) from error
 
     def close(self) -> None:
         """Release the store."""
@@ -206,7 +247,7 @@ class EventStore:
         connection = self._connection
         with connection.begin():
             there = set(inspect(connection).get_table_names())
-            if "about" not in there and there & {"events", "blobs"}:
+            if "about" not in there and there & set(_METADATA.tables):
                 raise _foreign(self.where, "none")
             _METADATA.create_all(connection)
             for index in _INDICES:
@@ -226,7 +267,7 @@ class EventStore:
 
 def _url_of(where: str) -> URL:
     if "://" not in where:
-        return URL.create("sqlite", database=where)
+        return _file_url(URL.create("sqlite", database=where))
     try:
         url = make_url(where)
         if url.get_backend_name() == "postgresql":
@@ -239,25 +280,41 @@ def _url_of(where: str) -> URL:
         raise ServiceError(
             f"store {url.render_as_string()}: must be an SQLite file or postgresql://…"
         )
-    return url
+    return _file_url(url)
+
+
+def _file_url(url: URL) -> URL:
+    """Return the URL of an SQLite file; refuse databases in memory, which end with the process."""
+    if url.database in (None, "", ":memory:") or url.query:
+        raise ServiceError(
+            f"store {url.render_as_string()}: must be a file, as a service continues from its "
+            "store after a restart; give the path of an SQLite file"
+        )
+    return url.set(drivername="sqlite")
 
 
 def _lock_file(path: Path) -> IO[bytes]:
-    """Return a file beside the store, locked as long as this process has the store."""
+    """Return the opened file of the store, locked as long as this process has the store.
+
+    The lock belongs to the file itself, so it holds for all its names.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        handle = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT, 0o600)
-        os.close(
-            os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-        )  # the file holds keys: readable by this user only
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)  # it contains keys
     except OSError as error:
         raise ServiceError(f"store {path}: cannot be opened ({error.strerror})") from error
     lock = os.fdopen(handle, "r+b")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if (names := os.fstat(handle).st_nlink) > 1:  # SQLite's own log has only one of the names
+            raise ServiceError(f"store {path}: has {names} names; remove its other hard links")
+        check_private("store", path)
     except BlockingIOError:
         lock.close()
         raise _taken(str(path)) from None
+    except CavmarlError:
+        lock.close()
+        raise
     return lock
 
 

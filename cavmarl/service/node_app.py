@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Annotated, Any
 
 import jwt
@@ -22,7 +23,6 @@ from starlette.types import ASGIApp
 from cavmarl.client.world_protocol import SAVED_HEADER
 from cavmarl.core.errors import ServiceError, WorkerError
 from cavmarl.service import response_bodies
-from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
 from cavmarl.service.auth import StrictRoute
 from cavmarl.service.error_names import problem
@@ -85,18 +85,13 @@ class Lease(SecurityBase):
         link = _link(request)
         kind, _, token = request.headers.get("authorization", "").partition(" ")
         try:
-            number = str(jwt.get_unverified_header(token).get("kid"))
-            key = await link.public_key(number)
-            claims = jwt.decode(
-                token, key, [ALGORITHM], audience=f"node:{link.name}", issuer=ISSUER,
-                options={"require": ["exp", "iat", "sub"], "verify_iat": False},
-            )  # fmt: skip
+            with _needing_the_service():
+                bearer = token if kind.lower() == "bearer" else ""
+                claims = await link.claims(bearer, "session", session)
         except (jwt.InvalidTokenError, KeyError):
             raise problem(
-                "bad-token", "the token of a lease is missing: resolve the session"
+                "bad-token", "the token of this session's lease is missing: resolve the session"
             ) from None
-        if kind.lower() != "bearer" or claims.get("use") != "session" or claims["sub"] != session:
-            raise problem("bad-token", "the token belongs to another session")
         if claims["inc"] != link.incarnation:
             raise problem(
                 "lost", "the token belongs to an earlier process of this node: resolve again"
@@ -138,19 +133,41 @@ async def open_worlds(
     """Create or find the worlds of a session; they continue from their saved state."""
     link, worlds = _link(request), _worlds(request)
     if session not in worlds:
-        document = await link.configuration(configuration)
-        state, number = await link.saved_state(session)
-        keys = await link.open_door(session, document)
-        try:
-            await asyncio.to_thread(worlds.add, session, document, state, number, keys)
-        except WorkerError as error:
-            raise problem("lost", f"its zone nodes are lost: {error}") from error
-        finally:
-            link.close_key_file(session)
-        link.expect(session)
+        with _needing_the_service():
+            await _begin(link, worlds, session, configuration)
     elif save:
         await _save(link, worlds, session)
     return response_bodies.WorldDescription(**worlds[session].describe())
+
+
+async def _begin(link: NodeLink, worlds: SessionWorlds, session: str, configuration: str) -> None:
+    """Create the worlds of a session; a session whose content cannot be used ends as failed."""
+    try:
+        document = await link.configuration(configuration)
+        state, number = await link.saved_state(session)
+        keys = await link.open_door(session, document)
+        await asyncio.to_thread(worlds.add, session, document, state, number, keys)
+    except WorkerError as error:
+        raise problem("lost", f"its zone nodes are lost: {error}") from error
+    except ServiceError as error:
+        if error.problem == "damaged":
+            with suppress(ServiceError):  # another node has it, or the service ends it later
+                await link.fail(session, str(error))
+        raise
+    finally:
+        link.close_key_file(session)
+    link.expect(session)
+
+
+@contextmanager
+def _needing_the_service() -> Iterator[None]:
+    """Let clients repeat a request for which the node cannot reach the service."""
+    try:
+        yield
+    except ServiceError as error:
+        if error.status:
+            raise
+        raise problem("unreachable", "the service does not answer this node", 1.0) from error
 
 
 @router.post("/reset", response_class=Response, responses=ANSWER)

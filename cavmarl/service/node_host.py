@@ -21,13 +21,13 @@ from cavmarl.core.server_address import listen
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 from cavmarl.service.configurations import world_keywords
+from cavmarl.service.error_names import without_folders
 from cavmarl.service.node_app import in_turn, make_node_app
-from cavmarl.service.node_link import NodeLink, is_final
+from cavmarl.service.node_link import MOST_MESSAGE, NodeLink, is_final
 from cavmarl.service.server import ServerOptions, check_transport, uvicorn_config
 from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
 
-MOST_MESSAGE = 2000
 TELL_S = 0.5  # time between two progress reports of a job
 DRAIN_S = 60.0  # after which a drained node ends even if sessions are left
 
@@ -51,6 +51,7 @@ class NodeOptions:
     authority: str | None = (
         None  # certificate of the authority that signed the service's certificate
     )
+    allow_plain_http: bool = False  # send the secret to a service elsewhere without TLS
 
 
 @dataclass
@@ -90,7 +91,10 @@ async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:
         "capabilities": [*tls, *options.capabilities],
         "allowed": list(options.allowed),
     }
-    trust = {"verify": options.authority or True}
+    trust = {
+        "verify": options.authority or True,
+        "allow_plain_http": options.allow_plain_http,
+    }
     link = NodeLink(options.service, options.secret, body, options.is_supposed_idle, **trust)
     host = _Host(link, SessionWorlds(options.slots), tell)
     server = uvicorn.Server(
@@ -202,7 +206,7 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
             for file in sorted(place.iterdir()):
                 await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
         except CavmarlError as error:
-            status, message = "failed", str(error)[:MOST_MESSAGE]
+            status, message = "failed", without_folders(str(error))[:MOST_MESSAGE]
         except asyncio.CancelledError:  # the job is closed, or another node has it
             for process in started:
                 process.kill()

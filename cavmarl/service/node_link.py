@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import itertools
 import os
 import secrets
@@ -18,11 +19,17 @@ import psutil
 from cavmarl.balance.probe import busiest_gpu
 from cavmarl.client.clients import AsyncClient
 from cavmarl.core.errors import ServiceError
+from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.configurations import world_keywords
+from cavmarl.service.error_names import problem, without_folders
+from cavmarl.service.service_records import STATE_HEADER
 
 NEW_S = 5.0  # time for which a new session is kept without being announced by the service
 GPU_EVERY = 5  # heartbeats between two measurements of the GPUs
 JOIN_S = 60.0  # time in which the nodes of a session's zones must connect
+KEYS_S = 1.0  # shortest time between two requests for the service's keys
+KEYS_KEPT_S = 60.0  # after which known keys are asked for again; the service may have new ones
+MOST_MESSAGE = 2000  # characters of the reason why a session or a job has failed
 MOST_ROWS = 1000  # transfers in one body, which is limited to 256 KiB
 
 
@@ -51,6 +58,8 @@ class NodeLink:
         self.is_draining = False
         self._beats = itertools.count()
         self._keys: dict[str, Any] = {}
+        self._keys_s = -KEYS_S  # time of the last request for keys
+        self._asking_for_keys = asyncio.Lock()
         self._expected: dict[str, float] = {}
         self._doors: dict[str, dict[str, Any]] = {}
         self._key_files: dict[str, int] = {}
@@ -109,12 +118,44 @@ class NodeLink:
         self._expected = {one: until for one, until in self._expected.items() if until > now_s}
         return {*told, *self._expected}
 
-    async def public_key(self, number: str) -> Any:
-        """Return a key that verifies tokens; raise KeyError if the service has no such key."""
-        if number not in self._keys:
-            keys = (await self.ask("GET", "/keys")).json()["keys"]
-            self._keys = {one["kid"]: jwt.PyJWK(one).key for one in keys}
+    async def public_key(self, number: str, pause_s: float = KEYS_S) -> Any:
+        """Return a key that verifies tokens; raise KeyError if the service is known to have none.
+
+        Args:
+            number: id of the key.
+            pause_s: time after a request to the service in which it is not asked again for an
+                unknown key, so that tokens of clients with invented keys cost little.
+        """
+        async with self._asking_for_keys:
+            until_s = self._keys_s + (KEYS_KEPT_S if number in self._keys else pause_s)
+            if time.monotonic() >= until_s:
+                self._keys_s = time.monotonic()
+                try:
+                    keys = (await self.ask("GET", "/keys")).json()["keys"]
+                except ServiceError:  # without it, sessions continue until their leases end
+                    if number not in self._keys:
+                        raise
+                else:
+                    self._keys = {one["kid"]: jwt.PyJWK(one).key for one in keys}
         return self._keys[number]
+
+    async def claims(
+        self, token: str, use: str, session: str, pause_s: float = KEYS_S
+    ) -> dict[str, Any]:
+        """Return what the service has signed for this node, a session and a use.
+
+        Raises:
+            KeyError or jwt.InvalidTokenError: the token was not signed by the service for these.
+        """
+        number = str(jwt.get_unverified_header(token).get("kid"))
+        key = await self.public_key(number, pause_s)
+        claims: dict[str, Any] = jwt.decode(
+            token, key, [ALGORITHM], audience=f"node:{self.name}", issuer=ISSUER,
+            options={"require": ["exp", "iat", "sub"], "verify_iat": False},
+        )  # fmt: skip
+        if claims.get("use") != use or claims["sub"] != session:
+            raise jwt.InvalidTokenError("the token has another purpose")
+        return claims
 
     async def configuration(self, sha256: str) -> dict[str, Any]:
         """Return the document of a configuration."""
@@ -122,11 +163,31 @@ class NodeLink:
         return found
 
     async def saved_state(self, session: str) -> tuple[bytes | None, int]:
-        """Return the newest state of a session, and the number of commands that it includes."""
+        """Return the newest state of a session, and the number of commands that it includes.
+
+        Raises:
+            ServiceError: the service did not sign this state for this session and node.
+        """
         answer = await self.ask("GET", f"/sessions/{session}/state")
         if answer.status_code == 204:
             return None, 0
-        return answer.content, int(answer.headers["cavmarl-number"])
+        state: bytes = answer.content
+        try:
+            signature = answer.headers.get(STATE_HEADER, "")
+            claims = await self.claims(signature, "state", session, pause_s=0.0)
+        except (jwt.InvalidTokenError, KeyError):
+            claims = {}
+        signed = claims.get("sha256"), str(claims.get("number"))
+        if signed != (hashlib.sha256(state).hexdigest(), answer.headers.get("cavmarl-number")):
+            raise problem(
+                "damaged", f"the state of session '{session}' was not signed by the service for it"
+            )
+        return state, int(claims["number"])
+
+    async def fail(self, session: str, message: str) -> None:
+        """Report that a session cannot continue on any node."""
+        body = {"status": "failed", "message": without_folders(message)[:MOST_MESSAGE]}
+        await self.ask("POST", f"/jobs/{session}/outcome", json=body)
 
     async def save_state(self, session: str, number: int, state: bytes) -> None:
         """Store a state with the service."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import traceback
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -12,12 +13,14 @@ from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from cavmarl.core.errors import CavmarlError, ServiceError
-from cavmarl.service.error_names import PROBLEM_TYPE, PROBLEMS
+from cavmarl.service.error_names import PROBLEM_TYPE, PROBLEMS, without_folders
 from cavmarl.service.node_selection import NoNodeError
 
 MOST_EXCLUSIONS = 100  # maximum number of errors in an answer
+FAULT = "cavmarl.fault"  # key of the scope of a request that failed: the exception
 
 _BY_STATUS = {404: "not-found", 405: "wrong-method", 408: "slow-body", 413: "too-large"}
 _BEAT = re.compile(r"/v1/nodes/([^/]+)/beat")
@@ -38,7 +41,7 @@ def answer(
         "type": f"urn:cavmarl:problem:{name}",
         "title": name,
         "status": status or known,
-        "detail": detail,
+        "detail": without_folders(detail),
         "cure": cure,
         **(more or {}),
     }
@@ -48,6 +51,7 @@ def answer(
 def serve_routes(app: FastAPI, routers: Sequence[APIRouter]) -> None:
     """Add routes to an application whose errors are answered as problems."""
     app.state.rejected = Counter()
+    app.state.faults = set()  # places of internal errors whose traceback was logged
     app.state.on_misreport = None  # called with heartbeats that report impossible values
     app.state.routes = [one for router in routers for one in router.routes]
     for router in routers:
@@ -55,6 +59,7 @@ def serve_routes(app: FastAPI, routers: Sequence[APIRouter]) -> None:
     app.add_exception_handler(CavmarlError, _on_error)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_http)
+    app.add_exception_handler(ClientDisconnect, _on_disconnect)
     app.add_exception_handler(Exception, _on_fault)
 
 
@@ -111,6 +116,10 @@ async def _on_http(request: Request, error: Exception) -> JSONResponse:
     return _refuse(request, name, str(error.detail), status=error.status_code, headers=headers)
 
 
+async def _on_disconnect(request: Request, _: Exception) -> JSONResponse:
+    return _refuse(request, "bad-body", "the connection was closed before the end of the body")
+
+
 def _methods_of(request: Request) -> set[str]:
     """Return all methods of a path; the router itself names only those of its first route."""
     methods: set[str] = set()
@@ -121,5 +130,12 @@ def _methods_of(request: Request) -> set[str]:
 
 
 async def _on_fault(request: Request, error: Exception) -> JSONResponse:
-    _LOGGER.error("%s: %s", type(error).__name__, error, exc_info=error)
+    """Log an internal error: one line, and the first time at its place the traceback."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{last.filename}:{last.lineno}"
+    is_new = place not in request.app.state.faults
+    request.app.state.faults.add(place)
+    shown = f"{type(error).__name__} at {place}: {str(error)[:200]!r}"
+    _LOGGER.error(shown, exc_info=error if is_new else None)
+    request.scope[FAULT] = error
     return _refuse(request, "broken", "the service could not do this; nothing of it was kept")

@@ -11,6 +11,7 @@ from cavmarl.service.service_records import Role
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}$")]
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9:][A-Za-z0-9:.-]{0,254}$")]
+Subject = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$")]
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 Port = Annotated[int, Field(ge=1, le=65535)]
@@ -19,6 +20,7 @@ Words = Annotated[list[Word], Field(max_length=64)]
 
 
 NO_OTHERS: Any = {"additionalProperties": False}  # refuse keys that do not match the pattern
+MOST_WORLDS = 1024  # of a session
 MAX_WAIT_S = 7 * 86_400.0  # largest `wait_s` of a job
 
 
@@ -72,7 +74,7 @@ class ConfigurationBody(_Body):
     nodes: Annotated[int, Field(ge=1, le=64)] | None = (
         None  # number of nodes that host the zones; None: one
     )
-    num_envs: Annotated[int, Field(ge=1, le=1024)] = 1
+    num_envs: Annotated[int, Field(ge=1, le=MOST_WORLDS)] = 1
     seed: Whole = 0
     overrides: Annotated[dict[str, Any], Field(max_length=256)] = {}
 

@@ -44,6 +44,7 @@ Drainers = Annotated[IdentityRecord, Depends(may("operator", "admin", "node"))]
 Admins = Annotated[IdentityRecord, Depends(may("admin"))]
 Nodes = Annotated[IdentityRecord, Depends(may("node"))]
 Anybody = Annotated[IdentityRecord, Depends(open_to_all())]
+Exchangers = Annotated[IdentityRecord, Depends(open_to_all(is_limited=False))]
 
 NodeName = Annotated[request_bodies.Name, Path()]
 SessionId = Annotated[str, Path(pattern=r"^s-[0-9a-f]{24}$")]

@@ -9,7 +9,7 @@ from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
 from cavmarl.service import configurations, request_bodies, response_bodies
 from cavmarl.service.auth import TheService
-from cavmarl.service.error_names import problem
+from cavmarl.service.error_names import problem, without_folders
 from cavmarl.service.ownership_routes import ownership
 from cavmarl.service.response_builders import (
     assigned,
@@ -26,6 +26,7 @@ from cavmarl.service.route_common import (
     Clients,
     Drainers,
     Everyone,
+    Exchangers,
     FileName,
     NodeName,
     Nodes,
@@ -35,7 +36,7 @@ from cavmarl.service.route_common import (
     Viewers,
     make_router,
 )
-from cavmarl.service.service_records import SessionRecord
+from cavmarl.service.service_records import STATE_HEADER, SessionRecord
 
 open_routes = make_router("/v1", "open")
 nodes = make_router("/v1/nodes", "nodes")
@@ -63,12 +64,17 @@ async def keys(_: Anybody, service: TheService) -> response_bodies.PublicKeys:
 
 @open_routes.post("/token")
 async def token(
-    _: Anybody, service: TheService, body: request_bodies.SecretBody | request_bodies.RefreshBody
+    _: Exchangers,
+    service: TheService,
+    request: Request,
+    body: request_bodies.SecretBody | request_bodies.RefreshBody,
 ) -> response_bodies.Tokens:
     """Return an access token and a refresh token for a secret or for a refresh token."""
-    if isinstance(body, request_bodies.SecretBody):
-        return response_bodies.Tokens(**service.access.exchange(body.secret))
-    return response_bodies.Tokens(**service.access.refresh(body.refresh_token))
+    access, admit = service.access, service.admit_exchange
+    with service.counting_wrong_secrets(request):
+        if isinstance(body, request_bodies.SecretBody):
+            return response_bodies.Tokens(**access.exchange(body.secret, admit))
+        return response_bodies.Tokens(**access.refresh(body.refresh_token, admit))
 
 
 @open_routes.delete("/token", status_code=204)
@@ -218,7 +224,8 @@ async def get_state(identity: Nodes, service: TheService, number: SessionId) -> 
     if session.saved_blob is None:
         return Response(status_code=204)
     content = service.broker.log.content(session.saved_blob)
-    headers = {"Cavmarl-Number": str(session.saved_number)}
+    signature = service.access.state_token(session, session.saved_number, content)
+    headers = {"Cavmarl-Number": str(session.saved_number), STATE_HEADER: signature}
     return Response(content, headers=headers, media_type="application/octet-stream")
 
 
@@ -261,7 +268,7 @@ async def finish(
 ) -> response_bodies.Session:
     """Record the outcome of a job."""
     session = service.broker.hosted(identity, number)
-    service.broker.finish(session, body.status, body.message)
+    service.broker.finish(session, body.status, without_folders(body.message))
     return session_answer(service, session)
 
 
@@ -292,7 +299,7 @@ async def events(
     service: TheService,
     after: Annotated[request_bodies.Whole, Query()] = 0,
     limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
-    subject: Annotated[str | None, Query(max_length=128)] = None,
+    subject: Annotated[request_bodies.Subject | None, Query()] = None,
 ) -> response_bodies.EventList:
     """Return events after a sequence number: a client's own, or those of all subjects."""
     owner = identity.id if identity.role == "client" else None

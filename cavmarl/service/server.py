@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import uvicorn
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from cavmarl.core.errors import ServiceError
+from cavmarl.core.private_files import check_private
+from cavmarl.core.request_heads import BoundedHeads
 from cavmarl.core.server_address import is_loopback, listen, shown_host
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
@@ -22,8 +22,6 @@ from cavmarl.service.rate_limit import RateLimit
 
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700
-MAX_HEAD_BYTES = 16 * 1024
-HEAD_S = 10.0  # time limit for receiving the head of a request
 SERVER_HEADER: list[tuple[str, str]] = [("server", "cavmarl")]
 
 
@@ -93,12 +91,19 @@ def first_admin(log: EventLog, access: Access) -> str | None:
 
 
 def check_transport(host: str, certificate: Path | None, key: Path | None) -> None:
-    """Raise ServiceError if secrets would be sent to other machines without encryption."""
+    """Check that secrets are encrypted on the way to other machines.
+
+    Raises:
+        ServiceError: they would not be, or a file is missing.
+        ConfigError: other users can read the private key.
+    """
     if (certificate is None) != (key is None):
         raise ServiceError("give both --certificate and --key, or neither")
     for path in (certificate, key):
         if path is not None and not path.is_file():
             raise ServiceError(f"{path}: does not exist; give the path of a PEM file")
+    if key is not None:
+        check_private("--key", key)
     if certificate is None and not is_loopback(host):
         raise ServiceError(
             f"--host {host}: other machines can reach it, and without TLS its secrets can be read: "
@@ -124,44 +129,3 @@ def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
         ws="none",
         proxy_headers=False,
     )
-
-
-class BoundedHeads(HttpToolsProtocol):
-    """HTTP that closes connections with long or slow request heads; the parser accepts these."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self._begin_head()
-
-    def data_received(self, data: bytes) -> None:
-        super().data_received(data)
-        if self._late is None:  # the head is complete
-            return
-        self._head_bytes += len(data)
-        if self._head_bytes > MAX_HEAD_BYTES:
-            self.transport.close()
-
-    def on_message_begin(self) -> None:
-        super().on_message_begin()
-        self._end_head()
-        self._begin_head()
-
-    def on_headers_complete(self) -> None:
-        self._end_head()
-        super().on_headers_complete()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._end_head()
-        super().connection_lost(exc)
-
-    def _begin_head(self) -> None:
-        self._head_bytes = 0
-        self._late = self.loop.call_later(HEAD_S, self.transport.close)
-
-    def _end_head(self) -> None:
-        if self._late is not None:
-            self._late.cancel()
-            self._late = None
-
-    _late: asyncio.TimerHandle | None = None
-    _head_bytes = 0

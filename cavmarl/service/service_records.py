@@ -6,13 +6,15 @@ log gives the same records again. Values of heartbeats are not part of the log.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-ROLES = ("viewer", "client", "operator", "admin", "node")
 Role = Literal["viewer", "client", "operator", "admin", "node"]
+ROLES: tuple[Role, ...] = ("viewer", "client", "operator", "admin", "node")
 
 SessionState = Literal["queued", "active", "closed", "done", "failed"]
+STATE_HEADER = "Cavmarl-State"  # of an answer with a state: the service's signature of it
 SESSION_OVER = ("closed", "done", "failed")
 KEPT_OWNERS = 10_000  # maximum number of owners that are kept for each world
 
@@ -120,6 +122,26 @@ class Infrastructure:
     waiting: dict[str, None] = field(
         default_factory=dict
     )  # jobs without a node, in order of arrival
+    # hash of content → number of configurations, states and results that refer to it
+    users: Counter[str] = field(default_factory=Counter)
+    # content without users that `take_unused` has not returned yet
+    unused: set[str] = field(default_factory=set, compare=False)
+
+    def take_unused(self) -> set[str]:
+        """Return the content that has lost its last user since the last call."""
+        found, self.unused = self.unused, set()
+        return found
+
+    def _replace_user(self, new: str | None, old: str | None) -> None:
+        """Count the reference to `new` content that takes the place of a reference to `old`."""
+        if new is not None:
+            self.users[new] += 1
+            self.unused.discard(new)
+        if old is not None:
+            self.users[old] -= 1
+            if not self.users[old]:
+                del self.users[old]
+                self.unused.add(old)
 
     def apply(self, event: LogEvent) -> None:
         """Apply an event that was checked before it was written."""
@@ -146,6 +168,7 @@ class Infrastructure:
 
     def _apply_configuration(self, word: str, event: LogEvent) -> None:
         self.configurations.setdefault(event.subject, []).append(event.data["hash"])
+        self._replace_user(event.data["hash"], None)
         self.configurations_of[event.owner] = self.configurations_of.get(event.owner, 0) + 1
 
     def _apply_clock(self, word: str, event: LogEvent) -> None:
@@ -194,7 +217,8 @@ class Infrastructure:
         if word in ("refused", "timeout"):  # changes no record
             return
         if word == "forgotten":
-            del self.sessions[event.subject]
+            for sha256 in self.sessions.pop(event.subject).results.values():
+                self._replace_user(None, sha256)
             return
         session = self.sessions[event.subject]
         match word:
@@ -207,6 +231,7 @@ class Infrastructure:
                 self.waiting.pop(event.subject, None)
                 session.placements += 1
             case "saved":
+                self._replace_user(event.data["sha256"], session.saved_blob)
                 session.saved_number = event.data["number"]
                 session.saved_blob = event.data["sha256"]
             case "repartitioned":
@@ -216,10 +241,13 @@ class Infrastructure:
                 for transfer in event.data["transfers"]:
                     _hand_over(session.owners, *transfer)
             case "result":
-                session.results[event.data["name"]] = event.data["sha256"]
+                name, sha256 = event.data["name"], event.data["sha256"]
+                self._replace_user(sha256, session.results.get(name))
+                session.results[name] = sha256
             case "closed" | "done" | "failed":
                 session.state, session.node = word, None
                 self.waiting.pop(event.subject, None)
+                self._replace_user(None, session.saved_blob)
                 session.saved_blob, session.message = None, event.data.get("message", "")
 
 

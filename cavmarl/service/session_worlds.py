@@ -62,8 +62,11 @@ class SessionWorld:
         # (W,) worlds that a page has restarted since the last command
         self._anew = np.zeros(document["num_envs"], dtype=np.bool_)
         if state:
-            self._vec.load_state(state[: -len(self._anew)])
-            self._anew[:] = np.frombuffer(state[-len(self._anew) :], dtype=np.bool_)
+            try:
+                self._load(state)
+            except BaseException:
+                self._vec.close()
+                raise
 
     def describe(self) -> dict[str, Any]:
         """Return shapes and names that a client needs."""
@@ -81,6 +84,16 @@ class SessionWorld:
             "action": {"shape": list(actions.shape), "dtype": _little(actions.dtype)},
             "observation": {"shape": list(shape or ()), "dtype": _little(seen.dtype or "f4")},
         }
+
+    def _load(self, state: bytes) -> None:
+        marks = np.frombuffer(state[-len(self._anew) :], dtype=np.uint8)
+        if len(marks) != len(self._anew) or np.any(marks > 1):
+            raise problem("damaged", "the saved state does not end in a mark for each world")
+        try:
+            self._vec.load_state(state[: -len(self._anew)])
+        except ConfigError as error:
+            raise problem("damaged", f"the saved state cannot be used: {error}") from error
+        self._anew[:] = marks
 
     def state(self) -> bytes | None:
         """Return the saved state, or None if part of it is in SUMO or in a journal."""

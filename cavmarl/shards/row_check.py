@@ -6,6 +6,8 @@ Kernels use their indices into the tables of the network and of the routes witho
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,10 +29,53 @@ Numbers = NDArray[np.int64]
 LEAST_FACTOR = 1e-6  # of desired speeds; a vehicle of a smaller one never gets anywhere
 _LARGEST = 1e12  # limit of all numbers in metres or seconds
 _ENDLESS = ("to_go", "step_to_go")  # fields that are infinite without a route
+_LEAST = dict.fromkeys(("s", "wait_s", "stopped_s", "distance_m", "free_s", "step_jerk"), 0.0)
+_LEAST |= {"speed_factor": LEAST_FACTOR}
 _FLOATS = tuple(name for name in VEHICLE.names or () if VEHICLE[name].kind == "f")
 _INT32 = tuple(name for name in VEHICLE.names or () if VEHICLE[name] == np.int32)
 MOST = int(np.iinfo(np.int32).max)
 MOST_IDS = 1 << 62  # limit of the ids of vehicles in a run
+
+
+class ColumnCheck:
+    """A check of the columns of records with an `id`.
+
+    Args:
+        ints: allowed ranges of integer columns.
+        floats: columns of floating-point numbers, in metres, seconds or radians.
+        endless: those of `floats` that may be infinite.
+        least: the smallest allowed numbers of some of `floats`.
+    """
+
+    def __init__(
+        self,
+        ints: Mapping[str, range],
+        floats: Sequence[str],
+        endless: Sequence[str],
+        least: Mapping[str, float],
+    ) -> None:
+        self._ints, self._floats = tuple(ints), tuple(floats)
+        self._low = np.array([allowed.start for allowed in ints.values()])
+        self._high = np.array([allowed.stop - 1 for allowed in ints.values()])
+        self._endless = [self._floats.index(name) for name in endless]
+        self._least = np.array([least.get(name, -np.inf) for name in floats])
+
+    def wrong(self, rows: NDArray[np.void]) -> str:
+        """Return what is wrong with a number of one of the rows; empty if nothing."""
+        ints = np.stack([rows[name] for name in self._ints], axis=1)
+        outside = (ints < self._low) | (ints > self._high)
+        if outside.any():
+            row, column = np.argwhere(outside)[0].tolist()
+            low, high = self._low.item(column), self._high.item(column)
+            return _of(rows[row], self._ints[column], f"is not in {low} to {high}")
+        floats = np.stack([rows[name] for name in self._floats], axis=1)
+        usual = np.abs(floats) <= _LARGEST
+        usual[:, self._endless] |= floats[:, self._endless] == np.inf
+        usual &= floats >= self._least
+        if usual.all():
+            return ""
+        row, column = np.argwhere(~usual)[0].tolist()
+        return _of(rows[row], self._floats[column], f"is no allowed number up to ±{_LARGEST:g}")
 
 
 class RowCheck:
@@ -84,8 +129,8 @@ class RowCheck:
             "transfer": range(AUTHORITATIVE, AUTHORITATIVE + 1),
         }
         every = range(-MOST - 1, MOST + 1)
-        self._low = np.array([values.get(name, every).start for name in _INT32])
-        self._high = np.array([values.get(name, every).stop - 1 for name in _INT32])
+        ints = {name: values.get(name, every) for name in _INT32}
+        self._columns = ColumnCheck(ints, _FLOATS, _ENDLESS, _LEAST)
         types = travel.types
         self._radius_m = 0.5 * float(_diagonals_m(types).max()) + 1e-6
         self._height_m = float(types["height"].max()) + 1e-6
@@ -101,31 +146,14 @@ class RowCheck:
             return ""
         rows = np.ascontiguousarray(rows)
         return (
-            self._wrong_ints(rows)
-            or self._wrong_floats(rows)
+            self._columns.wrong(rows)
+            or self._wrong_sizes(rows)
             or self._wrong_goals(rows)
             or self._wrong_identity(rows, num_orders)
             or self._wrong_ways(rows, tail)
         )
 
-    def _wrong_ints(self, rows: NDArray[np.void]) -> str:
-        ints = np.stack([rows[name] for name in _INT32], axis=1)
-        outside = (ints < self._low) | (ints > self._high)
-        if not outside.any():
-            return ""
-        row, column = np.argwhere(outside)[0].tolist()
-        low, high = self._low.item(column), self._high.item(column)
-        return _of(rows[row], _INT32[column], f"is not in {low} to {high}")
-
-    def _wrong_floats(self, rows: NDArray[np.void]) -> str:
-        floats = np.stack([rows[name] for name in _FLOATS], axis=1)
-        usual = np.abs(floats) <= _LARGEST
-        usual[:, _ENDLESS_COLUMNS] |= floats[:, _ENDLESS_COLUMNS] == np.inf
-        usual[:, _POSITIVE_COLUMNS] &= floats[:, _POSITIVE_COLUMNS] >= 0.0
-        usual[:, _FLOATS.index("speed_factor")] &= rows["speed_factor"] >= LEAST_FACTOR
-        if not usual.all():
-            row, column = np.argwhere(~usual)[0].tolist()
-            return _of(rows[row], _FLOATS[column], f"is no allowed number up to ±{_LARGEST:g}")
+    def _wrong_sizes(self, rows: NDArray[np.void]) -> str:
         radii_m = 0.5 * _diagonals_m(rows)
         sizes = np.stack([rows["length"], rows["width"], rows["height"]])
         wrong = (sizes <= 0.0).any(axis=0) | (radii_m > self._radius_m)
@@ -224,11 +252,6 @@ class RowCheck:
         lanes = self._roads.lanes
         behind = self._roads.links["to_lane"][lanes["link"][lane]]
         return np.where(lanes["internal"][lane], behind, lane).astype(np.int64)
-
-
-_POSITIVE = ("s", "wait_s", "stopped_s", "distance_m", "free_s", "step_jerk")
-_POSITIVE_COLUMNS = [_FLOATS.index(name) for name in _POSITIVE]
-_ENDLESS_COLUMNS = [_FLOATS.index(name) for name in _ENDLESS]
 
 
 def _diagonals_m(bodies: NDArray[np.void]) -> NDArray[np.float64]:

@@ -27,7 +27,14 @@ from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departure_queue import with_room
 from cavmarl.traffic.kernels.admission import accept, assign_lanes
-from cavmarl.traffic.kernels.demand_generator import call_orders, insert, populate, settle
+from cavmarl.traffic.kernels.demand_generator import (
+    END_ROOM_M,
+    PLACE_GAP_M,
+    call_orders,
+    insert,
+    populate,
+    settle,
+)
 from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.scenarios.cast import Cast
@@ -41,6 +48,7 @@ from cavmarl.traffic.way_search import WaySlots, seekers, way_slots
 
 FAST_FACTOR = 1.5  # speed divided by the limit; hardly any driver of a demand file wants more
 JAM_GAP_M = 2.5  # m between the bumpers of queued vehicles
+PLACED_SHARE = 0.75  # share of their lanes that placed agents may occupy so that others find room
 
 
 class TrafficCalls:
@@ -468,6 +476,23 @@ class NativeTraffic:
         """Return the kernel calls for a departure queue and its worlds' ticks and keys."""
         return keep_last(partial(TrafficCalls, self))
 
+    @property
+    def placed_agents(self) -> int:
+        """Number of agents that find places at a reset on each map, whatever is drawn."""
+        return min(for_each_map(self.network, self._placed_agents))
+
+    def _placed_agents(self, number: int) -> int:
+        length_m = float(self.blank["length"][0])
+        if self.population.mode != "closed":  # further agents wait
+            return int(self.trips_of(number).metres / (length_m + JAM_GAP_M))
+        trips = self.demand.agent_trips
+        origins = trips.pairs[trips.first[number] : trips.first[number + 1], 0]
+        lanes_m = self.network.lanes["length_m"][np.unique(origins)]
+        # A vehicle blocks the places up to its length and gap on both sides, or a short lane.
+        places_m = lanes_m - length_m - END_ROOM_M
+        blocked = np.maximum(places_m / (2.0 * (length_m + PLACE_GAP_M)), 1.0)
+        return max(1, int(PLACED_SHARE * blocked.sum()))
+
     def _check_room(self) -> None:
         """Check that the population has room on each map, standing bumper to bumper.
 
@@ -482,11 +507,16 @@ class NativeTraffic:
         if agents + background > room:
             default = PopulationConfig.background
             stated = f"{background}, the default" if background == default else f"{background}"
-            cure = "set population.agents (agents=N, --agents N) to fewer"
-            if background:
-                most = max(room - agents, 0)
-                cure = f"set population.background (background=N, --background N) to {most} or less"
-                cure += ", and use fewer agents" if agents > room else ""
+            fewer = min(agents, self._placed_agents(number))
+            cures = []
+            if fewer < agents:
+                cures.append(f"population.agents (agents=N, --agents N) to {fewer} or less")
+            if fewer + background > room:
+                most = max(room - fewer, 0)
+                cures.append(
+                    f"population.background (background=N, --background N) to {most} or less"
+                )
+            cure = "set " + " and ".join(cures)
             raise CapacityError(
                 f"population.agents + population.background = {agents + background} (the "
                 f"background is {stated}): the map '{self.network.name_of(number)}' has "

@@ -83,7 +83,9 @@ class ShownRecording:
         self.publisher.is_new = True
 
     def _frame(self, ghosts: bool) -> WorldFrame:
-        return self._recording.at(self._ticks[self._place], self._world, self._episode)
+        frame = self._recording.at(self._ticks[self._place], self._world, self._episode)
+        self._recording.check_on_map(frame)
+        return frame
 
     def _details(self, frame: WorldFrame, vehicle: int, sensors: bool) -> dict[str, Any]:
         found = vehicle_state(self._recording.network, self._agents, frame, vehicle)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +15,7 @@ CONTROLS = frozenset(
     {"pause", "play", "step", "pace", "reset", "seat", "drive", "seek", "insert", "close", "open"}
 )
 MAX_PLACE_M = 1e7
+_SHOWN_DIGITS = 10
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,11 @@ def _whole(name: str, value: Any) -> int:
 def _within(name: str, value: Any, low: float, high: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise MessageError(f"{name}: must be a number")
-    if not (math.isfinite(value) and low <= value <= high):
-        raise MessageError(f"{name} = {value:g}: must be from {low:g} to {high:g}")
+    if not low <= value <= high:
+        shown = f"{value:g}" if isinstance(value, float) else _shortened(str(value))
+        raise MessageError(f"{name} = {shown}: must be from {low:g} to {high:g}")
     return float(value)
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _SHOWN_DIGITS else f"{text[:_SHOWN_DIGITS]}…"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import validate
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, RecordingError
 from cavmarl.env.recorded_extras import SAMPLES
 from cavmarl.recordings.recording import Recording
 from cavmarl.sensors.sensed_shapes import Shape, observed_shapes, sampled_shapes
@@ -42,6 +43,9 @@ class RecordedSensors:
             tick: tick of a recorded frame.
             vehicle: id of the vehicle.
             sensors: whether to include the sensors' shapes; if there are none, `note` says why.
+
+        Raises:
+            RecordingError: the data do not fit the sensors' settings.
         """
         head, found = self._recording.head, {}
         rows = self._rows("observations", tick, vehicle) if self._observes else ()
@@ -50,15 +54,25 @@ class RecordedSensors:
             found["terms"] = named_terms(head.terms, row["terms"])
             found["observation"] = named_numbers(head.features, row["values"])
             if self._config is not None:
-                shapes += observed_shapes(self._config, row["values"])
+                shapes += self._drawn(partial(observed_shapes, self._config, row["values"]))
         if not sensors:
             return found
         if self._config is not None:
             for name, settings in self._config.rig.items():
                 sample = self._newest(SAMPLES + name, tick, vehicle)
                 if sample is not None:
-                    shapes += sampled_shapes(name, settings, sample)
+                    shapes += self._drawn(partial(sampled_shapes, name, settings, sample))
         return {**found, "shapes": shapes, "note": self._note}
+
+    def _drawn(self, draw: Callable[[], list[Shape]]) -> list[Shape]:
+        try:
+            with np.errstate(invalid="ignore"):  # recorded numbers may be NaN
+                return draw()
+        except (ArithmeticError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{self._recording.path}: its sensor data do not fit the settings of its sensors "
+                f"({error}); get the recording again, or record the run again"
+            ) from error
 
     def _rows(self, table: str, tick: int, vehicle: int) -> NDArray[np.void]:
         rows = self._recording.extra_at(table, tick, self._world, self._episode)

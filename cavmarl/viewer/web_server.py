@@ -20,6 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from cavmarl.core.errors import MessageError, ServiceError
+from cavmarl.core.request_heads import BoundedHeads
 from cavmarl.core.server_address import is_loopback, listen, shown_host
 from cavmarl.viewer.page_requests import CONTROLS, MAX_TEXT, read_object, read_request
 from cavmarl.viewer.subscribers import PageWatcher
@@ -51,6 +52,7 @@ HEADERS = {
 MOST_WATCHERS = 250
 FIRST_MESSAGE_S = 5.0
 WRONG_TOKEN_S = 0.5
+MAX_REASON_BYTES = 123  # of a close message, RFC 6455
 TRY_LATER, REFUSED, NOT_UNDERSTOOD = 1013, 4401, 1003
 
 
@@ -80,7 +82,7 @@ class WebServer:
             server_header=False,
             lifespan="off",
             loop="asyncio",
-            http="httptools",
+            http=BoundedHeads,
             ws=DroppedWhenDone,
             ws_max_size=4 * MAX_TEXT,
             ws_per_message_deflate=False,
@@ -223,7 +225,7 @@ class _LiveSocket:
             await self._socket.close(NOT_UNDERSTOOD, "the first message must be a hello")
             return None
         token = first.get("token")
-        given = token.encode() if isinstance(token, str) else b""
+        given = token.encode(errors="surrogatepass") if isinstance(token, str) else b""
         watch = self._options.watch_token.encode()
         if watch and hmac.compare_digest(given, watch):
             self._may_control = False
@@ -277,7 +279,12 @@ class _LiveSocket:
             try:
                 request = read_request(await self._socket.receive_text())
             except (MessageError, KeyError) as error:
-                await self._socket.close(NOT_UNDERSTOOD, str(error)[:100])
+                await self._socket.close(NOT_UNDERSTOOD, _close_reason(error))
                 return
             if self._may_control or request.kind not in CONTROLS:
                 self._audience.ask(watcher, request)
+
+
+def _close_reason(error: Exception) -> str:
+    """Return the start of an error's message that fits into a close message of WebSocket."""
+    return str(error).encode(errors="replace")[:MAX_REASON_BYTES].decode(errors="ignore")

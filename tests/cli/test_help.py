@@ -35,6 +35,16 @@ def test_help_ends_with_examples_that_are_understood(words: str) -> None:
         check_command(line[line.index("cavmarl") :])
 
 
+def test_submit_promises_only_what_a_service_takes() -> None:
+    """A service refuses files, folders and modules of its callers."""
+    command = COMMANDS["cavmarl submit"]
+    options = {word for one in command.params for word in one.opts}
+    assert "--import" not in options
+    texts = [one.help for one in command.params if one.name in ("env", "policy")]
+    assert len(texts) == 2
+    assert not [text for text in texts if "file" in text or "folder" in text]
+
+
 @pytest.mark.parametrize("words", COMMANDS)
 def test_help_describes_the_value_of_each_option(words: str) -> None:
     command = COMMANDS[words]

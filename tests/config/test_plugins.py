@@ -77,6 +77,31 @@ def test_a_command_uses_a_term_and_a_sensor_of_the_working_directory() -> None:
     assert world["config"]["plugins"] == ["my_plugin"]
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("baseline", "ring"),
+        ("suite", "tasks"),
+        ("scenario", "sweep"),
+        ("map", "survey", "ring", "-o", "points.ply"),
+        ("zoo", "verify", "merge_ippo"),
+        ("zoo", "cross", "ring", "-p", "idm", "-p", "idm"),
+    ],
+)
+def test_all_commands_that_make_worlds_import_plugins(words: tuple[str, ...]) -> None:
+    code, said = run(*words, "--import", "absent")
+    assert (code, said.count("there is no module 'absent'")) == (2, 1), said
+
+
+def test_processes_of_a_suite_import_plugins_too() -> None:
+    Path("own.yaml").write_text("maps: [ring]\n", encoding="utf-8")
+    words = ["-n", "1", "-r", "2", "--out", "found"]
+    code, said = run("suite", "own.yaml", "--import", "my_plugin", *words)
+    assert code == 0, said
+    world = json.loads(Path("found/ring/manifest.json").read_text(encoding="utf-8"))["world"]
+    assert world["plugins"].keys() == {"my_plugin"}
+
+
 def test_an_environment_names_its_plugins() -> None:
     folder = folder_with("[my_plugin]")
     with pytest.raises(ConfigError, match=r"env\.yaml: plugin 'my_plugin': there is no module"):

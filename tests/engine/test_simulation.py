@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -67,13 +68,10 @@ def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
 @pytest.mark.parametrize(
     ("agents", "background", "words"),
     [
-        (
-            100,
-            20,
-            r"is 20, the default.*--background N\) to 0 or less, and use fewer",
-        ),
-        (20, 60, r"the background is 60\).*--background N\) to \d+ or less$"),
-        (100, 0, r"--agents N\) to fewer$"),
+        (100, 20, r"is 20, the default.*--agents N\) to \d+ or less$"),
+        (1, 60, r"the background is 60\).*--background N\) to \d+ or less$"),
+        (100, 60, r"--agents N\) to \d+ or less and .*--background N\) to \d+ or less$"),
+        (100, 0, r"--agents N\) to \d+ or less$"),
     ],
 )
 def test_a_population_without_room_names_the_keys_to_change(
@@ -81,6 +79,23 @@ def test_a_population_without_room_names_the_keys_to_change(
 ) -> None:
     with pytest.raises(CapacityError, match=words):
         make_simulation("ring22", mode="closed", agents=agents, background=background)
+
+
+@pytest.mark.parametrize(
+    ("env", "agents", "background"),
+    [("ring22", 100, 20), ("ring22", 1, 60), ("ring22", 12, 0), ("ring", 90, 20), ("ring", 90, 0)],
+)
+def test_the_advice_for_a_full_map_works(env: str, agents: int, background: int) -> None:
+    with pytest.raises(CapacityError) as caught:
+        start(make_simulation(env, mode="closed", agents=agents, background=background), seed=1)
+    advised = dict(re.findall(r"\((agents|background)=N, --\w+ N\) to (\d+)", str(caught.value)))
+    assert advised
+    numbers = {"agents": agents, "background": background}
+    numbers |= {name: int(number) for name, number in advised.items()}
+    simulation = make_simulation(env, mode="closed", **numbers)
+    for seed in range(50):
+        start(simulation, seed)
+        assert simulation.outputs.present.sum() == numbers["agents"]
 
 
 @pytest.mark.parametrize("env", FREE_FLOW)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from cavmarl.core.errors import (
     RegisteredFunctionError,
     UnknownArgumentError,
 )
-from cavmarl.core.extensions import REGISTERED_TERMS
+from cavmarl.core.extensions import REGISTERED_SENSORS, REGISTERED_TERMS
 
 MAKERS: dict[str, Any] = {"parallel_env": cavmarl.parallel_env, "make_vec": cavmarl.make_vec}
 
@@ -96,3 +97,33 @@ def test_a_registered_function_returns_numbers(answer: Any) -> None:
         vec.close()
     finally:
         REGISTERED_TERMS.remove("text")
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_an_error_names_the_agent_whose_term_is_no_number(batched: bool) -> None:
+    def bad(view: Any) -> Any:
+        return np.where(view.own["agent"] == 6, -np.inf, 1.5)
+
+    cavmarl.register_term("bad", bad, batched=batched)
+    try:
+        vec = cavmarl.make_vec("ring", agents=8, overrides={"terms.weights": {"bad": 1.0}})
+        words = r"'bad' returned -inf for agent 6 \(vehicle \d+\); it must return 1 finite"
+        with closing(vec), pytest.raises(RegisteredFunctionError, match=words):
+            drive(vec)
+    finally:
+        REGISTERED_TERMS.remove("bad")
+
+
+def test_an_error_names_the_number_of_a_sensor_that_is_none() -> None:
+    def sense(view: Any) -> list[float]:
+        return [0.0, float("nan")] if view.own["agent"] == 5 else [0.0, 1.0]
+
+    features = [cavmarl.Feature(name, "a number") for name in ("one", "other")]
+    cavmarl.register_sensor("bad", sense, features=features)
+    try:
+        vec = cavmarl.make_vec("ring", agents=8, overrides={"sensors.registered": ["bad"]})
+        words = r"'bad' returned nan as number 1 for agent 5 "
+        with closing(vec), pytest.raises(RegisteredFunctionError, match=words):
+            drive(vec)
+    finally:
+        REGISTERED_SENSORS.remove("bad")

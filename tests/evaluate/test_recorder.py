@@ -109,6 +109,13 @@ def test_trips_of_less_than_a_metre_do_not_share_in_how_even_delays_are() -> Non
     assert uneven > 0.1
 
 
+def test_vehicles_that_were_driven_back_have_no_speed_to_share() -> None:
+    worlds = Worlds()
+    worlds.add(done=(True, True), progress=(4.0, 4.0))
+    worlds.add(done=(True, True), over=(True, True), progress=(-4.0, 4.0))
+    assert worlds.recorder.episodes()["jain_speed"].tolist() == [0.5, 1.0]
+
+
 def test_an_encroachment_after_ten_seconds_does_not_count() -> None:
     worlds = Worlds()
     worlds.recorder.least_pet_s[:, 0] = 9.9, 10.1

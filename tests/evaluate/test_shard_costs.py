@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
+from cavmarl.evaluate import shard_costs
 from cavmarl.evaluate.built_in_runs import DrivenWorld, world_maker
-from cavmarl.evaluate.shard_costs import measure_rounds, measure_shards
+from cavmarl.evaluate.shard_costs import MeasuredRound, measure_rounds, measure_shards
 
 
 @pytest.fixture
@@ -44,6 +48,20 @@ def test_every_zone_takes_some_time(simulation: Simulation) -> None:
         costs[zone].cost_s + costs[4 + zone].cost_s for zone in range(4)
     ]
     assert len(found.places) > 24
+
+
+def test_a_cost_is_the_median_of_five_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Loading a kernel makes the first part of the first zone dear.
+    parts_s = ([90.0, 1.0], [1.0, 1.0], [2.0, 5.0], [3.0, 1.0], [2.0, 1.0])
+    none = np.zeros(0, np.int64)
+    rounds = [
+        MeasuredRound(np.array(costs_s), none, np.zeros((0, 2)), none.astype(np.bool_))
+        for costs_s in parts_s
+    ]
+    monkeypatch.setattr(shard_costs, "measure_rounds", lambda *_, **__: iter(rounds))
+    world: Any = SimpleNamespace(seed=lambda seed, number: None, reset=lambda: None)
+    found = measure_shards(world, 1, 0, steps=5, before=1)
+    assert [shard.cost_s for shard in found.costs] == [2.0, 1.0]
 
 
 def test_suggested_actions_are_not_part_of_the_cost(simulation: Simulation) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning.actor_critic import ActorCritic
@@ -96,6 +97,31 @@ def test_seats_of_opponents_are_not_trained_and_drive_as_their_policy() -> None:
     assert not batch.acted[:, theirs].any()
     assert not batch.goes_on[:, theirs].any()
     assert batch.acted[:, ~theirs].float().mean() > 0.5
+
+
+def test_worlds_that_go_on_have_the_mask_that_they_were_saved_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one, other = (make_collector(make_worlds("SameStep"), 0) for _ in range(2))
+    last = one.vec.step
+    masks: list[NDArray[np.bool_]] = []
+
+    def step(actions: NDArray[Any]) -> Any:
+        found = last(actions)
+        masks.append(found[-1]["mask"].copy())
+        return found
+
+    monkeypatch.setattr(one.vec, "step", step)
+    while not masks or masks[-1].all():
+        one.collect(with_suggested=False)
+    saved = one.save()
+    given: list[NDArray[np.bool_]] = []
+    monkeypatch.setattr(
+        other.opponents, "act", lambda observations, mask, actions: given.append(mask.copy())
+    )
+    other.load(saved)
+    other.collect(with_suggested=False)
+    np.testing.assert_array_equal(given[0], masks[-1])
 
 
 def test_no_return_is_expected_after_a_red_light() -> None:

@@ -11,6 +11,8 @@ import sumolib.net
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cavmarl.config.registry import load_config
+from cavmarl.engine.world_setup import load_roads
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.components import strong_components
 from cavmarl.roads.sumo_net.reader import read_network
@@ -55,6 +57,51 @@ RING = """<net version="1.20">
   <connection from="a" to="x" fromLane="0" toLane="0" dir="s" state="M"/>
 </net>
 """
+
+
+# Two roads that a signal joins; its phases are put in.
+SIGNALLED = """<net version="1.20">
+  <edge id="a" from="A" to="B">
+    <lane id="a_0" index="0" speed="10" length="50" shape="0,0 50,0"/>
+  </edge>
+  <edge id="b" from="B" to="A">
+    <lane id="b_0" index="0" speed="10" length="50" shape="50,3 0,3"/>
+  </edge>
+  <tlLogic id="T" type="static" programID="0" offset="0">{phases}</tlLogic>
+  <junction id="A" type="priority" x="0" y="0" incLanes="b_0" intLanes="" shape=""/>
+  <junction id="B" type="traffic_light" x="50" y="0" incLanes="a_0" intLanes="" shape=""/>
+  <connection from="a" to="b" fromLane="0" toLane="0" dir="t" state="o" tl="T" linkIndex="0"/>
+  <connection from="b" to="a" fromLane="0" toLane="0" dir="t" state="M"/>
+</net>
+"""
+
+
+@pytest.mark.parametrize(
+    ("phases", "is_held"),
+    [
+        ([(1000, "r"), (10, "G")], True),
+        ([(10, "G"), (99999, "r")], True),
+        ([(999, "r"), (10, "G")], False),
+        ([(99999, "G"), (10, "r")], False),
+        ([(99999, "O")], False),
+    ],
+)
+def test_signals_that_hold_red_are_named(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    phases: list[tuple[int, str]],
+    is_held: bool,
+) -> None:
+    lines = [f'<phase duration="{seconds}" state="{state}"/>' for seconds, state in phases]
+    path = tmp_path / "map.net.xml"
+    path.write_text(SIGNALLED.format(phases="".join(lines)))
+    report = check_map(path)
+    words = "1 signal holds a phase with red for 1,000 s or more, so that vehicles wait: T"
+    assert report.signals_held == (("T",) if is_held else ())
+    assert any(words in note for note in report.notes) == is_held
+    caplog.clear()
+    load_roads(*load_config(path))
+    assert (words in caplog.text) == is_held
 
 
 @pytest.fixture

@@ -159,3 +159,31 @@ def test_lane_types_are_read_or_counted(
     assert network.edges["num_lanes"][edge] == lanes
     for_cars = network.lanes["permissions"][network.edges["first_lane"][edge]] & 1
     assert for_cars == (kind != "bus")
+
+
+@pytest.mark.parametrize("text", ["1000000000", "1e9", "inf", "-200000"])
+def test_an_endless_geometry_is_named_before_netconvert_fills_the_memory(
+    tmp_path: Path, text: str
+) -> None:
+    line = '<geometry s="0" x="0" y="0" hdg="0" length="200"><line/></geometry>'
+    spiral = line.replace("<line/>", '<spiral curvStart="0" curvEnd="0.1"/>')
+    endless = ROAD.replace(line, line + "\n" + spiral.replace('length="200"', f'length="{text}"'))
+    path = tmp_path / "map.xodr"
+    path.write_text(road_file(ROAD, endless.replace('id="1" junction', 'id="seven" junction')))
+    words = rf"map\.xodr:2: road 'seven' has a geometry of {text} m: at most 100000 m"
+    with pytest.raises(MapError, match=words):
+        build_network(path)
+
+
+def test_the_memory_of_netconvert_is_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAVMARL_MAX_GEOMETRY_M", "1000000000")
+    monkeypatch.setenv("CAVMARL_MAX_NETCONVERT_BYTES", str(512 << 20))
+    path = tmp_path / "map.xodr"
+    road = ROAD.replace('length="200"', 'length="1000000000"')
+    road = road.replace("<line/>", '<spiral curvStart="0" curvEnd="0.1"/>')
+    path.write_text(road_file(road))
+    words = r"netconvert needs more than 0\.5 GiB of memory: .*MAX_NETCONVERT_BYTES"
+    with pytest.raises(MapError, match=words):
+        build_network(path, tmp_path / "out.net.xml")

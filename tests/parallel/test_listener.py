@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -91,6 +92,53 @@ def test_strangers_are_refused(said: bytes, error: type[Exception]) -> None:
     stranger.shutdown(socket.SHUT_WR)
     assert isinstance(caller.join(), error)
     stranger.close()
+
+
+def test_a_silent_caller_makes_room_before_one_that_has_said_who_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(listener_module, "MAX_CALLERS", 2)
+    door = Listener("127.0.0.1", b"of this test")
+    known, silent, third = (socket.create_connection(door.place) for _ in range(3))
+    known.sendall(listener_module.HELLO.pack(MAGIC, VERSION, 0, bytes(16)))
+    for _ in range(3):
+        assert door.admit() == []
+    known.settimeout(5.0)
+    assert len(known.recv(48)) == 48, "a random number and a proof"
+    silent.settimeout(5.0)
+    assert silent.recv(1) == b"", "disconnected"
+    for one in (known, third):
+        one.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            one.recv(1)
+    for one in (known, silent, third):
+        one.close()
+    door.close()
+
+
+def test_each_part_of_the_handshake_has_five_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = SimpleNamespace(s=0.0)
+    monkeypatch.setattr(listener_module, "time", SimpleNamespace(monotonic=lambda: now.s))
+    door = Listener("127.0.0.1", b"of this test")
+    known, silent = (socket.create_connection(door.place) for _ in range(2))
+    door.admit()
+    now.s = 4.0
+    known.sendall(listener_module.HELLO.pack(MAGIC, VERSION, 0, bytes(16)))
+    door.admit()
+    assert len(known.recv(48)) == 48, "a random number and a proof"
+    now.s = 8.0
+    door.admit()
+    assert silent.recv(1) == b"", "disconnected"
+    known.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        known.recv(1)
+    now.s = 9.1
+    door.admit()
+    known.settimeout(5.0)
+    assert known.recv(1) == b"", "disconnected"
+    known.close()
+    silent.close()
+    door.close()
 
 
 def test_no_process_listens() -> None:

@@ -347,6 +347,8 @@ def test_zones_after_losses_and_joins() -> None:
     again = moves_of(found.zones, first, lost=[], living=[0, 1, 2], state=2)
     assert again.zones == first
     assert again.donors == [(2, 1)]
-    with pytest.raises(WorkerDeathError, match="zones 2; zones 3, 4"):
+    with pytest.raises(WorkerDeathError, match="zones 2; zones 3, 4") as caught:
         moves_of(first, first, lost=[1, 2], living=[0], state=1)
+    assert "make the environment again" in str(caught.value)
+    assert "SIGKILL" not in str(caught.value)  # nothing says that a process was killed
     assert json.dumps(again)  # it is sent as JSON

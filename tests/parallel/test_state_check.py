@@ -233,7 +233,11 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
     now_ms = int(simulation.ticks()[0] * simulation.config.clock.sim_dt_s * 1e3)
     # Checks that are overdue would all be made in the next tick, one by one.
     for name, value in (("next_ms", 0), ("next_ms", 1 << 40), ("since_ms", now_ms + 9_000)):
-        _refused(vec, lambda state, name=name, value=value: state[place][name].fill(value))
+
+        def mistime(state: State, name: str = name, value: int = value) -> None:
+            state[place][name] = value
+
+        _refused(vec, mistime)
     ticks = next(
         n for n, array in enumerate(worlds.save()) if array is simulation.shards[0].worlds.ticks
     )

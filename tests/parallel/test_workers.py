@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ import pytest
 from cavmarl import ActionError, CapacityError, ConfigError, make_vec
 from cavmarl.config.registry import entries
 from cavmarl.core.errors import EpisodeError, WorkerDeathError, WorkerError
+from cavmarl.core.processes import start_python
+from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.processes.worker_processes import WorkerProcesses
 from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 
@@ -29,6 +32,35 @@ def test_workers_change_no_result(make: Make, number: int, env: str) -> None:
     whole = drive(make(env, **wanted))
     for zones, workers in ((1, 1 + number % 3), (4, 2)):
         assert same(drive(make(env, zones=zones, workers=workers, **wanted)), whole), zones
+
+
+CLOSED = """
+import os, sys
+for number in map(int, sys.argv[2]):
+    os.close(number)
+from cavmarl import make_vec
+vec = make_vec("ring", num_envs=2, workers=2, agents=2)
+vec.reset(seed=1)
+vec.step(vec.suggest_actions())
+open(sys.argv[1], "w").write(vec.state_hash(0))
+vec.close()
+"""
+
+
+@pytest.mark.parametrize("closed", ["0", "12", "012"])
+def test_workers_run_without_standard_descriptors(tmp_path: Path, closed: str) -> None:
+    found = tmp_path / "hash"
+    process = start_python(["-c", CLOSED, str(found), closed])
+    assert process.wait(120.0) == 0
+    vec = make_vec("ring", num_envs=2, agents=2)
+    drive_once(vec)
+    assert found.read_text() == vec.state_hash(0)
+    vec.close()
+
+
+def drive_once(vec: CavVectorEnv) -> None:
+    vec.reset(seed=1)
+    vec.step(vec.suggest_actions())
 
 
 def test_worlds_are_reset_in_the_next_step_although_workers_die(make: Make) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl.config.registry import agent_entries
 from cavmarl.config.terms import TERMS
@@ -16,9 +17,10 @@ from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.cosim.stack.stack import REFERENCE_RIG
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.vector import make_vec
+from cavmarl.policies import shield
 from cavmarl.policies.loading import driver_keys, load_policy, policy_files
-from cavmarl.policies.network_files import RESIDUAL_PARTS
-from cavmarl.policies.policy import Policy
+from cavmarl.policies.policy import Environment, Policy
+from cavmarl.policies.shield import ShieldedPolicy
 from tests.support.saved_drivers import save_driver, small_vec
 
 SCRIPTED = ("idm", "random_actions")
@@ -235,6 +237,32 @@ def test_a_shield_brakes_where_the_built_in_driver_would(kind: str) -> None:
     assert policy_files(name) == policy_files("never_yield")
 
 
+class Fixed(Policy):
+    """Gives the same actions at all times."""
+
+    def __init__(self, env: Environment, actions: NDArray[np.float32]) -> None:
+        super().__init__(env)
+        self.actions = actions
+
+    def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> Any:
+        return self.actions
+
+
+def test_a_shield_leaves_a_driver_that_accelerates_more_or_brakes_harder_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    vec = make_vec("merge", num_envs=1, agents=5)
+    # The built-in driver accelerates less, coasts, brakes a little, as hard, and harder.
+    built_in = np.array([[(0.2, 0.5), (0.0, 0.5), (-0.3, 0.5), (-0.4, 0.5), (-0.9, 0.5)]])
+    own = np.array([[(1.0, -0.1), (0.8, -0.1), (-0.6, -0.1), (-0.4, -0.1), (-0.2, -0.1)]])
+    monkeypatch.setattr(shield, "built_in_actions", lambda env, mask: built_in)
+    observations, infos = vec.reset(seed=0)
+    found = ShieldedPolicy(vec, Fixed(vec, own)).act_batch(observations, infos["mask"])
+    assert found[0, :4].tolist() == own[0, :4].tolist()
+    assert found[0, 4].tolist() == [-0.9, 0.5]
+    assert own[0, 4].tolist() == [-0.2, -0.1], "the driver's own actions stay"
+
+
 def test_corrections_are_added_to_what_the_built_in_driver_would_do(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     vec = make_vec("merge", num_envs=1, agents=3)
@@ -249,7 +277,7 @@ def test_corrections_are_added_to_what_the_built_in_driver_would_do(tmp_path: Pa
         mask = infos["mask"]
         proposed, found = (p.act_batch(observations, mask)[mask] for p in (idm, policy))
         known = np.concatenate([observations[mask], proposed], axis=1)
-        own = network.outputs(known) * np.array(RESIDUAL_PARTS, dtype=np.float32)
+        own = network.outputs(known) * np.array([1.0, 0.1], dtype=np.float32)
         due = (own + proposed).clip(-1.0, 1.0)
         np.testing.assert_array_equal(found, due)
         assert step > 0 or (np.abs(due - proposed) > 0.0).any()

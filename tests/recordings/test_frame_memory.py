@@ -27,10 +27,18 @@ def test_rows_come_back_only_when_they_are_given_back() -> None:
     assert len(memory.take(1000)) == 1000, "what is too small is let go"
 
 
+def test_rows_that_are_given_back_twice_are_handed_out_once() -> None:
+    memory = FrameMemory()
+    rows = memory.take(10)
+    memory.give_back(rows)
+    memory.give_back(rows)
+    assert not np.shares_memory(memory.take(10), memory.take(10))
+
+
 def test_frames_in_memory_that_is_used_again_are_recorded_as_they_were(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording_writer, "COMMIT_S", 0.005)
+    monkeypatch.setattr(recording_writer, "MOST_WAITING_BYTES", 20_000)
     env = cavmarl.parallel_env("merge", record=tmp_path / "run")
     env.reset(seed=4)
     shown = list(env.world_frames())

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from cavmarl import ConfigError, RecordingError, RecordOptions, make_vec, parallel_env
+from cavmarl.recordings import recording_writer
 from cavmarl.recordings.extra_tables import take_rows
 from cavmarl.recordings.recording import Recording
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM, NUM_KINDS
@@ -59,6 +60,27 @@ def test_observations_are_those_of_each_step(tmp_path: Path, zones: int) -> None
     assert recording.extra("observations", 0, episode=4).size == 0
     with pytest.raises(RecordingError, match="has no v2x; it has observations: record with"):
         recording.extra("v2x")
+
+
+def test_rows_of_the_second_episode_are_found_by_its_own_ticks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording_writer, "MOST_WAITING_BYTES", 1)  # a part for each step
+    options = RecordOptions(tmp_path / "run", ("observations",))
+    seen = []
+    with closing(make_vec("merge", num_envs=1, agents=2, background=0, record=options)) as vec:
+        for seed in (1, 2):
+            vec.reset(seed=seed)
+            vec.step(vec.suggest_actions())
+            seen.append(vec.worlds.arrays.observations[0].copy())
+    recording = Recording.open(tmp_path / "run")
+    assert recording.ticks(0, 0) == recording.ticks(0, 1)
+    last = recording.ticks(0, 0)[-1]
+    for episode in (0, 1):
+        rows = recording.extra_at("observations", last, 0, episode)
+        assert rows["values"].tobytes() == seen[episode][rows["agent"]].tobytes()
+        assert len(rows) > 0
+    assert not np.array_equal(seen[0], seen[1])
 
 
 def test_samples_are_those_of_the_rig(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from cavmarl.balance.load_score import LoadRule
 from cavmarl.core.errors import ServiceError
+from cavmarl.service import rate_limit
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.node_host import run_evaluation
@@ -111,6 +112,24 @@ def test_a_node_with_a_little_less_load_is_not_stampeded(fleet: Fleet) -> None:
     fleet.beat("b", cpu=0.05)
     found = Counter(fleet.open().node for _ in range(20))
     assert found == {"a": 10, "b": 10}
+
+
+def test_a_new_session_counts_as_one_slots_share_of_the_processor(fleet: Fleet) -> None:
+    fleet.join("a", "b", slots=16)
+    fleet.beat("a", cpu=0.05)
+    fleet.beat("b", cpu=0.35)
+    # Each session adds 1 / 16: with five, a has 0.3625, more than b.
+    assert [fleet.open().node for _ in range(6)] == ["a"] * 5 + ["b"]
+
+
+def test_zones_of_other_sessions_take_slots(fleet: Fleet) -> None:
+    fleet.join("a", "b", slots=1)
+    assert fleet.open(zone_nodes=2).members
+    with pytest.raises(NoNodeError) as refused:
+        fleet.open()
+    assert {(one.node, one.reason) for one in refused.value.exclusions} == {
+        ("a", "capacity"), ("b", "capacity")
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -387,6 +406,19 @@ def test_jobs_that_no_node_can_take_cost_little_and_keep_none_waiting(fleet: Fle
     assert asked <= 1100  # a hundred a second
 
 
+def test_a_pass_that_stopped_goes_round_to_the_jobs_before(fleet: Fleet) -> None:
+    job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
+    early = fleet.open(job=job, needs=["x"])
+    for k in range(60):
+        fleet.open(job=job, needs=[f"none-{k}"])
+    fleet.register("a", capabilities=["x"])
+    fleet.now_s += 1.0
+    fleet.broker.jobs.place()  # 50 searches fail: it stops at another job than the first
+    fleet.now_s += 1.0
+    fleet.beat("a")
+    assert early.node == "a"
+
+
 def test_jobs_are_placed_in_their_order(fleet: Fleet) -> None:
     job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
     jobs = [fleet.open(job=job) for _ in range(12)]
@@ -439,3 +471,26 @@ def test_requests_of_one_caller_have_a_rate(fleet: Fleet) -> None:
     limit.take("bob")
     fleet.now_s += 0.5
     limit.take("ada")
+
+
+def test_the_caller_that_asked_longest_ago_is_forgotten_first(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rate_limit, "MOST_BUCKETS", 2)
+    limit = RateLimit(1e-6, 2.0, lambda: fleet.now_s)
+    for caller in ("ada", "bob", "bob", "ada", "cy", "cy"):
+        limit.take(caller)
+    assert limit.has("bob")
+    assert not limit.has("ada")
+    assert not limit.has("cy")
+
+
+def test_a_pause_saves_up_one_burst_at_most(fleet: Fleet) -> None:
+    limit = RateLimit(2.0, 3.0, lambda: fleet.now_s)
+    limit.take("ada")
+    fleet.now_s += 3600.0
+    for _ in range(3):
+        limit.take("ada")
+    assert not limit.has("ada")
+    with pytest.raises(ServiceError, match="2 requests per second"):
+        limit.take("ada")

@@ -106,6 +106,7 @@ def test_an_invalid_place_of_a_store_is_refused(where: str, words: str) -> None:
 def test_a_file_without_a_store_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     path.write_bytes(b"no database, but long enough to be read as one" * 100)
+    path.chmod(0o600)
     with pytest.raises(ServiceError, match="cannot be opened"):
         EventStore(path)
 

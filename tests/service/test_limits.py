@@ -45,14 +45,18 @@ def test_large_and_slow_and_deep_bodies_are_refused(service: RunningService) -> 
     assert problem_of(long) == "bad-body"
 
 
-def test_only_content_of_nodes_may_be_larger(service: RunningService) -> None:
-    """What is read before its sender is known is small."""
-    path = "/sessions/s-" + "0" * 24
+def test_only_content_of_nodes_may_be_larger(
+    service: RunningService, tokens: dict[str, Any]
+) -> None:
+    path, headers = "/sessions/s-" + "0" * 24, {"Content-Type": "application/json"}
     for name in (f"{path}/transfers", f"{path}/door"):
-        answer = ask(service, "x", "PUT", name, content=b"[" * 300_000)
+        content = b"[" * 300_000
+        answer = ask(service, tokens["node"], "PUT", name, content=content, headers=headers)
         assert (answer.status_code, problem_of(answer)) == (413, "too-large"), name
-    large = ask(service, "x", "PUT", f"{path}/state?at=1", content=b"x" * 300_000)
-    assert problem_of(large) == "bad-token"
+    large = ask(service, tokens["node"], "PUT", f"{path}/state?at=1", content=b"x" * 300_000)
+    assert problem_of(large) == "lost"
+    secret = {"secret": "x" * 100_000}  # read before its sender is known
+    assert httpx.post(f"{service.url}/v1/token", json=secret).status_code == 413
 
 
 def test_an_identity_has_so_many_streams_at_most(service: RunningService) -> None:
@@ -90,6 +94,20 @@ def test_a_world_that_no_node_could_hold_is_refused(
     answer = ask(service, tokens["client"], "POST", "/configurations", json=body)
     assert problem_of(answer) == "refused"
     assert "at most 200000" in answer.json()["detail"]
+
+
+def test_vehicles_that_pages_may_insert_need_room_in_a_node_too(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path / "store.sqlite")
+    keys: dict[str, Any] = {"environment": "merge", "agents": 5, "background": 0, "num_envs": 1000}
+    for insertions in (195, 196):
+        overrides = {"population.insertions": insertions}
+        body = ConfigurationBody(**keys, overrides=overrides)
+        if insertions == 195:
+            add_configuration(fleet.log, fleet.client, body)
+            continue
+        with pytest.raises(ServiceError, match="201000 vehicles in 1000 worlds: at most 200000"):
+            add_configuration(fleet.log, fleet.client, body)
+    fleet.close()
 
 
 def test_an_identity_has_so_many_configurations_at_most(tmp_path: Path) -> None:

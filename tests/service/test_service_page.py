@@ -45,12 +45,10 @@ def test_the_page_s_session_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
                 secret = Path(words[words.index("--secret-file") + 1]).read_text().strip()
                 cluster.start(words[words.index("--name") + 1], secret=secret)
                 continue
-            words, target = (words[:-2], words[-1]) if words[-2] == ">" else (words, "")
             done = CliRunner().invoke(app, words[1:], catch_exceptions=False)
             assert done.exit_code == 0, line
             said[words[1]] = done.stdout
-            if target:
-                Path(target).write_text(done.stdout)
+        assert Path("node.secret").stat().st_mode & 0o777 == 0o600
         assert cluster.processes["a"].wait(timeout=20.0) == 0
         cluster.stop()
     assert "done" in said["sessions"]

@@ -9,6 +9,7 @@ Seconds of processor say the same on a busy machine as on a quiet one; seconds o
 from __future__ import annotations
 
 import os
+import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
@@ -19,15 +20,25 @@ from typing import Any
 import psutil
 import pytest
 
-__all__ = ["CpuTimes", "argued", "costs_of_files", "known_costs", "rare_tests"]
+__all__ = [
+    "CpuTimes",
+    "argued",
+    "costs_of_files",
+    "is_due",
+    "known_costs",
+    "long_tests",
+    "rare_tests",
+]
 
 LISTED_AT_END_S = 2.0  # a test that costs more is listed at the end of a run
 ARGUED_S = 2.0  # one that costs more is slow, but for those of the file of argued tests
 LISTED_S = 0.5  # a test that costs less is not in the file of costs
 OFTEN_S = 1.5  # of a test's variants, so many seconds are in every run, and one of them at least
+TURNS = 30  # runs of `make rotation` in which each slow test comes up that is not long
 CHEAP_S = 0.05  # what one costs that is not in the file of costs
 COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
 ARGUED = COSTS.with_name("argued.txt")
+LONG = COSTS.with_name("long.txt")
 
 
 @cache
@@ -40,7 +51,17 @@ def known_costs() -> dict[str, float]:
 @cache
 def argued() -> frozenset[str]:
     """Dear tests that are in every run, and with `[*]` those whose variants all are."""
-    lines = ARGUED.read_text(encoding="utf-8").splitlines()
+    return _listed(ARGUED)
+
+
+@cache
+def long_tests() -> frozenset[str]:
+    """Slow tests that are in `make soak` alone; a file stands for all its slow tests."""
+    return _listed(LONG)
+
+
+def _listed(path: Path) -> frozenset[str]:
+    lines = path.read_text(encoding="utf-8").splitlines()
     return frozenset(line for line in lines if line and not line.startswith("#"))
 
 
@@ -65,6 +86,21 @@ def rare_tests(
         else:
             spent[test] = spent.get(test, 0.0) + cost_s
     return rare
+
+
+def is_due(name: str, turn: int, long: frozenset[str]) -> bool:
+    """Return whether `make rotation` runs a slow test in a turn: one of `TURNS` in a row.
+
+    The tests of a file come up in different turns, so that no turn has all of an expensive file.
+
+    Args:
+        name: of the test.
+        turn: number of the turn.
+        long: files and tests, without variants, that no turn runs.
+    """
+    if {name.partition("::")[0], name.partition("[")[0]} & long:
+        return False
+    return zlib.crc32(name.encode()) % TURNS == turn % TURNS
 
 
 def costs_of_files(names: Iterable[str], costs: Mapping[str, float]) -> dict[str, float]:

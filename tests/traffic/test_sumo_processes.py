@@ -72,6 +72,13 @@ def all_end(pids: list[int], within_s: float = 10.0) -> bool:
     return False
 
 
+def test_the_memory_of_sumo_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAVMARL_MAX_SUMO_BYTES", str(20 << 20))
+    overrides = settings(tiny_file(tmp_path), "sumo-traffic")
+    with pytest.raises(SumoError, match=r"more than 0\.0195312 GiB .*MAX_SUMO_BYTES"):
+        make_vec("grid4x4", num_envs=1, agents=3, background=0, overrides=overrides)
+
+
 @pytest.mark.parametrize("source", MODES)
 def test_two_processes_with_one_seed_have_equal_hashes(tmp_path: Path, source: str) -> None:
     """This one is one of them."""

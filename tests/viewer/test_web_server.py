@@ -240,6 +240,10 @@ def test_other_machines_are_only_served_with_a_token() -> None:
         ('{"kind": "drive", "throttle": "full"}', "must be a number"),
         ('{"kind": "insert", "x": 1}', "y: must be a number"),
         ('{"kind": "close", "x": 1e300, "y": 0}', "x = 1e+300: must be from"),
+        (f'{{"kind": "pace", "number": {"9" * 400}}}', "pace = 9999999999…: must be from"),
+        (f'{{"kind": "drive", "throttle": -{"9" * 400}}}', "throttle = -999999999…: must be from"),
+        ('{"kind": "\\ud800"}', "ud800"),
+        ('{"kind": "' + "\U0001f697" * 40 + '"}', "request of kind"),
     ],
 )
 def test_what_is_not_understood_ends_the_connection(serve: Serve, text: str, reason: str) -> None:
@@ -250,6 +254,16 @@ def test_what_is_not_understood_ends_the_connection(serve: Serve, text: str, rea
         code, why = ended_with(client)
         assert code == 1003
         assert reason in why
+
+
+@pytest.mark.parametrize("hello", ['{"token": "\\ud800"}', '{"world": "\\ud800"}', "{\ud800}"])
+def test_a_hello_with_half_a_character_is_refused(serve: Serve, hello: str) -> None:
+    served = serve(drives=False)
+    with live(served.server) as client:
+        client.send(hello.encode(errors="surrogatepass"), text=True)
+        assert ended_with(client)[0] in (1003, 1007, 4401)
+    with welcome(served.server) as client:
+        assert first_of(client, "hello")
 
 
 def test_a_page_that_may_only_watch_changes_nothing(serve: Serve) -> None:

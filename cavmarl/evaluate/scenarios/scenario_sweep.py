@@ -7,7 +7,7 @@ tests nothing.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -59,6 +59,7 @@ def sweep_scenarios(
     fails: str = "never_yield",
     density: str = "none",
     agents: int = 1,
+    overrides: Mapping[str, Any] | None = None,
 ) -> Iterator[SweepRow]:
     """Run each scenario on each map once per seed, with two drivers.
 
@@ -70,6 +71,7 @@ def sweep_scenarios(
         fails: driver that must fail.
         density: density of the other traffic.
         agents: number of agents in each run.
+        overrides: values of further keys of the environments.
 
     Raises:
         ConfigError: an unknown scenario, or no room for the agents; as in `make_scenario`.
@@ -79,7 +81,14 @@ def sweep_scenarios(
             row = SweepRow(scenario, str(env), [], [])
             for seed in seeds:
                 try:
-                    vec = make_scenario(scenario, env, density=density, seed=seed, agents=agents)
+                    vec = make_scenario(
+                        scenario,
+                        env,
+                        density=density,
+                        seed=seed,
+                        agents=agents,
+                        overrides=overrides,
+                    )
                 except ScenarioError:
                     break
                 with closing(vec):

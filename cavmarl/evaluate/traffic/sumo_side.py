@@ -22,12 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, require
+from cavmarl.core.processes import limit_memory
 from cavmarl.core.records.codes import SIGNAL_NONE
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.sumo_net.xml_source import limit
 from cavmarl.traffic.sumo.sumo_input import SumoInput, command_words, free_libsumo
+from cavmarl.traffic.sumo.sumo_process import MAX_SUMO_BYTES, MEMORY_LIMIT
 
 
 @dataclass(frozen=True)
@@ -65,11 +68,21 @@ def run_seeds(job: SumoJob, more_seeds: Sequence[int]) -> tuple[TrafficRun, list
 def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
     """Return an executor with a new process for one simulation of SUMO."""
     require("libsumo", "sumo")
-    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+    most_bytes = limit(MEMORY_LIMIT, MAX_SUMO_BYTES)
+    start = get_context("spawn")
+    with ProcessPoolExecutor(1, start, limit_memory, (most_bytes,)) as process:
         try:
             yield process
         except BrokenProcessPool as error:
-            raise ConfigError(f"{job.map_file}: SUMO ended its process on this demand") from error
+            raise ConfigError(
+                f"{job.map_file}: SUMO ended its process on this demand; if it needs more than "
+                f"{most_bytes / 2**30:g} GiB of memory, set {MEMORY_LIMIT} (in bytes)"
+            ) from error
+        except MemoryError as error:
+            raise ConfigError(
+                f"{job.map_file}: SUMO needs more than {most_bytes / 2**30:g} GiB of memory for "
+                f"this demand: use less of it, or set {MEMORY_LIMIT} (in bytes)"
+            ) from error
 
 
 def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from xml.etree.ElementTree import Element, tostring
 
 import defusedxml.ElementTree
 
-from cavmarl.core.atomic_file import draft_folder
+from cavmarl.core.atomic_file import draft_folder, write_whole
+from cavmarl.core.cache_folder import cache_dir, report_unwritable
 from cavmarl.core.errors import MapError
+from cavmarl.maps.exports.opendrive_carla import fit_to_carla, origin_of
 from cavmarl.maps.exports.opendrive_curves import mend_curves
 from cavmarl.maps.exports.opendrive_trip import RoundTrip, roads_of_file, roads_of_map
 from cavmarl.maps.netconvert import OPENDRIVE_OPTIONS
 from cavmarl.maps.netconvert_process import run_netconvert, sumo_home
 from cavmarl.maps.provenance import read_provenance
-from cavmarl.roads.sumo_net.reader import read_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.reader import read_network, source_hash
 
 _HEAD = b'<?xml version="1.0" encoding="UTF-8"?>\n'
 STAGES = ("reading", "netconvert writes", "ASAM's rules", "netconvert reads", "comparison")
+_CARLA_FORMAT = 2  # increase this if `carla_document` returns another text for a map
 _MINOR = "8"  # OpenDRIVE 1.8, which ASAM's checker verifies
 
 
@@ -28,11 +34,12 @@ def write_opendrive(
     target: Path,
     timeout_s: float | None = None,
     told: Callable[[str], None] = lambda stage: None,
+    for_carla: bool = False,
 ) -> RoundTrip:
     """Write a SUMO network as OpenDRIVE and read it back; call `told` at the start of each stage.
 
     If netconvert reads back something else, the target is still written, and the result reports the
-    differences.
+    differences. With `for_carla`, the file is changed as `opendrive_carla.fit_to_carla` describes.
 
     Raises:
         MapError: netconvert refuses the network or its own export, or the target cannot be written.
@@ -44,11 +51,12 @@ def write_opendrive(
     try:
         with draft_folder(target.parent) as folder:
             draft, back = folder / "map.xodr", folder / "back.net.xml"
-            words = ["--sumo-net-file", str(source), "--opendrive-output", str(draft)]
             told(STAGES[1])
-            run_netconvert(words, source, timeout_s)
+            _convert(source, draft, timeout_s)
             told(STAGES[2])
             root = _mended(draft, read_provenance(source))
+            if for_carla:
+                fit_to_carla(root, origin_of(network))
             draft.write_bytes(_HEAD + tostring(root, "utf-8") + b"\n")
             words = ["--opendrive-files", str(draft), "-t", types, "-o", str(back)]
             told(STAGES[3])
@@ -61,6 +69,37 @@ def write_opendrive(
     except OSError as error:
         raise MapError(f"{target}: cannot be written ({error.strerror or error})") from error
     return trip
+
+
+def carla_document(source: Path, network: RoadNetwork) -> str:
+    """Return a SUMO network as OpenDRIVE for CARLA's client, without reading it back.
+
+    The document is kept in the cache folder. `network`: the map as read from `source`.
+
+    Raises:
+        MapError: netconvert refuses the network.
+        MissingExtraError: netconvert is not installed.
+    """
+    kept = cache_dir() / "carla" / f"{source_hash(source)}-{_CARLA_FORMAT}.xodr"
+    with suppress(OSError, UnicodeError):
+        return kept.read_text(encoding="utf-8")
+    with TemporaryDirectory() as folder:
+        draft = Path(folder) / "map.xodr"
+        _convert(source, draft, None)
+        root = _mended(draft, read_provenance(source))
+    fit_to_carla(root, origin_of(network))
+    document: bytes = _HEAD + tostring(root, "utf-8") + b"\n"
+    try:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(kept, document)
+    except OSError as error:
+        report_unwritable(error)
+    return document.decode()
+
+
+def _convert(source: Path, draft: Path, timeout_s: float | None) -> None:
+    words = ["--sumo-net-file", str(source), "--opendrive-output", str(draft)]
+    run_netconvert(words, source, timeout_s)
 
 
 def _mended(draft: Path, facts: Mapping[str, str]) -> Element:

@@ -14,7 +14,7 @@ Points = NDArray[np.float64]
 
 FEWEST_POINTS = 50
 _NORMAL_NEIGHBOURS = 20
-_STAGES = 12
+STAGES = 12
 _SETTLED_M, _SETTLED_RAD = 1e-4, 1e-6
 _ITERATIONS = 50
 _WIDEST_M = 10.0  # points farther from the other cloud have no corresponding point
@@ -124,7 +124,7 @@ def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
     distance_m = before_m
     gate_m = min(max(2.0 * float(np.quantile(before_m, 0.95)), 1.0), _WIDEST_M)
     stages = 0
-    while stages < _STAGES:
+    while stages < STAGES:
         stages += 1
         found = gicp.align(
             target.cloud,

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.core.errors import WorkerError
+from cavmarl.core.processes import occupy_standard_descriptors
 
 Layout = Mapping[str, tuple[str, tuple[int, ...]]]
 """Arrays of a segment: name → dtype as text, and shape."""
@@ -111,6 +112,7 @@ def _room(dtype: str, shape: tuple[int, ...]) -> int:
 
 
 def _anonymous() -> int:
+    occupy_standard_descriptors()
     if hasattr(os, "memfd_create"):
         return os.memfd_create("cavmarl", os.MFD_CLOEXEC)
     fd, path = tempfile.mkstemp(prefix="cavmarl-")

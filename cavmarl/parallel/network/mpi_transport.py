@@ -41,6 +41,10 @@ NAP_S = 50e-6
 END_S = 60.0  # time for the other ranks to end after the caller
 PRINTED_S = 0.3  # time for printed text to arrive before the run is aborted
 HOW = f"mpirun -n 1 python PROGRAM : -n NODES cavmarl node --{MPI}"
+MPI_CURE = (
+    f"MPI has no failover: start the run again ({HOW}); backend='nodes:N' or 'ray:N' replaces lost "
+    "nodes"
+)
 _NOTICE = struct.Struct("<IIII")
 _SHARED = re.compile(r"/dev/shm/mpich_shm_\w+(?= *$)", re.MULTILINE)
 
@@ -254,7 +258,7 @@ class MpiTransport:
                 self._sent.popleft()
         except mpi.Exception as error:
             self.is_broken = True
-            raise WorkerError(f"MPI has lost a rank, and has no failover: {error}") from error
+            raise WorkerError(f"a rank was lost ({error}): {MPI_CURE}") from error
 
     def _receive_notice(self, rank: int, what: int, first: int, second: int) -> None:
         """Apply a notice about a connection."""

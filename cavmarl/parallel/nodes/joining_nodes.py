@@ -113,6 +113,7 @@ class JoiningNodes:
                         *self.refused,
                     )
                 )
+                why += "; start more nodes (cavmarl node --help), or raise workers.join_timeout_s"
             if why is not None:
                 raise WorkerError(why)
 

@@ -503,7 +503,11 @@ class NodePool:
         if self._successions > self._max_retries:
             causes = [f"node {hosts[0]} was lost"] * self._successions
             name = name_of(state.zones[hosts[0]])
-            raise WorkerDeathError(hosts[0], name, state.number, "step", causes)
+            cure = (
+                "The log says why each node was lost; make the environment again, with a larger "
+                f"workers.max_retries than {self._max_retries} if more losses are to be expected"
+            )
+            raise WorkerDeathError(hosts[0], name, state.number, "step", causes, cure)
         if not self._nodes:
             self._seat(1)
         successor = min(self._nodes)

@@ -11,8 +11,9 @@ from typing import Any, Protocol, TypeAlias
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.core.huge_pages import huge_heap
+from cavmarl.core.private_files import check_private
 from cavmarl.core.processes import start_python
-from cavmarl.parallel.network.mpi_transport import MPI, mpi_transport
+from cavmarl.parallel.network.mpi_transport import MPI, MPI_CURE, mpi_transport
 from cavmarl.parallel.network.ray_actors import RayActors
 from cavmarl.parallel.network.tcp_transport import TcpListener
 from cavmarl.parallel.network.transport import Place, TransportListener
@@ -125,10 +126,14 @@ class LocalNodes:
     def _ended(self, number: int) -> str:
         process = self._processes[number]
         process.kill()
-        return (
-            f"node {number} ended with exit status {process.wait()} before it had begun; see its "
-            "standard error"
+        status = process.wait()
+        cure = (
+            "it was killed, by a user, or for want of memory, or here for want of an answer: use "
+            "fewer nodes, or raise workers.max_retries"
+            if status < 0
+            else "see its standard error"
         )
+        return f"node {number} ended with exit status {status} before it had begun; {cure}"
 
     def replace(self, number: int, is_silent: bool) -> None:
         self._processes[number].kill()
@@ -166,7 +171,11 @@ class RayNodes:
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
         if self._retries == 0:
-            return f"node {number}, an actor of Ray, was lost before it had begun"
+            return (
+                f"node {number}, an actor of Ray, was lost before it had begun, more often than "
+                f"workers.max_retries allows; `ray logs` has its output: remove the reason, or "
+                "raise workers.max_retries"
+            )
         self._retries -= 1
         self.replace(number, is_silent)
         return None
@@ -200,15 +209,14 @@ class MpiNodes:
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
         mpi_transport().is_broken = True
-        return f"rank {number + 1} was lost before it had begun: MPI has no failover"
+        return f"rank {number + 1} was lost before it had begun: {MPI_CURE}"
 
     def replace(self, number: int, is_silent: bool) -> None:
         """Raise WorkerDeathError: a lost rank cannot be replaced."""
         mpi_transport().is_broken = True
         cause = "it does not answer" if is_silent else "its connection has ended"
-        raise WorkerDeathError(
-            number, f"rank {number + 1} of MPI, which has no failover", 0, "step", [cause]
-        )
+        part = f"rank {number + 1} of MPI, which has no failover"
+        raise WorkerDeathError(number, part, 0, "step", [cause], MPI_CURE)
 
     def stopped(self) -> set[int]:
         return set()  # they may be on other machines
@@ -293,12 +301,11 @@ def read_key(path: Path) -> bytes:
     """
     make = "make one: (umask 077; openssl rand -hex 32 > FILE), the same file on all machines"
     try:
+        check_private("key file", path)
         with open(path, "rb") as file:
-            key, mode = file.read(1 << 16).strip(), path.stat().st_mode
+            key = file.read(1 << 16).strip()
     except OSError as error:
         raise ConfigError(f"key file {path}: {error.strerror or error}; {make}") from error
-    if mode & 0o077:
-        raise ConfigError(f"key file {path}: other users can read it; run chmod 600 {path}")
     if len(key) < MIN_KEY:
         raise ConfigError(f"key file {path}: has {len(key)} of {MIN_KEY} characters; {make}")
     return key

@@ -76,7 +76,10 @@ class NodeWatch:
                     raise SilentNodeError(
                         number, MessageError("it does not answer offers")
                     ) from error
-        raise WorkerError(f"{silence}, {VAIN} times, although all nodes are alive") from silence
+        raise WorkerError(
+            f"{silence}, {VAIN} times, although all nodes are alive; raise workers.timeout_s = "
+            f"{timeout_s:g}"
+        ) from silence
 
     def _wait(self, timeout_s: float, wait: Callable[[float], Found]) -> Found:
         """Wait, and check from time to time whether a process is stopped."""

@@ -53,6 +53,12 @@ def read_order(data: memoryview, zones: int) -> dict[str, Any]:
     return order
 
 
+_LOST_STATE = (
+    "The state of these zones was only there: make the environment again, which begins new "
+    "episodes; the log says why each node was lost"
+)
+
+
 def moves_of(
     kept: Sequence[Sequence[int]],  # zones of each node when the state was kept
     homes: Sequence[Sequence[int]],  # zones of each node if none is lost
@@ -73,7 +79,7 @@ def moves_of(
         if heir in lost:
             both = "; ".join(name_of(homes[n]) for n in (number, heir))
             causes = [f"node {n} was lost" for n in lost]
-            raise WorkerDeathError(number, both, state, "step", causes)
+            raise WorkerDeathError(number, both, state, "step", causes, _LOST_STATE)
         heirs[number] = heir
     for number, heir in heirs.items():
         zones[heir] += zones[number]

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cavmarl.core.errors import WorkerError, WorkerFailureError
-from cavmarl.core.processes import start_python
+from cavmarl.core.processes import occupy_standard_descriptors, start_python
 from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.watchdog import CHECK_S, STOPPED_CHECKS, is_stopped
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
@@ -207,6 +207,7 @@ class ForkServer:
 
 def _wires() -> tuple[socket.socket, socket.socket]:
     """Return the two ends of a connection that carries messages."""
+    occupy_standard_descriptors()
     try:
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     except OSError as error:

@@ -23,7 +23,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.processes import die_with_parent
+from cavmarl.core.processes import die_with_parent, limit_memory
 
 HEAD = np.dtype([("kind", "<i4"), ("records", "<i4"), ("letters", "<i4"), ("line", "<i4")])
 START, STEP, LOOK_UP = 0, 1, 2  # kinds of requests
@@ -330,7 +330,8 @@ def _serve(wire: socket.socket) -> NoReturn:
 
 def main() -> None:
     """Serve requests until the process that started this one ends."""
-    number, parent, dies_with_thread = map(int, sys.argv[1:])
+    number, parent, dies_with_thread, most_bytes = map(int, sys.argv[1:])
+    limit_memory(most_bytes)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side handles Ctrl-C and closes
     if dies_with_thread:
         die_with_parent()

@@ -21,11 +21,14 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, SumoError, missing
 from cavmarl.core.huge_pages import huge_heap
-from cavmarl.core.processes import is_fork, refuse_fork
+from cavmarl.core.processes import is_fork, occupy_standard_descriptors, refuse_fork
+from cavmarl.roads.sumo_net.xml_source import limit
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_history import MOVED, SEEN
 
 ANSWER_S = 120.0  # a step that takes longer counts as hung
+MAX_SUMO_BYTES = 1 << 35
+MEMORY_LIMIT = "CAVMARL_MAX_SUMO_BYTES"  # environment variable that changes this limit
 END_S = 2.0  # time for the process to end by itself
 LAST_WORDS = 2000  # maximum number of quoted characters of its output
 
@@ -61,10 +64,13 @@ class SumoProcess:
     """
 
     def __init__(self, setup: Mapping[str, Any]) -> None:
+        occupy_standard_descriptors()
         ours, theirs = socket.socketpair()
         output = tempfile.TemporaryFile()
         with_thread = threading.current_thread() is threading.main_thread()
-        words = [str(theirs.fileno()), str(os.getpid()), str(int(with_thread))]
+        self._most_bytes = limit(MEMORY_LIMIT, MAX_SUMO_BYTES)
+        numbers = (theirs.fileno(), os.getpid(), int(with_thread), self._most_bytes)
+        words = list(map(str, numbers))
         path = os.pathsep.join(part for part in sys.path if part)
         with theirs:
             process = subprocess.Popen(
@@ -137,6 +143,8 @@ class SumoProcess:
         records = self._read(int(head["records"]))
         letters = self._read(int(head["letters"]))
         line: dict[str, Any] = json.loads(self._read(int(head["line"])))
+        if head["kind"] == child.REFUSED and _is_too_large(line["error"]):
+            raise SumoError(self._too_large())
         if head["kind"] == child.REFUSED:
             raise ConfigError(f"SUMO refuses: {line['error']}{self._last_words()}")
         return SumoAnswer(np.frombuffer(records, SEEN), bytes(letters), line)
@@ -162,15 +170,27 @@ class SumoProcess:
             how = f"has not answered for {ANSWER_S:g} s"
         words = self._last_words()
         self.close()
+        if _is_too_large(words):
+            return SumoError(self._too_large())
         return SumoError(
             f"the process of SUMO {how}{words}\nThe world is as it was before the step; reset it "
             "to continue"
+        )
+
+    def _too_large(self) -> str:
+        return (
+            f"the process of SUMO needs more than {self._most_bytes / 2**30:g} GiB of memory: use "
+            f"a smaller map or less traffic, or set {MEMORY_LIMIT} (in bytes)"
         )
 
     def _last_words(self) -> str:
         self._output.seek(0)
         text = self._output.read().decode(errors="replace").strip()[-LAST_WORDS:]
         return f": {text}" if text else ""
+
+
+def _is_too_large(words: str) -> bool:
+    return "bad_alloc" in words or "MemoryError" in words
 
 
 def _end(

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import ConfigError, MapError
+from cavmarl.maps.fidelity import cloud_registration
 from cavmarl.maps.fidelity.cloud_files import Cloud, read_cloud
 from cavmarl.maps.fidelity.cloud_filters import drop_outliers, thin_out
-from cavmarl.maps.fidelity.cloud_registration import Target, align, moved, nearest_distances
+from cavmarl.maps.fidelity.cloud_registration import (
+    Alignment,
+    Target,
+    align,
+    moved,
+    nearest_distances,
+)
 from cavmarl.maps.fidelity.comparison import compare, histogram, start_transform
 from tests.maps.fidelity.scenes import motion, street
 
@@ -68,6 +75,50 @@ def test_distances_equal_brute_force_and_have_a_direction() -> None:
     assert found["mean_distance_reverse_m"] == pytest.approx(apart.min(axis=0).mean())
     assert found["mean_distance_m"] != pytest.approx(found["mean_distance_reverse_m"], rel=0.05)
     assert sum(bin["points"] for bin in histogram(apart.min(axis=1))) == 1000
+
+
+def test_the_trimmed_rmse_leaves_out_points_that_have_no_partner() -> None:
+    reference = street(4000)
+    # One point of eleven is 30 m above the street, as leaves that only one of the scans has.
+    leaves = reference[:400] + np.array([0.0, 0.0, 30.0])
+    found = align(np.vstack([reference, leaves]), Target(reference))
+    assert found.converged
+    assert found.trimmed_rmse_m < 1e-3
+    assert np.sqrt(np.mean(found.distance_m**2)) > 30.0 / 11.0
+
+
+@pytest.mark.parametrize(
+    ("spacings_m", "limit_m"),
+    [((0.16, 0.1), 0.4), ((0.1, 0.16), 0.4), ((0.02, 0.01), 0.1), ((1.0, 0.1), 0.5)],
+)
+def test_the_limit_is_two_and_a_half_spacings_of_the_coarser_cloud(
+    spacings_m: tuple[float, float], limit_m: float
+) -> None:
+    clouds = []
+    for spacing_m in spacings_m:
+        x, y = np.meshgrid(*(spacing_m * np.arange(20.0),) * 2)
+        clouds.append(np.column_stack([x.ravel(), y.ravel(), np.zeros(400)]))
+    source, target = clouds
+    assert align(source, Target(target)).limit_m == pytest.approx(limit_m)
+
+
+def test_an_alignment_that_still_moves_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cloud_registration, "STAGES", 1)
+    cloud = street(4000)
+    found = align(moved(cloud, KNOWN), Target(cloud))
+    assert found.stages == 1
+    assert [problem for problem in found.problems if "the last stage (1) still moved" in problem]
+    assert align(cloud, Target(cloud)).problems == ()
+
+
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 150.0])
+def test_the_angle_is_that_about_the_axis(degrees: float) -> None:
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    transform = np.eye(4)
+    transform[1:3, 1:3] = [[cos, -sin], [sin, cos]]
+    found = Alignment(transform, 0.0, 0.1, 1, (), np.zeros(0), np.zeros(0))
+    assert found.angle_deg == pytest.approx(degrees)
+    assert found.yaw_deg == 0.0
 
 
 def test_other_places_do_not_converge() -> None:

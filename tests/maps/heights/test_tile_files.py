@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
 from cavmarl.maps.heights.height_model import HeightModel
@@ -43,6 +45,22 @@ def test_real_hgt_and_its_crop_agree(shared_maps: Path) -> None:
     one = HeightModel([shared_maps / "dem" / "N43E007.hgt.zip"]).at(places)[0]
     other = HeightModel([shared_maps / "dem" / "monaco_srtm3.tif"]).at(places)[0]
     assert np.abs(one - np.maximum(other, -2.0)).max() < 3.0  # the crop has 0 for negative heights
+
+
+def test_a_void_of_one_tile_has_the_height_of_the_next(tmp_path: Path) -> None:
+    def hole(heights: NDArray[Any]) -> None:
+        heights[40:60, 50:70] = np.nan
+
+    first = write_geotiff(tmp_path / "first.tif", plane(0.0, 0.0, 500.0), holes=hole)
+    second = write_geotiff(tmp_path / "second.tif", plane(0.0, 0.0, 700.0))
+    # Row 50 and column 60 are at latitude 48.015 - 50 · 0.0002 and longitude 10.995 + 60 · 0.0002.
+    places = np.array([[11.007, 48.005], [11.000, 48.000]])
+    heights, coverage = HeightModel([first, second]).at(places)
+    assert heights.tolist() == pytest.approx([700.0, 500.0])
+    assert coverage.filled_places == 0
+    heights, coverage = HeightModel([first]).at(places)
+    assert heights.tolist() == pytest.approx([500.0, 500.0])
+    assert coverage.filled_places == 1
 
 
 def test_tiles_go_on_where_others_end(tmp_path: Path) -> None:

@@ -1,0 +1,73 @@
+"""`cavmarl carla`: lets programs for CARLA use a world."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+from rich.console import Console
+
+from cavmarl.cli.output import SERVICE, about, flag, with_world
+from cavmarl.config.world_spec import WorldSpec
+
+if TYPE_CHECKING:
+    from cavmarl.cosim.carla import CarlaServer
+
+
+@with_world("agents", "background", "seed", "settings")
+def carla(
+    world: WorldSpec,
+    port: Annotated[
+        int,
+        about("Port of the calls; streams have the next port.", metavar="N", panel=SERVICE),
+    ] = 2000,
+    host: Annotated[
+        str, about("Address to listen at.", metavar="HOST", panel=SERVICE)
+    ] = "127.0.0.1",
+    any_host: Annotated[
+        bool,
+        flag(
+            "Allow an address that other machines can reach. The protocol has no login.",
+            panel=SERVICE,
+        ),
+    ] = False,
+    client_version: Annotated[
+        str, about("Version of the clients: 0.9.15, 0.9.16 or 0.10.0.", metavar="VERSION")
+    ] = "0.9.16",
+    max_clients: Annotated[
+        int, about("Number of clients at a time.", metavar="N", panel=SERVICE)
+    ] = 64,
+    max_actors: Annotated[
+        int, about("Number of actors that clients may spawn.", metavar="N", panel=SERVICE)
+    ] = 1024,
+    max_message_mb: Annotated[
+        int, about("Size of a message of a client.", metavar="MB", panel=SERVICE)
+    ] = 64,
+    max_unsent_mb: Annotated[
+        int,
+        about("Data that may wait for a client that does not read.", metavar="MB", panel=SERVICE),
+    ] = 64,
+) -> None:
+    """Let programs for CARLA use a world, through CARLA's own client, until interrupted."""
+    from cavmarl.cosim.carla import SessionLimits, serve
+
+    console = Console()
+    limits = SessionLimits(
+        max_message=max_message_mb << 20,
+        max_clients=max_clients,
+        max_actors=max_actors,
+        max_unsent=max_unsent_mb << 20,
+    )
+
+    def tell(server: CarlaServer) -> None:
+        map_path = server.session.map.path
+        console.print(f"{map_path} at {host}:{server.port}, for client {client_version}")
+
+    serve(
+        world,
+        port=port,
+        host=host,
+        any_host=any_host,
+        client=client_version,
+        limits=limits,
+        told=tell,
+    )

@@ -1,0 +1,269 @@
+"""The blueprints that clients can choose from, with CARLA's ids, attributes and default values.
+
+Client programs draw from the recommended values of each attribute that can be changed, so each of
+these has at least one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from cavmarl.sensors.kernels.panorama import BICYCLE, BUS, CAR, MOTORCYCLE, PEDESTRIAN, TRAM, TRUCK
+
+Kind = Literal["bool", "int", "float", "string", "colour"]
+
+_KINDS: tuple[Kind, ...] = ("bool", "int", "float", "string", "colour")
+_BOTH = ("true", "false")
+
+
+@dataclass(frozen=True)
+class BlueprintAttribute:
+    """An attribute, its default value, and the values from which programs draw."""
+
+    name: str
+    kind: Kind
+    default: str
+    recommended: tuple[str, ...] = ()  # for attributes that can be changed; empty: the default
+    can_change: bool = True
+
+
+@dataclass(frozen=True)
+class Blueprint:
+    """A kind of actor that clients can spawn.
+
+    `size_m`: length, width and height; zeros for sensors and controllers.
+    """
+
+    type_id: str
+    attributes: tuple[BlueprintAttribute, ...]
+    size_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def packed(self, number: int, first_kind: int) -> list[Any]:
+        """Return the definition as it is sent; `first_kind`: number of the attribute kind bool."""
+        attributes = [
+            [
+                one.name,
+                first_kind + _KINDS.index(one.kind),
+                one.default,
+                list(one.recommended or (one.default,)) if one.can_change else [],
+                one.can_change,
+                one.kind == "bool" and one.can_change,
+            ]
+            for one in self.attributes
+        ]
+        return [number, self.type_id, ",".join(reversed(self.type_id.split("."))), attributes]
+
+    def default(self, name: str) -> str:
+        """Return the default value of an attribute, or an empty text."""
+        return next((one.default for one in self.attributes if one.name == name), "")
+
+
+def _fixed(name: str, kind: Kind, value: str) -> BlueprintAttribute:
+    return BlueprintAttribute(name, kind, value, can_change=False)
+
+
+def _floats(**defaults: float) -> tuple[BlueprintAttribute, ...]:
+    return tuple(BlueprintAttribute(name, "float", str(value)) for name, value in defaults.items())
+
+
+def _ints(**defaults: int) -> tuple[BlueprintAttribute, ...]:
+    return tuple(BlueprintAttribute(name, "int", str(value)) for name, value in defaults.items())
+
+
+_COLOURS = ("17,37,103", "255,255,255", "180,44,44", "0,0,0", "107,162,146", "137,0,0")
+
+
+def _vehicle(
+    type_id: str,
+    base_type: str,
+    size_m: tuple[float, float, float],
+    wheels: int = 4,
+    special_type: str = "",
+) -> Blueprint:
+    return Blueprint(
+        f"vehicle.{type_id}",
+        (
+            BlueprintAttribute(
+                "role_name", "string", "autopilot", ("autopilot", "scenario", "ego_vehicle")
+            ),
+            BlueprintAttribute("color", "colour", _COLOURS[0], _COLOURS),
+            BlueprintAttribute("driver_id", "int", "0", ("0",)),
+            BlueprintAttribute("sticky_control", "bool", "true", _BOTH),
+            BlueprintAttribute("terramechanics", "bool", "false", _BOTH),
+            _fixed("number_of_wheels", "int", str(wheels)),
+            _fixed("object_type", "string", ""),
+            _fixed("base_type", "string", base_type),
+            _fixed("special_type", "string", special_type),
+            _fixed("generation", "int", "2"),
+            _fixed("has_lights", "bool", "true"),
+            _fixed("has_dynamic_doors", "bool", "false"),
+        ),
+        size_m,
+    )
+
+
+def _walker(number: int, age: str, gender: str) -> Blueprint:
+    return Blueprint(
+        f"walker.pedestrian.{number:04d}",
+        (
+            BlueprintAttribute("role_name", "string", "pedestrian"),
+            BlueprintAttribute("is_invincible", "bool", "true", _BOTH),
+            BlueprintAttribute("speed", "float", "1.4", ("0.0", "1.4", "2.6")),
+            BlueprintAttribute("use_wheelchair", "bool", "false", _BOTH),
+            _fixed("can_use_wheelchair", "bool", "false"),
+            _fixed("age", "string", age),
+            _fixed("gender", "string", gender),
+            _fixed("generation", "int", "2"),
+        ),
+        (0.38, 0.38, 1.86),
+    )
+
+
+def _sensor(type_id: str, *attributes: BlueprintAttribute) -> Blueprint:
+    common = (
+        BlueprintAttribute("role_name", "string", "front"),
+        BlueprintAttribute("sensor_tick", "float", "0.0"),
+        BlueprintAttribute("ros_name", "string", type_id.rpartition(".")[2]),
+    )
+    return Blueprint(f"sensor.{type_id}", (*common, *attributes))
+
+
+_CAMERA = (
+    *_ints(image_size_x=800, image_size_y=600),
+    *_floats(
+        fov=90.0,
+        lens_circle_falloff=5.0,
+        lens_circle_multiplier=0.0,
+        lens_k=-1.0,
+        lens_kcube=0.0,
+        lens_x_size=0.08,
+        lens_y_size=0.08,
+    ),
+)
+_RGB = (
+    *_CAMERA,
+    *_floats(
+        bloom_intensity=0.675,
+        fstop=1.4,
+        iso=100.0,
+        gamma=2.2,
+        lens_flare_intensity=0.1,
+        shutter_speed=200.0,
+        min_fstop=1.2,
+        exposure_compensation=0.0,
+        exposure_min_bright=10.0,
+        exposure_max_bright=12.0,
+        exposure_speed_up=3.0,
+        exposure_speed_down=1.0,
+        calibration_constant=16.0,
+        focal_distance=1000.0,
+        blur_amount=1.0,
+        blur_radius=0.0,
+        motion_blur_intensity=0.45,
+        motion_blur_max_distortion=0.35,
+        motion_blur_min_object_screen_size=0.1,
+        slope=0.88,
+        toe=0.55,
+        shoulder=0.26,
+        black_clip=0.0,
+        white_clip=0.04,
+        temp=6500.0,
+        tint=0.0,
+        chromatic_aberration_intensity=0.0,
+        chromatic_aberration_offset=0.0,
+    ),
+    *_ints(blade_count=5),
+    BlueprintAttribute("exposure_mode", "string", "histogram", ("histogram", "manual")),
+    BlueprintAttribute("enable_postprocess_effects", "bool", "true", _BOTH),
+)
+_LIDAR = (
+    *_ints(channels=32, points_per_second=56000),
+    *_floats(
+        range=10.0,
+        rotation_frequency=10.0,
+        upper_fov=10.0,
+        lower_fov=-30.0,
+        horizontal_fov=360.0,
+    ),
+)
+_LIDAR_NOISE = _floats(
+    atmosphere_attenuation_rate=0.004,
+    dropoff_general_rate=0.45,
+    dropoff_intensity_limit=0.8,
+    dropoff_zero_intensity=0.4,
+    noise_stddev=0.0,
+)
+_SEED = _ints(noise_seed=0)
+_GNSS = _floats(
+    noise_alt_bias=0.0,
+    noise_alt_stddev=0.0,
+    noise_lat_bias=0.0,
+    noise_lat_stddev=0.0,
+    noise_lon_bias=0.0,
+    noise_lon_stddev=0.0,
+)
+_IMU = _floats(
+    **{
+        f"noise_{what}_{axis}": 0.0
+        for what in ("accel_stddev", "gyro_bias", "gyro_stddev")
+        for axis in "xyz"
+    }
+)
+
+BLUEPRINTS = {
+    blueprint.type_id: blueprint
+    for blueprint in (
+        _vehicle("tesla.model3", "car", (4.79, 2.16, 1.49)),
+        _vehicle("audi.tt", "car", (4.18, 1.99, 1.39)),
+        _vehicle("audi.a2", "car", (3.71, 1.79, 1.55)),
+        _vehicle("lincoln.mkz_2020", "car", (4.89, 1.84, 1.49)),
+        _vehicle("mercedes.coupe_2020", "car", (4.67, 1.82, 1.42)),
+        _vehicle("nissan.micra", "car", (3.63, 1.85, 1.5)),
+        _vehicle("ford.mustang", "car", (4.72, 1.89, 1.3)),
+        _vehicle("mini.cooper_s_2021", "car", (4.55, 2.1, 1.77)),
+        _vehicle("volkswagen.t2", "van", (4.48, 2.07, 2.04)),
+        _vehicle("ford.ambulance", "van", (6.36, 2.35, 2.43), special_type="emergency"),
+        _vehicle("carlamotors.carlacola", "truck", (5.2, 2.61, 2.47)),
+        _vehicle("mitsubishi.fusorosa", "bus", (10.27, 3.94, 4.25)),
+        _vehicle("kawasaki.ninja", "motorcycle", (2.04, 0.8, 1.45), wheels=2),
+        _vehicle("diamondback.century", "bicycle", (1.65, 0.37, 1.59), wheels=2),
+        _walker(1, "adult", "female"),
+        _walker(2, "adult", "male"),
+        _walker(9, "child", "female"),
+        Blueprint("controller.ai.walker", (BlueprintAttribute("role_name", "string", "default"),)),
+        _sensor("camera.rgb", *_RGB),
+        _sensor("camera.depth", *_CAMERA),
+        _sensor("camera.semantic_segmentation", *_CAMERA),
+        _sensor("camera.instance_segmentation", *_CAMERA),
+        _sensor("lidar.ray_cast", *_LIDAR, *_LIDAR_NOISE, *_SEED),
+        _sensor("lidar.ray_cast_semantic", *_LIDAR),
+        _sensor(
+            "other.radar",
+            *_floats(horizontal_fov=30.0, vertical_fov=30.0, range=100.0),
+            *_ints(points_per_second=1500),
+            *_SEED,
+        ),
+        _sensor("other.gnss", *_GNSS, *_SEED),
+        _sensor("other.imu", *_IMU, *_SEED),
+        _sensor("other.collision"),
+        _sensor("other.lane_invasion"),
+        _sensor(
+            "other.obstacle",
+            *_floats(distance=5.0, hit_radius=0.5),
+            BlueprintAttribute("only_dynamics", "bool", "false", _BOTH),
+            BlueprintAttribute("debug_linetrace", "bool", "false", _BOTH),
+        ),
+    )
+}
+
+# The blueprint that stands for vehicles of the world, by the class that cameras see.
+BLUEPRINT_OF_CLASS = {
+    CAR: "vehicle.tesla.model3",
+    TRUCK: "vehicle.carlamotors.carlacola",
+    BUS: "vehicle.mitsubishi.fusorosa",
+    TRAM: "vehicle.mitsubishi.fusorosa",
+    MOTORCYCLE: "vehicle.kawasaki.ninja",
+    BICYCLE: "vehicle.diamondback.century",
+    PEDESTRIAN: "walker.pedestrian.0001",
+}

@@ -1,0 +1,205 @@
+"""`CarlaMap`: a road network as clients see it: OpenDRIVE, spawn points, and traffic lights.
+
+There is one traffic light on each approach to a junction: the lanes of one edge with one signal.
+Its state is green only if all movements from these lanes are green.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import defusedxml.ElementTree
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MapError
+from cavmarl.core.records.codes import (
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_GREEN_MINOR,
+    SIGNAL_OFF,
+    SIGNAL_OFF_BLINKING,
+    SIGNAL_RED,
+    SIGNAL_RED_YELLOW,
+    SIGNAL_STOP_THEN_GO,
+    SIGNAL_YELLOW_MAJOR,
+    SIGNAL_YELLOW_MINOR,
+)
+from cavmarl.cosim.carla.carla_geometry import CarlaPose, carla_pose
+from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
+
+RED, YELLOW, GREEN, OFF = 0, 1, 2, 3  # CARLA's numbers of states of traffic lights
+
+_STATE_OF_CODE = np.zeros(len(SIGNAL_STATES), np.uint8)
+_STATE_OF_CODE[[SIGNAL_RED, SIGNAL_RED_YELLOW, SIGNAL_STOP_THEN_GO]] = RED
+_STATE_OF_CODE[[SIGNAL_YELLOW_MINOR, SIGNAL_YELLOW_MAJOR]] = YELLOW
+_STATE_OF_CODE[[SIGNAL_GREEN_MINOR, SIGNAL_GREEN_MAJOR]] = GREEN
+_STATE_OF_CODE[[SIGNAL_OFF_BLINKING, SIGNAL_OFF]] = OFF
+
+SPAWN_HEIGHT_M = 0.3  # spawn points are this far above the road
+_SPAWN_EVERY_M = 40.0
+_FIRST_SPAWN_M = 15.0  # from the start of a longer lane
+_SHORTEST_M = 12.0  # a shorter lane has no spawn point
+_CAR = 1 << VEHICLE_CLASSES.index("passenger")
+_BOX_BEFORE_LINE_M = 2.0  # centre of the trigger volume, before the stop line
+
+
+class LightApproach(NamedTuple):
+    """A traffic light: the lanes of an edge that one signal controls."""
+
+    signal_id: str  # id of its signal in the OpenDRIVE document
+    signal: int  # SIGNAL row
+    indices: tuple[int, ...]  # indices of its movements in the state of the signal
+    lanes: tuple[int, ...]  # LANE rows
+    pose: CarlaPose  # at the stop line, looking across the road
+    half_width_m: float
+    pole: int  # number among the approaches of its signal
+
+    @property
+    def box(self) -> tuple[list[float], list[float]]:
+        """Return centre and half extents of the trigger volume, in the frame of the pose."""
+        return [0.0, _BOX_BEFORE_LINE_M, 0.0], [self.half_width_m, 1.5, 2.0]
+
+
+@dataclass(frozen=True, eq=False)
+class CarlaMap:
+    """The map of an episode.
+
+    Attributes:
+        name: name of the map, without folders.
+        document: the map as OpenDRIVE.
+        spawn_points: poses on lanes that cars may use.
+        approaches: the traffic lights.
+        states: (approaches, phases) state of each light in each PHASE of its signal.
+        approach_of_lane: (lanes,) index of the light at the end of each lane, or -1.
+        times_s: (approaches, 3) green, yellow and red time of the first program.
+        origin: latitude and longitude of (0, 0), in degrees.
+    """
+
+    name: str
+    document: str
+    network: RoadNetwork
+    spawn_points: tuple[CarlaPose, ...]
+    approaches: tuple[LightApproach, ...]
+    states: NDArray[np.uint8]
+    approach_of_lane: NDArray[np.int32]
+    times_s: NDArray[np.float32]
+    origin: tuple[float, float]
+
+    @property
+    def path(self) -> str:
+        """The name of the map as clients see it."""
+        return f"Carla/Maps/{self.name}"
+
+    def states_in(self, phases: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """Return the state (approaches,) of each light; `phases`: PHASE rows of the signals."""
+        signals = [approach.signal for approach in self.approaches]
+        found: NDArray[np.uint8] = self.states[np.arange(len(signals)), phases[signals]]
+        return found
+
+
+def make_carla_map(
+    network: RoadNetwork, name: str, document: str, origin: tuple[float, float]
+) -> CarlaMap:
+    """Return the map of a network; `document`: its OpenDRIVE, from `carla_document`.
+
+    Raises MapError: the network consists of several maps.
+    """
+    if len(network.maps) > 1:
+        raise MapError(f"{name}: {len(network.maps)} maps; a server for CARLA's clients has one")
+    root = defusedxml.ElementTree.fromstring(document.encode(), forbid_dtd=True)
+    ids = {signal.get("name", ""): signal.get("id", "") for signal in root.iter("signal")}
+    approaches = _approaches(network, ids)
+    at_end = np.full(len(network.lanes), -1, np.int32)
+    for number, approach in enumerate(approaches):
+        at_end[list(approach.lanes)] = number
+    return CarlaMap(
+        name,
+        document,
+        network,
+        tuple(_spawn_points(network)),
+        approaches,
+        _states(network, approaches),
+        at_end,
+        _times_s(network, approaches),
+        origin,
+    )
+
+
+def _spawn_points(network: RoadNetwork) -> list[CarlaPose]:
+    found = []
+    for lane, row in enumerate(network.lanes):
+        length = float(row["length_m"])
+        if row["internal"] or not row["permissions"] & _CAR or length < _SHORTEST_M:
+            continue
+        places = np.arange(_FIRST_SPAWN_M, length - _FIRST_SPAWN_M, _SPAWN_EVERY_M).tolist()
+        for s in places or [0.5 * length]:
+            x, y, z, cos, sin, slope = network.pose_on(lane, s)
+            pose = carla_pose(x, y, z, math.atan2(sin, cos), math.atan(slope))
+            found.append(pose.at((pose.x, pose.y, pose.z + SPAWN_HEIGHT_M)))
+    return found
+
+
+def _approaches(network: RoadNetwork, known: Mapping[str, str]) -> tuple[LightApproach, ...]:
+    """Return the approaches whose signal is in the document, in order of signal and edge.
+
+    `known`: ids of the signals in the document, by the ids that netconvert has given.
+    """
+    links = network.links[network.links["signal"] >= 0]
+    edges = network.lanes["edge"][links["from_lane"]]
+    found: list[LightApproach] = []
+    poles: dict[int, int] = {}
+    for signal, edge in sorted(set(zip(links["signal"].tolist(), edges.tolist(), strict=True))):
+        own = links[(links["signal"] == signal) & (edges == edge)]
+        indices = tuple(sorted(set(own["signal_index"].tolist())))
+        name = network.signal_ids[signal]
+        ids = [known[one] for index in indices if (one := f"{name}_{index}") in known]
+        if not ids:
+            continue
+        lanes = tuple(sorted(set(own["from_lane"].tolist())))
+        pose, half_width_m = _stop_line(network, lanes)
+        pole = poles[signal] = poles.get(signal, -1) + 1
+        found.append(LightApproach(ids[0], signal, indices, lanes, pose, half_width_m, pole))
+    return tuple(found)
+
+
+def _stop_line(network: RoadNetwork, lanes: tuple[int, ...]) -> tuple[CarlaPose, float]:
+    """Return the pose of a light at the middle of the ends of lanes, and half their width."""
+    ends = np.array([network.pose_on(lane, network.lanes["length_m"][lane]) for lane in lanes])
+    x, y, z, cos, sin, _ = ends.mean(axis=0).tolist()
+    across = carla_pose(x, y, z, math.atan2(sin, cos) - 0.5 * math.pi)
+    return across, 0.5 * float(network.lanes["width_m"][list(lanes)].sum())
+
+
+def _states(network: RoadNetwork, approaches: tuple[LightApproach, ...]) -> NDArray[np.uint8]:
+    found = np.full((len(approaches), len(network.phases)), OFF, np.uint8)
+    for program in network.programs:
+        first = int(program["first_phase"])
+        rows = range(first, first + int(program["num_phases"]))
+        for number, approach in enumerate(approaches):
+            if approach.signal != program["signal"]:
+                continue
+            for row in rows:
+                letters = int(network.phases["first_state"][row]) + np.array(approach.indices)
+                found[number, row] = _joint_state(_STATE_OF_CODE[network.phase_states[letters]])
+    return found
+
+
+def _joint_state(states: NDArray[np.uint8]) -> int:
+    """Return the state of a light that stands for several movements: the strictest of these."""
+    return next(state for state in (RED, YELLOW, GREEN, OFF) if (states == state).any())
+
+
+def _times_s(network: RoadNetwork, approaches: tuple[LightApproach, ...]) -> NDArray[np.float32]:
+    found = np.zeros((len(approaches), 3), np.float32)
+    states = _states(network, approaches)
+    for number, approach in enumerate(approaches):
+        program = network.programs[network.signals["program"][approach.signal]]
+        first = int(program["first_phase"])
+        rows = slice(first, first + int(program["num_phases"]))
+        durations = network.phases["duration_s"][rows]
+        for column, state in enumerate((GREEN, YELLOW, RED)):
+            found[number, column] = durations[states[number, rows] == state].sum()
+    return found

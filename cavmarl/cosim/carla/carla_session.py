@@ -1,0 +1,273 @@
+"""`CarlaSession`: the state that all clients of a server share, and the ticks of its world."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.cosim.carla.attached_sensors import SensorSuite
+from cavmarl.cosim.carla.call_arguments import CallRefused
+from cavmarl.cosim.carla.carla_actors import ActorTable, CarlaActor
+from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, Blueprint
+from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose
+from cavmarl.cosim.carla.carla_map import CarlaMap
+from cavmarl.cosim.carla.carla_snapshots import frame_head, snapshot_body
+from cavmarl.cosim.carla.carla_streams import EPISODE_STREAM, StreamHub
+from cavmarl.cosim.carla.carla_versions import ClientVersion
+from cavmarl.cosim.carla.external_vehicles import (
+    ExternalBody,
+    ExternalVehicles,
+    NoExternalVehicles,
+)
+from cavmarl.cosim.carla.hosted_world import (
+    STEP_S,
+    EndedVehicle,
+    HostedWorld,
+    WorldSource,
+)
+
+log = logging.getLogger("cavmarl.carla")
+
+_SAME_S = 1e-6  # step lengths that differ by less are equal
+_NOWHERE = CarlaPose(0.0, 0.0, 0.0)
+_WEATHER = [0.0] * 12 + [0.0331, 0.0]
+
+
+@dataclass(frozen=True)
+class EpisodeSettings:
+    """CARLA's `WorldSettings`; `others`: the fields without effect, as they were sent."""
+
+    synchronous: bool = False
+    no_rendering: bool = False
+    fixed_delta_s: float | None = None
+    others: tuple[Any, ...] = (True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True)
+
+    def packed(self) -> list[Any]:
+        fixed = [False] if self.fixed_delta_s is None else [True, self.fixed_delta_s]
+        return [self.synchronous, self.no_rendering, fixed, *self.others]
+
+
+@dataclass(frozen=True)
+class SessionLimits:
+    """Limits of what clients may demand.
+
+    Attributes:
+        max_message: bytes of a message.
+        max_clients: number of RPC connections.
+        max_actors: actors that clients have spawned.
+        max_unsent: bytes that wait for a client that does not read.
+
+    Raises ConfigError: a limit is not above 0.
+    """
+
+    max_message: int = 1 << 26
+    max_clients: int = 64
+    max_actors: int = 1024
+    max_unsent: int = 1 << 26
+
+    def __post_init__(self) -> None:
+        for name, limit in vars(self).items():
+            if limit < 1:
+                raise ConfigError(f"{name} = {limit}: must be at least 1")
+
+
+DEFAULT_LIMITS = SessionLimits()
+
+
+class CarlaSession:
+    """A hosted world, its actors, and the settings of its clients.
+
+    Args:
+        source: loads the world.
+        version: version of the clients.
+        streams: where snapshots and sensor frames are sent.
+        limits: limits of what clients may demand.
+        step_s: length of a step of the first world.
+
+    Attributes:
+        frame: number of ticks since the server has started; it numbers the snapshots.
+        episode: number of the episode; it grows when a client loads a map.
+        managers: ports and hosts of the clients' traffic managers.
+        weather, gravity: values that clients have set; they have no effect.
+    """
+
+    def __init__(
+        self,
+        source: WorldSource,
+        version: ClientVersion,
+        streams: StreamHub,
+        limits: SessionLimits = DEFAULT_LIMITS,
+        step_s: float = STEP_S,
+    ) -> None:
+        self.source, self.version, self.streams, self.limits = source, version, streams, limits
+        self.settings = EpisodeSettings()
+        self.weather, self.gravity = list(_WEATHER), 9.81
+        self.managers: dict[int, str] = {}
+        self.frame = 0
+        self.episode = 1
+        self.time_s = 0.0
+        self.first_step_s = step_s
+        self.world: HostedWorld = source.load("", step_s)
+        self.external: ExternalVehicles = NoExternalVehicles()
+        self.actors = ActorTable(self.world, 1)
+        self.sensors = SensorSuite(self, streams)
+        self._map_changed = True
+        self._told: set[str] = set()
+
+    @property
+    def map(self) -> CarlaMap:
+        return self.world.map
+
+    @property
+    def delta_s(self) -> float:
+        """Simulated time of a tick."""
+        fixed = self.settings.fixed_delta_s
+        return self.world.step_s if fixed is None else fixed
+
+    def tick(self, actions: Mapping[str, Any] | None = None) -> int:
+        """Advance the world by one tick and send its frames; return the number of the frame.
+
+        `actions`: actions of agents that no client drives; None: the built-in driver's.
+        """
+        self.frame += 1
+        self.time_s += self.delta_s
+        for _ in range(max(1, round(self.delta_s / self.world.step_s))):
+            for ended in self.world.step(actions):
+                self._tell_end(ended)
+        for actor in self.actors.take(self.world, self.time_s):
+            self._forget(actor)
+        self.publish()
+        return self.frame
+
+    def _tell_end(self, ended: EndedVehicle) -> None:
+        """Log why a vehicle that a client drives has left, and report its collision."""
+        actor = self.actors.of_agent(ended.agent)
+        if actor is None:
+            return
+        if ended.was_driven:
+            log.warning("actor %d (car_%d) leaves: %s", actor.number, ended.agent, ended.reason)
+        if ended.has_collided:
+            self._send(self.sensors.last_collisions(actor))
+
+    def publish(self) -> None:
+        """Send the snapshot of the present frame, then the frames of sensors."""
+        keep = self.settings.synchronous
+        if self.streams.is_wanted(EPISODE_STREAM):
+            head = frame_head(self.version.snapshot_kind, self.frame, self.time_s, _NOWHERE)
+            states = self.actors.states()
+            body = snapshot_body(self.episode, self.delta_s, self._map_changed, states)
+            self._map_changed = False
+            self.streams.send(EPISODE_STREAM, head, body, keep)
+        self._send(self.sensors.sense())
+
+    def _send(self, frames: Iterable[tuple[int, CarlaActor, int, bytes]]) -> None:
+        for stream, actor, kind, body in frames:
+            head = frame_head(kind, self.frame, self.time_s, actor.pose)
+            self.streams.send(stream, head, body, self.settings.synchronous)
+
+    def change_settings(self, settings: EpisodeSettings) -> None:
+        """Apply settings; a step length that does not fit the world restarts the world.
+
+        Raises CavmarlError: the world cannot have steps of this length. Nothing has changed.
+        """
+        wanted = settings.fixed_delta_s or self.first_step_s
+        steps = wanted / self.world.step_s
+        is_whole = round(steps) >= 1 and abs(steps - round(steps)) * self.world.step_s < _SAME_S
+        if not is_whole:
+            log.info("the world restarts with steps of %g s", wanted)
+            self._take_world(self.source.load("", wanted))
+        self.settings = settings
+
+    def load(self, name: str, reset_settings: bool) -> None:
+        """Begin a new episode on a map; raise CavmarlError if there is no such map."""
+        short = name.rpartition("/")[2]
+        world = self.source.load(short, self.world.step_s)
+        if reset_settings:
+            self.settings = EpisodeSettings(no_rendering=self.settings.no_rendering)
+        self.episode += 1
+        self.time_s = 0.0
+        self._map_changed = True
+        self._take_world(world)
+
+    def _take_world(self, world: HostedWorld) -> None:
+        for actor in list(self.actors.attached()):
+            self.sensors.remove(actor)
+        self.world = world
+        self.external = NoExternalVehicles()
+        self.actors = ActorTable(world, self.actors.next_number)
+
+    def spawn(
+        self, type_id: str, attributes: dict[str, str], pose: CarlaPose, parent: int = 0
+    ) -> CarlaActor:
+        """Add an actor; `pose` is relative to the parent, if there is one.
+
+        Raises CallRefused: there is no such blueprint, parent or room.
+        """
+        blueprint = BLUEPRINTS.get(type_id)
+        if blueprint is None:
+            raise CallRefused(f"actor definition not found: {type_id}")
+        if sum(1 for _ in self.actors.attached()) >= self.limits.max_actors:
+            raise CallRefused(f"{self.limits.max_actors} actors are spawned; destroy some first")
+        if parent and parent not in self.actors.actors:
+            raise CallRefused("unable to attach actor: parent actor not found")
+        if type_id.startswith(("sensor.", "controller.")):
+            return self._attach(blueprint, attributes, pose, parent)
+        there = compose(self.actors.pose_of(self.actors.actors[parent]), pose) if parent else pose
+        vehicle = self.external.spawn(ExternalBody(type_id, there, blueprint.size_m))
+        for actor in self.actors.take(self.world, self.time_s):
+            self._forget(actor)
+        spawned = self.actors.of_vehicle(vehicle)
+        assert spawned is not None
+        spawned.type_id = type_id
+        spawned.attributes = dict(attributes)
+        return spawned
+
+    def _attach(
+        self, blueprint: Blueprint, attributes: dict[str, str], pose: CarlaPose, parent: int
+    ) -> CarlaActor:
+        actor = self.actors.add(
+            blueprint.type_id,
+            pose,
+            attributes=dict(attributes),
+            parent=parent,
+            local=pose if parent else None,
+        )
+        try:
+            self.sensors.add(actor)
+        except CallRefused:
+            self.actors.remove(actor.number)
+            raise
+        self.actors.move_attached(actor)
+        return actor
+
+    def destroy(self, number: int) -> None:
+        """Remove an actor that a client has spawned; raise CallRefused for other actors."""
+        actor = self.actors.actors.get(number)
+        if actor is None:
+            raise CallRefused("unable to destroy actor: not found")
+        if actor.vehicle >= 0 and self.external.owns(actor.vehicle):
+            self.external.destroy(actor.vehicle)
+        elif not actor.type_id.startswith(("sensor.", "controller.")):
+            raise CallRefused(f"unable to destroy actor: {actor.type_id} belongs to the world")
+        for one in self.actors.remove(number):
+            self._forget(one)
+
+    def release(self, agents: set[int]) -> None:
+        """Give agents back to the built-in driver."""
+        for agent in agents:
+            self.world.controls.pop(agent, None)
+
+    def tell(self, message: str) -> None:
+        """Log a fault of a client; equal messages are logged once."""
+        if message not in self._told and len(self._told) < self.limits.max_actors:
+            self._told.add(message)
+            log.warning("%s", message)
+
+    def close(self) -> None:
+        self.source.close()
+
+    def _forget(self, actor: CarlaActor) -> None:
+        self.sensors.remove(actor)

@@ -1,0 +1,93 @@
+"""The attributes of an attached sensor, and what it can ask about the world."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.cosim.carla.call_arguments import CallRefused
+from cavmarl.cosim.carla.carla_actors import CarlaActor
+from cavmarl.cosim.carla.sensed_surroundings import Surroundings
+
+if TYPE_CHECKING:
+    from cavmarl.cosim.carla.carla_session import CarlaSession
+
+
+class SensorSettings:
+    """The attributes of a sensor as numbers. Raises CallRefused for other values."""
+
+    def __init__(self, actor: CarlaActor) -> None:
+        self._actor = actor
+
+    def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float:
+        written = self._actor.attribute(name)
+        try:
+            value = float(written)
+        except ValueError:
+            value = math.nan
+        if not (low <= value <= high and math.isfinite(value)):
+            raise CallRefused(
+                f"{self._actor.type_id}: {name} = {written!r}: must be a number from {low:g} to "
+                f"{high:g}"
+            )
+        return value
+
+    def whole(self, name: str, low: int, high: int) -> int:
+        return int(self.number(name, low, high))
+
+    def generator(self) -> np.random.Generator:
+        """Return the random numbers of a sensor."""
+        seed = self.whole("noise_seed", 0, 1 << 31)
+        return np.random.default_rng([seed, self._actor.number])
+
+
+class SensorContext:
+    """The world of a session, for its sensors."""
+
+    def __init__(self, session: CarlaSession) -> None:
+        self.session = session
+        self._surroundings: Surroundings | None = None
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """The view of the present world."""
+        world = self.session.world
+        if self._surroundings is None or self._surroundings.world is not world:
+            self._surroundings = Surroundings(world)
+        return self._surroundings
+
+    def carrier_of(self, actor: CarlaActor) -> int:
+        """Return the id of the vehicle that an actor is attached to, or -1."""
+        parent = self.session.actors.actors.get(actor.parent)
+        return -1 if parent is None else parent.vehicle
+
+    def hidden_carrier_of(self, actor: CarlaActor) -> int:
+        """Return the carrier of a camera that is in or above its body, which hides it, or -1."""
+        parent = self.session.actors.actors.get(actor.parent)
+        if parent is None or actor.local is None:
+            return -1
+        apart = np.abs(actor.local.place[:2])
+        return parent.vehicle if (apart <= parent.half_m[:2]).all() else -1
+
+    def numbers_of(self, vehicles: NDArray[np.int64]) -> NDArray[np.uint32]:
+        """Return the actors' numbers of vehicles' ids; 0 for ids without an actor."""
+        ids, places = np.unique(vehicles, return_inverse=True)
+        actors = [self.session.actors.of_vehicle(one) for one in ids.tolist()]
+        numbers = [0 if actor is None else actor.number for actor in actors]
+        found: NDArray[np.uint32] = np.array(numbers, np.uint32)[places]
+        return found
+
+    def velocities_of(self, vehicles: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return velocities (n, 3) of vehicles' ids; zero for ids without an actor."""
+        ids, places = np.unique(vehicles, return_inverse=True)
+        speeds = np.zeros((len(ids), 3))
+        for row, vehicle in enumerate(ids.tolist()):
+            actor = self.session.actors.of_vehicle(vehicle)
+            state = None if actor is None else self.session.actors.state_of(actor)
+            if state is not None:
+                speeds[row] = state["velocity"]
+        found: NDArray[np.float64] = speeds[places]
+        return found

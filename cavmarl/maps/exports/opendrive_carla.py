@@ -1,0 +1,121 @@
+"""Changes an OpenDRIVE export into what CARLA and its client programs read.
+
+CARLA's programs look for traffic lights of one type, with one signal on each approach, and find the
+lights of a junction by its controllers. Snapshots have room for short ids of signals only; the name
+of a signal is the id that netconvert has given. CARLA 0.9.16 reads the header of OpenDRIVE 1.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from cavmarl.maps.projection import unproject
+from cavmarl.roads.network import RoadNetwork
+
+LIGHT_TYPE = "1000001"
+DEFAULT_ORIGIN = (48.0, 11.0)  # latitude and longitude of (0, 0) on a map without a georeference
+MAX_ID_BYTES = 31
+_MINOR = "4"
+_TRAFFIC_LIGHTS = ("1000001", "1000011")  # with and without a light for pedestrians or turns
+
+
+def origin_of(network: RoadNetwork) -> tuple[float, float]:
+    """Return latitude and longitude in degrees of (0, 0) on a map.
+
+    Raises MissingExtraError: the map has a projection, and pyproj is not installed.
+    """
+    if network.geo is None:
+        return DEFAULT_ORIGIN
+    longitude, latitude = unproject(np.zeros((1, 2)), network.geo)[0]
+    return float(latitude), float(longitude)
+
+
+def fit_to_carla(root: Element, origin: tuple[float, float]) -> None:
+    """Change a document in place.
+
+    Args:
+        root: an export of `opendrive.write_opendrive`.
+        origin: latitude and longitude in degrees of (0, 0).
+    """
+    junctions = {junction.get("id", ""): junction for junction in root.iter("junction")}
+    controllers = {
+        control.get("signalId", ""): controller.get("id", "")
+        for controller in root.iterfind("controller")
+        for control in controller
+    }
+    new_ids: dict[str, str] = {}
+    for road in root.iterfind("road"):
+        has_cars = any(lane.get("type") == "driving" for lane in road.iter("lane"))
+        seen: set[str] = set()
+        for signals in road.iterfind("signals"):
+            for signal in _traffic_lights(signals):
+                signal_id, orientation = signal.get("id", ""), signal.get("orientation", "")
+                if orientation in seen or not has_cars:
+                    signals.remove(signal)
+                    continue
+                seen.add(orientation)
+                _add_controller(road, orientation, junctions, controllers.get(signal_id, ""))
+                _widen(road, signal)
+                new_ids[signal_id] = _short_id(signal_id, len(new_ids))
+                signal.set("name", signal_id)
+                signal.set("id", new_ids[signal_id])
+    for controller in root.findall("controller"):
+        for control in controller.findall("control"):
+            signal_id = control.get("signalId", "")
+            if signal_id in new_ids:
+                control.set("signalId", new_ids[signal_id])
+            else:
+                controller.remove(control)
+        if len(controller) == 0:
+            root.remove(controller)
+    header = root.find("header")
+    if header is not None:
+        header.set("revMinor", _MINOR)
+        for old in header.findall("geoReference"):
+            header.remove(old)
+        latitude, longitude = origin
+        place = Element("geoReference")
+        place.text = (
+            f"+proj=tmerc +lat_0={latitude:.9f} +lon_0={longitude:.9f} +k=1 +x_0=0 +y_0=0 "
+            "+datum=WGS84 +units=m +no_defs"
+        )
+        header.insert(0, place)
+
+
+def _traffic_lights(signals: Element) -> Iterator[Element]:
+    for signal in signals.findall("signal"):
+        if signal.get("dynamic") == "yes" and signal.get("type") in _TRAFFIC_LIGHTS:
+            yield signal
+
+
+def _short_id(signal_id: str, number: int) -> str:
+    """Return an id that fits a snapshot; ids of joined junctions are long."""
+    return signal_id if len(signal_id.encode()) <= MAX_ID_BYTES else f"light_{number}"
+
+
+def _widen(road: Element, signal: Element) -> None:
+    """Let a signal apply to all lanes of its direction, which have no other signal."""
+    signal.set("type", LIGHT_TYPE)
+    signal.set("subtype", "-1")
+    side = "right" if signal.get("orientation") == "+" else "left"
+    numbers = [int(lane.get("id", "0")) for lane in road.iterfind(f"lanes/laneSection/{side}/lane")]
+    for validity in signal.findall("validity"):
+        signal.remove(validity)
+    if numbers:
+        signal.append(Element("validity", fromLane=str(min(numbers)), toLane=str(max(numbers))))
+
+
+def _add_controller(
+    road: Element, orientation: str, junctions: dict[str, Element], controller: str
+) -> None:
+    """Name the controller of a signal in the junction at which the signal stands."""
+    link = road.find("link/" + ("successor" if orientation == "+" else "predecessor"))
+    if link is None or link.get("elementType") != "junction" or not controller:
+        return
+    junction = junctions[link.get("elementId", "")]
+    known = [one.get("id") for one in junction.iterfind("controller")]
+    if controller not in known:
+        junction.append(Element("controller", id=controller, type="0", sequence=str(len(known))))

@@ -1,0 +1,218 @@
+"""Each call answers in CARLA's form, whatever its arguments are, and faults change nothing."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.cosim.carla.call_arguments import CallRefused
+from cavmarl.cosim.carla.call_table import CALLS, Caller, Returns, answer
+from cavmarl.cosim.carla.carla_geometry import CarlaPose
+from cavmarl.cosim.carla.carla_session import CarlaSession, SessionLimits
+from tests.cosim.carla.conftest import Call, make_server
+
+POSE = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+CAR = [1, "vehicle.tesla.model3", [["role_name", 4, "hero"]]]
+GNSS = [1, "sensor.other.gnss", []]
+WRONG: list[Any] = [None, "text", -1, 1 << 70, math.nan, [[]], [math.inf] * 3, b"x", {}, True]
+
+
+def car_0(session: CarlaSession) -> int:
+    actor = session.actors.of_agent(0)
+    assert actor is not None
+    return actor.number
+
+
+@pytest.mark.parametrize("name", sorted(CALLS))
+def test_wrong_counts_are_errors_of_the_form_of_the_call(session: CarlaSession, name: str) -> None:
+    known = CALLS[name]
+    error, result = answer(Caller("test"), session, name, [None] * (len(known.checks) + 1))
+    assert error is None
+    mark = True if known.returns is Returns.NOTHING else 0
+    assert result[0][0] == mark
+    assert f"{name}: {len(known.checks) + 1} arguments" in result[0][1][0]
+
+
+@pytest.mark.parametrize("name", sorted(name for name in CALLS if CALLS[name].checks))
+def test_wrong_types_are_answered(session: CarlaSession, name: str) -> None:
+    known = CALLS[name]
+    before, frame = session.world.env.state_hash(), session.frame
+    for value in WRONG:
+        error, result = answer(Caller("test"), session, name, [value] * len(known.checks))
+        assert error is None
+        assert isinstance(result, list)
+    assert (session.world.env.state_hash(), session.frame) == (before, frame)
+
+
+def test_an_unknown_call_has_the_error_of_rpclib(session: CarlaSession) -> None:
+    error, result = answer(Caller("test"), session, "fly", [1, 2])
+    assert error == "rpclib: server could not find function 'fly' with argument count 3."
+    assert result is None
+
+
+def test_a_fault_of_the_server_is_an_answer_and_a_log_line(
+    session: CarlaSession,
+    call: Call,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(session.actors, "spectator", None)
+    with pytest.raises(RuntimeError, match="internal error in get_spectator: AttributeError"):
+        call("get_spectator")
+    assert "get_spectator" in caplog.text
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e7])
+def test_poses_outside_of_the_world_are_refused(
+    session: CarlaSession, call: Call, value: float
+) -> None:
+    pose = [[value, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    for name, arguments in (
+        ("spawn_actor", (GNSS, pose)),
+        ("set_actor_transform", (session.actors.spectator.number, pose)),
+    ):
+        with pytest.raises(RuntimeError, match=r"not a finite number|beyond 1e\+06 m"):
+            call(name, *arguments)
+
+
+def test_vehicles_need_room(call: Call) -> None:
+    with pytest.raises(RuntimeError, match=r"no room: population\.external is 0"):
+        call("spawn_actor", CAR, POSE)
+
+
+def test_blueprints_have_recommended_values_for_what_can_be_changed(call: Call) -> None:
+    for _, type_id, tags, attributes in call("get_actor_definitions"):
+        assert set(tags.split(",")) == set(type_id.split("."))
+        for name, kind, default, recommended, can_change, _ in attributes:
+            assert 1 <= kind <= 5
+            assert not can_change or recommended, f"{type_id}: {name} = {default}"
+
+
+def test_a_sensor_lives_until_it_is_destroyed(session: CarlaSession, call: Call) -> None:
+    parent = car_0(session)
+    number, attached_to, (_, type_id, _), _, _, token = call(
+        "spawn_actor_with_parent", GNSS, POSE, parent, 0, ""
+    )
+    assert (attached_to, type_id, len(token)) == (parent, "sensor.other.gnss", 24)
+    assert [one[0] for one in call("get_actors_by_id", [number, 999_999])] == [number]
+    assert call("destroy_actor", number)
+    with pytest.raises(RuntimeError, match="unable to destroy actor: not found"):
+        call("destroy_actor", number)
+
+
+def test_a_sensor_with_an_invalid_attribute_is_not_spawned(
+    session: CarlaSession, call: Call
+) -> None:
+    what = [1, "sensor.lidar.ray_cast", [["channels", 2, "many"]]]
+    before = len(session.actors.actors)
+    with pytest.raises(RuntimeError, match="channels = 'many': must be a number from 1 to 512"):
+        call("spawn_actor", what, POSE)
+    assert len(session.actors.actors) == before
+
+
+def test_the_number_of_sensors_is_limited() -> None:
+    with make_server(limits=SessionLimits(max_actors=2)) as server:
+        session = server.session
+        for _ in range(2):
+            session.spawn("sensor.other.imu", {}, CarlaPose(0.0, 0.0, 0.0))
+        with pytest.raises(CallRefused, match="2 actors are spawned; destroy some first"):
+            session.spawn("sensor.other.imu", {}, CarlaPose(0.0, 0.0, 0.0))
+
+
+def test_vehicles_of_the_world_are_not_moved_or_destroyed(
+    session: CarlaSession, call: Call
+) -> None:
+    number = car_0(session)
+    with pytest.raises(RuntimeError, match="belongs to the world"):
+        call("destroy_actor", number)
+    with pytest.raises(RuntimeError, match="vehicles of the world move by themselves"):
+        call("set_actor_transform", number, POSE)
+
+
+def test_an_unknown_actor_is_named(call: Call) -> None:
+    with pytest.raises(RuntimeError, match="Actor could not be found in the registry"):
+        call("apply_control_to_vehicle", 10**6, [0.0, 0.0, 0.0, False, False, False, 0])
+
+
+def test_a_control_drives_an_agent_until_its_client_leaves(
+    session: CarlaSession, call: Call
+) -> None:
+    number = car_0(session)
+    for _ in range(60):
+        call("apply_control_to_vehicle", number, [0.0, 0.0, 1.0, False, False, False, 0])
+        session.tick()
+    state = session.actors.state_of(session.actors.actors[number])
+    assert state is not None
+    assert state["brake"] == 1.0
+    assert np.linalg.norm(state["velocity"]) < 0.1
+    session.release({0})
+    assert 0 not in session.world.controls
+
+
+def test_only_agents_are_driven(session: CarlaSession, call: Call) -> None:
+    other = next(one for one in session.actors.vehicles if one.agent < 0)
+    with pytest.raises(RuntimeError, match="only agents can be controlled"):
+        call("apply_control_to_vehicle", other.number, [1.0, 0.0, 0.0, False, False, False, 0])
+
+
+def test_a_batch_answers_each_command_in_order(session: CarlaSession, call: Call) -> None:
+    light = int(session.actors.lights["id"][0])
+    spawn = [0, [GNSS, POSE, [False, 208], 0, "", [[[6, [0, POSE]]]]]]
+    answers = call(
+        "apply_batch",
+        [[spawn], [[21, [light, 2]]], [[18, [car_0(session), 3]]], [[99, [1]]], [[1, []]]],
+        False,
+    )
+    assert [one[0][0] for one in answers] == [1, 0, 1, 0, 0]
+    assert call("destroy_actor", answers[0][0][1])
+    assert call("get_vehicle_light_state", car_0(session)) == [3]
+
+
+def test_settings_are_kept_and_impossible_steps_refused(session: CarlaSession, call: Call) -> None:
+    rest = [True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
+    assert call("set_episode_settings", [True, False, [True, 0.1], *rest]) == session.frame
+    assert call("get_episode_settings")[:3] == [True, False, [True, 0.1]]
+    tick = session.world.master.tick
+    frame = call("tick_cue")
+    assert (frame, session.world.master.tick - tick) == (session.frame, 2)  # steps of 0.05 s
+    with pytest.raises(RuntimeError, match=r"fixed_delta_seconds = 60: must be from 0.001 to 10"):
+        call("set_episode_settings", [True, False, [True, 60.0], *rest])
+    assert call("get_episode_settings")[2] == [True, 0.1]
+    call("set_episode_settings", [False, False, [False], *rest])
+    assert call("tick_cue") == session.frame + 1
+
+
+def test_a_step_that_does_not_fit_restarts_the_world(session: CarlaSession, call: Call) -> None:
+    rest = [True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
+    episode, lights = session.episode, session.actors.lights["id"].tolist()
+    call("set_episode_settings", [True, False, [True, 0.02], *rest])
+    assert session.world.step_s == pytest.approx(0.02)
+    assert session.episode == episode
+    assert not set(lights) & set(session.actors.lights["id"].tolist())
+    session.tick()
+    assert session.world.master.dt_s == pytest.approx(0.02)
+    call("set_episode_settings", [False, False, [False], *rest])
+
+
+def test_a_map_is_loaded_by_its_name(session: CarlaSession, call: Call) -> None:
+    episode = session.episode
+    with pytest.raises(RuntimeError, match="Map 'Town01' not found"):
+        call("load_new_episode", "Town01", True, 0)
+    assert session.episode == episode
+    call("load_new_episode", "/Game/Carla/Maps/intersection", True, 0)
+    assert (session.episode, session.map.path) == (episode + 1, "Carla/Maps/intersection")
+    call("load_new_episode", "", True, 0)
+    assert session.map.path == "Carla/Maps/intersection"
+    call("load_new_episode", "grid4x4", True, 0)
+
+
+def test_managers_are_listed(call: Call) -> None:
+    assert call("get_traffic_manager_running", 8000) == ["", 0]
+    assert call("add_traffic_manager_running", ["10.0.0.1", 8000])
+    assert not call("add_traffic_manager_running", ["10.0.0.2", 8000])
+    assert call("get_traffic_manager_running", 8000) == ["10.0.0.1", 8000]
+    assert call("destroy_traffic_manager", 8000)
+    assert not call("is_traffic_manager_running", 8000)

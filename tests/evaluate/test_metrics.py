@@ -1,0 +1,54 @@
+"""Values of metrics from trips made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.evaluate.metrics import METRICS, metric_values
+from cavmarl.evaluate.tables import EPISODE, TRIP
+
+BY_NAME = {metric.name: metric for metric in METRICS}
+
+
+def trips(*distances_m: float) -> NDArray[np.void]:
+    """Trips that count, without any infraction."""
+    rows = np.zeros(len(distances_m), TRIP)
+    rows["distance_m"], rows["counted"] = distances_m, True
+    return rows
+
+
+def values(name: str, rows: NDArray[np.void]) -> list[float]:
+    return metric_values(BY_NAME[name], rows, np.zeros(0, EPISODE)).tolist()
+
+
+@pytest.mark.parametrize("infraction", ["collision", "off_road", "red_light", "wrong_way"])
+def test_each_infraction_shortens_the_way_between_two(infraction: str) -> None:
+    rows = trips(4000.0, 1500.0, 500.0)
+    assert values("km_per_infraction", rows) == [6.0], "none: all kilometres"
+    rows[infraction][0] = True
+    rows["red_light"][1] = True
+    assert values("km_per_infraction", rows) == [3.0]
+    rows["collision"][2] = True
+    assert values("km_per_infraction", rows) == [2.0]
+
+
+def test_a_way_that_was_driven_back_is_no_way() -> None:
+    assert values("km_per_infraction", trips(3000.0, -1000.0)) == [3.0]
+    assert values("km_per_infraction", trips()) == []
+
+
+def test_only_trips_that_count_have_values() -> None:
+    rows = trips(1000.0, 2000.0)
+    rows["counted"][1] = False
+    rows["collision"][1] = True
+    assert values("km_per_infraction", rows) == [1.0]
+    assert values("collision", rows) == [0.0]
+
+
+def test_delays_are_of_trips_that_arrived() -> None:
+    rows = trips(1000.0, 2000.0, 3000.0)
+    rows["delay_s"], rows["arrived"] = (5.0, 90.0, 7.0), (True, False, True)
+    assert values("delay_s", rows) == [5.0, 7.0]
+    assert values("mean_speed_mps", rows) == [0.0, 0.0, 0.0]

@@ -1,0 +1,108 @@
+"""How long agents have stood, and why, on worlds made by hand."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.config.terms import TERMS
+from cavmarl.core.records.codes import ACTION_FASTER, ACTION_IDLE
+from cavmarl.evaluate.recorder import Recorder
+from cavmarl.evaluate.stuck_trips import StandingWatch
+
+STEP_S = 0.5
+
+
+class Worlds:
+    """One world with agents whose speeds, and the built-in driver's actions, are given."""
+
+    def __init__(self, suggested: list[float], kind: str = "continuous") -> None:
+        agents = len(suggested)
+        self.asked = 0
+        arrays = SimpleNamespace(suggested=np.full((1, agents, 2), np.nan))
+
+        def suggest() -> None:
+            self.asked += 1
+            arrays.suggested[0, :, 0] = suggested
+
+        vec: Any = SimpleNamespace(
+            step_s=STEP_S,
+            num_envs=1,
+            num_agents=agents,
+            config=SimpleNamespace(action=SimpleNamespace(kind=kind)),
+            worlds=SimpleNamespace(suggest=suggest, arrays=arrays),
+        )
+        self.recorder = Recorder(1, agents, 1000, STEP_S, np.zeros(len(TERMS)))
+        self.watch = StandingWatch(vec, self.recorder)
+        self.mask = np.ones((1, agents), np.bool_)
+        self.step = 0
+        self._x_m = np.zeros(agents)
+
+    def drive(self, steps: int, *speeds_mps: float) -> None:
+        for _ in range(steps):
+            self.recorder.places_m[0, :, 0] = self._x_m
+            self.recorder.places_m[0, :, 1] = 0.0
+            self.watch.look(self.step, self.mask)
+            self._x_m += STEP_S * np.array(speeds_mps)
+            self.step += 1
+
+    def cut(self) -> NDArray[np.void]:
+        """The trips, which the horizon cuts."""
+        agents = self.mask.shape[1]
+        nothing = np.zeros((1, agents))
+        return self.recorder.add(
+            self.step,
+            self.mask,
+            nothing.astype(np.float32),
+            np.zeros((1, agents, len(TERMS)), np.float32),
+            nothing.astype(np.bool_),
+            np.array([True]),
+            np.zeros(1, np.int64),
+        )
+
+
+def test_a_vehicle_stands_below_a_tenth_of_a_metre_a_second() -> None:
+    worlds = Worlds([0.0, 0.0, 0.0])
+    worlds.drive(5, 0.0, 0.09, 0.11)
+    # The first look has no earlier place.
+    assert worlds.recorder.still_s[0].tolist() == [2.0, 2.0, 0.0]
+    worlds.drive(1, 0.0, 1.0, 0.0)
+    worlds.drive(1, 0.0, 0.0, 0.0)
+    assert worlds.recorder.still_s[0].tolist() == [3.0, 0.0, 0.5]
+
+
+def test_an_agent_that_was_away_has_not_stood() -> None:
+    worlds = Worlds([0.0])
+    worlds.drive(5, 0.0)
+    worlds.mask[:] = False
+    worlds.drive(1, 0.0)
+    worlds.mask[:] = True
+    worlds.drive(1, 0.0)
+    assert worlds.recorder.still_s[0].tolist() == [0.0]
+    worlds.drive(2, 0.0)
+    assert worlds.recorder.still_s[0].tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "goes", "waits"),
+    [("continuous", 0.6, 0.4), ("discrete", ACTION_FASTER, ACTION_IDLE)],
+)
+def test_ten_seconds_count_as_blocked_or_stood(kind: str, goes: float, waits: float) -> None:
+    worlds = Worlds([goes, waits, goes], kind)
+    worlds.drive(21, 0.0, 0.0, 5.0)
+    rows = worlds.cut()
+    assert rows["stood"].tolist() == [True, False, False]
+    assert rows["blocked"].tolist() == [False, True, False]
+    assert rows["out_of_time"].tolist() == [False, False, True]
+    # The built-in driver is asked every 5 s, from when somebody has stood for 5 s.
+    assert worlds.asked == 2
+
+
+def test_less_than_ten_seconds_do_not() -> None:
+    worlds = Worlds([0.6])
+    worlds.drive(20, 0.0)
+    assert worlds.cut()["out_of_time"].tolist() == [True]

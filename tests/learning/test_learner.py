@@ -1,0 +1,72 @@
+"""The weights and rates of PPO's update over a run, by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from cavmarl.config.action import ActionConfig
+from cavmarl.config.sensors import SensorsConfig
+from cavmarl.learning.actor_critic import ActorCritic
+from cavmarl.policies.network_files import NetworkConfig
+from tests.support.training import load_program
+
+PPO = load_program("ppo")
+
+
+def learner(**settings: Any) -> Any:
+    """It observes three numbers."""
+    torch.manual_seed(0)
+    network = ActorCritic(NetworkConfig("merge", 3, SensorsConfig(), ActionConfig(), (4,)))
+    return PPO.Learner(network, PPO.Args(**settings))
+
+
+@pytest.mark.parametrize(
+    ("left", "weight"), [(1.0, 2.0), (0.875, 1.0), (0.8, 0.4), (0.75, 0.0), (0.3, 0.0)]
+)
+def test_imitation_ends_after_its_share_of_the_run(left: float, weight: float) -> None:
+    found = learner(imitation_weight=2.0, imitation_share=0.25)
+    assert found.imitation_weight(left) == pytest.approx(weight)
+
+
+def batch(rewards: list[float]) -> Any:
+    """Decisions of one agent that end its trip each, numbered by what it observes."""
+    steps = len(rewards)
+    shape = (steps, 1, 1)
+    observations = torch.zeros(*shape, 3)
+    observations[:, 0, 0, 0] = torch.arange(steps)
+    return PPO.Batch(
+        observations=observations,
+        states=torch.zeros(steps, 1, 0),
+        actions=torch.zeros(*shape, 2),
+        log_probs=torch.zeros(shape),
+        values=torch.zeros(shape),
+        rewards=torch.tensor(rewards).reshape(shape),
+        acted=torch.ones(shape, dtype=torch.bool),
+        next_values=torch.zeros(shape),
+        goes_on=torch.zeros(shape, dtype=torch.bool),
+    )
+
+
+@pytest.mark.parametrize(("anneal", "rate"), [(True, 0.5), (False, 2.0)])
+def test_the_learning_rate_falls_with_what_is_left(anneal: bool, rate: float) -> None:
+    found = learner(learning_rate=2.0, anneal=anneal, epochs=1, minibatches=1)
+    found.update(batch([1.0, 2.0, 3.0]), 0.25)
+    assert [group["lr"] for group in found.optimizer.param_groups] == [rate]
+
+
+def test_decisions_with_the_largest_advantages_are_learned_from_good_or_bad(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = learner(keep=0.5, epochs=1, minibatches=1)
+    heads, learned = found.network.heads, []
+
+    def noting(seen: Any, states: Any) -> Any:
+        learned.append(sorted(seen[:, 0].tolist()))
+        return heads(seen, states)
+
+    monkeypatch.setattr(found.network, "heads", noting)
+    found.update(batch([3.0, -4.0, 1.0, -2.0]), 1.0)
+    assert learned == [[0.0, 1.0]]

@@ -1,0 +1,37 @@
+"""Levels of the places of a lane of which a part is on a bridge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.maps.heights import levels
+
+
+@pytest.mark.parametrize("level", [1, -2])
+def test_a_bridge_reaches_from_its_first_place_to_its_last(
+    monkeypatch: pytest.MonkeyPatch, level: int
+) -> None:
+    monkeypatch.setattr(levels, "project", lambda source, places, geo: places)
+    lane = SimpleNamespace(internal=False, ways=("road", "bridge"))
+    stations: Any = SimpleNamespace(
+        lanes=(lane,),
+        plane_m=np.column_stack([np.arange(11.0), np.zeros(11)]),
+        first=np.array([0, 11]),
+        rows=lambda row: slice(0, 11),
+        graph=SimpleNamespace(places=11, links=np.zeros((0, 2), np.int64)),
+    )
+    roads: Any = SimpleNamespace(
+        ways={
+            "road": SimpleNamespace(level=0, nodes=("a", "b")),
+            "bridge": SimpleNamespace(level=level, nodes=("b", "between", "c")),
+        },
+        places={"a": (0.0, 0.0), "b": (6.9, 0.1), "between": (9.0, 0.0), "c": (3.2, 0.0)},
+    )
+    geo: Any = None
+    found = levels.levels_of(stations, roads, geo, Path("town.osm"))
+    assert found.tolist() == [0, 0, 0, *[level] * 5, 0, 0, 0]
