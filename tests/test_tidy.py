@@ -71,7 +71,6 @@ PASSED_ON = {
 
 # A new capability raises these two by what it needs; the commit says why.
 PACKAGE_LINES = 123_700
-REACHABLE_LINES = 78_600  # from `make_vec` and `parallel_env`
 REACHABLE_LINES = 77_300  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.

@@ -73,8 +73,13 @@ def act(env: Any, step: int) -> None:
         env.external.pose(0, middle_x, middle_y, 0.3, z=0.2, pitch=0.1)
 
 
-def hashes(kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
-    with closing(parallel_env("grid4x4", agents=3, background=20, overrides=ROOM, **more)) as env:
+def hashes(
+    kill_at: tuple[int, ...] = (), overrides: dict[str, Any] | None = None, **more: Any
+) -> list[str]:
+    overrides = ROOM | (overrides or {})
+    with closing(
+        parallel_env("grid4x4", agents=3, background=20, overrides=overrides, **more)
+    ) as env:
         env.reset(seed=2)
         found = []
         for step in range(45):
@@ -290,3 +295,18 @@ def test_saved_states_include_external_vehicles_and_waiting_commands() -> None:
     wanted, saved = finished(0, None, 1)
     assert finished(24, saved, 1)[0] == wanted
     assert finished(24, saved, 2)[0] == wanted
+
+
+def test_sensors_messages_and_moving_borders_change_nothing() -> None:
+    more = {"v2x.enabled": True, "rig": {"lidar": {"type": "lidar", "rate_hz": 5, "rays": 24}}}
+    undivided = hashes(overrides=more)
+    moving = {**more, "zones.repartition_steps": 6, "zones.check_invariants": True}
+    assert hashes(overrides=moving, zones=3) == undivided
+
+
+def test_sumo_s_traffic_refuses_them() -> None:
+    with pytest.raises(ConfigError, match=r"population\.external = 4: .*SUMO would not see"):
+        parallel_env(
+            "grid4x4",
+            overrides={**ROOM, "traffic.source": "sumo-traffic", "traffic.demand": ["any.sumocfg"]},
+        )
