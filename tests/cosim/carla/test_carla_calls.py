@@ -15,7 +15,6 @@ from cavmarl.cosim.carla.carla_session import CarlaSession, SessionLimits
 from tests.cosim.carla.conftest import Call, make_server
 
 POSE = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-CAR = [1, "vehicle.tesla.model3", [["role_name", 4, "hero"]]]
 GNSS = [1, "sensor.other.gnss", []]
 WRONG: list[Any] = [None, "text", -1, 1 << 70, math.nan, [[]], [math.inf] * 3, b"x", {}, True]
 
@@ -76,11 +75,6 @@ def test_poses_outside_of_the_world_are_refused(
     ):
         with pytest.raises(RuntimeError, match=r"not a finite number|beyond 1e\+06 m"):
             call(name, *arguments)
-
-
-def test_vehicles_need_room(call: Call) -> None:
-    with pytest.raises(RuntimeError, match=r"no room: population\.external is 0"):
-        call("spawn_actor", CAR, POSE)
 
 
 def test_blueprints_have_recommended_values_for_what_can_be_changed(call: Call) -> None:

@@ -189,12 +189,6 @@ except RuntimeError as error:
     found["destroy"] = str(error)
 else:
     found["destroy"] = ""
-vehicle = world.get_blueprint_library().find("vehicle.tesla.model3")
-try:
-    world.spawn_actor(vehicle, world.get_map().get_spawn_points()[0])
-except RuntimeError as error:
-    found["spawn"] = str(error)
-found["try_spawn"] = world.try_spawn_actor(vehicle, world.get_map().get_spawn_points()[0]) is None
 """
         + FREE,
     )
@@ -203,8 +197,6 @@ found["try_spawn"] = world.try_spawn_actor(vehicle, world.get_map().get_spawn_po
     assert found["speed"] == pytest.approx(4.2, abs=0.3)
     assert found["moved"] == pytest.approx(0.5 * 4.2, abs=0.4)
     assert found["box"] == [2.5, 1.0]
-    assert "no room: population.external is 0" in found["spawn"]
-    assert found["try_spawn"]
 
 
 def test_maps_are_loaded_and_generated(port: int) -> None:
@@ -346,7 +338,7 @@ found["batch"] = [one.error for one in client.apply_batch_sync(commands, True)]
     assert all("CARLA's recorder is not available" in one for one in found["errors"])
     assert found["batch"][:3] == ["", "", ""]
     assert "vehicles of the world move by themselves" in found["batch"][3]
-    assert "no room" in found["batch"][4]
+    assert found["batch"][4] == ""
     assert "belongs to the world" in found["batch"][5]
 
 
