@@ -310,22 +310,18 @@ def test_external_vehicles_and_slots_that_do_not_match(make: Make) -> None:
     vec = make("grid4x4", num_envs=2, zones=2, overrides={"population.external": 3})
     vec.reset(seed=1)
     min_x, min_y, _, _ = vec.network.extent_m
-    slots = [vec.external.spawn(min_x + 50.0, min_y + 20.0 * k, 0.0, world=1) for k in range(2)]
+    for k in range(2):
+        vec.external.spawn(min_x + 50.0, min_y + 20.0 * k, 0.0, world=1)
     vec.step(vec.suggest_actions())
     ids = vec.external.ids(world=1)
     arrays = _worlds(vec).save()
     (at,) = [n for n, array in enumerate(arrays) if _content(array) == _content(ids_of(vec))]
     for value in (-2, MANY, int(ids[1])):
-        _refused(vec, lambda state, value=value: _set(state[at], (1, 0), value))
+        _refused(vec, with_id(at, value))
     for name, wrong in (
         ("kind", 0.0), ("kind", 3.0), ("x", np.nan), ("vtype", 9.5), ("length", 50.0),
     ):  # fmt: skip
-        _refused(
-            vec,
-            lambda state, name=name, wrong=wrong: _set(
-                state[at - 1].view(EXTERNAL)[name], (1, slots[0], 0), wrong
-            ),
-        )
+        _refused(vec, with_command(at - 1, name, wrong))
     for name, value in (("order", 2), ("order", 9), ("order", -1), ("way", 0), ("goal", 0)):
 
         def forge(state: State, name: str = name, value: int = value) -> None:
@@ -340,8 +336,18 @@ def ids_of(vec: CavVectorEnv) -> Array:
     return _worlds(vec).simulation.external.ids
 
 
-def _set(array: Array, place: tuple[int, ...], value: float) -> None:
-    array[place] = value
+def with_id(at: int, value: int) -> Forge:
+    def forge(state: State) -> None:
+        state[at][1, 0] = value
+
+    return forge
+
+
+def with_command(at: int, name: str, value: float) -> Forge:
+    def forge(state: State) -> None:
+        state[at].view(EXTERNAL)[name][1, 0] = value
+
+    return forge
 
 
 def test_messages_with_missing_reports(make: Make) -> None:

@@ -109,6 +109,7 @@ class CarlaSession:
         self.world: HostedWorld = source.load("", step_s)
         self.actors = ActorTable(self.world, 1)
         self.sensors = SensorSuite(self, streams)
+        streams.first_frames[EPISODE_STREAM] = self._snapshot
         self._map_changed = True
         self._told: set[str] = set()
 
@@ -151,12 +152,19 @@ class CarlaSession:
         """Send the snapshot of the present frame, then the frames of sensors."""
         keep = self.settings.synchronous
         if self.streams.is_wanted(EPISODE_STREAM):
-            head = frame_head(self.version.snapshot_kind, self.frame, self.time_s, _NOWHERE)
-            states = self.actors.states()
-            body = snapshot_body(self.episode, self.delta_s, self._map_changed, states)
+            self.streams.send(EPISODE_STREAM, *self._snapshot(), keep)
             self._map_changed = False
-            self.streams.send(EPISODE_STREAM, head, body, keep)
         self._send(self.sensors.sense())
+
+    def _snapshot(self) -> tuple[bytes, bytes]:
+        """Return the head and the body of the snapshot of the present frame.
+
+        A client also gets it when it begins to listen: in a synchronous world, it would otherwise
+        wait for a frame that was sent before its connection was open.
+        """
+        head = frame_head(self.version.snapshot_kind, self.frame, self.time_s, _NOWHERE)
+        states = self.actors.states()
+        return head, snapshot_body(self.episode, self.delta_s, self._map_changed, states)
 
     def _send(self, frames: Iterable[tuple[int, CarlaActor, int, bytes]]) -> None:
         for stream, actor, kind, body in frames:

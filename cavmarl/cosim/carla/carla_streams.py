@@ -11,6 +11,7 @@ import asyncio
 import logging
 import socket
 import struct
+from collections.abc import Callable
 
 log = logging.getLogger("cavmarl.carla")
 
@@ -28,6 +29,9 @@ class StreamHub:
         port: port of the streams.
         max_unsent: largest number of bytes that wait for one client.
         max_listeners: largest number of connections.
+
+    Attributes:
+        first_frames: makes the head and the body that a new listener of a stream gets at once.
     """
 
     def __init__(self, port: int, max_unsent: int = 1 << 26, max_listeners: int = 4096) -> None:
@@ -35,6 +39,7 @@ class StreamHub:
         self.max_unsent, self.max_listeners = max_unsent, max_listeners
         self.connections: set[StreamConnection] = set()
         self._listeners: dict[int, set[StreamConnection]] = {}
+        self.first_frames: dict[int, Callable[[], tuple[bytes, bytes]]] = {}
 
     def token(self, stream: int) -> bytes:
         """Return the bytes with which a client finds a stream."""
@@ -48,12 +53,14 @@ class StreamHub:
 
         `keep`: whether a slow client also gets the frame; see the module.
         """
-        frame = _STREAM.pack(len(head) + len(body)) + head + body
+        frame = _packed(head, body)
         for connection in list(self._listeners.get(stream, ())):
             connection.send(frame, keep, self.max_unsent)
 
     def listen(self, stream: int, connection: StreamConnection) -> None:
         self._listeners.setdefault(stream, set()).add(connection)
+        if stream in self.first_frames:
+            connection.send(_packed(*self.first_frames[stream]()), True, self.max_unsent)
 
     def forget(self, stream: int, connection: StreamConnection) -> None:
         listeners = self._listeners.get(stream, set())
@@ -70,6 +77,10 @@ class StreamHub:
         """Close all connections."""
         for connection in list(self.connections):
             connection.close()
+
+
+def _packed(head: bytes, body: bytes) -> bytes:
+    return _STREAM.pack(len(head) + len(body)) + head + body
 
 
 class StreamConnection(asyncio.Protocol):

@@ -243,12 +243,16 @@ other = carla.Client("127.0.0.1", int(sys.argv[1]))
 other.set_timeout(20.0)
 shared = other.get_world()
 found["synchronous"] = shared.get_settings().synchronous_mode
+import time
+time.sleep(0.5)
+found["seen"] = len(shared.get_actors())  # before the next tick
 frames = [world.tick(), shared.tick(), world.tick()]
 found["frames"] = [frames[1] - frames[0], frames[2] - frames[1]]
 """
         + FREE,
     )
     assert found["synchronous"]
+    assert found["seen"] > 10
     assert found["frames"] == [1, 1]
 
 
