@@ -69,9 +69,11 @@ def running_server(**options: Any) -> Iterator[int]:
     with make_server(**options) as server:
         thread = threading.Thread(target=server.run, args=(over.is_set,), daemon=True)
         thread.start()
-        yield server.port
-        over.set()
-        thread.join(10.0)
+        try:
+            yield server.port
+        finally:  # the world must not be closed while the thread steps it
+            over.set()
+            thread.join(10.0)
         assert not thread.is_alive()
 
 

@@ -26,7 +26,7 @@ def test_the_page_lists_every_call() -> None:
 
 def test_the_program_of_the_tutorial_runs(port: int) -> None:
     page = (ROOT / "docs/tutorials/carla_client.md").read_text(encoding="utf-8")
-    (program,) = re.findall(r"^```py\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    program = program.replace("2000", "int(sys.argv[1])").replace("8000", "8321")
+    blocks = re.findall(r"^```py\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    program = "".join(blocks).replace("2000", "int(sys.argv[1])").replace("8000", "8321")
     found = run_client(port, program + "\nfound['agents'] = len(agents)\n")
     assert found == {"agents": 3}
