@@ -117,7 +117,7 @@ def compiled_step(tick: Tick, last: CompiledStep | None) -> CompiledStep | None:
         or len(group.shards) != 1
         or tick.coordination.needs_ghosts
         or tick.attached
-        or tick.sumo.traffic is not None
+        or tick.outside.sumo is not None
         or tick.traffic.rerouting is not None
         or group.calls.has_registered
     ):

@@ -22,8 +22,8 @@ from cavmarl.core.records.external_records import (
 )
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.engine.outside_traffic import NoOutsideTraffic
 from cavmarl.engine.peers import Peers
-from cavmarl.engine.sumo_phases import NoSumo
 from cavmarl.shards.row_check import MOST_IDS
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.kernels.external_rows import add_external, move_external
@@ -125,7 +125,7 @@ class ExternalComponent:
         return ""
 
 
-class ExternalPhases(NoSumo):
+class ExternalPhases(NoOutsideTraffic):
     """The phases of a tick in worlds with vehicles that the caller poses or drives."""
 
     def __init__(self, part: ExternalComponent, tick: Tick) -> None:

@@ -138,11 +138,11 @@ class Simulation(WorldViews):
         self._episodes[chosen] += 1
         tick.departures = tick.traffic.draw_orders(tick.departures, worlds, chosen)
         tick.traffic.populate(tick.departures, worlds, chosen)
-        tick.sumo.reset(chosen, worlds)
+        tick.outside.reset(chosen, worlds)
         tick.division.distribute(chosen)
         tick.peers.drop_foreign_rows(chosen)
         tick.coordination.reset(chosen)
-        tick.sumo.switch_signals(tick)
+        tick.outside.switch_signals(tick)
         for part in tick.attached:
             part.reset(chosen)
         tick.sense(chosen)
@@ -191,7 +191,7 @@ class Simulation(WorldViews):
         self._tick.trace(wrap, note)
 
     def close(self) -> None:
-        self._tick.sumo.close()
+        self._tick.outside.close()
         for coordinator in self.coordinators:
             coordinator.close()
 
@@ -218,7 +218,7 @@ class Simulation(WorldViews):
         """
         self._put_back(saved)
         tick = self._tick
-        tick.sumo.catch_up(self._shard.worlds)
+        tick.outside.catch_up(self._shard.worlds)
         tick.peers.drop_foreign_rows(self.everywhere)
         tick.peers.resume_from(tick.departures, tick.division.side)
 
@@ -226,7 +226,7 @@ class Simulation(WorldViews):
         """Resume like `load` if zones are divided among processes; `home` is a zone of this one."""
         self._put_back(saved, home)
         tick = self._tick
-        tick.sumo.catch_up(self._shard.worlds)
+        tick.outside.catch_up(self._shard.worlds)
         tick.departures.num_passing[:] = 0
         tick.peers.resume_from(tick.departures, tick.division.side)
         tick.peers.share_rows(tick.departures, tick.division.side)
@@ -282,7 +282,7 @@ class Simulation(WorldViews):
             repartition_steps_done=self.zones.repartition_steps_done,
             has_past=self._carried_from < self.outputs.observations.shape[2],
             attached=tick.attached,
-            sumo=tick.sumo.traffic,
+            sumo=tick.outside.sumo,
         )
 
     def suggest(self, out: NDArray[np.float64]) -> None:

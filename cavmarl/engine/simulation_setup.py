@@ -9,7 +9,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.external_component import ExternalComponent, ExternalPhases
-from cavmarl.engine.sumo_phases import SumoPhases
+from cavmarl.engine.outside_traffic import SumoPhases
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
@@ -26,14 +26,14 @@ def add_sumo(tick: Tick, demand: object, network: RoadNetwork) -> None:
     if isinstance(demand, SumoDemand):
         travel, zoned = tick.traffic.travel, tick.division.zoned
         traffic = SumoTraffic(demand, network, travel, travel.num_fixed, zoned, blank_vehicle())
-        tick.sumo = SumoPhases(traffic)
+        tick.outside = SumoPhases(traffic)
 
 
 def add_external(tick: Tick) -> None:
     """Let the caller pose and drive vehicles, if there is room for such vehicles."""
     for part in tick.attached:
         if isinstance(part, ExternalComponent):
-            tick.sumo = ExternalPhases(part, tick)
+            tick.outside = ExternalPhases(part, tick)
 
 
 def add_coordinators(

@@ -13,10 +13,10 @@ from cavmarl.core.compiled.bound_call import bind
 from cavmarl.core.math.counters import count_tick, occasions
 from cavmarl.core.records.arrays import DepartureQueue, Worlds
 from cavmarl.engine.component import Component
+from cavmarl.engine.outside_traffic import NoOutsideTraffic, OutsideTraffic, SumoPhases
 from cavmarl.engine.peers import NoPeers, Peers
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.step_trace import Traced
-from cavmarl.engine.sumo_phases import GlobalTraffic, NoSumo, SumoPhases
 from cavmarl.handoff.coordinator.coordinators import NoOwnershipRuntime, OwnershipRuntime
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.shards.executor import Executor, TeamExecutor
@@ -33,7 +33,7 @@ class Tick:
         departures: the queue through which vehicles enter and leave; a reset may replace it.
         coordination: decides which zone owns which vehicle.
         peers: the processes that run the other zones.
-        sumo: the phases of another simulator, or their replacement where there is none.
+        outside: the phases of vehicles that SUMO or the caller moves, or their replacement.
         common: ticks, keys and signals of the worlds, which all zones share.
     """
 
@@ -55,7 +55,7 @@ class Tick:
         self.executor: Executor = ShardGroup(shards)
         self.coordination: OwnershipRuntime = NoOwnershipRuntime()
         self.peers: Peers = NoPeers(division)
-        self.sumo: GlobalTraffic = NoSumo()
+        self.outside: OutsideTraffic = NoOutsideTraffic()
         self.finish_phase: Callable[[], None] = _no_wait
         self.note_phase: Callable[[str], None] = _ignore
         self._shard = shards[0]
@@ -115,7 +115,7 @@ class Tick:
     def _advance(self, commands: Commands) -> None:
         """Advance → leave → exchange → resolve → enter → commit → signals."""
         self.executor.advance(commands)
-        self.sumo.follow(self)
+        self.outside.follow(self)
         self.leave()
         if self.coordination.needs_ghosts:
             self.division.exchange()
@@ -130,7 +130,7 @@ class Tick:
         self._enter()
         self.executor.commit()
         self.count_tick()
-        self.sumo.switch_signals(self)
+        self.outside.switch_signals(self)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Clear → sense → settle → credit, in the chosen worlds (W,)."""
@@ -163,7 +163,7 @@ class Tick:
 
     def _enter(self) -> None:
         """Add departures that find a gap to `next_rows`."""
-        self.sumo.let_in(self)
+        self.outside.let_in(self)
         self.traffic.call_orders(self.departures, self.worlds)
         if any(self.departures.num_queue.tolist()):
             self.let_in()
@@ -178,7 +178,7 @@ class Tick:
         self.executor.propose(traffic.demand, departures)
         peers.share_proposals(departures)
         if any(departures.num_passing.tolist()):
-            traffic.accept(departures, worlds, self.sumo.running(peers))
+            traffic.accept(departures, worlds, self.outside.running(peers))
             self.admit()
 
     def admit(self) -> None:
@@ -205,8 +205,8 @@ class Tick:
         self.traffic = wrap(self.traffic)
         self.shared = wrap(self.shared)
         self.coordination = wrap(self.coordination)
-        if self.sumo.traffic is not None:
-            self.sumo = SumoPhases(wrap(self.sumo.traffic))
+        if self.outside.sumo is not None:
+            self.outside = SumoPhases(wrap(self.outside.sumo))
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
         """Report phases: shards' phases to `wrap(executor)`, components' phases to `note`.

@@ -186,7 +186,7 @@ class WorldViews:
     @property
     def sumo(self) -> SumoTraffic | None:
         """SUMO in these worlds; None if `traffic.source` is native."""
-        return self._tick.sumo.traffic
+        return self._tick.outside.sumo
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         tick = self._tick

@@ -16,14 +16,23 @@ COMMAND = [sys.executable, "-m", "cavmarl", "carla", "grid4x4", "--agents", "2",
 
 
 def test_it_listens_until_it_is_interrupted() -> None:
-    with subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        told = process.stdout.readline()
-        found = re.search(r"Carla/Maps/grid4x4 at 127\.0\.0\.1:(\d+), for client 0\.9\.16", told)
-        assert found, told
-        with socket.create_connection(("127.0.0.1", int(found[1])), 10.0):
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30.0) == 130
+    # In the background of a shell, SIGINT is ignored, here and in children.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    process = subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
+    with process:
+        try:
+            assert process.stdout is not None
+            told = process.stdout.readline()
+            found = re.search(
+                r"Carla/Maps/grid4x4 at 127\.0\.0\.1:(\d+), for client 0\.9\.16", told
+            )
+            assert found, told
+            with socket.create_connection(("127.0.0.1", int(found[1])), 10.0):
+                process.send_signal(signal.SIGINT)
+                assert process.wait(30.0) == 130
+        finally:
+            process.kill()  # after a failure, the process must not be waited for
 
 
 @pytest.mark.parametrize(

@@ -149,8 +149,8 @@ class ObstacleSensor:
         states = session.actors.vehicle_states
         if parent is None or not len(states):
             return None
-        vehicles = session.actors.vehicles
-        half = np.array([vehicle.half_m for vehicle in vehicles])
+        rows = session.world.rows
+        half = 0.5 * np.stack([rows["length"], rows["width"]], axis=1)
         yaw = np.radians(states["turn"][:, 1] - actor.pose.yaw)
         axes = axes_of(actor.pose)
         relative = states["place"] - np.array(actor.pose.place)
@@ -160,12 +160,12 @@ class ObstacleSensor:
         gaps = np.where(
             (np.abs(aside) < across + self._radius_m) & (ahead > 0.0), ahead - along, np.inf
         )
-        gaps[[vehicle is parent for vehicle in vehicles]] = np.inf
+        gaps[states["id"] == parent.number] = np.inf
         nearest = int(gaps.argmin())
         if gaps[nearest] > self._distance_m:
             return None
         version = session.version
-        other = packed_actor(vehicles[nearest], version)
+        other = packed_actor(session.actors.vehicles[nearest], version)
         return pack([packed_actor(parent, version), other, max(0.0, float(gaps[nearest]))])
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.codes import CLASS_PEDESTRIAN
+from cavmarl.core.records.codes import CLASS_PEDESTRIAN, DRIVER_EXTERNAL
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_blueprints import BLUEPRINT_OF_CLASS, BLUEPRINTS, Blueprint
 from cavmarl.cosim.carla.carla_geometry import ZERO, CarlaPose, Vector, compose
@@ -348,9 +348,8 @@ class ActorTable:
         self._write_lanes(world, rows)
         for k in np.flatnonzero(rows["agent"] >= 0).tolist():
             self._write_control(states[k], world.controls.get(int(rows["agent"][k])))
-        for k, actor in enumerate(self._listed):
-            if actor.slot >= 0:
-                self._write_control(states[k], world.external.controls.get(actor.slot))
+        for k in np.flatnonzero(rows["driver"] == DRIVER_EXTERNAL).tolist():
+            self._write_control(states[k], world.external.controls.get(int(rows["order"][k])))
         self._write_walkers(ahead, speed)
 
     def _write_lanes(self, world: HostedWorld, rows: NDArray[np.void]) -> None:

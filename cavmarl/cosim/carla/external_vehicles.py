@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 from cavmarl.core.errors import ActionError, CavmarlError
+from cavmarl.core.records.codes import DRIVER_EXTERNAL
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_geometry import CarlaPose
 from cavmarl.cosim.carla.vehicle_controls import WHEELBASE_SHARE, Control, motion_of, same_turn
@@ -109,18 +110,16 @@ class ExternalVehicles:
 
     def act(self) -> None:
         """Give the controls to the environment, for the next step."""
-        if not self.controls:
-            self._posed.clear()
-            return
-        simulation, ids = self._env.simulation, self.ids()
+        simulation = self._env.simulation
         rows = simulation.vehicles(0)
-        speed_of = dict(zip(rows["id"].tolist(), rows["speed"].tolist(), strict=True))
+        rows = rows[rows["driver"] == DRIVER_EXTERNAL]
+        speed_of = dict(zip(rows["order"].tolist(), rows["speed"].tolist(), strict=True))
         for slot, control in self.controls.items():
             if slot in self._posed:
                 continue
             vtype = simulation.type_rows[self._vtypes[slot]]
             axles_apart = float(simulation.types["wheelbase"][vtype]) / self._lengths_m[slot]
-            acceleration, angle = motion_of(control, speed_of.get(ids[slot], 0.0))
+            acceleration, angle = motion_of(control, speed_of.get(slot, 0.0))
             self._env.external.drive(
                 slot, acceleration, same_turn(angle, axles_apart / WHEELBASE_SHARE)
             )

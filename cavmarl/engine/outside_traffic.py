@@ -1,4 +1,7 @@
-"""The phases of a tick that SUMO runs, and their replacement in a world without SUMO."""
+"""The phases of a tick in which vehicles move that cavmarl's drivers do not drive.
+
+SUMO moves them here, the caller of the environment in `ExternalPhases`.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +19,15 @@ if TYPE_CHECKING:
     from cavmarl.engine.tick import Tick
 
 
-class GlobalTraffic(Protocol):
-    """The part of a tick that another simulator may take over.
+class OutsideTraffic(Protocol):
+    """The part of a tick that another simulator or the caller may take over.
 
     Attributes:
-        traffic: SUMO, or None.
+        sumo: SUMO, or None.
     """
 
     @property
-    def traffic(self) -> SumoTraffic | None: ...
+    def sumo(self) -> SumoTraffic | None: ...
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
         """Begin an episode in the chosen worlds (W,)."""
@@ -55,10 +58,10 @@ class GlobalTraffic(Protocol):
         ...
 
 
-class NoSumo:
-    """The replacement where there is no other simulator: signals follow their own programs."""
+class NoOutsideTraffic:
+    """The phases without outside traffic: signals follow their own programs."""
 
-    traffic: SumoTraffic | None = None
+    sumo: SumoTraffic | None = None
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
         """Do nothing."""
@@ -90,7 +93,7 @@ class SumoPhases:
     """The phases of a tick in worlds with SUMO."""
 
     def __init__(self, traffic: SumoTraffic) -> None:
-        self.traffic: SumoTraffic | None = traffic
+        self.sumo: SumoTraffic | None = traffic
         self._sumo = traffic
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
