@@ -100,24 +100,30 @@ def saved_arrays(vec: CavVectorEnv, saved: bytes) -> list[NDArray[Any]]:
 
 
 MASK, CAUSES, INSERTED, WAITING, USED, BARRIERS, LAST, CLIPPED = range(8)
+SIZES = -2
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "message"),
+    ("place", "at", "value", "message"),
     [
-        (CAUSES, 3, "events are declared in worlds without messages"),
-        (INSERTED, 9.0, "an insertion has an unknown kind"),
-        (WAITING, -1, "the number of insertions is out of range"),
-        (WAITING, 3, "the number of insertions is out of range"),
-        (WAITING, 0, "an insertion is not counted"),
-        (USED, 99, "the number of insertions is out of range"),
-        (BARRIERS, 1 << 30, "a barrier stands on a lane that does not exist"),
-        (LAST, 1.5, "a last action is out of range"),
-        (LAST, np.nan, "a last action is out of range"),
-        (CLIPPED, -1, "a count of tolerated actions is negative"),
+        (CAUSES, 0, 3, "events are declared in worlds without messages"),
+        (INSERTED, 0, 9.0, "an insertion has an unknown kind"),
+        (WAITING, 0, -1, "the number of insertions is out of range"),
+        (WAITING, 0, 3, "the number of insertions is out of range"),
+        (WAITING, 0, 0, "an insertion is not counted"),
+        (USED, 0, 99, "the number of insertions is out of range"),
+        (BARRIERS, 0, 1 << 30, "a barrier stands on a lane that does not exist"),
+        (LAST, 0, 1.5, "a last action is out of range"),
+        (LAST, 0, np.nan, "a last action is out of range"),
+        (CLIPPED, 0, -1, "a count of tolerated actions is negative"),
+        (INSERTED, 1, 1e9, "an insertion is on a lane that does not exist"),
+        (INSERTED, 1, 0.5, "an insertion is on a lane that does not exist"),
+        (INSERTED, 2, -1.0, "an insertion is beside its lane"),
+        (INSERTED, 2, np.nan, "an insertion is beside its lane"),
+        (SIZES, 0, -1, "a world has a negative size"),
     ],
 )
-def test_values_beside_the_worlds(place: int, value: float, message: str) -> None:
+def test_values_beside_the_worlds(place: int, at: int, value: float, message: str) -> None:
     vec = make(overrides={"population.insertions": 3})
     vec.reset(seed=0)
     lane = next(name for name in vec.network.lane_ids if not name.startswith(":"))
@@ -125,7 +131,7 @@ def test_values_beside_the_worlds(place: int, value: float, message: str) -> Non
     saved = vec.save_state()
     vec.load_state(saved)
     with pytest.raises(ConfigError, match=message):
-        vec.load_state(forged(vec, saved, place, value))
+        vec.load_state(forged(vec, saved, place, value, at))
     assert vec.save_state() == saved
 
 

@@ -14,6 +14,7 @@ from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.core.records.external_records import EXTERNAL
 from cavmarl.driving.vehicles import VEHICLE
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.traffic.departure_queue import DEPARTURE
@@ -439,3 +440,30 @@ def test_flags_that_are_neither_true_nor_false() -> None:
     content[-1] = 7
     with pytest.raises(ConfigError, match="neither true nor false"):
         from_bytes(content, like)
+
+
+def test_a_clock_that_is_far_ahead(make: Make) -> None:
+    vec = _busy(make)
+    worlds = _worlds(vec)
+    assert not worlds.simulation.shards[0].worlds.controllers.size, "their times would be refused"
+    ticks = next(
+        n
+        for n, array in enumerate(worlds.save())
+        if array is worlds.simulation.shards[0].worlds.ticks
+    )
+    _refused(vec, lambda state: state[ticks].fill(1 << 62))
+
+
+def test_an_ownership_of_another_number_of_vehicles(make: Make) -> None:
+    vec = _busy(make)
+    worlds = _worlds(vec)
+    place = len(worlds.save()) - 2 * 2 - 2
+    before = SavedOwnership.unpack(worlds.save()[place][0])
+    assert before is not None
+    assert before.numbers.owned > 40
+    forged = before._replace(numbers=before.numbers._replace(owned=2)).pack()
+
+    def disown(state: State) -> None:
+        state[place][0, : len(forged)] = forged
+
+    _refused(vec, disown)

@@ -85,6 +85,14 @@ world.tick()
 world.tick()
 found["jumped"] = car.get_location().distance(other.location)
 found["same"] = [car.id == number, len(world.get_actors([number]))]
+car.apply_control(carla.VehicleControl(throttle=0.5))
+world.tick()
+car.set_transform(start)
+world.tick()
+found["back"] = car.get_location().distance(start.location)
+world.tick()
+world.tick()
+found["onward"] = car.get_location().distance(start.location)
 """
             + FREE,
         )
@@ -92,6 +100,8 @@ found["same"] = [car.id == number, len(world.get_actors([number]))]
     assert found["speed"] == pytest.approx(10.0, abs=0.5)
     assert found["jumped"] < 1.0
     assert found["same"] == [True, 1]
+    assert found["back"] < 0.5
+    assert found["onward"] > found["back"], "its control is still in force"
 
 
 def test_the_traffic_manager_drives_spawned_vehicles() -> None:
