@@ -24,7 +24,7 @@ from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.outside_traffic import NoOutsideTraffic
 from cavmarl.engine.peers import Peers
-from cavmarl.shards.row_check import MOST_IDS
+from cavmarl.shards.row_check import MOST_IDS, diagonals_m
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.kernels.external_rows import add_external, move_external
 
@@ -218,9 +218,9 @@ def wrong_bodies(told: NDArray[np.void], types: NDArray[np.void]) -> str:
     """Return what is wrong with the types and the sizes of commands EXTERNAL (n,)."""
     if not np.isin(told["vtype"], np.arange(len(types))).all():
         return "an external vehicle has an unknown type"
-    radius_m = float(np.hypot(types["length"], types["width"]).max())
+    most_m = float(diagonals_m(types).max())
     sizes = np.stack([told["length"], told["width"], told["height"]])
     wrong = (sizes <= 0.0).any(axis=0) | (told["height"] > types["height"].max())
-    if (wrong | (np.hypot(told["length"], told["width"]) > radius_m)).any():
+    if (wrong | (diagonals_m(told) > most_m)).any():
         return "an external vehicle is larger than all types, or has no size"
     return ""

@@ -32,6 +32,7 @@ from cavmarl.engine.external_component import records_of, wrong_bodies, wrong_co
 from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
+from cavmarl.shards.row_check import diagonals_m
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.kernels.external_rows import enter_at
 
@@ -298,7 +299,7 @@ class ExternalCommands:
         """Raise an ActionError if another vehicle, present or waiting, covers the place."""
         rows = simulation.vehicles(world)
         leaving = simulation.external.ids[world, self._told["kind"][world] == EXTERNAL_REMOVED]
-        reach_m = float(np.hypot(simulation.types["length"], simulation.types["width"]).max())
+        reach_m = float(diagonals_m(simulation.types).max())
         near = np.maximum(np.abs(rows["x"] - told["x"]), np.abs(rows["y"] - told["y"])) <= reach_m
         others = [row for row in rows[near] if row["id"] not in leaving]
         is_new = ~self._is_used[world] & (self._told["kind"][world] != EXTERNAL_NONE)

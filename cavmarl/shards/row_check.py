@@ -132,7 +132,7 @@ class RowCheck:
         ints = {name: values.get(name, every) for name in _INT32}
         self._columns = ColumnCheck(ints, _FLOATS, _ENDLESS, _LEAST)
         types = travel.types
-        self._radius_m = 0.5 * float(_diagonals_m(types).max()) + 1e-6
+        self._radius_m = 0.5 * float(diagonals_m(types).max()) + 1e-6
         self._height_m = float(types["height"].max()) + 1e-6
 
     def wrong(
@@ -154,7 +154,7 @@ class RowCheck:
         )
 
     def _wrong_sizes(self, rows: NDArray[np.void]) -> str:
-        radii_m = 0.5 * _diagonals_m(rows)
+        radii_m = 0.5 * diagonals_m(rows)
         sizes = np.stack([rows["length"], rows["width"], rows["height"]])
         wrong = (sizes <= 0.0).any(axis=0) | (radii_m > self._radius_m)
         wrong |= rows["height"] > self._height_m
@@ -254,7 +254,8 @@ class RowCheck:
         return np.where(lanes["internal"][lane], behind, lane).astype(np.int64)
 
 
-def _diagonals_m(bodies: NDArray[np.void]) -> NDArray[np.float64]:
+def diagonals_m(bodies: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return the diagonals (n,) in m of records with a length and a width, seen from above."""
     length, width = bodies["length"].astype(np.float64), bodies["width"].astype(np.float64)
     return np.asarray(np.sqrt(length * length + width * width), dtype=np.float64)
 
