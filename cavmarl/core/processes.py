@@ -50,10 +50,16 @@ def die_with_parent() -> None:
 
 
 def limit_memory(most_bytes: int) -> None:
-    """Limit the memory that this process and its children may each allocate; Linux only."""
+    """Limit the memory that this process may allocate from now on; Linux only.
+
+    Its children get the same limit.
+    """
     if _LIBC is not None:
         hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-        most = most_bytes if hard == resource.RLIM_INFINITY else min(most_bytes, hard)
+        pages_now = int(Path("/proc/self/statm").read_text().split()[5])
+        most = most_bytes + pages_now * resource.getpagesize()
+        if hard != resource.RLIM_INFINITY:
+            most = min(most, hard)
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
 
 

@@ -73,9 +73,12 @@ def all_end(pids: list[int], within_s: float = 10.0) -> bool:
 
 
 def test_the_memory_of_sumo_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CAVMARL_MAX_SUMO_BYTES", str(20 << 20))
-    overrides = settings(tiny_file(tmp_path), "sumo-traffic")
-    with pytest.raises(SumoError, match=r"more than 0\.0195312 GiB .*MAX_SUMO_BYTES"):
+    demand = tiny_file(tmp_path)
+    types = "".join(f'<vType id="t{k}"/>' for k in range(100_000))  # several hundred MiB
+    demand.write_text(demand.read_text().replace("</routes>", f"{types}</routes>"))
+    monkeypatch.setenv("CAVMARL_MAX_SUMO_BYTES", str(32 << 20))
+    overrides = settings(demand, "sumo-traffic")
+    with pytest.raises(SumoError, match=r"more than 0\.03125 GiB .*MAX_SUMO_BYTES"):
         make_vec("grid4x4", num_envs=1, agents=3, background=0, overrides=overrides)
 
 

@@ -53,9 +53,9 @@ class SumoSimulation:
     """
 
     def __init__(self, setup: dict[str, Any]) -> None:
-        self._sumo: Any = None
+        self._sumo: Any = importlib.import_module(setup["interface"])
+        self._program = _program(setup["interface"])
         self._runs = False
-        self._interface = setup["interface"]
         self._seen = np.dtype([tuple(field) for field in setup["seen"]])
         self.moved = np.dtype([tuple(field) for field in setup["moved"]])
         self._lane_row = {name: row for row, name in enumerate(setup["lanes"])}
@@ -76,9 +76,7 @@ class SumoSimulation:
     def start(self, words: list[str]) -> dict[str, Any]:
         self._stop()
         self._forget()
-        if self._sumo is None:
-            self._sumo = importlib.import_module(self._interface)
-        self._sumo.start([_binary(self._interface), *words])
+        self._sumo.start([self._program, *words])
         self._runs = True
         self._vehicle = self._sumo.vehicle
         fields = {**_FIELDS, **(_FIELDS_SEEN if self._is_seen else {})}
@@ -272,7 +270,7 @@ def _describe(kinds: Any, name: str) -> dict[str, Any]:
     }
 
 
-def _binary(interface: str) -> str:
+def _program(interface: str) -> str:
     """Return the first word of SUMO's command line; libsumo ignores its value."""
     if interface == "libsumo":
         return "sumo"
@@ -306,9 +304,12 @@ def _answer(
     wire.sendall(head.tobytes() + records + letters + text)
 
 
-def _serve(wire: socket.socket) -> NoReturn:
+def _serve(wire: socket.socket, most_bytes: int) -> NoReturn:
     _, _, setup = _request(wire)
     simulation = SumoSimulation(setup)
+    # The files decide from here on how much memory is needed. An import that fails for want of
+    # memory raises almost any error, so the limit applies only after it.
+    limit_memory(most_bytes)
     while True:
         kind, records, line = _request(wire)
         try:
@@ -331,12 +332,11 @@ def _serve(wire: socket.socket) -> NoReturn:
 def main() -> None:
     """Serve requests until the process that started this one ends."""
     number, parent, dies_with_thread, most_bytes = map(int, sys.argv[1:])
-    limit_memory(most_bytes)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side handles Ctrl-C and closes
     if dies_with_thread:
         die_with_parent()
     if os.getppid() == parent:
-        _serve(socket.socket(fileno=number))
+        _serve(socket.socket(fileno=number), most_bytes)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,8 @@ MAX_SUMO_BYTES = 1 << 35
 MEMORY_LIMIT = "CAVMARL_MAX_SUMO_BYTES"  # environment variable that changes this limit
 END_S = 2.0  # time for the process to end by itself
 LAST_WORDS = 2000  # maximum number of quoted characters of its output
+# What SUMO, Python and the system say when they get no memory.
+OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Cannot allocate memory")
 
 
 class SumoAnswer(NamedTuple):
@@ -143,10 +145,11 @@ class SumoProcess:
         records = self._read(int(head["records"]))
         letters = self._read(int(head["letters"]))
         line: dict[str, Any] = json.loads(self._read(int(head["line"])))
-        if head["kind"] == child.REFUSED and _is_too_large(line["error"]):
-            raise SumoError(self._too_large())
         if head["kind"] == child.REFUSED:
-            raise ConfigError(f"SUMO refuses: {line['error']}{self._last_words()}")
+            error = f"{line['error']}{self._last_words()}"
+            if _is_too_large(error):
+                raise SumoError(self._too_large())
+            raise ConfigError(f"SUMO refuses: {error}")
         return SumoAnswer(np.frombuffer(records, SEEN), bytes(letters), line)
 
     def _read(self, size: int) -> bytearray:
@@ -190,7 +193,7 @@ class SumoProcess:
 
 
 def _is_too_large(words: str) -> bool:
-    return "bad_alloc" in words or "MemoryError" in words
+    return any(sign in words for sign in OUT_OF_MEMORY)
 
 
 def _end(
