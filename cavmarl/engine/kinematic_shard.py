@@ -68,7 +68,9 @@ class KinematicShard:
     def _refuse_shared_features(self, config: EnvConfig, network: RoadNetwork) -> None:
         size = self._shared.outputs.observations.shape[2]
         wrong = {
-            "v2x, rig, scenario or population.external": bool(self._tick.attached),
+            "v2x, rig, scenario, population.external or signals.overrides": bool(
+                self._tick.attached
+            ),
             "traffic-actuated signals": network.num_controllers > 0,
             "clock.control_latency_ticks": config.clock.control_latency_ticks > 0,
             "sensors.stack, or an observation with history": carried_from(config.sensors) < size,

@@ -21,6 +21,7 @@ from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
+from cavmarl.env.signal_overrides import SignalOverrides
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions
@@ -31,10 +32,10 @@ from cavmarl.shards.shard import Commands
 class StepSession:
     """The running worlds of one environment.
 
-    A step takes decoded actions and the waiting inputs: declared events, insertions and commands to
-    external vehicles. After each reset and step, the session records the worlds and calls its
-    watchers. A copy or a pickle of a session has its own worlds, which continue bit for bit; it has
-    no recording and no watchers.
+    A step takes decoded actions and the waiting inputs: declared events, insertions, commands to
+    external vehicles and overridden signals. After each reset and step, the session records the
+    worlds and calls its watchers. A copy or a pickle of a session has its own worlds, which
+    continue bit for bit; it has no recording and no watchers.
 
     Args:
         worlds: the worlds to step.
@@ -48,6 +49,7 @@ class StepSession:
         events: the events that agents have declared for the next step.
         insertions: vehicles and barriers for the next step.
         external: commands for the next step to vehicles that the caller poses or drives.
+        signals: signals that show states of the caller.
         is_ready: whether `reset` has been called.
         simulated_s: wall time of all steps of the worlds so far.
     """
@@ -64,6 +66,7 @@ class StepSession:
         self.events = DeclaredEvents(config, num_worlds)
         self.insertions = Insertions(config, worlds.world.network, num_worlds)
         self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
+        self.signals = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
         self.is_ready = False
         self._is_closed = False
         self.simulated_s = 0.0
@@ -103,7 +106,7 @@ class StepSession:
     def step(self, commands: Commands) -> None:
         """Step the worlds with all waiting inputs. If the step fails, the inputs keep waiting."""
         began = time.perf_counter()
-        waiting = (self.events, self.insertions, self.external)
+        waiting = (self.events, self.insertions, self.external, self.signals)
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)
@@ -117,6 +120,7 @@ class StepSession:
         self.decoder.forget(chosen)
         self.insertions.forget(chosen)
         self.external.forget(chosen)
+        self.signals.forget(chosen)
 
     def refuse_unready(self, call: str) -> None:
         """Raise an EpisodeError that names a call if there has been no reset yet."""
@@ -234,8 +238,8 @@ class StepSession:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Objects that refer to arrays of the worlds are created again.
-        inputs = self.events.memory, self.insertions.memory, self.external.memory
-        memory = self.decoder.memory, *inputs
+        parts = self.decoder, self.events, self.insertions, self.external, self.signals
+        memory = tuple(part.memory for part in parts)
         kept = self.is_ready, self.simulated_s, self._first_seed
         return (
             _restored_session,
@@ -246,7 +250,7 @@ class StepSession:
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         (self.is_ready, self.simulated_s, self._first_seed), memory = state
         self.decoder.memory, self.events.memory, *memory = memory
-        self.insertions.memory, self.external.memory = memory
+        self.insertions.memory, self.external.memory, self.signals.memory = memory
 
 
 def _restored_session(worlds: SteppedWorlds, in_place: bool) -> StepSession:

@@ -14,6 +14,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.recorded_worlds import Record
+from cavmarl.env.signal_overrides import SignalOverrides
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_copies import OwnWorlds
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
@@ -90,6 +91,16 @@ class WorldsEnvironment(OwnWorlds):
         """
         self._session.refuse_idle("external")
         return self._session.external
+
+    @property
+    def signals(self) -> SignalOverrides:
+        """The signals that show states of the caller; see `signals.overrides`.
+
+        Raises:
+            EpisodeError: before the first reset.
+        """
+        self._session.refuse_idle("signals")
+        return self._session.signals
 
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
         """Let a car enter a world in the next step, or as soon as there is a safe gap.

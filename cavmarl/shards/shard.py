@@ -69,6 +69,9 @@ class Commands:
     # (W, E, K) EXTERNAL, new commands to vehicles that the caller poses or drives; (0, 0, K): there
     # is no room for such vehicles
     external: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, EXTERNAL_FIELDS)))
+    # (W, N, 2) LINK row and 1 + SIGNAL_* code of each link whose signal the caller overrides, 0: an
+    # unused place; (0, 0, 2): overrides are not configured
+    overridden: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0, 2), np.int32))
 
 
 COMMANDS = tuple(entry.name for entry in fields(Commands))
@@ -132,6 +135,7 @@ class Shard:
             common=None if first is None else first.worlds,
             zeros=zeros,
             num_cues=len(travel.scripts.cues),
+            num_overrides=override_columns(config, network),
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
@@ -191,16 +195,19 @@ def make_worlds(
     common: Worlds | None = None,
     zeros: Zeros = np.zeros,
     num_cues: int = 0,
+    num_overrides: int = 0,
 ) -> Worlds:
     """Return the arrays of W empty worlds with room for `capacity` vehicles each.
 
-    Agents' commands take effect `latency_ticks` later; scripts wait for `num_cues` cues. If
+    Agents' commands take effect `latency_ticks` later; scripts wait for `num_cues` cues. There are
+    `num_overrides` columns for states that the caller shows at signals, see `override_columns`. If
     `zoned` is given, the rows are views of its zone `zone`. The state that all zones share (ticks,
     keys, signals, detections, cues) is that of `common`, if given; else `zeros` allocates it.
     """
     if zoned is None:
         zoned = make_zone_state(1, num_worlds, capacity)
     rows = zoned.rows[0, zone]
+    num_phases = len(network.signals) + num_overrides
     worlds = Worlds(
         rows=rows,
         next_rows=rows,
@@ -208,7 +215,7 @@ def make_worlds(
         num_rows=zoned.num_rows[zone],
         ticks=zeros(num_worlds, dtype=np.int64),
         keys=zeros(num_worlds, dtype=np.uint64),
-        signal_phase=zeros((num_worlds, len(network.signals)), dtype=np.int32),
+        signal_phase=zeros((num_worlds, num_phases), dtype=np.int32),
         controllers=zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
         detected_s=zeros((num_worlds, len(network.detectors)), dtype=np.float64),
         num_through=zoned.num_through[zone],
@@ -225,6 +232,11 @@ def make_worlds(
     if common is None:
         return worlds
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
+
+
+def override_columns(config: EnvConfig, network: RoadNetwork) -> int:
+    """Return the number of columns of `Worlds.signal_phase` behind those of the signals."""
+    return len(network.links) if config.signals.overrides else 0
 
 
 def common_of(worlds: Worlds) -> SharedState:

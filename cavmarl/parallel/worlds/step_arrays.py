@@ -44,11 +44,12 @@ class StepArrays(NamedTuple):
     ticks: NDArray[np.int64]  # (W,) since each world's reset
     episode_over: NDArray[np.bool_]  # (W,) worlds that were reset, or will be in the next step
     chosen: NDArray[np.bool_]  # (W,) worlds to reset
-    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next four
+    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next five
     meta_actions: NDArray[np.int64]  # (W, A)
     declared: NDArray[np.int32]  # (W, A)
     inserted: NDArray[np.float64]  # (W, I, 3)
     external: NDArray[np.float64]  # (W, E, K)
+    overridden: NDArray[np.int32]  # (W, N, 2)
     suggested: NDArray[np.float64]  # (W, A, 2) actions of the built-in driver
     states: NDArray[np.float32]  # (W, S) global states at the last request
     frames: Frames  # of mounted sensors
@@ -90,6 +91,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "declared": ("<i4", agents),
         "inserted": ("<f8", (num_worlds, config.population.insertions, 3)),
         "external": ("<f8", (num_worlds, config.population.external, EXTERNAL_FIELDS)),
+        "overridden": ("<i4", (num_worlds, config.signals.overrides, 2)),
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
         **frame_layout(config, num_worlds),

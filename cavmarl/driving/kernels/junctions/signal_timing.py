@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_state
 from cavmarl.roads.kernels.signal_phases import program_at
 
 
@@ -16,15 +17,18 @@ def time_to_change(
     # CONTROLLER (num_controllers,), the state of the actuated programs
     controllers: NDArray[np.void],
     link: int,  # LINK row that has a signal
-    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
+    phase: NDArray[np.int32],  # (num_signals + …,) see `Worlds.signal_phase`
     time: float,  # s since the world's reset
     dt: float,  # length of a tick, s
 ) -> float:
     """Return the time in s until the signal of a link changes its state.
 
     If the state never changes, the result is the length of the cycle. For an actuated program it is
-    the earliest possible time: each phase counts with its minimum duration.
+    the earliest possible time: each phase counts with its minimum duration. A state that the caller
+    shows can change at any time.
     """
+    if overridden_state(roads, link, phase) != NOT_OVERRIDDEN:
+        return 0.0
     index = roads.links[link]["signal_index"]
     signal = roads.links[link]["signal"]
     program = roads.programs[program_at(roads, signal, time, dt)]
