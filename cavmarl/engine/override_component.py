@@ -63,10 +63,9 @@ def wrong_states(told: NDArray[np.int32], has_signal: NDArray[np.bool_]) -> str:
 
     `told`: (W, N, 2) see `Commands.overridden`. `has_signal`: (num_links,).
     """
-    link, state = told[..., 0], told[..., 1]
+    link, state = told[told[..., 1] != 0].T
     if ((state < 0) | (state > len(SIGNAL_STATES))).any():
         return "a signal shows an unknown state"
-    link = link[state > 0]
     if ((link < 0) | (link >= len(has_signal))).any() or not has_signal[link].all():
         return "a link without a signal shows a state"
     return ""

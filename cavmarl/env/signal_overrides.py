@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
+from cavmarl.core.records.codes import SIGNAL_NONE
 from cavmarl.engine.override_component import wrong_states
 from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
@@ -77,10 +78,7 @@ class SignalOverrides:
         is_used = told[:, 1] > 0
         others = is_used & ~np.isin(told[:, 0], links)
         if np.count_nonzero(others) + len(links) > self._most:
-            raise CapacityError(
-                f"world {world}: signals.overrides = {self._most} links show states of the caller "
-                "already; set it higher, or release a signal"
-            )
+            raise self._full(world)
         kept = told[others]
         told[:] = 0
         told[: len(kept)] = kept
@@ -102,6 +100,28 @@ class SignalOverrides:
         links = self._links(world, signal, index)
         told = self._told[world]
         told[np.isin(told[:, 0], links)] = 0
+
+    def show_links(self, codes: NDArray[np.uint8], world: int = 0) -> None:
+        """Show these states from the next step on, and release all other links.
+
+        Args:
+            codes: (num_links,) SIGNAL_* code of each link; SIGNAL_NONE: that of its program.
+            world: number of the world.
+
+        Raises:
+            ActionError: a link without a signal has a code, or a code is invalid.
+            CapacityError, ConfigError: see `show`.
+        """
+        self._check_world(world)
+        links = np.flatnonzero(codes != SIGNAL_NONE)
+        if len(links) > self._most:
+            raise self._full(world)
+        told = np.zeros_like(self._told[world])
+        told[: len(links), 0] = links
+        told[: len(links), 1] = codes[links].astype(np.int32) + 1
+        if wrong := wrong_states(told, self._network.links["signal"] >= 0):
+            raise ActionError(f"codes: {wrong}")
+        self._told[world] = told
 
     def letters(self, signal: str, world: int = 0) -> str:
         """Return the letters that a signal shows now, by index; `-`: no link has the index.
@@ -129,8 +149,7 @@ class SignalOverrides:
         """Begin an episode in the chosen worlds (W,)."""
         self._told[chosen] = 0
 
-    def _links(self, world: int, signal: str, index: int | None) -> NDArray[np.intp]:
-        """Return the LINK rows of a signal, or of one of its indices."""
+    def _check_world(self, world: int) -> None:
         if not self._most:
             raise ConfigError(
                 "these worlds do not let the caller control signals: set signals.overrides to the "
@@ -138,6 +157,16 @@ class SignalOverrides:
             )
         if not 0 <= world < len(self._told):
             raise ActionError(f"world {world}: must be from 0 to {len(self._told) - 1}")
+
+    def _full(self, world: int) -> CapacityError:
+        return CapacityError(
+            f"world {world}: signals.overrides = {self._most} links show states of the caller "
+            "already; set it higher, or release a signal"
+        )
+
+    def _links(self, world: int, signal: str, index: int | None) -> NDArray[np.intp]:
+        """Return the LINK rows of a signal, or of one of its indices."""
+        self._check_world(world)
         network = self._network
         if signal not in network.signal_ids:
             known = ", ".join(network.signal_ids[:8]) or "no signals"

@@ -1,4 +1,4 @@
-"""Calls about actors: vehicles, walkers, sensors and traffic lights."""
+"""Calls about actors: vehicles, walkers and sensors."""
 
 from __future__ import annotations
 
@@ -42,7 +42,6 @@ from cavmarl.cosim.carla.vehicle_controls import (
 _MAX_ATTRIBUTES = 256
 _WORLDS = "vehicles of the world move by themselves; spawn a vehicle to place it"
 _KINEMATIC = "vehicles are kinematic: they have no mass"
-_FIXED_LIGHTS = "the programs of the map set the traffic lights"
 _NO_BONES = "walkers have no bones"
 
 description = record_of(whole, text, listed(record_of(text, whole, text), most=_MAX_ATTRIBUTES))
@@ -275,17 +274,6 @@ def _vehicle_state(session: CarlaSession, number: int, name: str) -> np.void:
     return state
 
 
-@call("get_group_traffic_lights", actor_id)
-def get_group_traffic_lights(caller: Caller, session: CarlaSession, number: int) -> list[int]:
-    ids = session.actors.lights["id"].tolist()
-    if number not in ids:
-        raise CallRefused(f"actor {number} is not a traffic light")
-    approaches = session.map.approaches
-    signal = approaches[ids.index(number)].signal
-    return [one for one, each in zip(ids, approaches, strict=True) if each.signal == signal]
-
-
-answer_constant([], "get_light_boxes", checks=(actor_id,))
 answer_constant(
     [],
     "get_actor_bone_names",
@@ -352,18 +340,6 @@ refuse(
 )
 refuse("get_pose_from_animation", checks=(actor_id,), because=_NO_BONES)
 refuse("get_bones_transform", checks=(actor_id,), because=_NO_BONES, returns=Returns.VALUE)
-refuse("set_traffic_light_state", checks=(actor_id, whole), because=_FIXED_LIGHTS)
-refuse(
-    "set_traffic_light_green_time",
-    "set_traffic_light_yellow_time",
-    "set_traffic_light_red_time",
-    checks=(actor_id, number),
-    because=_FIXED_LIGHTS,
-)
-refuse("freeze_traffic_light", checks=(actor_id, flag), because=_FIXED_LIGHTS)
-refuse("freeze_all_traffic_lights", checks=(flag,), because=_FIXED_LIGHTS)
-accept("reset_traffic_light_group", checks=(actor_id,), note="the programs of the map run anyway")
-accept("reset_all_traffic_lights", checks=(), note="the programs of the map run anyway")
 refuse(
     "get_gbuffer_token",
     checks=(actor_id, whole),

@@ -115,14 +115,13 @@ class ActorTable:
         self._by_vehicle: dict[int, CarlaActor] = {}
         self.spectator = self.add("spectator", SPECTATOR_POSE)
         self._light_states = self._make_lights(world.map)
-        self._light_since = np.zeros(len(self._light_states))
         self._ids = np.zeros(0, np.int64)
         self._listed: list[CarlaActor] = []
         self._row_of: dict[int, int] = {}
         self._is_walker = np.zeros(0, np.bool_)
         self._other_states = np.zeros(0, ACTOR_STATE)
         self.vehicle_states = np.zeros(0, VEHICLE_STATE)
-        self.take(world, 0.0)
+        self.take(world)
 
     @property
     def next_number(self) -> int:
@@ -217,14 +216,14 @@ class ActorTable:
             if actor.type_id.startswith(("sensor.", "controller.")):
                 yield actor
 
-    def take(self, world: HostedWorld, time_s: float) -> list[CarlaActor]:
+    def take(self, world: HostedWorld) -> list[CarlaActor]:
         """Take over the present state of a world; return the actors that have gone."""
         rows = world.rows
         gone: list[CarlaActor] = []
         if not np.array_equal(rows["id"], self._ids):
             gone = self._list(world, rows)
         self._write_vehicles(world, rows)
-        self._write_lights(world, time_s)
+        self._write_lights(world)
         for actor in self.attached():
             self.move_attached(actor)
         return gone
@@ -263,17 +262,16 @@ class ActorTable:
             state["signal_id"] = approach.signal_id.encode()[:31]
             place_state(state, approach.pose)
         states["state"] = ACTIVE
-        states["times_s"] = carla_map.times_s
         return states
 
-    def _write_lights(self, world: HostedWorld, time_s: float) -> None:
+    def _write_lights(self, world: HostedWorld) -> None:
         states = self._light_states
         if not len(states):
             return
-        shown = world.map.states_in(world.phases)
-        self._light_since[shown != states["light_state"]] = time_s
-        states["light_state"] = shown
-        states["elapsed_s"] = time_s - self._light_since
+        states["light_state"] = world.lights.states()
+        states["elapsed_s"] = world.lights.elapsed_s
+        states["times_s"] = world.lights.times_s
+        states["is_frozen"] = world.lights.is_frozen
 
     def _list(self, world: HostedWorld, rows: NDArray[np.void]) -> list[CarlaActor]:
         """List the actors of the rows; return those whose vehicle has left."""

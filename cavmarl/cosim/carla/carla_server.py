@@ -19,7 +19,7 @@ from typing import Self
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.core.server_address import is_loopback, listen
-from cavmarl.cosim.carla import actor_calls, batch_calls, episode_calls
+from cavmarl.cosim.carla import actor_calls, batch_calls, episode_calls, light_calls
 from cavmarl.cosim.carla.call_table import Caller, answer
 from cavmarl.cosim.carla.carla_session import DEFAULT_LIMITS, CarlaSession, SessionLimits
 from cavmarl.cosim.carla.carla_streams import StreamConnection, StreamHub, without_delay
@@ -33,7 +33,12 @@ log = logging.getLogger("cavmarl.carla")
 
 PORT = 2000
 LOOPBACK = "127.0.0.1"
-CALL_MODULES = (actor_calls, batch_calls, episode_calls)  # they fill the table of calls
+CALL_MODULES = (
+    actor_calls,
+    batch_calls,
+    episode_calls,
+    light_calls,
+)  # they fill the table of calls
 _LATE_S = 0.5  # a free-running world that is later than this does not catch up
 _MAX_PORT = 65534  # the streams have the next port
 

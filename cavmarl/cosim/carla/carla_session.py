@@ -133,7 +133,7 @@ class CarlaSession:
         for _ in range(max(1, round(self.delta_s / self.world.step_s))):
             for ended in self.world.step(actions):
                 self._tell_end(ended)
-        for actor in self.actors.take(self.world, self.time_s):
+        for actor in self.actors.take(self.world):
             self._forget(actor)
         self.publish()
         return self.frame
