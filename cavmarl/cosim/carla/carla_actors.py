@@ -22,6 +22,7 @@ from cavmarl.cosim.carla.carla_snapshots import (
     WALKER_STATE,
     place_state,
 )
+from cavmarl.cosim.carla.external_vehicles import WALKER
 from cavmarl.cosim.carla.hosted_world import HostedWorld
 from cavmarl.cosim.carla.vehicle_controls import (
     BRAKE_MPS2,
@@ -56,6 +57,7 @@ TAG_OF_CLASS = {
 }
 TAG_OF_BASE = {
     "car": 14, "van": 14, "truck": 15, "bus": 16, "motorcycle": 18, "bicycle": 19,
+    WALKER: 12,
 }  # fmt: skip
 _CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestrian"}
 
@@ -198,15 +200,16 @@ class ActorTable:
         slot: int,
         size_m: tuple[float, float, float],
     ) -> CarlaActor:
-        """Add a vehicle that enters in the next tick."""
+        """Add a vehicle or walker that enters in the next tick."""
         length, width, height = size_m
+        base_type = blueprint.default("base_type") or WALKER
         return self.add(
             blueprint.type_id,
             pose,
             attributes=dict(attributes),
-            centre=(0.0, 0.0, 0.5 * height),
+            centre=(0.0, 0.0, 0.0 if base_type == WALKER else 0.5 * height),
             half_m=(0.5 * length, 0.5 * width, 0.5 * height),
-            tags=bytes([TAG_OF_BASE[blueprint.default("base_type")]]),
+            tags=bytes([TAG_OF_BASE[base_type]]),
             slot=slot,
         )
 
@@ -369,7 +372,8 @@ class ActorTable:
         if isinstance(control, CarlaControl):
             state["throttle"], state["steer"], state["brake"] = control[:3]
             state["hand_brake"], state["reverse"], state["manual_gear"] = control[3:6]
-            state["gear"] = control.gear if control.manual_gear_shift else 1
+            automatic = -1 if control.reverse else 1
+            state["gear"] = control.gear if control.manual_gear_shift else automatic
 
     def _write_walkers(self, ahead: NDArray[np.float64], speed: NDArray[np.float64]) -> None:
         if not self._is_walker.any():
