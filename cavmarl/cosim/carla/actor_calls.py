@@ -138,11 +138,19 @@ def set_actor_location(
     _move(session, actor, session.actors.pose_of(actor).at(there))
 
 
-@call("set_walker_state", actor_id, pose, number, returns=Returns.NOTHING, note="in batches only")
+@call(
+    "set_walker_state",
+    actor_id,
+    pose,
+    number,
+    returns=Returns.NOTHING,
+    note="in batches only; the pose is on the ground",
+)
 def set_walker_state(
     caller: Caller, session: CarlaSession, number: int, there: CarlaPose, speed: float
 ) -> None:
-    _move(session, _walker(session, number, "set_walker_state"), there)
+    actor = _walker(session, number, "set_walker_state")
+    _move(session, actor, there.at((there.x, there.y, there.z + actor.half_m[2])))
 
 
 @call(

@@ -29,6 +29,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MINOR,
 )
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, carla_pose
+from cavmarl.cosim.carla.navigation_mesh import NavigationMesh, make_navigation_mesh
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.shown_signals import signal_codes
 
@@ -103,6 +104,11 @@ class CarlaMap:
             shown = _STATE_OF_CODE[signal_codes(self.network, phases)[self._links]]
             found = np.minimum.reduceat(shown, self._first_link)
         return found
+
+    @cached_property
+    def navigation_mesh(self) -> NavigationMesh | None:
+        """Where walkers may walk; None: the map has no roads, or is too large."""
+        return make_navigation_mesh(self.network, self.name)
 
     @cached_property
     def links_of(self) -> tuple[NDArray[np.intp], ...]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import struct
 
+import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN
@@ -85,7 +87,8 @@ found["speed"] = first.get_velocity().length()
 found["box"] = [first.bounding_box.extent.z, first.bounding_box.location.z]
 there = second.get_transform()
 there.location.x += 0.1
-client.apply_batch_sync([State(second.id, there, 2.0)], True)
+ground = carla.Transform(there.location - carla.Location(z=0.93), there.rotation)
+client.apply_batch_sync([State(second.id, ground, 2.0)], True)
 found["state"] = second.get_location().distance(there.location)
 camera = library.find("sensor.camera.semantic_segmentation")
 camera.set_attribute("image_size_x", "160")
@@ -141,3 +144,76 @@ found["speed"] = car.get_velocity().length()
         )
     assert found["spawned"]
     assert found["nearest"] > 2.7
+
+
+def test_walkers_of_the_client_walk_on_the_navigation_mesh() -> None:
+    with running_server(agents=1, background=0) as port:
+        found = run_client(
+            port,
+            SYNCHRONOUS
+            + """
+library = world.get_blueprint_library()
+world.set_pedestrians_seed(7)
+world.set_pedestrians_cross_factor(1.0)
+kinds = library.filter("walker.pedestrian.*")
+places = [world.get_random_location_from_navigation() for _ in range(8)]
+road_map = world.get_map()
+def off_road(place):
+    there = road_map.get_waypoint(place)
+    return there.transform.location.distance(carla.Location(place.x, place.y, 0.0))
+found["beside"] = [off_road(one) for one in places]
+Spawn = carla.command.SpawnActor
+def raised(place):
+    return carla.Transform(place + carla.Location(z=1.0))
+batch = [Spawn(kinds[k % len(kinds)], raised(place)) for k, place in enumerate(places)]
+walkers = [one.actor_id for one in client.apply_batch_sync(batch, True) if not one.error]
+control = library.find("controller.ai.walker")
+batch = [Spawn(control, carla.Transform(), one) for one in walkers]
+answers = client.apply_batch_sync(batch, True)
+found["errors"] = [one.error for one in answers if one.error]
+controls = world.get_actors([one.actor_id for one in answers])
+world.tick()
+for one in controls:
+    one.start()
+    one.go_to_location(world.get_random_location_from_navigation())
+    one.set_max_speed(1.6)
+actors = world.get_actors(walkers)
+starts = [one.get_location() for one in actors]
+beside, speeds = [], []
+for _ in range(200):
+    world.tick()
+    beside += [off_road(one.get_location()) for one in actors]
+    speeds += [one.get_velocity().length() for one in actors]
+found["moved"] = [one.get_location().distance(start) for one, start in zip(actors, starts)]
+found["heights"] = [one.get_location().z for one in actors]
+found["fastest"] = max(speeds)
+for one in controls:
+    one.stop()
+batch = [carla.command.DestroyActor(one) for one in (*controls, *walkers)]
+client.apply_batch_sync(batch, True)
+world.tick()
+found["left"] = len(world.get_actors().filter("walker.*"))
+"""
+            + FREE,
+        )
+    assert all(1.5 < away < 5.0 for away in found["beside"])
+    assert found["errors"] == []
+    assert len(found["moved"]) == 8
+    assert sum(moved > 4.0 for moved in found["moved"]) >= 4
+    assert found["heights"] == pytest.approx([0.93] * 8, abs=0.3)
+    assert 1.0 < found["fastest"] < 3.0
+    assert found["left"] == 0
+
+
+def test_the_mesh_covers_every_road_and_is_one_file(session: CarlaSession, call: Call) -> None:
+    (name,) = call("get_required_files", "Nav")
+    assert call("get_required_files", "TM") == []
+    content = call("request_file", name)
+    assert content == call("get_navigation_mesh")
+    assert name.startswith("Cavmarl/grid4x4-")
+    with pytest.raises(RuntimeError, match="this server has no file '/etc/passwd'"):
+        call("request_file", "/etc/passwd")
+    head = struct.unpack_from("<7i", content, 12 + 28 + 8)
+    roads = np.count_nonzero(~session.map.network.edges["internal"])
+    assert head[:2] == (int.from_bytes(b"DNAV", "big"), 7)
+    assert head[6] > 10 * roads
