@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -80,7 +80,7 @@ class _Strip(NamedTuple):
 
 def make_navigation_mesh(network: RoadNetwork, name: str) -> NavigationMesh | None:
     """Return the navigation mesh of a map; None: the map has no roads, or is too large."""
-    vertices, quadrangles, areas = _shapes(network)
+    vertices, quadrangles, areas = mesh_shapes(network)
     if not len(quadrangles) or len(vertices) > _MOST_VERTICES:
         return None
     content = _encode(vertices, quadrangles, areas)
@@ -88,7 +88,7 @@ def make_navigation_mesh(network: RoadNetwork, name: str) -> NavigationMesh | No
     return NavigationMesh(f"Cavmarl/{name}-{digest}.bin", content)
 
 
-def _shapes(
+def mesh_shapes(
     network: RoadNetwork,
 ) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
     """Return vertices (n, 3) in Detour's frame, quadrangles (m, 4), and areas and flags (m, 2)."""
@@ -118,13 +118,9 @@ def _shapes(
     points = np.concatenate(places)
     corners += _connections(network, strips, points, side)
     vertices = np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1).astype(np.float32)
-    found, areas = [], []
-    for shape, area in corners:
-        turned = _oriented(vertices, shape)
-        if turned is not None:
-            found.append(turned)
-            areas.append(area)
-    return vertices, np.array(found, np.intp).reshape(-1, 4), np.array(areas, np.intp)
+    quadrangles, is_valid = _oriented(vertices, np.array([shape for shape, _ in corners], np.intp))
+    areas = np.array([area for _, area in corners], np.intp)
+    return vertices, quadrangles[is_valid], areas[is_valid]
 
 
 def _beside(
@@ -181,16 +177,18 @@ def _connections(
                 yield tuple(map(int, corner)), _SIDEWALK
 
 
-def _oriented(vertices: NDArray[np.float32], shape: Sequence[int]) -> tuple[int, ...] | None:
-    """Return a quadrangle in Detour's direction; None if it is not convex, or has no area."""
-    for order in (tuple(shape), tuple(reversed(shape))):
-        corners = vertices[list(order)][:, [0, 2]].astype(np.float64)
-        before = corners - np.roll(corners, 1, axis=0)
-        after = np.roll(corners, -1, axis=0) - corners
-        turns = before[:, 1] * after[:, 0] - before[:, 0] * after[:, 1]
-        if (turns > _LEAST_AREA_M2).all():
-            return order
-    return None
+def _oriented(
+    vertices: NDArray[np.float32], quadrangles: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return quadrangles (m, 4) in Detour's direction, and whether each is convex."""
+    corners = vertices[quadrangles][:, :, [0, 2]].astype(np.float64)
+    before = corners - np.roll(corners, 1, axis=1)
+    after = np.roll(before, -1, axis=1)
+    turns = before[..., 1] * after[..., 0] - before[..., 0] * after[..., 1]
+    least, most = turns.min(axis=1), turns.max(axis=1)
+    found = quadrangles.copy()
+    found[most < 0.0] = found[most < 0.0, ::-1]
+    return found, (least > _LEAST_AREA_M2) | (most < -_LEAST_AREA_M2)
 
 
 def _encode(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN
+from cavmarl.cosim.carla.navigation_mesh import mesh_shapes
 from tests.cosim.carla.conftest import Call, CarlaSession, run_client, running_server
 from tests.cosim.carla.test_official_client import FREE, SYNCHRONOUS
 
@@ -217,3 +218,21 @@ def test_the_mesh_covers_every_road_and_is_one_file(session: CarlaSession, call:
     roads = np.count_nonzero(~session.map.network.edges["internal"])
     assert head[:2] == (int.from_bytes(b"DNAV", "big"), 7)
     assert head[6] > 10 * roads
+
+
+def test_the_mesh_is_connected_around_each_block(session: CarlaSession) -> None:
+    vertices, shapes, areas = mesh_shapes(session.map.network)
+    corners = vertices[shapes][:, :, [0, 2]].astype(np.float64)
+    area_m2 = 0.5 * np.sum(
+        np.roll(corners[..., 0], -1, axis=1) * corners[..., 1]
+        - corners[..., 0] * np.roll(corners[..., 1], -1, axis=1),
+        axis=1,
+    )
+    assert (area_m2 > 0.0).all()
+    sides: dict[tuple[int, int], int] = {}
+    for shape in shapes.tolist():
+        for one, other in zip(shape, shape[1:] + shape[:1], strict=True):
+            sides[one, other] = sides.get((one, other), 0) + 1
+    assert set(sides.values()) == {1}
+    assert sum((other, one) in sides for one, other in sides) > 2 * len(shapes) - 400
+    assert np.count_nonzero(areas[:, 0] == 2) == 64
