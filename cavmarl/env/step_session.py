@@ -20,8 +20,8 @@ from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
+from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
-from cavmarl.env.signal_overrides import SignalOverrides
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions

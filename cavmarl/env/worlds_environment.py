@@ -13,8 +13,8 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.external_commands import ExternalCommands
+from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record
-from cavmarl.env.signal_overrides import SignalOverrides
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_copies import OwnWorlds
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds

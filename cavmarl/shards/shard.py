@@ -135,8 +135,10 @@ class Shard:
             common=None if first is None else first.worlds,
             zeros=zeros,
             num_cues=len(travel.scripts.cues),
-            num_overrides=override_columns(config, network),
         )
+        if first is None and (more := override_columns(config, network)):
+            columns = zeros((num_worlds, len(network.signals) + more), dtype=np.int32)
+            self.worlds = self.worlds._replace(signal_phase=columns)
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
         # `side` and `next_side` for kernels: (2,), one array for all shards of this process.
@@ -195,19 +197,16 @@ def make_worlds(
     common: Worlds | None = None,
     zeros: Zeros = np.zeros,
     num_cues: int = 0,
-    num_overrides: int = 0,
 ) -> Worlds:
     """Return the arrays of W empty worlds with room for `capacity` vehicles each.
 
-    Agents' commands take effect `latency_ticks` later; scripts wait for `num_cues` cues. There are
-    `num_overrides` columns for states that the caller shows at signals, see `override_columns`. If
+    Agents' commands take effect `latency_ticks` later; scripts wait for `num_cues` cues. If
     `zoned` is given, the rows are views of its zone `zone`. The state that all zones share (ticks,
     keys, signals, detections, cues) is that of `common`, if given; else `zeros` allocates it.
     """
     if zoned is None:
         zoned = make_zone_state(1, num_worlds, capacity)
     rows = zoned.rows[0, zone]
-    num_phases = len(network.signals) + num_overrides
     worlds = Worlds(
         rows=rows,
         next_rows=rows,
@@ -215,7 +214,7 @@ def make_worlds(
         num_rows=zoned.num_rows[zone],
         ticks=zeros(num_worlds, dtype=np.int64),
         keys=zeros(num_worlds, dtype=np.uint64),
-        signal_phase=zeros((num_worlds, num_phases), dtype=np.int32),
+        signal_phase=zeros((num_worlds, len(network.signals)), dtype=np.int32),
         controllers=zeros((num_worlds, network.num_controllers), dtype=CONTROLLER),
         detected_s=zeros((num_worlds, len(network.detectors)), dtype=np.float64),
         num_through=zoned.num_through[zone],
