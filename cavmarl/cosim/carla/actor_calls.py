@@ -31,7 +31,7 @@ from cavmarl.cosim.carla.call_table import (
     refuse,
 )
 from cavmarl.cosim.carla.carla_actors import CarlaActor
-from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose, relative
+from cavmarl.cosim.carla.carla_geometry import CarlaPose, Vector, compose, relative
 from cavmarl.cosim.carla.carla_records import packed_actor, packed_box
 from cavmarl.cosim.carla.carla_session import CarlaSession
 from cavmarl.cosim.carla.external_vehicles import MASS_KG
@@ -244,7 +244,11 @@ def _push(name: str, *more: Check, is_force: bool) -> None:
         note=f"{_SPAWNED}: changes the velocity of a body of {MASS_KG:g} kg",
     )
     def push(
-        caller: Caller, session: CarlaSession, number: int, given: tuple[float, ...], *_: Any
+        caller: Caller,
+        session: CarlaSession,
+        number: int,
+        given: Vector,
+        there: Vector | None = None,
     ) -> None:
         slot = _spawned(session, number, name)
         share = (session.world.step_s if is_force else 1.0) / MASS_KG
