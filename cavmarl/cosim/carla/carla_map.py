@@ -42,7 +42,7 @@ SPAWN_HEIGHT_M = 0.3  # spawn points are this far above the road
 _SPAWN_EVERY_M = 40.0
 _FIRST_SPAWN_M = 15.0  # from the start of a longer lane
 _SHORTEST_M = 12.0  # a shorter lane has no spawn point
-_CAR = 1 << VEHICLE_CLASSES.index("passenger")
+CAR = 1 << VEHICLE_CLASSES.index("passenger")
 _BOX_BEFORE_LINE_M = 2.0  # centre of the trigger volume, before the stop line
 
 
@@ -119,7 +119,7 @@ def make_carla_map(
         name,
         document,
         network,
-        tuple(_spawn_points(network)),
+        tuple(spawn_points(network)),
         approaches,
         _states(network, approaches),
         at_end,
@@ -128,11 +128,12 @@ def make_carla_map(
     )
 
 
-def _spawn_points(network: RoadNetwork) -> list[CarlaPose]:
+def spawn_points(network: RoadNetwork) -> list[CarlaPose]:
+    """Return poses on lanes that cars may use, `SPAWN_HEIGHT_M` above the road."""
     found = []
     for lane, row in enumerate(network.lanes):
         length = float(row["length_m"])
-        if row["internal"] or not row["permissions"] & _CAR or length < _SHORTEST_M:
+        if row["internal"] or not row["permissions"] & CAR or length < _SHORTEST_M:
             continue
         places = np.arange(_FIRST_SPAWN_M, length - _FIRST_SPAWN_M, _SPAWN_EVERY_M).tolist()
         for s in places or [0.5 * length]:

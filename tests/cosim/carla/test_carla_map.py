@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element, fromstring
 
@@ -19,7 +20,7 @@ from cavmarl.maps.exports.opendrive_carla import (
     origin_of,
 )
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.network import SIGNAL_STATES, GeoReference, RoadNetwork
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +83,17 @@ def test_the_header_has_a_place_on_the_earth(root: Element) -> None:
     assert header.get("revMinor") == "4"
     place = header.findtext("geoReference", "")
     assert f"+lat_0={DEFAULT_ORIGIN[0]:.9f} +lon_0={DEFAULT_ORIGIN[1]:.9f}" in place
+
+
+def test_the_origin_of_a_map_needs_no_files_of_heights(network: RoadNetwork) -> None:
+    """CARLA's towns name a geoid, for which PROJ would need a file."""
+    pytest.importorskip("pyproj", reason="needs the extra 'maps'")
+    projection = (
+        "+proj=tmerc +lat_0=49 +lon_0=8 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m "
+        "+geoidgrids=egm96_15.gtx +vunits=m +no_defs"
+    )
+    there = replace(network, geo=GeoReference(projection, 0.0, 0.0))
+    assert origin_of(there) == pytest.approx((49.0, 8.0))
 
 
 def test_the_file_for_carla_has_the_same_roads(tmp_path: Path) -> None:
