@@ -11,7 +11,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.cosim.carla.attached_sensors import SensorSuite
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_actors import ActorTable, CarlaActor
-from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, Blueprint
+from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, UNAVAILABLE, Blueprint
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose
 from cavmarl.cosim.carla.carla_map import CarlaMap
 from cavmarl.cosim.carla.carla_snapshots import frame_head, snapshot_body
@@ -174,6 +174,8 @@ class CarlaSession:
     def change_settings(self, settings: EpisodeSettings) -> None:
         """Apply settings; a step length that does not fit the world restarts the world.
 
+        What clients have spawned is kept; the other vehicles are new ones.
+
         Raises CavmarlError: the world cannot have steps of this length. Nothing has changed.
         """
         wanted = settings.fixed_delta_s or self.first_step_s
@@ -181,8 +183,24 @@ class CarlaSession:
         is_whole = round(steps) >= 1 and abs(steps - round(steps)) * self.world.step_s < _SAME_S
         if not is_whole:
             log.info("the world restarts with steps of %g s", wanted)
-            self._take_world(self.source.load("", wanted))
+            self._restart(wanted)
         self.settings = settings
+
+    def _restart(self, step_s: float) -> None:
+        before, controls = self.actors, self.world.external.controls
+        driven = {
+            actor.number: controls[actor.slot]
+            for actor in before.actors.values()
+            if actor.slot in controls
+        }
+        self.world = self.source.load("", step_s)
+        self.actors = ActorTable(self.world, before.spectator.number, before.next_number)
+        for actor in self.actors.keep_spawned(self.world, before):
+            log.warning("actor %d (%s) could not be kept", actor.number, actor.type_id)
+            self._forget(actor)
+        for number, control in driven.items():
+            if number in self.actors.actors:
+                self.world.external.control(self.actors.actors[number].slot, control)
 
     def load(self, name: str, reset_settings: bool) -> None:
         """Begin a new episode on a map; raise CavmarlError if there is no such map."""
@@ -211,6 +229,8 @@ class CarlaSession:
         blueprint = BLUEPRINTS.get(type_id)
         if blueprint is None:
             raise CallRefused(f"actor definition not found: {type_id}")
+        if type_id in UNAVAILABLE:
+            raise CallRefused(f"{type_id} is not available")
         if sum(1 for _ in self.actors.spawned()) >= self.limits.max_actors:
             raise CallRefused(f"{self.limits.max_actors} actors are spawned; destroy some first")
         if parent and parent not in self.actors.actors:
@@ -250,7 +270,7 @@ class CarlaSession:
             raise CallRefused("unable to destroy actor: not found")
         if actor.slot >= 0:
             self.world.external.destroy(actor.slot)
-        elif not actor.type_id.startswith(("sensor.", "controller.")):
+        elif not actor.is_attached:
             raise CallRefused(f"unable to destroy actor: {actor.type_id} belongs to the world")
         for one in self.actors.remove(number):
             self._forget(one)

@@ -77,6 +77,21 @@ def test_long_ids_of_signals_are_replaced() -> None:
     assert [one.get("id") for one in root.iterfind("junction/controller")] == ["c"]
 
 
+def test_junctions_lead_only_to_lanes_for_cars() -> None:
+    root = fromstring(
+        '<OpenDRIVE><road id="1"><lanes><laneSection><right><lane id="-1" type="restricted"/>'
+        '<lane id="-2" type="driving"/></right></laneSection></lanes></road><road id="2"><lanes>'
+        '<laneSection><right><lane id="-1" type="biking"/></right></laneSection></lanes></road>'
+        '<junction id="9"><connection id="0" connectingRoad="1"><laneLink from="-1" to="-1"/>'
+        '<laneLink from="-2" to="-2"/></connection><connection id="1" connectingRoad="2">'
+        '<laneLink from="-1" to="-1"/></connection></junction></OpenDRIVE>'
+    )
+    fit_to_carla(root, DEFAULT_ORIGIN)
+    (connection,) = root.iter("connection")
+    assert connection.get("connectingRoad") == "1"
+    assert [link.get("to") for link in connection] == ["-2"]
+
+
 def test_the_header_has_a_place_on_the_earth(root: Element) -> None:
     header = root.find("header")
     assert header is not None
