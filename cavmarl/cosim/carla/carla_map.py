@@ -29,6 +29,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MINOR,
 )
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, carla_pose
+from cavmarl.maps.components import strong_components
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 
 RED, YELLOW, GREEN, OFF = 0, 1, 2, 3  # CARLA's numbers of states of traffic lights
@@ -139,8 +140,13 @@ def _ids_of_signals(document: str) -> dict[str, str]:
 
 
 def spawn_points(network: RoadNetwork) -> list[CarlaPose]:
-    """Return poses on lanes that cars may use, `SPAWN_HEIGHT_M` above the road."""
-    found = []
+    """Return poses on lanes that cars may use, `SPAWN_HEIGHT_M` above the road.
+
+    Programs draw starts and destinations from them. If the lanes that lead to each other have at
+    least half of the poses, there are no poses on other lanes, such as those that leave the map.
+    """
+    found: list[CarlaPose] = []
+    lanes: list[int] = []
     for lane, row in enumerate(network.lanes):
         length = float(row["length_m"])
         if row["internal"] or not row["permissions"] & CAR or length < _SHORTEST_M:
@@ -150,6 +156,23 @@ def spawn_points(network: RoadNetwork) -> list[CarlaPose]:
             x, y, z, cos, sin, slope = network.pose_on(lane, s)
             pose = carla_pose(x, y, z, math.atan2(sin, cos), math.atan(slope))
             found.append(pose.at((pose.x, pose.y, pose.z + SPAWN_HEIGHT_M)))
+            lanes.append(lane)
+    connected = np.flatnonzero(_in_largest_part(network)[lanes]).tolist()
+    return [found[row] for row in connected] if 2 * len(connected) >= len(found) else found
+
+
+def _in_largest_part(network: RoadNetwork) -> NDArray[np.bool_]:
+    """Return (lanes,) whether a lane is in the largest part in which cars can reach each lane."""
+    lanes, links = network.lanes, network.links
+    for_cars = (lanes["permissions"] & CAR) != 0
+    arcs = [np.stack([links["from_lane"], links["to_lane"]], axis=1)]
+    for side in ("left", "right"):
+        there = np.flatnonzero(lanes[side] >= 0)
+        arcs.append(np.stack([there, lanes[side][there]], axis=1))
+    joined = np.concatenate(arcs).astype(np.int32)
+    part = strong_components(len(lanes), joined[for_cars[joined].all(axis=1)])
+    part[lanes["internal"] | ~for_cars] = len(lanes)  # in no part
+    found: NDArray[np.bool_] = part == np.bincount(part)[: len(lanes)].argmax()
     return found
 
 

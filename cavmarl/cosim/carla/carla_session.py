@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ClockError, ConfigError
 from cavmarl.cosim.carla.attached_sensors import SensorSuite
 from cavmarl.cosim.carla.call_arguments import CallRefused
+from cavmarl.cosim.carla.call_table import Caller
 from cavmarl.cosim.carla.carla_actors import ActorTable, CarlaActor
 from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, UNAVAILABLE, Blueprint
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose
@@ -71,6 +73,7 @@ class SessionLimits:
 
 
 DEFAULT_LIMITS = SessionLimits()
+OtherTicks = Literal["obey", "refuse", "follow"]
 
 
 class CarlaSession:
@@ -82,6 +85,10 @@ class CarlaSession:
         streams: where snapshots and sensor frames are sent.
         limits: limits of what clients may demand.
         step_s: length of a step of the first world.
+        other_ticks: what happens in a synchronous world if a client ticks that is not the time
+            master: the client that has ticked first, until it disconnects. `obey`: the world
+            advances, as CARLA's does. `refuse`: the client gets an error. `follow`: the client
+            waits for the next tick of the master.
 
     Attributes:
         frame: number of ticks since the server has started; it numbers the snapshots.
@@ -97,9 +104,12 @@ class CarlaSession:
         streams: StreamHub,
         limits: SessionLimits = DEFAULT_LIMITS,
         step_s: float = STEP_S,
+        other_ticks: OtherTicks = "obey",
     ) -> None:
         self.source, self.version, self.streams, self.limits = source, version, streams, limits
         self.settings = EpisodeSettings()
+        self.other_ticks = other_ticks
+        self._ticking: Caller | None = None
         self.weather, self.gravity = list(_WEATHER), 9.81
         self.managers: dict[int, str] = {}
         self.frame = 0
@@ -137,6 +147,30 @@ class CarlaSession:
             self._forget(actor)
         self.publish()
         return self.frame
+
+    def tick_for(self, caller: Caller) -> int:
+        """Handle the tick of a client; return the number of the frame that the client waits for.
+
+        Ticks of other clients than the time master are events of the world's `TimeMaster`.
+
+        Raises CallRefused: another client is the time master, and `other_ticks` is `refuse`.
+        """
+        if self._ticking is None:
+            self._ticking = caller
+        if caller is not self._ticking:
+            follower = self.world.master.follow(caller.name)
+            with suppress(ClockError):  # the event is recorded
+                follower.tick()
+            follower.leave()
+            self.tell(f"{caller.name} ticks, but {self._ticking.name} has ticked first")
+            if self.other_ticks == "refuse":
+                raise CallRefused(
+                    f"{caller.name} ticks, but {self._ticking.name} is the time master: wait for "
+                    "its ticks (wait_for_tick), or start the server with --other-ticks follow"
+                )
+            if self.other_ticks == "follow":
+                return self.frame + 1
+        return self.tick()
 
     def _tell_end(self, ended: EndedVehicle) -> None:
         """Log why a vehicle that a client drives has left, and report its collision."""
@@ -275,9 +309,11 @@ class CarlaSession:
         for one in self.actors.remove(number):
             self._forget(one)
 
-    def release(self, agents: set[int]) -> None:
-        """Give agents back to the built-in driver."""
-        for agent in agents:
+    def release(self, caller: Caller) -> None:
+        """Give the agents of a client that has left back to the built-in driver."""
+        if caller is self._ticking:
+            self._ticking = None
+        for agent in caller.agents:
             self.world.controls.pop(agent, None)
 
     def tell(self, message: str) -> None:

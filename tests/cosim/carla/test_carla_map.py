@@ -158,6 +158,33 @@ def test_spawn_points_are_on_lanes_in_their_direction(
         assert math.remainder(heading + pose.yaw, 360.0) == pytest.approx(0.0, abs=0.1)
 
 
+def test_spawn_points_lead_to_each_other(carla_map: CarlaMap, network: RoadNetwork) -> None:
+    """Lanes that lead out of the map, or come from outside, have no spawn points."""
+    lanes = [
+        lane
+        for lane in np.flatnonzero(~network.lanes["internal"]).tolist()
+        for pose in carla_map.spawn_points
+        for s, d, _, _ in [network.beside(lane, pose.x, -pose.y)]
+        if abs(d) < 0.5 and 0.0 < s < network.lanes["length_m"][lane]
+    ]
+    edges = set(network.lanes["edge"][lanes].tolist())
+    after = {
+        edge: set(
+            network.lanes["edge"][
+                network.links["to_lane"][network.lanes["edge"][network.links["from_lane"]] == edge]
+            ].tolist()
+        )
+        & edges
+        for edge in edges
+    }
+    assert len(edges) == 48
+    for first in edges:
+        seen = {first}
+        while new := set().union(*(after[edge] for edge in seen)) - seen:
+            seen |= new
+        assert seen == edges
+
+
 def test_a_light_stands_at_its_stop_line(carla_map: CarlaMap, network: RoadNetwork) -> None:
     approach = carla_map.approaches[0]
     ends = [network.lane_polyline(lane)[-1] for lane in approach.lanes]
