@@ -38,7 +38,7 @@ def client_python() -> str:
     return sys.executable
 
 
-def run_client_program(program: Path, *arguments: Path, timeout_s: float = 600.0) -> None:
+def run_client_program(program: Path, *arguments: object, timeout_s: float = 600.0) -> None:
     """Run a program file with CARLA's client.
 
     Raises:
