@@ -104,7 +104,7 @@ def measure_client_drift(
             }
             spec = replace(spec, overrides={**coupled, **spec.overrides})
         output = Path(folder) / "clocks.json"
-        with _running(spec, other_ticks) as server:
+        with serving(spec, other_ticks) as server:
             run_client_program(
                 Path(carla_clock_client.__file__), server.port, steps, rogue,
                 int(other_ticks == "follow"), output,
@@ -144,7 +144,7 @@ def trips(spec: WorldSpec, number: int) -> str:
 
 
 @contextmanager
-def _running(spec: WorldSpec, other_ticks: OtherTicks) -> Iterator[CarlaServer]:
+def serving(spec: WorldSpec, other_ticks: OtherTicks) -> Iterator[CarlaServer]:
     over = threading.Event()
     with CarlaServer(LoadedWorlds(spec), port=0, step_s=STEP_S, other_ticks=other_ticks) as server:
         thread = threading.Thread(target=server.run, args=(over.is_set,), daemon=True)
