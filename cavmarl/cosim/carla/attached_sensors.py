@@ -210,12 +210,18 @@ class SensorSuite:
         self._streams = streams
         self._mounted: dict[int, _Mounted] = {}
         self._next_stream = _FIRST_STREAM
+        self._added = 0  # in this episode
+
+    def begin_episode(self) -> None:
+        """Let the next sensors draw the random numbers of a first episode."""
+        self._added = 0
 
     def add(self, actor: CarlaActor) -> None:
         """Mount the sensor of a new actor; raise CallRefused if an attribute is invalid."""
         if actor.type_id in _OF_THE_CLIENT:
             return
-        settings = SensorSettings(actor)
+        settings = SensorSettings(actor, self._added)
+        self._added += 1
         every_s = settings.number("sensor_tick", 0.0, 1e6)
         sensor = _SENSORS[actor.type_id](settings)
         self._mounted[actor.number] = _Mounted(actor, sensor, self._next_stream, every_s)

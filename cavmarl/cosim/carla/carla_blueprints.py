@@ -211,6 +211,7 @@ _IMU = _floats(
     }
 )
 
+_CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)
 # Programs look these up, but a server refuses to spawn them.
 _OTHER_CAMERAS = (
     "camera.optical_flow",
@@ -264,9 +265,14 @@ BLUEPRINTS = {
         _vehicle("bh.crossbike", "bicycle", (1.51, 0.86, 1.62), wheels=2),
         _vehicle("diamondback.century", "bicycle", (1.65, 0.37, 1.59), wheels=2),
         _vehicle("gazelle.omafiets", "bicycle", (1.83, 0.45, 1.76), wheels=2),
-        _walker(1, "adult", "female"),
-        _walker(2, "adult", "male"),
-        _walker(9, "child", "female"),
+        *(
+            _walker(
+                number,
+                "child" if number in _CHILDREN else "adult",
+                "female" if number % 2 else "male",
+            )
+            for number in range(1, 53)
+        ),
         Blueprint("controller.ai.walker", (BlueprintAttribute("role_name", "string", "default"),)),
         _sensor("camera.rgb", *_RGB),
         _sensor("camera.depth", *_CAMERA),

@@ -246,6 +246,7 @@ class CarlaSession:
         self.time_s = 0.0
         self._map_changed = True
         self._take_world(world)
+        self.sensors.begin_episode()
 
     def _take_world(self, world: HostedWorld) -> None:
         for actor in list(self.actors.attached()):
