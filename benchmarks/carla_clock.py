@@ -105,10 +105,8 @@ def measure_client_drift(
             spec = replace(spec, overrides={**coupled, **spec.overrides})
         output = Path(folder) / "clocks.json"
         with serving(spec, other_ticks) as server:
-            run_client_program(
-                Path(carla_clock_client.__file__), server.port, steps, rogue,
-                int(other_ticks == "follow"), output,
-            )  # fmt: skip
+            words = (server.port, steps, rogue, int(other_ticks == "follow"), output)
+            run_client_program(Path(carla_clock_client.__file__), words)
             counted = server.session.world.master.own_ticks
         read = json.loads(output.read_text(encoding="utf-8"))
     frames = read["frames"]

@@ -105,7 +105,7 @@ def measure_load(spec: WorldSpec, load: Load, ticks: int) -> dict[str, Any]:
         sensors, output = Path(folder) / "sensors.json", Path(folder) / "found.json"
         sensors.write_text(json.dumps(load.sensors), encoding="utf-8")
         run_client_program(
-            Path(carla_client.__file__), server.port, ticks, sensors, output, timeout_s=3600.0
+            Path(carla_client.__file__), (server.port, ticks, sensors, output), timeout_s=3600.0
         )
         found = json.loads(output.read_text(encoding="utf-8"))
     sensors_found = []

@@ -17,7 +17,7 @@ _OF_HEIGHTS = ("+geoidgrids=", "+geoid_crs=", "+vunits=", "+vto_meter=")
 
 
 def projection_of(geo: GeoReference) -> Any:
-    """Return the `pyproj.Proj` of a map, without the vertical part, which may need extra files.
+    """Return pyproj's projection of a map, without the vertical part, which may need extra files.
 
     Raises:
         MapError: PROJ does not know the projection.

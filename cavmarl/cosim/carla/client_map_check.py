@@ -231,7 +231,7 @@ def _answers(document: str, questions: dict[str, Any]) -> dict[str, Any]:
         files = [Path(folder) / name for name in ("map.xodr", "questions.json", "answers.json")]
         files[0].write_text(document, encoding="utf-8")
         files[1].write_text(json.dumps(questions), encoding="utf-8")
-        run_client_program(Path(client_map_reader.__file__), *files)
+        run_client_program(Path(client_map_reader.__file__), files)
         answers: dict[str, Any] = json.loads(files[2].read_text(encoding="utf-8"))
     return answers
 

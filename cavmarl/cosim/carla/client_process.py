@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -38,7 +39,9 @@ def client_python() -> str:
     return sys.executable
 
 
-def run_client_program(program: Path, *arguments: object, timeout_s: float = 600.0) -> None:
+def run_client_program(
+    program: Path, arguments: Sequence[object] = (), timeout_s: float = 600.0
+) -> None:
     """Run a program file with CARLA's client.
 
     Raises:
