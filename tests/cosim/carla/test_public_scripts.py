@@ -12,6 +12,7 @@ import signal
 import subprocess
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -105,6 +106,51 @@ def test_generate_traffic(port: int) -> None:
     assert "spawned 10 vehicles and 0 walkers" in text
     assert "destroying 10 vehicles" in text
     assert "Traceback" not in text.partition("KeyboardInterrupt")[0]
+
+
+@pytest.mark.parametrize("name", ["synchronous_mode.py", "sensor_synchronization.py"])
+def test_frames_of_sensors_come_with_their_ticks(name: str, tmp_path: Path) -> None:
+    """The programs drive on at random, so they need a map without ends."""
+    where = folder("PythonAPI", "examples")
+    copy = tmp_path / name
+    with running_server(agents=1, background=0, env="ring") as port:
+        copy.write_text((where / name).read_text("utf-8").replace("2000", str(port)), "utf-8")
+        for _ in range(5):
+            process = started([str(copy)], where)
+            with suppress(subprocess.TimeoutExpired):  # it runs until it is interrupted
+                process.wait(8.0)
+            text = ended(process)
+            if "Spawn failed because of collision" not in text:  # a random place can be taken
+                break
+    assert "Cancelled by user. Bye!" in text or "Exited by user." in text, text
+    assert "Traceback" not in text
+    assert name == "synchronous_mode.py" or text.count("Frame: ") > 60
+
+
+def test_agents_navigation_finds_routes_between_spawn_points() -> None:
+    """A junction with lanes for others, or a spawn point on a way out, would have no route."""
+    agents = str(folder("PythonAPI", "carla"))
+    with running_server(agents=1, background=0, env="town") as port:
+        found = run_client(
+            port,
+            f"sys.path.insert(0, {agents!r})\n"
+            + """
+import random
+from agents.navigation.global_route_planner import GlobalRoutePlanner
+planner = GlobalRoutePlanner(world.get_map(), 2.0)
+points = [one.location for one in world.get_map().get_spawn_points()]
+random.seed(1)
+found["pairs"] = found["routes"] = 0
+for _ in range(60):
+    found["pairs"] += 1
+    try:
+        found["routes"] += len(planner.trace_route(*random.sample(points, 2))) > 1
+    except Exception as error:
+        found["error"] = repr(error)
+""",
+        )
+    assert found["pairs"] == 60
+    assert found["routes"] >= 58, found
 
 
 def test_sumo_and_the_world_show_each_other_their_vehicles(port: int, tmp_path: Path) -> None:
