@@ -13,6 +13,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.arrays import DepartureQueue, Outputs, TripTables, Worlds
 from cavmarl.engine.component import Component
 from cavmarl.engine.external_component import ExternalComponent
+from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
@@ -110,6 +111,14 @@ class WorldViews:
         raise ConfigError(
             "population.external = 0: there is no room for vehicles of the caller; set it higher"
         )
+
+    @property
+    def signals(self) -> SignalComponent:
+        """The signals that agents control."""
+        for part in self._tick.attached:
+            if isinstance(part, SignalComponent):
+                return part
+        raise ConfigError("signals.agents = none: set it to all, or to a list of ids of signals")
 
     @property
     def travel(self) -> TripTables:

@@ -71,7 +71,7 @@ def test_report_is_that_of_one_array_after_the_other(seed: int, network: RoadNet
     expected_steps, found, expected = steps.copy(), results_of(), results_of()
     ended = report(outputs, steps, HORIZON, found)
     assert ended == naive.report(outputs, expected_steps, HORIZON, expected)
-    over = report_continuation(outputs, departures, steps, HORIZON, found)
+    over = report_continuation(outputs, departures, steps, HORIZON, False, found)
     assert over == naive.report_continuation(outputs, departures, expected_steps, HORIZON, expected)
     np.testing.assert_array_equal(steps, expected_steps)
     for name in Results._fields:
