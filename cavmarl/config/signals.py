@@ -91,6 +91,5 @@ class SignalsConfig(Section, key="signals"):
         self.need(
             name,
             abs(ratio - round(ratio)) < 1e-6 and (name != "decide_s" or round(ratio) >= 1),
-            f"must be a whole number of {unit} = {unit_s:g}; try "
-            f"{max(1, round(ratio)) * unit_s:g}",
+            f"must be a whole number of {unit} = {unit_s:g}; try {max(1, round(ratio)) * unit_s:g}",
         )

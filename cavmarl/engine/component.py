@@ -43,8 +43,9 @@ class Component(Protocol):
 
     Attributes:
         reads_all: names of the methods, `reset`, `begin` or `end`, that read the vehicles of all
-            zones; the present value counts. Other methods read the vehicles and ghosts of the zones in this process. An agent's part
-            of `arrays` is kept in the process that has its vehicle.
+            zones; the value at the time of the call counts. Other methods read the vehicles and
+            ghosts of the zones in this process. An agent's part of `arrays` is kept in the process
+            that has its vehicle.
     """
 
     @property

@@ -146,7 +146,8 @@ class SignalComponent:
 
     @property
     def _rows(self) -> NDArray[np.void]:
-        return self._division.zoned.rows[self._division.side]
+        rows: NDArray[np.void] = self._division.zoned.rows[self._division.side]
+        return rows
 
     @property
     def _lane_index(self) -> NDArray[np.int32]:

@@ -13,8 +13,8 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.arrays import DepartureQueue, Outputs, TripTables, Worlds
 from cavmarl.engine.component import Component
 from cavmarl.engine.external_component import ExternalComponent
-from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.rig_component import RigComponent
+from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
 from cavmarl.engine.v2x_component import V2xComponent

@@ -16,12 +16,11 @@ from typing import NamedTuple
 from cavmarl.config.signals import ALL_SIGNALS, SignalsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
-from cavmarl.roads.sumo_net.signal_rows import MAX_MS, SignalRows
+from cavmarl.roads.sumo_net.signal_rows import MAX_MS, ControlledPhase, SignalRows
 
 AGENT_PROGRAM = "agent"
 MAX_GREENS = 64
 _GREENS, _YELLOWS = "gG", "yYu"
-_CYCLE_GREEN_S = 30.0  # assumed duration of a green, for estimates of travel times
 
 log = logging.getLogger(__name__)
 
@@ -30,20 +29,24 @@ class AgentProgram(NamedTuple):
     """The phases between which an agent chooses.
 
     Attributes:
-        greens: letters of each green.
+        greens: letters of each green, and its duration in s in the map's program.
         yellow: whether yellow comes between two greens.
         all_red: whether red for all links comes before a green.
     """
 
-    greens: tuple[str, ...]
+    greens: tuple[tuple[str, float], ...]
     yellow: bool
     all_red: bool
 
-    def phases(self, config: SignalsConfig) -> list[tuple[str, int, int, int, bool]]:
+    def phases(self, config: SignalsConfig) -> list[ControlledPhase]:
         """Return the phases in the form of `SignalRows.add_controlled`."""
         n = len(self.greens)
         min_ms, max_ms = round(1e3 * config.min_green_s), round(1e3 * config.max_green_s)
-        greens = [(state, min_ms, max_ms or MAX_MS, k, True) for k, state in enumerate(self.greens)]
+        max_ms = max_ms or MAX_MS
+        greens = [
+            ControlledPhase(state, duration_s, min_ms, max_ms, k, True)
+            for k, (state, duration_s) in enumerate(self.greens)
+        ]
         pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
         found = [*greens]
         for is_used, duration_s, make in (
@@ -56,19 +59,19 @@ class AgentProgram(NamedTuple):
             is_last = make is _all_red or not self.all_red
             for place, (i, j) in enumerate(pairs):
                 following = j if is_last else n + len(pairs) + place
-                found.append((make(self.greens[i], self.greens[j]), ms, ms, following, False))
+                state = make(self.greens[i][0], self.greens[j][0])
+                found.append(ControlledPhase(state, duration_s, ms, ms, following, False))
         # The next phase of a green is known only if its agent changes it in the next decision.
         first_change = {i: n + place for place, (i, j) in reversed([*enumerate(pairs)])}
         if len(found) > n:
             for i in range(n):
-                state, low, high, _, green = found[i]
-                found[i] = (state, low, high, first_change[i], green)
+                found[i] = found[i]._replace(following=first_change[i])
         return found
 
     def cycle_s(self, config: SignalsConfig) -> float:
-        """Return the assumed duration of a cycle."""
-        green_s = max(config.min_green_s, min(_CYCLE_GREEN_S, config.max_green_s or _CYCLE_GREEN_S))
-        return len(self.greens) * (green_s + config.yellow_s + config.all_red_s)
+        """Return the duration of a cycle with the durations of the map's program."""
+        change_s = config.yellow_s + config.all_red_s
+        return sum(duration_s + change_s for _, duration_s in self.greens)
 
 
 def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetwork:
@@ -108,26 +111,28 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     )
 
 
-def greens_of(network: RoadNetwork, signal: int) -> tuple[str, ...]:
-    """Return the letters of the greens of a signal's present program, each once."""
+def greens_of(network: RoadNetwork, signal: int) -> tuple[tuple[str, float], ...]:
+    """Return the greens of a signal's present program: letters, and duration in s; each once."""
     links = network.links[network.links["signal"] == signal]
     used = sorted({int(index) for index in links["signal_index"]})
     program = network.programs[network.signals["program"][signal]]
     num_links = int(network.signals["num_links"][signal])
     first = int(program["first_phase"])
-    found: dict[str, None] = {}
+    found: dict[str, float] = {}
     for phase in network.phases[first : first + program["num_phases"]]:
         start = int(phase["first_state"])
         codes = network.phase_states[start : start + num_links].tolist()
         letters = "".join(SIGNAL_STATES[code] for code in codes)
         shown = {letters[index] for index in used}
         if shown & set(_GREENS) and not shown & set(_YELLOWS):
-            found[letters] = None
-    return tuple(found)
+            found.setdefault(letters, float(phase["duration_s"]))
+    return tuple(found.items())
 
 
 def _chosen(
-    network: RoadNetwork, config: SignalsConfig, greens: dict[str, tuple[str, ...]]
+    network: RoadNetwork,
+    config: SignalsConfig,
+    greens: dict[str, tuple[tuple[str, float], ...]],
 ) -> Sequence[str]:
     """Return the ids of the signals that agents control, in the order of the map."""
     if len(network.maps) > 1:

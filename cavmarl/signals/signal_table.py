@@ -32,6 +32,8 @@ class SignalTable:
         movements: for each signal, (M, 2) lanes from which and to which vehicles may drive, as
             indices of `lanes`, in the order of the signal's links; each once.
         opened: for each signal, (num_greens, M) whether a green opens a movement.
+        served: for each signal, (num_greens, N) 1 for lanes that a green opens.
+        green_s: (S, G) duration of each green in the map's program; 0 beyond a signal's greens.
         arrays: the same for kernels.
         sizes: sizes of the arrays.
     """
@@ -72,6 +74,10 @@ class SignalTable:
         lane_index = np.full(len(network.lanes), -1, dtype=np.int32)
         lane_index[lane_row] = np.arange(len(lane_row))
         self.lanes = tuple(network.lane_ids[row] for row in lane_row.tolist())
+        self.served = [
+            _served(moves, opened, len(index))
+            for moves, opened in zip(self.movements, self.opened, strict=True)
+        ]
         self.arrays = ControlledSignals(
             row=np.array(chosen, dtype=np.int32),
             controller=programs["controller"][used].astype(np.int32),
@@ -85,6 +91,11 @@ class SignalTable:
             speed_mps=network.lanes["speed_mps"][lane_row],
         )
         greens_max = int(self.arrays.num_greens.max(initial=0))
+        self.green_s = np.zeros((len(chosen), greens_max))
+        for s, row in enumerate(chosen):
+            phases = _phases(network, row)
+            durations = phases["duration_s"][phases["green"]]
+            self.green_s[s, : len(durations)] = durations
         features = [
             len(greens) + 1 + 2 * len(lanes)
             for greens, lanes in zip(self.greens, incoming, strict=True)
@@ -111,12 +122,26 @@ def sizes_of(network: RoadNetwork) -> SignalSizes:
 
 def _greens(network: RoadNetwork, row: int) -> NDArray[np.uint8]:
     """Return the letters (num_greens, num_links) of the greens of a signal's agent program."""
-    program = network.programs[network.signals["program"][row]]
     num_links = int(network.signals["num_links"][row])
-    first = int(program["first_phase"])
-    phases = network.phases[first : first + program["num_phases"]]
+    phases = _phases(network, row)
     starts = phases["first_state"][phases["green"]]
     return np.array([network.phase_states[k : k + num_links] for k in starts.tolist()])
+
+
+def _phases(network: RoadNetwork, row: int) -> NDArray[np.void]:
+    program = network.programs[network.signals["program"][row]]
+    first = int(program["first_phase"])
+    return network.phases[first : first + program["num_phases"]]
+
+
+def _served(
+    movements: NDArray[np.int64], opened: NDArray[np.bool_], num_lanes: int
+) -> NDArray[np.int64]:
+    """Return (num_greens, N) 1 for lanes from which a green opens a movement."""
+    served = np.zeros((len(opened), num_lanes), dtype=np.int64)
+    for green, is_open in enumerate(opened):
+        served[green, movements[is_open, 0]] = 1
+    return served
 
 
 def _padded(lists: list[list[int]]) -> NDArray[np.int32]:

@@ -8,7 +8,6 @@ from itertools import accumulate, chain, pairwise
 from pathlib import Path
 from typing import Any
 
-from cavmarl.config.env import EnvConfig
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
 from cavmarl.engine.compilation import compiled_before

@@ -82,9 +82,7 @@ class StepArrays(NamedTuple):
         return StepArrays(*parts)
 
 
-def layout_of(
-    config: EnvConfig, capacity: int, num_worlds: int, signals: SignalSizes
-) -> Layout:
+def layout_of(config: EnvConfig, capacity: int, num_worlds: int, signals: SignalSizes) -> Layout:
     """Return name → dtype and shape of the `StepArrays` of worlds with room for `capacity`."""
     of_signals = (num_worlds, signals.signals)
     observed = ("<f4", (*of_signals, signals.features))

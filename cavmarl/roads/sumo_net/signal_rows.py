@@ -40,6 +40,17 @@ class SignalArrays(NamedTuple):
     program_ids: tuple[str, ...]
 
 
+class ControlledPhase(NamedTuple):
+    """A phase that an agent chooses, or that comes between two such phases."""
+
+    letters: str
+    duration_s: float  # in the map's program
+    min_ms: int
+    max_ms: int
+    following: int  # number of the next phase in the program
+    green: bool
+
+
 class SignalRows:
     """The signals of a map: rows, letters, and the row of every id."""
 
@@ -138,21 +149,18 @@ class SignalRows:
         self,
         signal_id: str,
         program_id: str,
-        phases: Sequence[tuple[str, int, int, int, bool]],
+        phases: Sequence[ControlledPhase],
         cycle_s: float,
     ) -> None:
         """Append a program whose phases an agent chooses, and let it run.
 
-        `phases`: letters, minimum and maximum duration in ms, number of the following phase, and
-        whether the phase is green. `cycle_s`: duration of a cycle, for estimates of travel times.
+        `cycle_s`: duration of a cycle, for estimates of travel times.
         """
         signal, first = self.row[signal_id], len(self.phases)
         num_links = self.signals[signal][1]
-        for letters, min_ms, max_ms, following, green in phases:
+        for letters, duration_s, min_ms, max_ms, following, green in phases:
             state = len(self.letters)
-            self.phases.append(
-                (cycle_s, min_ms, max_ms, first + following, green, state, 0, 0)
-            )
+            self.phases.append((duration_s, min_ms, max_ms, first + following, green, state, 0, 0))
             self.letters.extend(map(SIGNAL_STATES.index, letters[:num_links]))
         row = len(self.programs)
         controller = self._next_controller()

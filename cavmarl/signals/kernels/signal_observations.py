@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
 from cavmarl.signals.kernels.green_choices import GREEN, SINCE
 from cavmarl.signals.kernels.lane_counts import (
     LENGTH_MM,
@@ -18,7 +19,6 @@ from cavmarl.signals.kernels.lane_counts import (
     STOOD_TICKS,
     VEHICLES,
 )
-from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
 
 MIN_GAP_M = 2.5  # between standing vehicles, for the number of vehicles that a lane holds
 WAIT_SCALE_S = 100.0  # of the term diff_wait
@@ -53,8 +53,7 @@ def observe_signals(
             out[num_greens] = 1.0 if lasted >= least else 0.0
             num_lanes = 0
             while (
-                num_lanes < controlled.incoming.shape[1]
-                and controlled.incoming[s, num_lanes] >= 0
+                num_lanes < controlled.incoming.shape[1] and controlled.incoming[s, num_lanes] >= 0
             ):
                 num_lanes += 1
             for k in range(num_lanes):
