@@ -318,7 +318,7 @@ class CavVectorEnv(WorldsEnvironment):
         ):
             raise ActionError(f"actions lack {'signals' if 'vehicles' in actions else 'vehicles'}")
         choices = signals.from_array(actions["signals"])
-        idle = np.zeros(self.worlds.arrays.suggested.shape[:2])  # there are no vehicles' agents
+        idle = np.zeros_like(self.worlds.arrays.suggested)  # no agents drive vehicles
         return actions.get("vehicles", self._session.decoder.encode(idle)), choices
 
     def _signal_infos(self) -> dict[str, NDArray[Any]]:

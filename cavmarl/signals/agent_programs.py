@@ -16,7 +16,7 @@ from typing import NamedTuple
 from cavmarl.config.signals import ALL_SIGNALS, SignalsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
-from cavmarl.roads.sumo_net.signal_rows import MAX_MS, ControlledPhase, SignalRows
+from cavmarl.roads.sumo_net.signal_rows import ControlledPhase, SignalRows
 
 AGENT_PROGRAM = "agent"
 MAX_GREENS = 64
@@ -42,7 +42,6 @@ class AgentProgram(NamedTuple):
         """Return the phases in the form of `SignalRows.add_controlled`."""
         n = len(self.greens)
         min_ms, max_ms = round(1e3 * config.min_green_s), round(1e3 * config.max_green_s)
-        max_ms = max_ms or MAX_MS
         greens = [
             ControlledPhase(state, duration_s, min_ms, max_ms, k, True)
             for k, (state, duration_s) in enumerate(self.greens)
