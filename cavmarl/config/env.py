@@ -159,7 +159,7 @@ class EnvConfig(Section, key=""):
         )
         if self.v2x.enabled:
             self.v2x.check_clock(self.clock.sim_dt_s)
-        if self.signals.are_agents:
+        if self.signals.are_controlled:
             self.signals.check_clock(self.clock.sim_dt_s, self.clock.ctrl_dt_s)
         self._check_messages()
         if self.observation.mode == "messages":
@@ -259,7 +259,7 @@ class EnvConfig(Section, key=""):
         )
         self.need(
             "signals.agents",
-            not self.signals.are_agents,
+            not self.signals.are_controlled,
             f"traffic.source = {source}: SUMO runs the signals; leave the key out",
         )
         self.need(

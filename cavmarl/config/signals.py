@@ -15,13 +15,19 @@ SIGNAL_TERMS = ("diff_wait", "average_speed", "queue", "pressure")
 NO_SIGNALS = "none"
 ALL_SIGNALS = "all"
 
+BY_AGENTS: Literal["agents"] = "agents"
+SIGNAL_CONTROLLERS = ("program", "longest_queue", "max_pressure")  # see `signals.controllers`
+
 
 @dataclass(frozen=True)
 class SignalsConfig(Section, key="signals"):
-    """The signals that agents control; docs/reference/signal_agents.md describes their API.
+    """The signals whose greens are chosen; docs/reference/signal_agents.md describes the API.
 
     Attributes:
-        agents: `none`; `all` signals with two or more greens; or a list of ids of signals.
+        agents: `none`; `all` signals with two or more greens; or a list of ids of signals. Other
+            signals keep their programs.
+        controller: who chooses the greens of these signals: `agents` of the environment, or one of
+            `SIGNAL_CONTROLLERS`; then all agents are vehicles.
         decide_s: time between two decisions; a whole number of steps of `clock.ctrl_dt_s`.
         yellow_s: duration of yellow between two greens.
         all_red_s: duration of red for all links, between yellow and the next green.
@@ -35,6 +41,7 @@ class SignalsConfig(Section, key="signals"):
     """
 
     agents: str | tuple[str, ...] = NO_SIGNALS
+    controller: Literal["agents", "program", "longest_queue", "max_pressure"] = BY_AGENTS
     decide_s: Annotated[float, Within(0.001, 3600.0)] = 5.0
     yellow_s: Annotated[float, Within(0.0, 60.0)] = 2.0
     all_red_s: Annotated[float, Within(0.0, 60.0)] = 0.0
@@ -71,9 +78,14 @@ class SignalsConfig(Section, key="signals"):
             check_finite(f"signals.terms.{name}", weight, -1e6, 1e6)
 
     @property
-    def are_agents(self) -> bool:
-        """Whether agents control any signal."""
+    def are_controlled(self) -> bool:
+        """Whether the greens of any signal are chosen."""
         return self.agents != NO_SIGNALS
+
+    @property
+    def have_agents(self) -> bool:
+        """Whether agents of the environment choose them."""
+        return self.are_controlled and self.controller == BY_AGENTS
 
     @property
     def weight_of_each(self) -> tuple[float, ...]:

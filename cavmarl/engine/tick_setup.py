@@ -82,7 +82,7 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
     if host.config.population.external:
         parts.append(ExternalComponent(host))
-    if host.config.signals.are_agents:
+    if host.config.signals.are_controlled:
         parts.append(SignalComponent(host))
     if host.config.rig:
         parts.append(RigComponent(host))

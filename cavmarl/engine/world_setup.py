@@ -73,7 +73,7 @@ class World(NamedTuple):
     @property
     def signal_sizes(self) -> SignalSizes:
         """Sizes of the arrays about signals with agents."""
-        return sizes_of(self.network) if self.config.signals.are_agents else SignalSizes()
+        return sizes_of(self.network) if self.config.signals.are_controlled else SignalSizes()
 
     @property
     def capacity(self) -> int:
@@ -293,7 +293,7 @@ def find_map(env: str | Path) -> Path:
 
 def check_agents(config: EnvConfig) -> None:
     """Refuse a world without agents where a caller wants to drive one."""
-    if config.population.agents == 0 and not config.signals.are_agents:
+    if config.population.agents == 0 and not config.signals.have_agents:
         raise ConfigError(
             "population.agents = 0: an environment needs at least one agent; set it higher, or let "
             "agents control signals (signals.agents)"

@@ -110,7 +110,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         cars = self.possible_agents
         self.observation_spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(cars, one_observation)
         self.action_spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(cars, one_action)
-        self._signals = self._session.signals
+        self._signals = self._session.signal_agents
         if self._signals is not None:
             self.possible_agents = [*cars, *self._signals.agents]
             self.observation_spaces |= self._signals.observation_spaces()

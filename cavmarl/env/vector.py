@@ -142,8 +142,8 @@ class CavVectorEnv(WorldsEnvironment):
         self.action_space = batch_space(
             batch_space(self.single_action_space, self.num_agents), num_envs
         )
-        if self._session.signals is not None:
-            self._add_signals(self._session.signals)
+        if self._session.signal_agents is not None:
+            self._add_signals(self._session.signal_agents)
         self.metadata |= {
             "autoreset_mode": present_mode(worlds.in_next_step, disabled),
             "render_modes": ["rgb_array"],
@@ -219,7 +219,7 @@ class CavVectorEnv(WorldsEnvironment):
         self._mask = self.worlds.arrays.mask.copy()
         self._over = self._over & ~chosen
         infos = {"mask": self._mask.copy()}
-        if self._session.signals is not None:
+        if self._session.signal_agents is not None:
             infos |= self._signal_infos()
         return self._observations(), infos
 
@@ -273,8 +273,8 @@ class CavVectorEnv(WorldsEnvironment):
             refuse_over(self._over)
         session = self._session
         choices = None
-        if session.signals is not None:
-            actions, choices = self._split(actions, session.signals)
+        if session.signal_agents is not None:
+            actions, choices = self._split(actions, session.signal_agents)
         session.step(session.decoder.from_array(actions, self._mask), choices)
         arrays = self.worlds.arrays
         over = self._over = arrays.episode_over.copy()
@@ -295,9 +295,9 @@ class CavVectorEnv(WorldsEnvironment):
         }
         terminations &= ~arrays.truncations  # reaching the trip's own horizon is no termination
         rewards, truncations = arrays.rewards.copy(), arrays.truncations.copy()
-        if session.signals is None:
+        if session.signal_agents is None:
             return observations, rewards, terminations, truncations, infos
-        over_all = over[:, None].repeat(len(session.signals.agents), axis=1)
+        over_all = over[:, None].repeat(len(session.signal_agents.agents), axis=1)
         return (
             observations,
             {"vehicles": rewards, "signals": arrays.signal_rewards.copy()},
@@ -332,7 +332,7 @@ class CavVectorEnv(WorldsEnvironment):
 
     def _observations(self) -> Observations:
         found = self._vehicle_observations()
-        if self._session.signals is None:
+        if self._session.signal_agents is None:
             return found
         return {"vehicles": found, "signals": self.worlds.arrays.signal_observations.copy()}
 
@@ -374,7 +374,7 @@ class CavVectorEnv(WorldsEnvironment):
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """Return the observations; in the worlds `ended` (W,), those before the reset."""
         found, arrays = self._final_vehicle_observations(ended), self.worlds.arrays
-        if self._session.signals is None:
+        if self._session.signal_agents is None:
             return found
         last, over = arrays.final_signal_observations, arrays.episode_over
         return {
@@ -422,7 +422,7 @@ class CavVectorEnv(WorldsEnvironment):
         self._session.refuse_idle("suggest_actions()")
         self.worlds.suggest()
         found = self._session.decoder.encode(self.worlds.arrays.suggested)
-        signals = self._session.signals
+        signals = self._session.signal_agents
         if signals is None:
             return found
         return {"vehicles": found, "signals": np.maximum(signals.suggest(), 0)}

@@ -91,7 +91,7 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
         ConfigError: a signal is unknown or has fewer than two greens; there are several maps; or no
             signal of the map has two greens.
     """
-    if not config.are_agents:
+    if not config.are_controlled:
         return network
     greens = {
         name: greens_of(network, row)[: MAX_GREENS + 1]

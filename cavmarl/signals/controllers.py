@@ -93,7 +93,7 @@ class MaxPressure:
         return _best(view, pressure)
 
 
-CONTROLLERS: dict[str, Callable[[], SignalController]] = {
+CONTROLLERS: dict[str, Callable[[], SignalController]] = {  # the names of SIGNAL_CONTROLLERS
     "program": ProgramController,
     "longest_queue": LongestQueue,
     "max_pressure": MaxPressure,

@@ -12,9 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from cavmarl import ActionError, CavEnv, CavVectorEnv, ConfigError, make_vec, parallel_env
+from cavmarl.adapters.gymnasium_env import CavEgoEnv
+from cavmarl.adapters.gymnasium_rows import CavAgentRows
+from cavmarl.core.errors import PolicyError
+from cavmarl.policies.loading import load_policy
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.signals.controllers import make_controller
 from cavmarl.signals.kernels.green_choices import GREEN, REFUSED, SINCE
@@ -104,7 +109,7 @@ def test_choices_that_are_not_allowed_are_counted_or_refused() -> None:
 def test_keep_or_next_goes_through_the_greens_in_their_order() -> None:
     with closing(world(action="keep_or_next", min_green_s=0.0, decide_s=5.0)) as env:
         env.reset()
-        assert env.action_space(env.signals.agents[0]).n == 2
+        assert env.action_space(env.signals.agents[0]) == spaces.Discrete(2)
         greens = []
         for step in range(21):
             env.step(choose(env, 1 if step % 10 == 0 else 0))
@@ -185,7 +190,7 @@ def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
                         )
                     if step == 0:
                         continue
-                    vehicles, standing, waited = sum(counts[name] for name in names)
+                    vehicles, standing, waited = np.sum([counts[name] for name in names], axis=0)
                     waits += waited > 0
                     beyond = sum(counts[table.lanes[k]][0] for k in outgoing)
                     terms = dict(zip(weights, arrays.signal_terms[0, s].tolist(), strict=True))
@@ -239,6 +244,7 @@ def test_a_world_can_have_agents_of_signals_alone() -> None:
     vec = make_vec("grid4x4", num_envs=2, agents=0, background=40, overrides=ALL)
     with closing(vec):
         observations, infos = vec.reset(seed=0)
+        assert isinstance(vec.observation_space, spaces.Dict)
         assert vec.observation_space["signals"].contains(observations["signals"])
         assert infos["signal_decides"].all()
         choices = np.zeros((2, 16), dtype=np.int64)
@@ -422,3 +428,33 @@ def test_max_pressure_lets_more_vehicles_through_than_the_program() -> None:
 def test_an_unknown_controller_is_refused() -> None:
     with pytest.raises(ConfigError, match="no controller of signals 'greedy': must be one of prog"):
         make_controller("greedy")
+
+
+def test_a_controller_chooses_for_signals_in_worlds_of_vehicles() -> None:
+    overrides = ALL | {"signals.controller": "max_pressure", "horizon_s": 40.0}
+    own = make_vec("grid4x4", agents=3, background=60, seed=2, overrides=ALL | {"horizon_s": 40.0})
+    ready = make_vec("grid4x4", agents=3, background=60, seed=2, zones=4, overrides=overrides)
+    controller = make_controller("max_pressure")
+    with closing(own), closing(ready):
+        own.reset()
+        observations, infos = ready.reset()
+        assert observations.shape[1] == ready.num_agents
+        assert "signal_mask" not in infos
+        for _ in range(35):
+            actions = own.suggest_actions() | {"signals": controller.choose(own.signals.view)}
+            actions["signals"] = np.maximum(actions["signals"], 0)
+            own.step(actions)
+            ready.step(ready.suggest_actions())
+        assert own.state_hash() == ready.state_hash()
+
+
+def test_drivers_of_vehicles_refuse_agents_of_signals() -> None:
+    vec = make_vec("grid4x4", agents=3, background=5, overrides=ALL)
+    with closing(vec), pytest.raises(PolicyError, match=r"set signals\.controller to one of prog"):
+        load_policy("idm", vec)
+
+
+@pytest.mark.parametrize("adapter", [CavEgoEnv, CavAgentRows])
+def test_adapters_that_show_vehicles_alone_refuse_agents_of_signals(adapter: Any) -> None:
+    with pytest.raises(ConfigError, match="this adapter gives the agents of vehicles alone"):
+        adapter("grid4x4", overrides=ALL)

@@ -60,7 +60,8 @@ class LocalWorlds:
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
-        self._has_signals = world.config.signals.are_agents
+        self._shows_signals = world.config.signals.are_controlled
+        self._has_signals = world.config.signals.have_agents
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
@@ -188,7 +189,7 @@ class LocalWorlds:
         """Write what the agents of the chosen worlds (W,) observe."""
         if self._senses and self._is_flat:
             write_sensed(self.arrays.frames, chosen, self.arrays.observations)
-        if self._has_signals:
+        if self._shows_signals:
             found = self.simulation.signals.outputs
             for name, values in found._asdict().items():
                 getattr(self.arrays, f"signal_{name}")[chosen] = values[chosen]
