@@ -72,18 +72,22 @@ def reward_signals(
     controlled: ControlledSignals,
     dt: float,
     weights: NDArray[np.float64],  # (T,) of SIGNAL_TERMS
-    chosen: NDArray[np.bool_],  # (W,) worlds in which an interval between decisions ends
+    chosen: NDArray[np.bool_],  # (W,) worlds whose rewards are written
+    observed: NDArray[np.bool_],  # (W,) worlds in which it is time for a decision
+    ends: bool,  # whether an interval between decisions has ended there; else the first one begins
     counts: NDArray[np.int64],  # (W, N, COUNTS)
     stood: NDArray[np.int64],  # (W, S) sum of ticks at the last decision, updated
-    terms: NDArray[np.float32],  # (W, S, T) overwritten; 0 in other worlds
-    rewards: NDArray[np.float32],  # (W, S) overwritten; 0 in other worlds
+    terms: NDArray[np.float32],  # (W, S, T) overwritten; 0 where no interval ends
+    rewards: NDArray[np.float32],  # (W, S) overwritten; 0 where no interval ends
 ) -> None:
     """Write the terms of the rewards for the interval since the last decision, and their sum."""
     for w in range(chosen.size):
+        if not chosen[w]:
+            continue
         for s in range(controlled.row.size):
             terms[w, s] = 0.0
             rewards[w, s] = 0.0
-            if not chosen[w]:
+            if not (observed[w] and ends):
                 continue
             vehicles, standing, waited, speed, beyond = 0, 0, 0, 0, 0
             for k in range(controlled.incoming.shape[1]):
