@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.signals.kernels.green_choices import GREEN, KEEP, SINCE
+from cavmarl.signals.kernels.green_scores import LaneWeights, choose_best
 from cavmarl.signals.kernels.lane_counts import VEHICLES
 from cavmarl.signals.signal_table import SignalTable
 
@@ -70,7 +71,7 @@ class LongestQueue:
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
         """Choose the green with most vehicles on lanes that it opens; the present one on a tie."""
-        return _best(view, lambda s: view.table.served[s] @ view.counts[..., VEHICLES].T)
+        return _best(view, view.table.served)
 
 
 class MaxPressure:
@@ -82,15 +83,7 @@ class MaxPressure:
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
         """Choose the green whose movements have most vehicles before and fewest behind them."""
-        vehicles = view.counts[..., VEHICLES]
-
-        def pressure(s: int) -> NDArray[np.int64]:
-            before, behind = view.table.movements[s].T
-            of_each = vehicles[:, before] - vehicles[:, behind]
-            found: NDArray[np.int64] = view.table.opened[s].astype(np.int64) @ of_each.T
-            return found
-
-        return _best(view, pressure)
+        return _best(view, view.table.pressure)
 
 
 CONTROLLERS: dict[str, Callable[[], SignalController]] = {  # the names of SIGNAL_CONTROLLERS
@@ -113,21 +106,21 @@ def make_controller(name: str) -> SignalController:
     return CONTROLLERS[name]()
 
 
-def _best(view: SignalView, score: Callable[[int], NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Choose the green of the highest score (num_greens, W); the present green wins a tie."""
-    green = view.states[..., GREEN]
-    worlds = np.arange(len(green))
-    wanted = green.copy()
-    for s, num_greens in enumerate(view.table.arrays.num_greens.tolist()):
-        scores = score(s).T
-        # Twice the score, so that one more is less than any difference.
-        doubled = 2 * scores
-        doubled[worlds, green[:, s]] += 1
-        if view.config.max_green_s > 0.0:
-            must = ~_keeps(view)[:, s] & view.decides
-            doubled[must, green[must, s]] = np.iinfo(np.int64).min
-        wanted[:, s] = doubled[:, :num_greens].argmax(axis=1)
-    return _choices(view, wanted)
+def _best(view: SignalView, weights: LaneWeights) -> NDArray[np.int64]:
+    """Choose the allowed green whose lanes have most vehicles, weighted."""
+    choices = np.empty(view.states.shape[:2], dtype=np.int64)
+    choose_best(
+        weights,
+        VEHICLES,
+        view.config.action == "keep_or_next",
+        view.table.arrays.num_greens,
+        view.counts,
+        view.states,
+        view.masks,
+        view.decides,
+        choices,
+    )
+    return choices
 
 
 def _keeps(view: SignalView) -> NDArray[np.bool_]:

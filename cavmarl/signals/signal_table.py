@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.records.codes import CHOSEN_BY_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
+from cavmarl.signals.kernels.green_scores import LaneWeights
 
 
 class SignalSizes(NamedTuple):
@@ -32,7 +34,9 @@ class SignalTable:
         movements: for each signal, (M, 2) lanes from which and to which vehicles may drive, as
             indices of `lanes`, in the order of the signal's links; each once.
         opened: for each signal, (num_greens, M) whether a green opens a movement.
-        served: for each signal, (num_greens, N) 1 for lanes that a green opens.
+        served: weight 1 for each lane that a green opens.
+        pressure: for each movement that a green opens, weight 1 for the lane before the signal, and
+            -1 for the lane behind it.
         green_s: (S, G) duration of each green in the map's program; 0 beyond a signal's greens.
         arrays: the same for kernels.
         sizes: sizes of the arrays.
@@ -74,10 +78,6 @@ class SignalTable:
         lane_index = np.full(len(network.lanes), -1, dtype=np.int32)
         lane_index[lane_row] = np.arange(len(lane_row))
         self.lanes = tuple(network.lane_ids[row] for row in lane_row.tolist())
-        self.served = [
-            _served(moves, opened, len(index))
-            for moves, opened in zip(self.movements, self.opened, strict=True)
-        ]
         self.arrays = ControlledSignals(
             row=np.array(chosen, dtype=np.int32),
             controller=programs["controller"][used].astype(np.int32),
@@ -91,6 +91,10 @@ class SignalTable:
             speed_mps=network.lanes["speed_mps"][lane_row],
         )
         greens_max = int(self.arrays.num_greens.max(initial=0))
+        self.served, self.pressure = (
+            _weights(self.movements, self.opened, greens_max, of_each)
+            for of_each in (_of_served_lanes, _of_pressure)
+        )
         self.green_s = np.zeros((len(chosen), greens_max))
         for s, row in enumerate(chosen):
             phases = _phases(network, row)
@@ -134,14 +138,36 @@ def _phases(network: RoadNetwork, row: int) -> NDArray[np.void]:
     return network.phases[first : first + program["num_phases"]]
 
 
-def _served(
-    movements: NDArray[np.int64], opened: NDArray[np.bool_], num_lanes: int
-) -> NDArray[np.int64]:
-    """Return (num_greens, N) 1 for lanes from which a green opens a movement."""
-    served = np.zeros((len(opened), num_lanes), dtype=np.int64)
-    for green, is_open in enumerate(opened):
-        served[green, movements[is_open, 0]] = 1
-    return served
+def _of_served_lanes(moves: list[tuple[int, int]]) -> dict[int, int]:
+    """Return the weight of each lane from which movements start."""
+    return dict.fromkeys((before for before, _ in moves), 1)
+
+
+def _of_pressure(moves: list[tuple[int, int]]) -> dict[int, int]:
+    """Return the weight of each lane in the pressure of movements."""
+    found: dict[int, int] = {}
+    for before, behind in moves:
+        found[before] = found.get(before, 0) + 1
+        found[behind] = found.get(behind, 0) - 1
+    return {lane: weight for lane, weight in found.items() if weight}
+
+
+def _weights(
+    movements: Sequence[NDArray[np.int64]],
+    opened: Sequence[NDArray[np.bool_]],
+    greens_max: int,
+    of_each: Callable[[list[tuple[int, int]]], dict[int, int]],
+) -> LaneWeights:
+    """Return the weights of lanes for each green, from the movements that the green opens."""
+    lists: list[dict[int, int]] = []
+    for moves, greens in zip(movements, opened, strict=True):
+        lists += [of_each(list(map(tuple, moves[is_open].tolist()))) for is_open in greens]
+        lists += [{}] * (greens_max - len(greens))
+    return LaneWeights(
+        first=np.cumsum([0, *map(len, lists)], dtype=np.int64),
+        lanes=np.array([lane for each in lists for lane in each], dtype=np.int32),
+        weights=np.array([weight for each in lists for weight in each.values()], dtype=np.int64),
+    )
 
 
 def _padded(lists: list[list[int]]) -> NDArray[np.int32]:
