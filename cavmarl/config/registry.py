@@ -118,6 +118,7 @@ def load_config(
     env: str | Path,
     *,
     zones: int | None = None,
+    zone_simulators: Mapping[int, str] | None = None,
     sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
@@ -131,6 +132,7 @@ def load_config(
             map: see `make_world`. A configuration of SUMO also sets `traffic.demand`, and no
             background vehicles are generated.
         zones: sets `zones.count`.
+        zone_simulators: sets `zones.simulators`.
         sensor_workers: sets `workers.sensors`.
         agents: sets `population.agents`.
         background: sets `population.background`.
@@ -160,6 +162,7 @@ def load_config(
         config = _config_of_file(found)
     keywords = {
         "zones.count": zones,
+        "zones.simulators": zone_simulators,
         "workers.sensors": sensor_workers,
         "population.agents": agents,
         "population.background": background,

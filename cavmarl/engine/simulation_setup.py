@@ -9,10 +9,12 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.external_component import ExternalComponent, ExternalPhases
+from cavmarl.engine.hosted_zones import HostedPhases, HostedZones
 from cavmarl.engine.outside_traffic import SumoPhases
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
+from cavmarl.handoff.simulators.simulator_kinds import hosted_zones
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
@@ -36,8 +38,22 @@ def add_external(tick: Tick) -> None:
             tick.outside = ExternalPhases(part, tick)
 
 
+def add_simulators(tick: Tick, config: EnvConfig, network: RoadNetwork) -> HostedZones | None:
+    """Let other simulators run zones, if `zones.simulators` names any."""
+    hosted = hosted_zones(config.zones.simulators, tick.division.count)
+    if not hosted:
+        return None
+    part = HostedZones(tick, config, network, hosted)
+    tick.attached, tick.outside = (*tick.attached, part), HostedPhases(part)
+    return part
+
+
 def add_coordinators(
-    tick: Tick, config: EnvConfig, network: RoadNetwork, runs: Sequence[OpenRun] | None
+    tick: Tick,
+    config: EnvConfig,
+    network: RoadNetwork,
+    runs: Sequence[OpenRun] | None,
+    hosted: HostedZones | None = None,
 ) -> tuple[TransferLog, ...]:
     """Let coordinators decide ownership, if there are several zones, a journal or checks.
 
@@ -45,11 +61,14 @@ def add_coordinators(
         One log of transfers per world; none without coordinators.
     """
     zones = config.zones
-    if tick.division.count == 1 and not (zones.journal or zones.check_invariants):
+    is_plain = not (zones.journal or zones.check_invariants or hosted)
+    if tick.division.count == 1 and is_plain:
         return ()
     reach_m = longest_move_m(network, tick.traffic.travel, config.clock.sim_dt_s)
-    setup = make_coordinators(zones, tick.division, reach_m, runs=runs)
+    setup = make_coordinators(zones, tick.division, reach_m, runs=runs, gate=hosted)
     tick.coordination = setup.coordination
+    if hosted is not None:
+        hosted.coordinators = setup.coordination.coordinators
     return setup.transfers
 
 

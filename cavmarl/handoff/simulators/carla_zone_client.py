@@ -1,0 +1,276 @@
+"""The program of a process that runs a zone with CARLA's official client.
+
+It is run by its file name, possibly by another Python, and imports nothing of this package: CARLA's
+client supports only some versions of Python, and it can abort its process. Requests come as lines
+of JSON on standard input; each line is answered with one line.
+
+CARLA's frame is left-handed: y and yaw have the opposite sign.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+SPAWN_HEIGHT_M = 0.3  # above the ground, so that the wheels do not touch it
+LARGE_M = 7.0  # longer vehicles are buses or trucks
+WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles
+MOST_SLIP = 0.6  # largest sine of the slip angle
+PLACED_TICKS = 2  # ticks for which a vehicle is placed, before it drives by its own physics
+SEEN_LANES = 0.5  # least share of the sent places that must be on a road of CARLA's map
+STATES = {"r": "Red", "y": "Yellow", "u": "Yellow", "g": "Green", "G": "Green", "s": "Red"}
+_PR_SET_PDEATHSIG = 1
+
+Row = Sequence[float]
+
+
+class Pose(NamedTuple):
+    """The state of a vehicle in cavmarl's frame: m, rad, m/s."""
+
+    x: float
+    y: float
+    z: float
+    heading: float
+    speed: float
+
+    @classmethod
+    def of(cls, row: Row) -> Pose:
+        return cls(*row[1:6])
+
+
+class Car:
+    """An actor that stands for a vehicle."""
+
+    def __init__(self, actor: Any, pose: Pose) -> None:
+        self.actor = actor
+        self.pose = pose  # where it was placed last
+        self.length_m = 2.0 * actor.bounding_box.extent.x
+        self.is_owned = False
+        self.is_seen = False  # a snapshot has had it; before, it reads as place (0, 0, 0)
+        self.left = PLACED_TICKS  # ticks for which it is still placed
+
+
+class Zone:
+    """The vehicles of a zone in CARLA's world.
+
+    Args:
+        start: host, port, timeout in s, length of a tick in s, and places on lanes.
+    """
+
+    def __init__(self, start: dict[str, Any]) -> None:
+        self._carla: Any = importlib.import_module("carla")
+        self._client = self._carla.Client(start["host"], start["port"])
+        self._client.set_timeout(start["timeout_s"])
+        self._dt = start["dt"]
+        self._world = self._client.get_world()
+        self._map = self._world.get_map()
+        self._check_map(start["places"])
+        self._before = self._world.get_settings()
+        settings = self._world.get_settings()
+        settings.synchronous_mode, settings.fixed_delta_seconds = True, self._dt
+        self._world.apply_settings(settings)
+        self._cars: dict[int, Car] = {}
+        self._lights = {
+            light.get_opendrive_id(): light
+            for light in self._world.get_actors().filter("traffic.traffic_light")
+        }
+        self._shown: dict[str, str] = {}
+        library = self._world.get_blueprint_library().filter("vehicle.*")
+        self._blueprints = sorted(library, key=lambda one: str(one.id))
+
+    def _check_map(self, places: Sequence[Sequence[float]]) -> None:
+        on_road = sum(
+            self._map.get_waypoint(self._carla.Location(x, -y, z), project_to_road=False)
+            is not None
+            for x, y, z in places
+        )
+        if on_road < SEEN_LANES * len(places):
+            raise ValueError(
+                f"its map {self._map.name} is another one: {len(places) - on_road} of "
+                f"{len(places)} places on lanes are beside its roads; load the map of this world "
+                "(cavmarl map export NAME --opendrive FILE)"
+            )
+
+    def prepare(self, rows: Sequence[Row]) -> dict[int, str]:
+        refused = {}
+        for row in rows:
+            vehicle = int(row[0])
+            if vehicle not in self._cars and not self._place(vehicle, row):
+                refused[vehicle] = "CARLA has no room at its place"
+        return refused
+
+    def spawn(self, rows: Sequence[Row]) -> None:
+        for row in rows:
+            vehicle = int(row[0])
+            if vehicle not in self._cars and not self._place(vehicle, row):
+                raise ValueError(f"CARLA has no room for vehicle {vehicle}, which it had accepted")
+            car = self._cars[vehicle]
+            car.is_owned, car.left = True, 0 if car.is_seen else PLACED_TICKS
+            car.actor.set_simulate_physics(True)
+            car.actor.set_target_velocity(self._velocity(Pose.of(row)))
+
+    def _place(self, vehicle: int, row: Row) -> bool:
+        """Add an actor without physics. Return whether there was room for it."""
+        pose = Pose.of(row)
+        there = self._transform(pose._replace(z=pose.z + SPAWN_HEIGHT_M))
+        actor = self._world.try_spawn_actor(self._blueprint(row[6]), there)
+        if actor is None:
+            return False
+        actor.set_simulate_physics(False)
+        self._cars[vehicle] = Car(actor, pose)
+        return True
+
+    def _blueprint(self, length_m: float) -> Any:
+        bases = ("bus", "truck") if length_m > LARGE_M else ("car",)
+        fitting = [
+            one
+            for one in self._blueprints
+            if one.has_attribute("base_type") and str(one.get_attribute("base_type")) in bases
+        ]
+        return (fitting or self._blueprints)[0]
+
+    def drop(self, vehicles: Sequence[int]) -> None:
+        """Give vehicles up. Those that remain visible become ghosts in `show`."""
+        for vehicle in vehicles:
+            car = self._cars[vehicle]
+            car.is_owned = False
+            car.actor.set_simulate_physics(False)
+
+    def show(self, ghosts: Sequence[Row], signals: dict[str, str]) -> None:
+        near = {int(row[0]): row for row in ghosts}
+        for vehicle in [one for one, car in self._cars.items() if not car.is_owned]:
+            if vehicle not in near:
+                self._cars.pop(vehicle).actor.destroy()
+        moves = []
+        for vehicle, row in near.items():
+            if vehicle not in self._cars:
+                self._place(vehicle, row)  # without room, it is not shown now
+                continue
+            car = self._cars[vehicle]
+            car.pose = Pose.of(row)
+            moves.append(self._move(car))
+        if moves:
+            self._client.apply_batch_sync(moves, False)
+        for name, letter in signals.items():
+            light = self._lights.get(name)
+            if light is not None and self._shown.get(name) != letter:
+                self._shown[name] = letter
+                light.set_state(getattr(self._carla.TrafficLightState, STATES.get(letter, "Off")))
+
+    def advance(self, wanted: Sequence[Row]) -> list[list[float]]:
+        """Run a tick. Return (id, x, y, heading, speed) of the owned vehicles."""
+        commands = []
+        for row in wanted:
+            car, pose = self._cars[int(row[0])], Pose.of(row)
+            if car.is_seen and car.left == 0:
+                commands.append(self._drive(car, pose))
+            else:
+                commands.append(self._move(car, pose))
+            car.pose = pose
+        self._client.apply_batch_sync(commands, False)
+        self._world.tick()
+        snapshot = self._world.get_snapshot()
+        found = []
+        for row in wanted:
+            car = self._cars[int(row[0])]
+            state = snapshot.find(car.actor.id)
+            is_placed = state is None or not car.is_seen or car.left > 0
+            pose = car.pose if is_placed else self._read(state)
+            found.append([row[0], pose.x, pose.y, pose.heading, pose.speed])
+        for car in self._cars.values():
+            if car.is_seen:
+                car.left = max(0, car.left - 1)
+            car.is_seen |= snapshot.find(car.actor.id) is not None
+        return found
+
+    def _move(self, car: Car, pose: Pose | None = None) -> Any:
+        there = self._transform(car.pose if pose is None else pose)
+        return self._carla.command.ApplyTransform(car.actor, there)
+
+    def _drive(self, car: Car, wanted: Pose) -> Any:
+        """Return the control by which a vehicle reaches a heading and a speed in one tick."""
+        now = self._read(self._world.get_snapshot().find(car.actor.id))
+        accel = (wanted.speed - now.speed) / self._dt
+        turn = math.remainder(wanted.heading - now.heading, 2.0 * math.pi)
+        step_m = max(now.speed, 0.1) * self._dt
+        slip = turn * 0.5 * WHEELBASE_SHARE * car.length_m / step_m
+        slip = min(max(slip, -MOST_SLIP), MOST_SLIP)
+        steer = math.atan(2.0 * math.tan(math.asin(slip)))
+        control = self._carla.VehicleAckermannControl(
+            steer=-steer, speed=max(0.0, now.speed + 0.5 * accel), acceleration=abs(accel)
+        )
+        return self._carla.command.ApplyVehicleAckermannControl(car.actor, control)
+
+    def _read(self, state: Any) -> Pose:
+        there, velocity = state.get_transform(), state.get_velocity()
+        heading = -math.radians(there.rotation.yaw)
+        speed = velocity.x * math.cos(heading) - velocity.y * math.sin(heading)
+        place = there.location
+        return Pose(place.x, -place.y, place.z, math.remainder(heading, 2.0 * math.pi), speed)
+
+    def _transform(self, pose: Pose) -> Any:
+        yaw = -math.degrees(pose.heading)
+        place = self._carla.Location(pose.x, -pose.y, pose.z)
+        return self._carla.Transform(place, self._carla.Rotation(yaw=yaw))
+
+    def _velocity(self, pose: Pose) -> Any:
+        cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+        return self._carla.Vector3D(pose.speed * cos, -pose.speed * sin, 0.0)
+
+    def close(self) -> None:
+        """Remove all actors, and restore the settings of CARLA's world."""
+        for car in self._cars.values():
+            car.actor.destroy()
+        self._cars.clear()
+        self._world.apply_settings(self._before)
+
+
+def answer(zone: Zone | None, request: dict[str, Any]) -> tuple[Zone | None, Any]:
+    """Return the zone and the result of a request."""
+    kind = request["do"]
+    if kind == "start":
+        return Zone(request), None
+    if zone is None:
+        raise ValueError("the zone has not started")
+    match kind:
+        case "prepare":
+            return zone, zone.prepare(request["rows"])
+        case "spawn":
+            return zone, zone.spawn(request["rows"])
+        case "drop":
+            return zone, zone.drop(request["vehicles"])
+        case "show":
+            return zone, zone.show(request["ghosts"], request["signals"])
+        case "advance":
+            return zone, zone.advance(request["wanted"])
+        case "close":
+            return zone, zone.close()
+    raise ValueError(f"there is no request {kind!r}")
+
+
+def main() -> None:
+    if sys.platform == "linux":  # the process ends with the process that has started it
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what CARLA's client prints is no answer
+    zone: Zone | None = None
+    for line in sys.stdin:
+        try:
+            zone, result = answer(zone, json.loads(line))
+            text = json.dumps({"result": result})
+        except Exception as error:  # the client raises many kinds of exceptions
+            text = json.dumps({"error": f"{type(error).__name__}: {error}"})
+        answers.write(text + "\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()
