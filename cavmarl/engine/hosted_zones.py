@@ -19,7 +19,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError, ZoneSimulatorError
 from cavmarl.core.records.codes import EVENTS_THAT_END
-from cavmarl.driving.kernels.motion.reported_motion import follow_reports
+from cavmarl.driving.kernels.motion.reported_motion import find_aims, follow_reports
 from cavmarl.engine.outside_traffic import NoOutsideTraffic
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator import Coordinator
@@ -77,6 +77,8 @@ class HostedZones:
         self._runs: dict[_Place, _Run] = {}  # zones that have failed are absent
         self._broken: dict[int, str] = {}  # world → why it cannot continue before a reset
         self._patience = max(1, round(ENTRY_S / config.clock.sim_dt_s))
+        self._roads, self._travel = tick.shards[0].roads, tick.shards[0].travel
+        self._find_aims = specialized(find_aims)
         self._follow_reports = specialized(follow_reports)
         self._letters: dict[int, str] = {}  # PHASE row → signal letters
 
@@ -105,7 +107,7 @@ class HostedZones:
             zone=place.zone,
             network=self._network,
             dt_s=self._config.clock.sim_dt_s,
-            wheelbases=self._tick.shards[0].travel.types["wheelbase"].astype(np.float64),
+            wheelbases=self._travel.types["wheelbase"].astype(np.float64),
             place=hosted.place,
             options=hosted.options,
         )
@@ -179,8 +181,9 @@ class HostedZones:
             rows = self._next_rows(place)
             found = np.flatnonzero(np.isin(rows["id"], list(run.owned)))
             wanted[place] = found = found[np.argsort(rows["id"][found])]
-            there = rows[found]
-            self._ask(place, "run a tick", partial(run.simulator.advance, there))
+            aims = np.empty((len(found), 2))
+            self._find_aims(self._roads, self._travel, found, rows, aims)
+            self._ask(place, "run a tick", partial(run.simulator.advance, rows[found], aims))
         for place, run in list(self._runs.items()):
             self._ask(place, "run a tick", partial(self._take, place, run, wanted[place]))
 
@@ -216,7 +219,7 @@ class HostedZones:
             return
         shard, w = self._tick.shards[zone], place.w
         self._follow_reports(
-            shard.roads,
+            self._roads,
             shard.plans,
             shard.lane_grid,
             at,

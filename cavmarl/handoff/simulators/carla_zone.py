@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import selectors
@@ -118,8 +119,9 @@ class CarlaZone:
         }
         self._call("show", ghosts=_rows(ghosts), signals=letters)
 
-    def advance(self, wanted: NDArray[np.void]) -> None:
-        self._send("advance", wanted=_rows(wanted))
+    def advance(self, wanted: NDArray[np.void], aims: NDArray[np.float64]) -> None:
+        points = [None if math.isnan(point[0]) else point for point in aims.tolist()]
+        self._send("advance", wanted=_rows(wanted), aims=points)
 
     def read(self) -> NDArray[np.void]:
         found = np.zeros(0, dtype=MOTION)
@@ -132,7 +134,8 @@ class CarlaZone:
         """Remove all actors, and end the client's process."""
         with suppress(ZoneSimulatorError):
             if self._process.poll() is None:
-                self._call("close")
+                self._send("close")
+                self._line(time.monotonic() + _END_S)
         self._end()
 
     def _end(self) -> None:
@@ -162,8 +165,7 @@ class CarlaZone:
             raise self._failure(f"its client has ended ({self._last_words()})") from error
 
     def _receive(self, kind: str) -> Any:
-        line = self._line(time.monotonic() + self._timeout_s + _GRACE_S)
-        answer = json.loads(line)
+        answer = json.loads(self._line(time.monotonic() + self._timeout_s + _GRACE_S))
         if "error" in answer:
             advice = ""
             if "No module named 'carla'" in answer["error"]:
@@ -182,7 +184,7 @@ class CarlaZone:
                 if left_s <= 0.0 or not selector.select(left_s):
                     self._process.kill()
                     raise self._failure(
-                        f"its client has not answered within {self._timeout_s + _GRACE_S:g} s"
+                        f"its client has not answered in time (timeout_s = {self._timeout_s:g})"
                     )
                 data = os.read(pipe.fileno(), 1 << 16)
                 if not data:

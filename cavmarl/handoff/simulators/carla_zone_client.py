@@ -16,7 +16,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 SPAWN_HEIGHT_M = 0.3  # above the ground, so that the wheels do not touch it
@@ -44,6 +44,12 @@ class Pose(NamedTuple):
     def of(cls, row: Row) -> Pose:
         return cls(*row[1:6])
 
+    def after(self, dt: float) -> Pose:
+        """Return the state after a tick straight on."""
+        step_m = self.speed * dt
+        x, y = self.x + step_m * math.cos(self.heading), self.y + step_m * math.sin(self.heading)
+        return self._replace(x=x, y=y)
+
 
 class Car:
     """An actor that stands for a vehicle."""
@@ -68,7 +74,7 @@ class Zone:
         self._carla: Any = importlib.import_module("carla")
         self._client = self._carla.Client(start["host"], start["port"])
         self._client.set_timeout(start["timeout_s"])
-        self._dt = start["dt"]
+        self._dt, self._timeout_s = start["dt"], start["timeout_s"]
         self._world = self._client.get_world()
         self._map = self._world.get_map()
         self._check_map(start["places"])
@@ -154,7 +160,7 @@ class Zone:
                 self._place(vehicle, row)  # without room, it is not shown now
                 continue
             car = self._cars[vehicle]
-            car.pose = Pose.of(row)
+            car.pose = Pose.of(row).after(self._dt)  # where it is at the end of the tick
             moves.append(self._move(car))
         if moves:
             self._client.apply_batch_sync(moves, False)
@@ -164,18 +170,22 @@ class Zone:
                 self._shown[name] = letter
                 light.set_state(getattr(self._carla.TrafficLightState, STATES.get(letter, "Off")))
 
-    def advance(self, wanted: Sequence[Row]) -> list[list[float]]:
+    def advance(
+        self, wanted: Sequence[Row], aims: Sequence[Sequence[float] | None]
+    ) -> list[list[float]]:
         """Run a tick. Return (id, x, y, heading, speed) of the owned vehicles."""
         commands = []
-        for row in wanted:
+        before = self._world.get_snapshot()
+        for row, aim in zip(wanted, aims, strict=True):
             car, pose = self._cars[int(row[0])], Pose.of(row)
             if car.is_seen and car.left == 0:
-                commands.append(self._drive(car, pose))
+                now = self._read(before.find(car.actor.id))
+                commands.append(self._drive(car, now, pose, aim))
             else:
                 commands.append(self._move(car, pose))
             car.pose = pose
         self._client.apply_batch_sync(commands, False)
-        self._world.tick()
+        self._world.tick(self._timeout_s)
         snapshot = self._world.get_snapshot()
         found = []
         for row in wanted:
@@ -194,13 +204,20 @@ class Zone:
         there = self._transform(car.pose if pose is None else pose)
         return self._carla.command.ApplyTransform(car.actor, there)
 
-    def _drive(self, car: Car, wanted: Pose) -> Any:
-        """Return the control by which a vehicle reaches a heading and a speed in one tick."""
-        now = self._read(self._world.get_snapshot().find(car.actor.id))
+    def _drive(self, car: Car, now: Pose, wanted: Pose, aim: Sequence[float] | None) -> Any:
+        """Return the control by which a vehicle reaches its wanted speed, and steers.
+
+        It steers to its aim by pure pursuit (Coulter 1992). An agent turns as it is commanded.
+        """
         accel = (wanted.speed - now.speed) / self._dt
-        turn = math.remainder(wanted.heading - now.heading, 2.0 * math.pi)
-        step_m = max(now.speed, 0.1) * self._dt
-        slip = turn * 0.5 * WHEELBASE_SHARE * car.length_m / step_m
+        if aim is None:
+            turn = math.remainder(wanted.heading - now.heading, 2.0 * math.pi)
+            curvature = turn / (max(now.speed, 0.1) * self._dt)
+        else:
+            dx, dy = aim[0] - now.x, aim[1] - now.y
+            angle = math.atan2(dy, dx) - now.heading
+            curvature = 2.0 * math.sin(angle) / max(math.hypot(dx, dy), 1.0)
+        slip = 0.5 * WHEELBASE_SHARE * car.length_m * curvature
         slip = min(max(slip, -MOST_SLIP), MOST_SLIP)
         steer = math.atan(2.0 * math.tan(math.asin(slip)))
         control = self._carla.VehicleAckermannControl(
@@ -232,27 +249,17 @@ class Zone:
         self._world.apply_settings(self._before)
 
 
-def answer(zone: Zone | None, request: dict[str, Any]) -> tuple[Zone | None, Any]:
-    """Return the zone and the result of a request."""
-    kind = request["do"]
-    if kind == "start":
-        return Zone(request), None
-    if zone is None:
-        raise ValueError("the zone has not started")
-    match kind:
-        case "prepare":
-            return zone, zone.prepare(request["rows"])
-        case "spawn":
-            return zone, zone.spawn(request["rows"])
-        case "drop":
-            return zone, zone.drop(request["vehicles"])
-        case "show":
-            return zone, zone.show(request["ghosts"], request["signals"])
-        case "advance":
-            return zone, zone.advance(request["wanted"])
-        case "close":
-            return zone, zone.close()
-    raise ValueError(f"there is no request {kind!r}")
+def answer(zone: Zone, kind: str, content: dict[str, Any]) -> Any:
+    """Return the result of a request."""
+    calls: dict[str, Callable[..., Any]] = {
+        "prepare": zone.prepare,
+        "spawn": zone.spawn,
+        "drop": zone.drop,
+        "show": zone.show,
+        "advance": zone.advance,
+        "close": zone.close,
+    }
+    return calls[kind](**content)
 
 
 def main() -> None:
@@ -263,8 +270,13 @@ def main() -> None:
     os.dup2(2, 1)  # what CARLA's client prints is no answer
     zone: Zone | None = None
     for line in sys.stdin:
+        content = json.loads(line)
+        kind = content.pop("do")
         try:
-            zone, result = answer(zone, json.loads(line))
+            if zone is None:
+                zone, result = Zone(content), None
+            else:
+                result = answer(zone, kind, content)
             text = json.dumps({"result": result})
         except Exception as error:  # the client raises many kinds of exceptions
             text = json.dumps({"error": f"{type(error).__name__}: {error}"})

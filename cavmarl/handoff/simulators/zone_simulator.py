@@ -75,12 +75,14 @@ class ZoneSimulator(Protocol):
         """
         ...
 
-    def advance(self, wanted: NDArray[np.void]) -> None:
+    def advance(self, wanted: NDArray[np.void], aims: NDArray[np.float64]) -> None:
         """Begin a tick, and possibly return before it ends.
 
         Args:
             wanted: VEHICLE (n,), the owned vehicles as they would be after the tick if cavmarl
                 moved them, with the commanded `throttle` and `steering`.
+            aims: (n, 2), a point in m ahead on the way of each vehicle, for simulators that steer;
+                NaN for agents, whose `steering` is theirs.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Rows whose motion another simulator reports: their places on the lanes, and their rates.
+"""Rows whose motion another simulator reports: their aims, their places on the lanes, their rates.
 
 A row first moves as cavmarl would move it. If the report differs, the row is corrected, so that a
 simulator that moves vehicles exactly as cavmarl does changes no bit.
@@ -6,13 +6,15 @@ simulator that moves vehicles exactly as cavmarl does changes no bit.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.math.geometry import project_near, wrap_angle
+from cavmarl.core.math.geometry import lane_pose, project_near, wrap_angle
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.records.arrays import LaneGrid, RoadArrays
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, TripTables
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     EVENT_ARRIVED,
@@ -23,8 +25,45 @@ from cavmarl.core.records.codes import (
     SIGNAL_RED_YELLOW,
 )
 from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.motion.motion import ARRIVE_M, MAX_SPEED_MPS, STANDING_MPS
 from cavmarl.driving.kernels.motion.tracking import WINDOW_M, locate, side_lane
+
+AIM_S = 0.6  # distance of a vehicle's aim, as driving time
+AIM_MIN_M = 4.0
+AIM_LANES = 8  # largest number of lanes between a vehicle and its aim
+
+
+@kernel
+def find_aims(
+    roads: RoadArrays,
+    travel: TripTables,
+    places: NDArray[np.int64],  # (n,) rows
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    aims: NDArray[np.float64],  # (n, 2) is written: x and y; NaN for agents
+) -> None:
+    """Find the point on the middle of its way that each vehicle should steer to."""
+    for k in range(places.shape[0]):
+        row = rows[places[k]]
+        if row["driver"] == DRIVER_AGENT:
+            aims[k, 0] = aims[k, 1] = math.nan
+            continue
+        lane = row["lane"]
+        way = row["way"]
+        s = row["s"] + max(AIM_S * row["speed"], AIM_MIN_M)
+        for _ in range(AIM_LANES):
+            length = roads.lanes[lane]["length_m"]
+            if s <= length:
+                break
+            following, way, _ = next_step(roads, travel, lane, way)
+            if following < 0:
+                break
+            s -= length
+            lane = following
+        here = roads.lanes[lane]
+        x, y, _, _, _, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+        aims[k, 0] = x
+        aims[k, 1] = y
 
 
 @inlined_kernel
