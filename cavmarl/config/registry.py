@@ -239,13 +239,19 @@ def find_settings(what: str, name: str) -> Path:
 
 
 def _refuse_code(keys: object, where: str) -> None:
-    """Raise an error if an env.yaml names a file of code, which only the caller may do."""
+    """Raise an error if an env.yaml names code or programs, which only the caller may do."""
     scenario = keys.get("scenario") if isinstance(keys, dict) else None
     name = scenario.get("name") if isinstance(scenario, dict) else None
     if isinstance(name, str) and path_of_code(name):
         raise ConfigError(
             f"{where}: scenario.name = {name!r} is code, which a folder of data must not run; if "
             f"you trust it, pass overrides={{'scenario.name': {name!r}}} or --set scenario.name"
+        )
+    zones = keys.get("zones") if isinstance(keys, dict) else None
+    if isinstance(zones, dict) and zones.get("simulators"):
+        raise ConfigError(
+            f"{where}: zones.simulators names other programs, which a folder of data must not use; "
+            "pass zone_simulators, or --set zones.simulators"
         )
 
 

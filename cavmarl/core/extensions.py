@@ -120,7 +120,12 @@ REGISTERED_MODELS: Registry[int] = Registry("driver_model")
 REGISTERED_BACKENDS: Registry[Any] = Registry("backend")
 REGISTERED_ZONE_SIMULATORS: Registry[Any] = Registry("zone_simulator")
 
-_OF_WORLDS = (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS)
+_OF_WORLDS = (
+    REGISTERED_TERMS,
+    REGISTERED_SENSORS,
+    REGISTERED_MODELS,
+    REGISTERED_ZONE_SIMULATORS,
+)
 
 
 def load_plugins(modules: Iterable[str], failure: type[CavmarlError] = ConfigError) -> None:

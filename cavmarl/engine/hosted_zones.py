@@ -94,11 +94,21 @@ class HostedZones:
     def _begin(self, place: _Place) -> None:
         run = self._runs.get(place)
         if run is not None:
-            self._ask(place, "begin an episode", lambda: _empty(run))
+            self._ask(place, "begin an episode", partial(self._empty, place, run))
         else:
             simulator = self._ask(place, "start", lambda: self._make(place))
             if simulator is not None:
                 self._runs[place] = _Run(simulator)
+
+    def _empty(self, place: _Place, run: _Run) -> None:
+        """Remove all vehicles and ghosts of a simulator: the next episode uses their ids again."""
+        if run.owned:
+            run.simulator.drop(sorted(run.owned))
+        run.owned.clear()
+        run.accepted.clear()
+        run.refused.clear()
+        none = self._tick.worlds.rows[place.w, :0]
+        run.simulator.show(none, self._signals(place.w))
 
     def _make(self, place: _Place) -> ZoneSimulator:
         hosted = self._hosted[place.zone]
@@ -212,7 +222,8 @@ class HostedZones:
         if most_m == 0.0:
             for name in ("heading", "speed"):
                 is_right &= told[name] == wanted[name]
-        is_right |= before["events"] & EVENTS_THAT_END != 0  # these vehicles do not move
+        # An agent whose trip is over does not move until it leaves.
+        is_right |= (before["agent"] >= 0) & (before["events"] & EVENTS_THAT_END != 0)
         if not is_right.all():
             raise self._deviation(zone, wanted, told, int(np.argmin(is_right)))
         if most_m == 0.0:
@@ -325,15 +336,6 @@ class HostedPhases(NoOutsideTraffic):
     def close(self) -> None:
         """End the simulators."""
         self._hosted.close()
-
-
-def _empty(run: _Run) -> None:
-    """Remove all vehicles of a simulator."""
-    if run.owned:
-        run.simulator.drop(sorted(run.owned))
-    run.owned.clear()
-    run.accepted.clear()
-    run.refused.clear()
 
 
 def _refuse_features(config: EnvConfig) -> None:

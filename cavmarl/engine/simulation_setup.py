@@ -43,6 +43,11 @@ def add_simulators(tick: Tick, config: EnvConfig, network: RoadNetwork) -> Hoste
     hosted = hosted_zones(config.zones.simulators, tick.division.count)
     if not hosted:
         return None
+    num_worlds = tick.division.num_worlds
+    if num_worlds > 1 and any(one.is_single for one in hosted):
+        raise ConfigError(
+            f"num_envs = {num_worlds}: a CARLA server runs a zone of one world; set num_envs = 1"
+        )
     part = HostedZones(tick, config, network, hosted)
     tick.attached, tick.outside = (*tick.attached, part), HostedPhases(part)
     return part

@@ -14,6 +14,7 @@ import importlib
 import json
 import math
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -83,10 +84,12 @@ class Zone:
         settings.synchronous_mode, settings.fixed_delta_seconds = True, self._dt
         self._world.apply_settings(settings)
         self._cars: dict[int, Car] = {}
-        self._lights = {
+        lights = {
             light.get_opendrive_id(): light
             for light in self._world.get_actors().filter("traffic.traffic_light")
         }
+        id_of = _signal_ids(self._map.to_opendrive())
+        self._lights = {name: lights[one] for name, one in id_of.items() if one in lights}
         self._shown: dict[str, str] = {}
         library = self._world.get_blueprint_library().filter("vehicle.*")
         self._blueprints = sorted(library, key=lambda one: str(one.id))
@@ -247,6 +250,15 @@ class Zone:
             car.actor.destroy()
         self._cars.clear()
         self._world.apply_settings(self._before)
+
+
+def _signal_ids(document: str) -> dict[str, str]:
+    """Return the ids of the signals in an OpenDRIVE document, by name."""
+    found = {}
+    for element in re.findall(r"<signal\s[^>]*>", document):
+        values = dict(re.findall(r'(\w+)="([^"]*)"', element))
+        found[values.get("name", "")] = values.get("id", "")
+    return found
 
 
 def answer(zone: Zone, kind: str, content: dict[str, Any]) -> Any:

@@ -38,6 +38,11 @@ class HostedZone(NamedTuple):
     options: dict[str, str]
     tolerance_m: float
 
+    @property
+    def is_single(self) -> bool:
+        """Whether the simulator can run a zone of one world only."""
+        return self.kind.make is carla_zone.make
+
 
 def register_zone_simulator(name: str, make: MakeSimulator, *, tolerance_m: float = 0.0) -> None:
     """Register a simulator that can run zones, for `zone_simulators` of `make_vec`.
@@ -75,7 +80,7 @@ def hosted_zones(simulators: Mapping[int, str], num_zones: int) -> tuple[HostedZ
                 f"{num_zones - 1}"
             )
         found.append(_read(zone, text))
-    places = [one.place for one in found if one.kind.make is carla_zone.make]
+    places = [one.place for one in found if one.is_single]
     if len(set(places)) < len(places):
         raise ConfigError("zones.simulators: each zone needs a CARLA server of its own")
     return tuple(found)

@@ -156,9 +156,11 @@ def follow_reports(
     """Correct the rows that differ from the reports."""
     for k in range(places.shape[0]):
         row = rows[places[k]]
-        if was[k]["events"] & EVENTS_THAT_END or is_as_reported(row, told[k]):
+        if is_as_reported(row, told[k]):
             continue
         if row["driver"] == DRIVER_AGENT:
+            if was[k]["events"] & EVENTS_THAT_END:
+                continue  # its trip is over: it does not move
             _correct_agent(roads, plans, grid, row, was[k], told[k], phase, dt)
         else:
             _correct_background(roads, row, was[k], told[k], dt)
