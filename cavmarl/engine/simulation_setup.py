@@ -9,8 +9,8 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.external_component import ExternalComponent, ExternalPhases
-from cavmarl.engine.hosted_zones import HostedPhases, HostedZones
 from cavmarl.engine.outside_traffic import SumoPhases
+from cavmarl.engine.simulator_component import SimulatorComponent, SimulatorPhases
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
@@ -38,7 +38,9 @@ def add_external(tick: Tick) -> None:
             tick.outside = ExternalPhases(part, tick)
 
 
-def add_simulators(tick: Tick, config: EnvConfig, network: RoadNetwork) -> HostedZones | None:
+def add_simulators(
+    tick: Tick, config: EnvConfig, network: RoadNetwork
+) -> SimulatorComponent | None:
     """Let other simulators run zones, if `zones.simulators` names any."""
     hosted = hosted_zones(config.zones.simulators, tick.division.count)
     if not hosted:
@@ -48,8 +50,8 @@ def add_simulators(tick: Tick, config: EnvConfig, network: RoadNetwork) -> Hoste
         raise ConfigError(
             f"num_envs = {num_worlds}: a CARLA server runs a zone of one world; set num_envs = 1"
         )
-    part = HostedZones(tick, config, network, hosted)
-    tick.attached, tick.outside = (*tick.attached, part), HostedPhases(part)
+    part = SimulatorComponent(tick, config, network, hosted)
+    tick.attached, tick.outside = (*tick.attached, part), SimulatorPhases(part)
     return part
 
 
@@ -58,7 +60,7 @@ def add_coordinators(
     config: EnvConfig,
     network: RoadNetwork,
     runs: Sequence[OpenRun] | None,
-    hosted: HostedZones | None = None,
+    hosted: SimulatorComponent | None = None,
 ) -> tuple[TransferLog, ...]:
     """Let coordinators decide ownership, if there are several zones, a journal or checks.
 

@@ -16,6 +16,7 @@ from cavmarl.core.errors import ConfigError, ProtocolError, ZoneSimulatorError
 from cavmarl.handoff.coordinator.coordinator import Coordinator, Near
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.division import ZonedShards
+from cavmarl.handoff.shard_setup import neighbours_of
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import state_digest
@@ -91,7 +92,8 @@ class MessageCoordinator(Coordinator):
         gate: ZoneGate,
     ) -> None:
         self._states = CrossingStates()
-        super().__init__(Directory(run, range(division.count), self._states, limits), journal)
+        zones, near = range(division.count), neighbours_of(division)
+        super().__init__(Directory(run, zones, self._states, limits, near), journal)
         self._division, self._world, self._gate = division, world, gate
         self._limits, self._transfers = limits, transfers
         self._endpoints: dict[int, Endpoint] = {}

@@ -27,7 +27,7 @@ PYTHON = "CAVMARL_CARLA_PYTHON"  # environment variable: the Python that has CAR
 TOLERANCE_M = 2.0
 TIMEOUT_S = 30.0
 MOST_TIMEOUT_S = 3600.0
-_GRACE_S = 5.0  # the client reports its own timeout before the process counts as hung
+GRACE_S = 5.0  # the client reports its own timeout before the process counts as hung
 _END_S = 5.0  # time for the process to end by itself
 _LAST_WORDS = 500
 _CHECKED_LANES = 20
@@ -165,7 +165,12 @@ class CarlaZone:
             raise self._failure(f"its client has ended ({self._last_words()})") from error
 
     def _receive(self, kind: str) -> Any:
-        answer = json.loads(self._line(time.monotonic() + self._timeout_s + _GRACE_S))
+        line = self._line(time.monotonic() + self._timeout_s + GRACE_S)
+        try:
+            answer: dict[str, Any] = dict(json.loads(line))
+        except ValueError as error:
+            self._process.kill()
+            raise self._failure(f"its client has sent {line[:80]!r}, which is no answer") from error
         if "error" in answer:
             advice = ""
             if "No module named 'carla'" in answer["error"]:

@@ -32,7 +32,7 @@ _PR_SET_PDEATHSIG = 1
 Row = Sequence[float]
 
 
-class Pose(NamedTuple):
+class CarState(NamedTuple):
     """The state of a vehicle in cavmarl's frame: m, rad, m/s."""
 
     x: float
@@ -42,10 +42,10 @@ class Pose(NamedTuple):
     speed: float
 
     @classmethod
-    def of(cls, row: Row) -> Pose:
+    def of(cls, row: Row) -> CarState:
         return cls(*row[1:6])
 
-    def after(self, dt: float) -> Pose:
+    def after(self, dt: float) -> CarState:
         """Return the state after a tick straight on."""
         step_m = self.speed * dt
         x, y = self.x + step_m * math.cos(self.heading), self.y + step_m * math.sin(self.heading)
@@ -55,7 +55,7 @@ class Pose(NamedTuple):
 class Car:
     """An actor that stands for a vehicle."""
 
-    def __init__(self, actor: Any, pose: Pose) -> None:
+    def __init__(self, actor: Any, pose: CarState) -> None:
         self.actor = actor
         self.pose = pose  # where it was placed last
         self.length_m = 2.0 * actor.bounding_box.extent.x
@@ -123,11 +123,11 @@ class Zone:
             car = self._cars[vehicle]
             car.is_owned, car.left = True, 0 if car.is_seen else PLACED_TICKS
             car.actor.set_simulate_physics(True)
-            car.actor.set_target_velocity(self._velocity(Pose.of(row)))
+            car.actor.set_target_velocity(self._velocity(CarState.of(row)))
 
     def _place(self, vehicle: int, row: Row) -> bool:
         """Add an actor without physics. Return whether there was room for it."""
-        pose = Pose.of(row)
+        pose = CarState.of(row)
         there = self._transform(pose._replace(z=pose.z + SPAWN_HEIGHT_M))
         actor = self._world.try_spawn_actor(self._blueprint(row[6]), there)
         if actor is None:
@@ -163,7 +163,7 @@ class Zone:
                 self._place(vehicle, row)  # without room, it is not shown now
                 continue
             car = self._cars[vehicle]
-            car.pose = Pose.of(row).after(self._dt)  # where it is at the end of the tick
+            car.pose = CarState.of(row).after(self._dt)  # where it is at the end of the tick
             moves.append(self._move(car))
         if moves:
             self._client.apply_batch_sync(moves, False)
@@ -180,7 +180,7 @@ class Zone:
         commands = []
         before = self._world.get_snapshot()
         for row, aim in zip(wanted, aims, strict=True):
-            car, pose = self._cars[int(row[0])], Pose.of(row)
+            car, pose = self._cars[int(row[0])], CarState.of(row)
             if car.is_seen and car.left == 0:
                 now = self._read(before.find(car.actor.id))
                 commands.append(self._drive(car, now, pose, aim))
@@ -203,11 +203,11 @@ class Zone:
             car.is_seen |= snapshot.find(car.actor.id) is not None
         return found
 
-    def _move(self, car: Car, pose: Pose | None = None) -> Any:
+    def _move(self, car: Car, pose: CarState | None = None) -> Any:
         there = self._transform(car.pose if pose is None else pose)
         return self._carla.command.ApplyTransform(car.actor, there)
 
-    def _drive(self, car: Car, now: Pose, wanted: Pose, aim: Sequence[float] | None) -> Any:
+    def _drive(self, car: Car, now: CarState, wanted: CarState, aim: Sequence[float] | None) -> Any:
         """Return the control by which a vehicle reaches its wanted speed, and steers.
 
         It steers to its aim by pure pursuit (Coulter 1992). An agent turns as it is commanded.
@@ -228,19 +228,19 @@ class Zone:
         )
         return self._carla.command.ApplyVehicleAckermannControl(car.actor, control)
 
-    def _read(self, state: Any) -> Pose:
+    def _read(self, state: Any) -> CarState:
         there, velocity = state.get_transform(), state.get_velocity()
         heading = -math.radians(there.rotation.yaw)
         speed = velocity.x * math.cos(heading) - velocity.y * math.sin(heading)
         place = there.location
-        return Pose(place.x, -place.y, place.z, math.remainder(heading, 2.0 * math.pi), speed)
+        return CarState(place.x, -place.y, place.z, math.remainder(heading, 2.0 * math.pi), speed)
 
-    def _transform(self, pose: Pose) -> Any:
+    def _transform(self, pose: CarState) -> Any:
         yaw = -math.degrees(pose.heading)
         place = self._carla.Location(pose.x, -pose.y, pose.z)
         return self._carla.Transform(place, self._carla.Rotation(yaw=yaw))
 
-    def _velocity(self, pose: Pose) -> Any:
+    def _velocity(self, pose: CarState) -> Any:
         cos, sin = math.cos(pose.heading), math.sin(pose.heading)
         return self._carla.Vector3D(pose.speed * cos, -pose.speed * sin, 0.0)
 

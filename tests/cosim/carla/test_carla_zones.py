@@ -16,7 +16,7 @@ import pytest
 import cavmarl
 from cavmarl.core.errors import ZoneSimulatorError
 from cavmarl.cosim.carla.carla_versions import DEFAULT_VERSION
-from cavmarl.engine.hosted_zones import HostedZones
+from cavmarl.engine.simulator_component import SimulatorComponent
 from cavmarl.handoff.simulators.carla_zone import PYTHON, CarlaZone
 from tests.cosim.carla.conftest import client_python, running_server
 from tests.support.zone_simulators import step_on
@@ -56,8 +56,8 @@ def carla_zones(
 
 def clients_of(vec: cavmarl.CavVectorEnv) -> list[CarlaZone]:
     """The clients of all hosted zones."""
-    (part,) = (one for one in vec.simulation.attached if isinstance(one, HostedZones))
-    found = [run.simulator for run in part._runs.values()]
+    (part,) = (one for one in vec.simulation.attached if isinstance(one, SimulatorComponent))
+    found = part.simulators
     assert all(isinstance(one, CarlaZone) for one in found)
     return found  # type: ignore[return-value]
 

@@ -1,4 +1,4 @@
-"""`HostedZones`: the zones of W worlds that other simulators run.
+"""`SimulatorComponent`: the simulators that run zones of W worlds.
 
 The vehicles of such a zone are rows of its shard. cavmarl moves them first, which gives the states
 that the simulator is to reach. The simulator's report then corrects the rows.
@@ -56,7 +56,7 @@ class _Run:
         self.before: NDArray[np.void]  # VEHICLE (n,), its vehicles before the tick
 
 
-class HostedZones:
+class SimulatorComponent:
     """A `Component` that runs the simulators of zones, and the gate of the coordinators.
 
     Attributes:
@@ -81,6 +81,11 @@ class HostedZones:
         self._find_aims = specialized(find_aims)
         self._follow_reports = specialized(follow_reports)
         self._letters: dict[int, str] = {}  # PHASE row → signal letters
+
+    @property
+    def simulators(self) -> list[ZoneSimulator]:
+        """The simulators that run now."""
+        return [run.simulator for run in self._runs.values()]
 
     # Part of a tick
 
@@ -174,7 +179,7 @@ class HostedZones:
         return "".join(SIGNAL_STATES[code] for code in network.phase_states[first : first + num])
 
     def end(self) -> None:
-        """Do nothing: `HostedPhases` moves the vehicles."""
+        """Do nothing: `SimulatorPhases` moves the vehicles."""
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return nothing: rows have the state of the vehicles."""
@@ -323,10 +328,10 @@ class HostedZones:
             self._end(place)
 
 
-class HostedPhases(NoOutsideTraffic):
+class SimulatorPhases(NoOutsideTraffic):
     """The phases of a tick in worlds in which other simulators run zones."""
 
-    def __init__(self, hosted: HostedZones) -> None:
+    def __init__(self, hosted: SimulatorComponent) -> None:
         self._hosted = hosted
 
     def follow(self, tick: Tick) -> None:

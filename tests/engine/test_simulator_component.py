@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 import cavmarl
 from cavmarl.core.errors import ConfigError, ZoneSimulatorError
+from cavmarl.core.extensions import REGISTERED_ZONE_SIMULATORS
 from cavmarl.engine.world_description import describe_world
+from cavmarl.verify.equivalence import verify_zones
 from tests.support.zone_simulators import OwnKinematics, registered, step_on, steps_alike
 
+ROOT = Path(__file__).resolve().parents[2]
 ENV = "grid4x4"
 SEEN: dict[str, Any] = {"agents": 4, "background": 40, "seed": 3}
 
@@ -84,22 +87,25 @@ def test_sensors_messages_and_several_worlds_work_in_hosted_zones() -> None:
 
 
 def test_simulators_are_shown_ghosts_and_signals() -> None:
+    compared = 0
     with registered(OwnKinematics) as name:
-        vec = hosted(name, 1)
+        vec = hosted(name, 1, overrides={"clock.ctrl_dt_s": 0.05})
         vec.reset()
         (one,) = OwnKinematics.made
         network = vec.simulation.network
-        for _ in range(20):
-            near = set(vec.simulation.division.ghosts(0, 1)["id"].tolist())
-            phases = vec.simulation.signal_phases(0).copy()
-            vec.simulation._tick.attached[-1].begin(None)  # type: ignore[arg-type]
-            assert one.ghosts == near
+        for _ in range(60):
+            near = set(vec.simulation.zones.ghosts(1)["id"].tolist())
+            phases, moved = vec.simulation.signal_phases(0).copy(), vec.simulation.migrations
+            vec.step(vec.suggest_actions())
+            if vec.simulation.migrations == moved:
+                assert one.ghosts == near
+                compared += len(near)
             for signal, phase in enumerate(phases):
                 first = network.phases["first_state"][phase]
                 codes = network.phase_states[first : first + len(one.signals[signal])]
                 assert one.signals[signal] == "".join("rugGysoOY"[code] for code in codes)
-            vec.step(vec.suggest_actions())
         vec.close()
+    assert compared > 100
 
 
 class Hesitant(OwnKinematics):
@@ -381,3 +387,37 @@ def test_registration_checks_names_and_tolerances() -> None:
     for tolerance_m in (-1.0, float("nan"), 1e9):
         with pytest.raises(ConfigError, match="tolerance_m"):
             cavmarl.register_zone_simulator("mine", OwnKinematics, tolerance_m=tolerance_m)
+
+
+def test_the_simulator_of_the_guide_is_exact() -> None:
+    text = (ROOT / "docs/guides/zone_simulators.md").read_text(encoding="utf-8")
+    blocks = [part.partition("```")[0] for part in text.split("```python\n")[1:]]
+    (code,) = (block for block in blocks if "register_zone_simulator" in block)
+    names: dict[str, Any] = {"__name__": "guide"}
+    try:
+        exec(code, names)
+        divided = names["vec"]
+        whole = cavmarl.make_vec("ring")
+        whole.reset(seed=1), divided.reset(seed=1)
+        steps_alike(whole, divided, 40)
+        assert divided.simulation.migrations > 0
+        divided.close()
+    finally:
+        REGISTERED_ZONE_SIMULATORS.remove("echo")
+
+
+def test_verify_says_that_a_simulator_is_not_exact() -> None:
+    with registered(Drifting, tolerance_m=0.1) as name:
+        found = verify_zones(
+            ENV, [4], steps=5, agents=2, background=10, overrides={"zones.simulators": {1: name}}
+        )
+        (result,) = found.results
+        assert result.tolerance_m == 0.1
+        assert result.difference is None
+    with registered(OwnKinematics) as name:
+        found = verify_zones(
+            ENV, [4], steps=5, agents=2, background=10, overrides={"zones.simulators": {1: name}}
+        )
+        (result,) = found.results
+        assert result.tolerance_m == 0.0
+        assert found.holds
