@@ -8,6 +8,7 @@ runs a zone with a tolerance is run, but not compared.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Unpack
@@ -101,29 +102,31 @@ def verify_zones(
     divided = _divided(spec, layout, check)
     plain = {key: value for key, value in divided.items() if not key.startswith("zones.")}
 
-    def run(count: int, settings: Mapping[str, Any]) -> DrivenRun:
-        wanted = spec.keywords | {"overrides": settings}
-        return DrivenRun(
-            make_vec(spec.env, num_envs=worlds, zones=count, **wanted), policy, spec.seed
-        )
+    with ExitStack() as opened:
 
-    whole = run(1, plain)
-    compared = [
-        _Compared(run(count, divided | _journal(journals, count) if count > 1 else plain))
-        for count in _counts(zones, divided)
-    ]
-    for step in range(steps + 1):
-        if step > 0:
-            whole.step()
-        for other in compared:
-            other.follow(step, whole)
-        if progress is not None:
-            progress(step, steps)
-        if all(other.difference is not None for other in compared):
-            break
-    ticks = int(whole.vec.simulation.ticks()[0])
-    hashes = tuple(whole.vec.state_hash(w) for w in range(worlds))
-    results = tuple(other.result() for other in compared)
+        def run(count: int, settings: Mapping[str, Any]) -> DrivenRun:
+            wanted = spec.keywords | {"overrides": settings}
+            vec = make_vec(spec.env, num_envs=worlds, zones=count, **wanted)
+            opened.callback(vec.close)
+            return DrivenRun(vec, policy, spec.seed)
+
+        whole = run(1, plain)
+        compared = [
+            _Compared(run(count, divided | _journal(journals, count) if count > 1 else plain))
+            for count in _counts(zones, divided)
+        ]
+        for step in range(steps + 1):
+            if step > 0:
+                whole.step()
+            for other in compared:
+                other.follow(step, whole)
+            if progress is not None:
+                progress(step, steps)
+            if all(other.difference is not None for other in compared):
+                break
+        ticks = int(whole.vec.simulation.ticks()[0])
+        hashes = tuple(whole.vec.state_hash(w) for w in range(worlds))
+        results = tuple(other.result() for other in compared)
     return Equivalence(spec.env, worlds, steps, ticks, hashes, results)
 
 

@@ -9,7 +9,6 @@ CARLA's frame is left-handed: y and yaw have the opposite sign.
 
 from __future__ import annotations
 
-import ctypes
 import importlib
 import json
 import math
@@ -27,7 +26,6 @@ MOST_SLIP = 0.6  # largest sine of the slip angle
 PLACED_TICKS = 2  # ticks for which a vehicle is placed, before it drives by its own physics
 SEEN_LANES = 0.5  # least share of the sent places that must be on a road of CARLA's map
 STATES = {"r": "Red", "y": "Yellow", "u": "Yellow", "g": "Green", "G": "Green", "s": "Red"}
-_PR_SET_PDEATHSIG = 1
 
 Row = Sequence[float]
 
@@ -275,8 +273,6 @@ def answer(zone: Zone, kind: str, content: dict[str, Any]) -> Any:
 
 
 def main() -> None:
-    if sys.platform == "linux":  # the process ends with the process that has started it
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what CARLA's client prints is no answer
@@ -294,6 +290,8 @@ def main() -> None:
             text = json.dumps({"error": f"{type(error).__name__}: {error}"})
         answers.write(text + "\n")
         answers.flush()
+    if zone is not None:  # the process that has started this one has ended
+        zone.close()
 
 
 if __name__ == "__main__":
