@@ -132,7 +132,7 @@ class Hesitant(OwnKinematics):
 def test_refused_vehicles_stay_with_their_zone_and_enter_later() -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
     settings = {
-        "zones.check_invariants": False,
+        "zones.check_invariants": True,
         "zones.max_deferred_ticks": 6,
         "zones.backoff_ticks": 0,
     }

@@ -102,7 +102,7 @@ class Zone:
             raise ValueError(
                 f"its map {self._map.name} is another one: {len(places) - on_road} of "
                 f"{len(places)} places on lanes are beside its roads; load the map of this world "
-                "(cavmarl map export NAME --opendrive FILE)"
+                "(cavmarl map export NAME --carla --opendrive FILE)"
             )
 
     def prepare(self, rows: Sequence[Row]) -> dict[int, str]:

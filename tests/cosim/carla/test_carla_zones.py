@@ -152,7 +152,7 @@ def test_a_client_that_hangs_ends_in_an_error() -> None:
 
 def test_a_server_that_has_no_room_for_a_vehicle_refuses_it() -> None:
     # The server has room for external vehicles of its own, and for fewer than the zone needs.
-    with carla_zones(2, 1, background=80, overrides={"zones.max_deferred_ticks": 3}) as vec:
+    with carla_zones(2, 1, background=150, overrides={"zones.max_deferred_ticks": 3}) as vec:
         vec.reset()
         with pytest.raises(ZoneSimulatorError, match="CARLA has no room at its place"):
             step_on(vec, 300)
