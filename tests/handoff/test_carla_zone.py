@@ -56,3 +56,21 @@ def test_a_python_that_is_missing_is_an_error(
     with pytest.raises(ZoneSimulatorError, match=r"cannot be started \(No such file"):
         vec.reset()
     vec.close()
+
+
+def test_cavmarl_runs_a_zone_whose_simulator_cannot_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv(carla_zone.PYTHON, python_that(tmp_path, "exit 3"))
+    vec = cavmarl.make_vec(
+        "ring",
+        zones=2,
+        zone_simulators={1: "carla://127.0.0.1:9"},
+        agents=2,
+        background=4,
+        overrides={"zones.simulator_failure": "return", "zones.check_invariants": True},
+    )
+    vec.reset()
+    vec.step(vec.suggest_actions())
+    assert "cavmarl runs the zone until the episode ends" in caplog.text
+    vec.close()

@@ -89,6 +89,7 @@ class Zone:
         id_of = _signal_ids(self._map.to_opendrive())
         self._lights = {name: lights[one] for name, one in id_of.items() if one in lights}
         self._shown: dict[str, str] = {}
+        self._world.freeze_all_traffic_lights(True)  # their own programs do not run
         library = self._world.get_blueprint_library().filter("vehicle.*")
         self._blueprints = sorted(library, key=lambda one: str(one.id))
 
@@ -179,27 +180,33 @@ class Zone:
         before = self._world.get_snapshot()
         for row, aim in zip(wanted, aims, strict=True):
             car, pose = self._cars[int(row[0])], CarState.of(row)
-            if car.is_seen and car.left == 0:
-                now = self._read(before.find(car.actor.id))
+            now = self._find(before, int(row[0]))
+            if now is not None and car.left == 0:
                 commands.append(self._drive(car, now, pose, aim))
             else:
                 commands.append(self._move(car, pose))
             car.pose = pose
         self._client.apply_batch_sync(commands, False)
         self._world.tick(self._timeout_s)
-        snapshot = self._world.get_snapshot()
+        after = self._world.get_snapshot()
         found = []
         for row in wanted:
-            car = self._cars[int(row[0])]
-            state = snapshot.find(car.actor.id)
-            is_placed = state is None or not car.is_seen or car.left > 0
-            pose = car.pose if is_placed else self._read(state)
+            car, now = self._cars[int(row[0])], self._find(after, int(row[0]))
+            pose = now if now is not None and car.is_seen and car.left == 0 else car.pose
             found.append([row[0], pose.x, pose.y, pose.heading, pose.speed])
         for car in self._cars.values():
             if car.is_seen:
                 car.left = max(0, car.left - 1)
-            car.is_seen |= snapshot.find(car.actor.id) is not None
+            car.is_seen |= after.find(car.actor.id) is not None
         return found
+
+    def _find(self, snapshot: Any, vehicle: int) -> CarState | None:
+        """Return the state of a vehicle in a snapshot; None if no snapshot has had it yet."""
+        car = self._cars[vehicle]
+        state = snapshot.find(car.actor.id)
+        if state is None and car.is_seen:
+            raise ValueError(f"CARLA no longer has the actor of vehicle {vehicle}")
+        return None if state is None else self._read(state)
 
     def _move(self, car: Car, pose: CarState | None = None) -> Any:
         there = self._transform(car.pose if pose is None else pose)
@@ -247,6 +254,7 @@ class Zone:
         for car in self._cars.values():
             car.actor.destroy()
         self._cars.clear()
+        self._world.freeze_all_traffic_lights(False)
         self._world.apply_settings(self._before)
 
 

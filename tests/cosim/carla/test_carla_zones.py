@@ -18,7 +18,7 @@ from cavmarl.core.errors import ZoneSimulatorError
 from cavmarl.cosim.carla.carla_versions import DEFAULT_VERSION
 from cavmarl.engine.simulator_component import SimulatorComponent
 from cavmarl.handoff.simulators.carla_zone import PYTHON, CarlaZone
-from tests.cosim.carla.conftest import client_python, running_server
+from tests.cosim.carla.conftest import client_python, run_client, running_server
 from tests.support.zone_simulators import step_on
 
 
@@ -72,7 +72,7 @@ def is_running(pid: int) -> bool:
 
 @pytest.mark.parametrize(("zones", "hosted"), [(2, (1,)), (4, (1, 2))])
 def test_vehicles_cross_the_borders_of_carla_zones_and_none_is_lost(
-    zones: int, hosted: tuple[int, ...]
+    zones: int, hosted: tuple[int, ...], caplog: pytest.LogCaptureFixture
 ) -> None:
     with carla_zones(zones, *hosted) as vec:
         vec.reset()
@@ -101,6 +101,8 @@ def test_vehicles_cross_the_borders_of_carla_zones_and_none_is_lost(
         assert stats["contacts"] <= 2
         assert np.quantile(far, 0.9) < 0.5, "they drive on the middle of their lanes"
     assert not any(map(is_running, pids))
+    # The client shows the signals, which this server does not let clients set.
+    assert "set_traffic_light_state" in caplog.text
 
 
 def test_a_reset_uses_the_same_client() -> None:
@@ -148,6 +150,16 @@ def test_a_client_that_hangs_ends_in_an_error() -> None:
             vec.step(vec.suggest_actions())
         assert time.monotonic() - begin_s < 15.0
         assert not is_running(client.pid)
+
+
+def test_an_actor_that_another_client_destroys_is_an_error() -> None:
+    with carla_zones(2, 1, background=10) as vec:
+        vec.reset()
+        step_on(vec, 3)
+        port = int(vec.config.zones.simulators[1].rpartition(":")[2])
+        run_client(port, "[one.destroy() for one in world.get_actors().filter('vehicle.*')]")
+        with pytest.raises(ZoneSimulatorError, match="CARLA no longer has the actor of vehicle"):
+            step_on(vec, 3)
 
 
 def test_a_server_that_has_no_room_for_a_vehicle_refuses_it() -> None:
