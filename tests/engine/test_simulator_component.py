@@ -169,6 +169,18 @@ def test_a_vehicle_that_is_refused_for_too_long_is_an_error() -> None:
         assert all(one.is_closed for one in OwnKinematics.made)
 
 
+def test_cavmarl_takes_a_zone_back_that_refuses_vehicles_for_too_long() -> None:
+    whole = cavmarl.make_vec(ENV, **SEEN)
+    settings = {"zones.simulator_failure": "return", "zones.check_invariants": True}
+    with registered(Unwilling) as name:
+        divided = hosted(name, overrides=settings)
+        whole.reset(), divided.reset()
+        steps_alike(whole, divided, 80)
+        assert all(one.is_closed for one in OwnKinematics.made)
+        assert counts_of(divided)["forced"] > 0
+        divided.close()
+
+
 class Mortal(OwnKinematics):
     """Fails in one of its calls, in the first simulator of a zone only."""
 

@@ -190,13 +190,15 @@ class MessageCoordinator(Coordinator):
     def _insist(self, zone: int, vehicles: Sequence[int]) -> None:
         """Ask a simulator for the last time to accept vehicles."""
         refused = self._gate.refusals(self._world, zone, vehicles)
-        for vehicle, reason in refused.items():
-            message = (
-                f"zone {zone}: its simulator has refused vehicle {vehicle} for "
-                f"{self._limits.deferral} ticks ({reason}); free the place there, or increase "
-                "zones.max_deferred_ticks"
-            )
-            self._gate.fail(self._world, zone, ZoneSimulatorError(message, zone))
+        if not refused:
+            return
+        vehicle, reason = next(iter(refused.items()))
+        message = (
+            f"zone {zone}: its simulator has refused vehicle {vehicle} for "
+            f"{self._limits.deferral} ticks ({reason}); free the place there, or increase "
+            "zones.max_deferred_ticks"
+        )
+        self._gate.fail(self._world, zone, ZoneSimulatorError(message, zone))
 
     def _hand_over(self, switches: Sequence[Switch], row_of: Mapping[int, int]) -> None:
         for switch in switches:
