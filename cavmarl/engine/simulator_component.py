@@ -294,7 +294,8 @@ class SimulatorComponent:
             log.warning("%s. cavmarl runs the zone until the episode ends", error)
             coordinator.rehost(zone)
             return
-        # Other worlds are in the middle of the same tick.
+        # The other simulators and the other worlds are in the middle of the same tick.
+        self.close()
         self._broken = dict.fromkeys(range(len(self.coordinators)), str(error))
         self._tick.division.align()
         raise error

@@ -78,6 +78,7 @@ class CarlaZone:
             raise self._failure(f"{python} cannot be started ({error.strerror})") from error
         self.pid = self._process.pid
         self._rest = b""
+        self._unread = 0  # answers that are due; several after an interrupt
         try:
             self._call(
                 "start",
@@ -161,6 +162,7 @@ class CarlaZone:
         try:
             self._process.stdin.write(json.dumps({"do": kind, **content}).encode() + b"\n")
             self._process.stdin.flush()
+            self._unread += 1
         except (OSError, ValueError) as error:
             raise self._failure(f"its client has ended ({self._last_words()})") from error
 
@@ -179,7 +181,14 @@ class CarlaZone:
         return answer["result"]
 
     def _line(self, until_s: float) -> bytes:
-        """Return the next line of the client."""
+        """Return the last answer that is due."""
+        line = b""
+        while self._unread:
+            line = self._next_line(until_s)
+            self._unread -= 1
+        return line
+
+    def _next_line(self, until_s: float) -> bytes:
         pipe = self._process.stdout
         assert pipe is not None
         with selectors.DefaultSelector() as selector:
