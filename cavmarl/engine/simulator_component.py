@@ -120,6 +120,7 @@ class SimulatorComponent:
         setup = ZoneSetup(
             world=place.w,
             zone=place.zone,
+            rect=tuple(self._tick.division.zones.rects[place.zone].tolist()),
             network=self._network,
             dt_s=self._config.clock.sim_dt_s,
             wheelbases=self._travel.types["wheelbase"].astype(np.float64),

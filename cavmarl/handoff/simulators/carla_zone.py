@@ -25,15 +25,17 @@ from cavmarl.handoff.simulators.zone_simulator import MOTION, ZoneSetup, number_
 
 PYTHON = "CAVMARL_CARLA_PYTHON"  # environment variable: the Python that has CARLA's client
 TOLERANCE_M = 2.0
+GHOSTS_M = 60.0
 TIMEOUT_S = 30.0
 MOST_TIMEOUT_S = 3600.0
+MOST_GHOSTS_M = 10_000.0
 GRACE_S = 5.0  # the client reports its own timeout before the process counts as hung
 _END_S = 5.0  # time for the process to end by itself
 _LAST_WORDS = 500
 _CHECKED_LANES = 20
 _FIELDS = ("id", "x", "y", "z", "heading", "speed", "length", "width")
 _PLACE = re.compile(r"(?P<host>[A-Za-z0-9.-]+|\[[0-9A-Fa-f:]+\]):(?P<port>[0-9]{1,5})")
-_OPTIONS = {"timeout_s", "tolerance_m"}
+_OPTIONS = {"ghosts_m", "timeout_s", "tolerance_m"}
 
 
 def check(place: str, options: Mapping[str, str]) -> None:
@@ -46,9 +48,10 @@ def check(place: str, options: Mapping[str, str]) -> None:
     if unknown := sorted(options.keys() - _OPTIONS):
         raise ConfigError(
             f"zones.simulators: carla has no option {unknown[0]!r}; it has "
-            f"{' and '.join(sorted(_OPTIONS))}"
+            f"{', '.join(sorted(_OPTIONS))}"
         )
     number_option(options, "timeout_s", TIMEOUT_S, MOST_TIMEOUT_S)
+    number_option(options, "ghosts_m", GHOSTS_M, MOST_GHOSTS_M)
 
 
 class CarlaZone:
@@ -64,6 +67,7 @@ class CarlaZone:
         self._setup = setup
         self._signals = setup.network.signal_ids
         self._timeout_s = number_option(setup.options, "timeout_s", TIMEOUT_S, MOST_TIMEOUT_S)
+        self._ghosts_m = number_option(setup.options, "ghosts_m", GHOSTS_M, MOST_GHOSTS_M)
         self._output = tempfile.TemporaryFile()
         python = os.environ.get(PYTHON) or sys.executable
         try:
@@ -118,7 +122,12 @@ class CarlaZone:
             for name, state in zip(self._signals, signals, strict=True)
             for index, letter in enumerate(state)
         }
-        self._call("show", ghosts=_rows(ghosts), signals=letters)
+        # Drivers see farther than CARLA needs to show.
+        min_x, min_y, max_x, max_y = self._setup.rect
+        x, y = ghosts["x"], ghosts["y"]
+        dx, dy = np.maximum(min_x - x, x - max_x), np.maximum(min_y - y, y - max_y)
+        near = np.hypot(np.maximum(dx, 0.0), np.maximum(dy, 0.0)) <= self._ghosts_m
+        self._call("show", ghosts=_rows(ghosts[near]), signals=letters)
 
     def advance(self, wanted: NDArray[np.void], aims: NDArray[np.float64]) -> None:
         points = [None if math.isnan(point[0]) else point for point in aims.tolist()]

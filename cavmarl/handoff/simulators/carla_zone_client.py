@@ -110,30 +110,32 @@ class Zone:
         refused = {}
         for row in rows:
             vehicle = int(row[0])
-            if vehicle not in self._cars and not self._place(vehicle, row):
-                refused[vehicle] = "CARLA has no room at its place"
+            reason = "" if vehicle in self._cars else self._place(vehicle, row)
+            if reason:
+                refused[vehicle] = reason
         return refused
 
     def spawn(self, rows: Sequence[Row]) -> None:
         for row in rows:
             vehicle = int(row[0])
-            if vehicle not in self._cars and not self._place(vehicle, row):
-                raise ValueError(f"CARLA has no room for vehicle {vehicle}, which it had accepted")
+            if vehicle not in self._cars and (reason := self._place(vehicle, row)):
+                raise ValueError(f"vehicle {vehicle}, which CARLA had accepted: {reason}")
             car = self._cars[vehicle]
             car.is_owned, car.left = True, 0 if car.is_seen else PLACED_TICKS
             car.actor.set_simulate_physics(True)
             car.actor.set_target_velocity(self._velocity(CarState.of(row)))
 
-    def _place(self, vehicle: int, row: Row) -> bool:
-        """Add an actor without physics. Return whether there was room for it."""
+    def _place(self, vehicle: int, row: Row) -> str:
+        """Add an actor without physics. Return the reason if CARLA refuses it, else ""."""
         pose = CarState.of(row)
         there = self._transform(pose._replace(z=pose.z + SPAWN_HEIGHT_M))
-        actor = self._world.try_spawn_actor(self._blueprint(row[6]), there)
-        if actor is None:
-            return False
+        try:
+            actor = self._world.spawn_actor(self._blueprint(row[6]), there)
+        except RuntimeError as error:
+            return str(error)
         actor.set_simulate_physics(False)
         self._cars[vehicle] = Car(actor, pose)
-        return True
+        return ""
 
     def _blueprint(self, length_m: float) -> Any:
         bases = ("bus", "truck") if length_m > LARGE_M else ("car",)
@@ -159,7 +161,7 @@ class Zone:
         moves = []
         for vehicle, row in near.items():
             if vehicle not in self._cars:
-                self._place(vehicle, row)  # without room, it is not shown now
+                self._place(vehicle, row)  # if CARLA refuses it, it is not shown now
                 continue
             car = self._cars[vehicle]
             car.pose = CarState.of(row).after(self._dt)  # where it is at the end of the tick

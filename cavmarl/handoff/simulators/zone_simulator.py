@@ -34,6 +34,8 @@ class ZoneSetup(NamedTuple):
 
     world: int  # number of the world
     zone: int
+    # min_x, min_y, max_x, max_y of the zone in m; zones at the rim of the map extend to infinity
+    rect: tuple[float, float, float, float]
     network: RoadNetwork
     dt_s: float  # length of a tick
     wheelbases: NDArray[np.float64]  # m, by `VEHICLE["vtype"]`
