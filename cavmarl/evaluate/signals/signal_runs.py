@@ -18,7 +18,7 @@ from cavmarl.evaluate.signals.signal_meter import SignalFigures, SignalMeter
 from cavmarl.evaluate.traffic.native_side import idle_commands
 from cavmarl.evaluate.traffic.sumo_side import SumoJob, start_sumo, sumo_process
 from cavmarl.render.ground import signal_codes
-from cavmarl.signals.controllers import SignalView, make_controller
+from cavmarl.signals.controllers import make_controller
 from cavmarl.signals.kernels.green_choices import SINCE
 
 TICK_S = 0.2
@@ -72,17 +72,7 @@ def _measured(simulation: Simulation, seconds: int, seed: int) -> SignalFigures:
     commands, view = idle_commands(simulation), None
     if config.signals.are_controlled:
         controller = make_controller(config.signals.controller)
-        outputs = simulation.signals.outputs
-        view = SignalView(
-            config=config.signals,
-            dt=config.clock.sim_dt_s,
-            table=simulation.signals.table,
-            ticks=simulation.ticks(),
-            counts=outputs.counts,
-            states=outputs.states,
-            masks=outputs.masks,
-            decides=outputs.decides,
-        )
+        view = simulation.signal_view()
     switches = 0
     for second in range(1, seconds + 1):
         if view is not None:
