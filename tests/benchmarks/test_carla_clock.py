@@ -7,7 +7,7 @@ import pytest
 from benchmarks.carla_clock import measure_client_drift
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.cosim.carla.carla_session import OtherTicks
-from cavmarl.cosim.carla.client_process import CLIENT_PYTHON
+from cavmarl.handoff.simulators.carla_zone import PYTHON
 from tests.cosim.carla.conftest import client_python
 
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
@@ -19,7 +19,7 @@ SPEC = WorldSpec.of("grid4x4", agents=2, background=0, seed=0)
 def test_own_ticks_of_a_client_are_noticed_and_can_be_held(
     other_ticks: OtherTicks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(CLIENT_PYTHON, client_python("0.9.16"))
+    monkeypatch.setenv(PYTHON, client_python("0.9.16"))
     found = measure_client_drift(SPEC, steps=100, rogue=0.92, other_ticks=other_ticks, sumo=20)
     (row,) = found.rows
     assert (found.own_ticks, found.counted) == (92, 92)
@@ -36,7 +36,7 @@ def test_own_ticks_of_a_client_are_noticed_and_can_be_held(
 
 
 def test_a_client_that_only_follows_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(CLIENT_PYTHON, client_python("0.9.16"))
+    monkeypatch.setenv(PYTHON, client_python("0.9.16"))
     found = measure_client_drift(SPEC, steps=60, sumo=20)
     assert (found.own_ticks, found.counted, found.drift_events) == (0, 0, 0)
     assert {row.ratio for row in found.rows} == {1.0}

@@ -6,14 +6,14 @@ import pytest
 
 from benchmarks.carla_rates import TEN_SENSORS, Load, measure_load
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.cosim.carla.client_process import CLIENT_PYTHON
+from cavmarl.handoff.simulators.carla_zone import PYTHON
 from tests.cosim.carla.conftest import client_python
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
 
 def test_no_frame_of_ten_sensors_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(CLIENT_PYTHON, client_python("0.9.16"))
+    monkeypatch.setenv(PYTHON, client_python("0.9.16"))
     spec = WorldSpec.of("grid4x4", seed=0)
     found = measure_load(spec, Load("ten sensors", 12, TEN_SENSORS, 0.0), ticks=1000)
     assert len(found["sensors"]) == 10

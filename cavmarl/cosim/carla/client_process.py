@@ -16,8 +16,8 @@ from pathlib import Path
 from cavmarl.core.errors import CavmarlError, MissingExtraError
 from cavmarl.core.processes import dying_with_parent
 from cavmarl.cosim.carla.carla_versions import DEFAULT_VERSION
+from cavmarl.handoff.simulators.carla_zone import PYTHON
 
-CLIENT_PYTHON = "CAVMARL_CARLA_PYTHON"  # environment variable: the Python that has the client
 _ABSENT = "No module named 'carla'"
 _QUOTED_LINES = 5
 
@@ -31,7 +31,7 @@ def client_python() -> str:
 
     Raises MissingExtraError: the client is not installed.
     """
-    found = os.environ.get(CLIENT_PYTHON)
+    found = os.environ.get(PYTHON)
     if found:
         return found
     if find_spec("carla") is None:
@@ -79,5 +79,5 @@ def run_client_program(
 def _missing(python: str) -> MissingExtraError:
     return MissingExtraError(
         f"{python}: CARLA's client is not installed: pip install carla=={DEFAULT_VERSION}, or set "
-        f"{CLIENT_PYTHON} to a Python that has it"
+        f"{PYTHON} to a Python that has it"
     )

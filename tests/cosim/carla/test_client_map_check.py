@@ -12,12 +12,9 @@ from cavmarl.cli.map import app
 from cavmarl.config.registry import entries, load_config, resolve_maps
 from cavmarl.core.errors import MissingExtraError
 from cavmarl.cosim.carla.client_map_check import check_with_client
-from cavmarl.cosim.carla.client_process import (
-    CLIENT_PYTHON,
-    ClientProgramError,
-    run_client_program,
-)
+from cavmarl.cosim.carla.client_process import ClientProgramError, run_client_program
 from cavmarl.engine.world_setup import find_map
+from cavmarl.handoff.simulators.carla_zone import PYTHON
 from cavmarl.maps.exports.opendrive import write_opendrive
 from cavmarl.roads.cache import load_network
 from tests.cosim.carla.conftest import client_python
@@ -29,7 +26,7 @@ ENVS = sorted(set(entries()) - {"cities", "cities_validation", "rush"})  # rush:
 
 @pytest.fixture
 def client(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(CLIENT_PYTHON, client_python("0.9.16"))
+    monkeypatch.setenv(PYTHON, client_python("0.9.16"))
 
 
 @pytest.mark.parametrize("env", ENVS)
@@ -86,7 +83,7 @@ def test_an_absent_client_is_an_error_before_any_work(
         "#!/bin/sh\necho \"ModuleNotFoundError: No module named 'carla'\" >&2\nexit 1\n"
     )
     python.chmod(0o755)
-    monkeypatch.setenv(CLIENT_PYTHON, str(python) if found == "here" else found)
+    monkeypatch.setenv(PYTHON, str(python) if found == "here" else found)
     monkeypatch.setattr("cavmarl.cosim.carla.client_process.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"carla==0\.9\.16, or set CAVMARL_CARLA_PYTHON"):
         run_client_program(tmp_path / "program.py")
@@ -96,7 +93,7 @@ def test_a_client_that_aborts_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_p
     python = tmp_path / "python"
     python.write_text("#!/bin/sh\necho 'std::bad_alloc' >&2\nkill -ABRT $$\n")
     python.chmod(0o755)
-    monkeypatch.setenv(CLIENT_PYTHON, str(python))
+    monkeypatch.setenv(PYTHON, str(python))
     with pytest.raises(ClientProgramError, match=r"ended with SIGABRT:\n  std::bad_alloc"):
         run_client_program(tmp_path / "program.py")
     python.write_text("#!/bin/sh\nexec sleep 60\n")
