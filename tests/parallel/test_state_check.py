@@ -349,13 +349,24 @@ def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> Non
 
     at, seen, counts = map(place, (outputs.states, outputs.observations, outputs.counts))
     for column, value in ((0, -1), (0, 2), (1, 2), (1, MANY), (2, -1), (2, 1 << 41), (3, -1)):
-        _refused(vec, lambda state, c=column, v=value: state[at].__setitem__((1, 3, c), v))
-    _refused(vec, lambda state: state[at + 1].__setitem__((0, 2), -1))  # sums of waiting
+        _refused(vec, with_value(at, (1, 3, column), value))
+    _refused(vec, with_value(at + 1, (0, 2), -1))  # sums of waiting
     for wrong in (-0.5, 1.5, np.nan):
-        _refused(vec, lambda state, v=wrong: state[seen].__setitem__((0, 0, 0), v))
-    _refused(vec, lambda state: state[counts].__setitem__((0, 0, 0), -1))
+        _refused(vec, with_value(seen, (0, 0, 0), wrong))
+    _refused(vec, with_value(counts, (0, 0, 0), -1))
     controllers = place(common_of_worlds(_worlds(vec).simulation).controllers)
-    _refused(vec, lambda state: state[controllers]["next_ms"].__setitem__((0, 0), 5000))
+
+    def due(state: State) -> None:
+        state[controllers]["next_ms"][0, 0] = 5000
+
+    _refused(vec, due)
+
+
+def with_value(at: int, place: tuple[int, ...], value: float) -> Forge:
+    def forge(state: State) -> None:
+        state[at][place] = value
+
+    return forge
 
 
 def ids_of(vec: CavVectorEnv) -> Array:
