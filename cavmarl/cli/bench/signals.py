@@ -18,7 +18,8 @@ def signals(
         typer.Argument(metavar="MAP", help="A .sumocfg with a network and one route file."),
     ],
     worlds: Annotated[
-        list[int] | None, about("Number of worlds. Repeat it for more. [default: 1, 16]")
+        list[int] | None,
+        about("Number of worlds. Repeat it for more. [default: 1, 16]", metavar="N"),
     ] = None,
     after: Annotated[int, about("Simulated seconds before the first turn.", metavar="S")] = 300,
     turn: Annotated[int, about("Decisions of a turn, each of 5 s.", metavar="N")] = 60,
