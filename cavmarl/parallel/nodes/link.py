@@ -61,7 +61,7 @@ class FrameKind(IntEnum):
     AGENT = 15  # N → N: state of an agent whose vehicle changes its node
     WANTED = 16  # N → C: files that the node does not have
     FILES = 17  # C → N: these files
-    MISSED = 18  # N → C: the connection to another node has ended
+    MISSED = 18  # N → C: the connection to another node has ended, or has carried a bad frame
     REFUSED = 19  # C → N: why the node is rejected
     END = 20  # C → N: the node is not needed any more
     GIVE = 21  # N → N: the state of zones that move to another node

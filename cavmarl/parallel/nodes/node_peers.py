@@ -33,6 +33,7 @@ from cavmarl.zones.kernels.row_frames import Passing, count_own
 
 Array = NDArray[Any]
 _SHARE = FrameKind.SHARE
+SHARE_BITS = 32  # the number of a share has the generation above them
 PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "places")
 
 
@@ -54,7 +55,7 @@ class NodePeers:
         links: Links,  # to all other nodes
         zones: Sequence[Sequence[int]],  # of each node
         number: int,  # of this node
-        first_share: int = 0,  # number of the first share, the same at all nodes
+        generation: int = 0,  # number of changes of nodes
     ) -> None:
         shard = simulation.shards[0]
         self._zoned = shard.zoned
@@ -84,7 +85,7 @@ class NodePeers:
         }
         self._count_own = specialized(count_own)
         self._agents = AgentStream([getattr(simulation.outputs, name) for name in PIECES])
-        self._sent = first_share
+        self._sent = generation << SHARE_BITS  # number of the last share
         self._is_stepping = False
         self._gate: DepartureQueue | None = None
         self._leaving: Passing  # vehicles that pass `_gate`
@@ -313,9 +314,9 @@ class NodePeers:
         kind, which, data = self._links.receive_next(number)
         if kind is _SHARE and which == self._sent:
             return data
-        if kind is FrameKind.SYNC:
+        if kind is FrameKind.SYNC and which << SHARE_BITS > self._sent:
             self._links.unread(number, NodeFrame(kind, which, data))
-            raise RecoveryOrderedError(None)
+            raise RecoveryOrderedError(None, number)
         error = MessageError(f"it is at {kind.name} {which}, not at share {self._sent}")
         raise LinkLostError(number, error)
 
