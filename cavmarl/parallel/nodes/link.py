@@ -24,6 +24,7 @@ import numpy as np
 from xxhash import xxh3_64_intdigest
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
+from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.transport import MOST_PIECES, Bytes, Connection
 from cavmarl.parallel.nodes.peer_faults import read_json
 
@@ -202,7 +203,7 @@ class Link:
         frame: NodeFrame,
         summed: int,  # checksum in the head
         urgent: deque[tuple[int, NodeFrame]],
-        number: int,
+        number: int,  # of the link
     ) -> None:
         """Check a complete frame, and queue it."""
         if xxh3_64_intdigest(frame.data) != summed:
@@ -212,6 +213,8 @@ class Link:
             self.frames.append(frame)
         elif kind in URGENT:
             urgent.append((number, frame))
+        elif number != COORDINATOR:
+            raise MessageError(f"it must not send frames of kind {kind.name}")
         elif kind is FrameKind.END:
             raise NeededNoMoreError
         else:

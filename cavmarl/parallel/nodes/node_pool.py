@@ -157,7 +157,7 @@ class NodePool:
             WorkerError: too many nodes were lost.
         """
         self.coordinator.close()
-        self.generation += 1
+        self._begin_generation()
         self._prepare(runs)
         self._begin()
 
@@ -178,11 +178,16 @@ class NodePool:
                 self._check_kept(self._state.number)
             except LinkLostError as lost:
                 self._lose(lost, has_begun=False)
-                self.generation += 1  # frames of this attempt are void
+                self._begin_generation()  # frames of this attempt are void
             else:
                 self._new.clear()
                 self._is_torn = False
                 return
+
+    def _begin_generation(self) -> None:
+        """Count a change of nodes. Earlier frames of nodes are void from now on."""
+        self.generation += 1
+        self._present.clear()
 
     def _pump(self) -> None:
         """Serve the connected nodes. Raises LinkLostError: a node is lost."""
@@ -524,7 +529,7 @@ class NodePool:
         moves, kept = self._moves()
         self.zones, self._living = moves.zones, living_of(moves.zones)
         self.owner[~np.isin(self.owner, self._living)] = UNOWNED  # the owner may be any node
-        self.generation += 1
+        self._begin_generation()
         self._cut = state.cut
         self.coordinator.set_neighbours(state.cut.neighbours)
         hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)
@@ -586,7 +591,6 @@ class NodePool:
             "runs": self._runs,
             "hostings": hostings_as_json(hostings),
         }
-        self._present.clear()
         for number in self._living:
             data = json.dumps({**order, "number": number}).encode()
             size = len(data).to_bytes(8, "little")

@@ -36,7 +36,7 @@ from cavmarl.parallel.nodes.node_frames import (
 from cavmarl.parallel.nodes.node_handshake import accept_nodes, call_node
 from cavmarl.parallel.nodes.node_loads import load_report
 from cavmarl.parallel.nodes.node_network import RemoteNetwork
-from cavmarl.parallel.nodes.node_peers import NodePeers
+from cavmarl.parallel.nodes.node_peers import SHARE_BITS, NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import Pong
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
@@ -237,8 +237,9 @@ class NodeProgram:
 
     def _answer_ping(self, frame: NodeFrame) -> None:
         """Say what this node awaits."""
-        awaited = self._links.awaited if self._witness is None else [self._witness]
-        pong = Pong(awaited, self._answered, self._received_actions.due())
+        witnesses = [] if self._witness is None else [self._witness]
+        due = self._received_actions.due()
+        pong = Pong(self._links.awaited, witnesses, self._answered, due)
         self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [json.dumps(pong).encode()])
 
     def serve(self) -> NoReturn:
@@ -334,11 +335,7 @@ class NodeProgram:
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
         for node in others:
-            while True:
-                found = links.receive_next(node)
-                if found.kind is FrameKind.SYNC and found.number == frame.number:
-                    self._synchronized.add(node)
-                    break
+            self._await_sync(node)
         if order["begins"]:
             self._replicas.await_replica(state, zones)
         if not order["begins"]:
@@ -350,6 +347,26 @@ class NodeProgram:
             takers = [taker for donor, taker in order["donors"] if donor == self._number]
             self._replicas.load(state, adopted, donors, takers, mine, self._generation)
         self._endpoints.report()
+
+    def _await_sync(self, number: int) -> None:
+        """Drop the frames of earlier generations of another node.
+
+        Raises:
+            LinkLostError: the node has gone, or has sent no SYNC.
+            RecoveryOrderedError: the coordinator has ordered another recovery.
+        """
+        links, generation = self._links, self._generation
+        while True:
+            frame = links.receive_next(number)
+            is_sync = frame.kind is FrameKind.SYNC
+            if is_sync and frame.number > generation:
+                links.unread(number, frame)
+                raise RecoveryOrderedError(None, number)
+            if (is_sync and frame.data) or frame.number >> SHARE_BITS >= generation > 0:
+                raise LinkLostError(number, MessageError("it has sent no SYNC"))
+            if is_sync and frame.number == generation:
+                self._synchronized.add(number)
+                return
 
     def _connect(self, places: Mapping[int, Place], others: Sequence[int]) -> None:
         """Connect to new nodes; of two new nodes, the one with the higher number calls.

@@ -26,6 +26,7 @@ class Pong(NamedTuple):
     """The answer of a node to a PING."""
 
     awaited: list[int]  # nodes whose frames it awaits, or COORDINATOR
+    witnesses: list[int]  # node that claims that a recovery is ordered, if it waits for the order
     answered: Sequence[Sequence[int]]  # world, vehicle and zone of each offer that it has answered
     agents: list[int]  # whose actions it awaits
 
@@ -68,7 +69,8 @@ class NodeWatch:
         """Apply the answer of a node to a PING. Raises the errors of `reading`."""
         check_indices("PING", [frame.number], self._pings + 1)
         pong = Pong(*read_list(frame))
-        check_indices("node", (peer for peer in pong.awaited if peer != COORDINATOR), MOST_NODES)
+        peers = [peer for peer in (*pong.awaited, *pong.witnesses) if peer != COORDINATOR]
+        check_indices("node", peers, MOST_NODES)
         for agent in pong.agents:
             self._holder(agent)
         if frame.number == self._pings:
@@ -143,6 +145,10 @@ class NodeWatch:
         for number in living:
             if number not in self._answered:
                 raise SilentNodeError(number, MessageError("it does not answer"))
+        witnesses = (number for pong in self._answered.values() for number in pong.witnesses)
+        for number in witnesses:  # an order would have come before the PING
+            if number in living:
+                raise SilentNodeError(number, MessageError("it claims an order to recover"))
         for pong in self._answered.values():
             for number in {self._holder(agent) for agent in pong.agents} & {*living}:
                 raise SilentNodeError(number, MessageError("it has not refused others' actions"))
