@@ -13,6 +13,7 @@ from cavmarl.core.errors import MessageError
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import (
+    UNOWNED,
     Outcome,
     note_own,
     pack_agents,
@@ -89,10 +90,15 @@ class AgentStream:
         """Write the frame of node `number` to the tables, and note that it owns these agents.
 
         Raises:
-            MessageError: the bytes are no such frame, or name unknown agents.
+            MessageError: the bytes are no such frame, or name unknown agents, or those of another
+                node.
         """
-        if self._unpack(self._tables, *_read(data), number, owner) != len(data):
+        words, content = _read(data)
+        unowned = np.count_nonzero(owner == UNOWNED)
+        if self._unpack(self._tables, words, content, number, owner) != len(data):
             raise MessageError(f"{len(data)} bytes are no frame about agents")
+        if np.count_nonzero(owner == UNOWNED) != unowned - words.item(0):
+            raise MessageError("a frame names agents of other nodes, or an agent twice")
 
 
 class ResultStream:

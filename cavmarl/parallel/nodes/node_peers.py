@@ -126,6 +126,8 @@ class NodePeers:
             with reading(number):
                 agents = np.frombuffer(data, np.int64)
                 check_indices("agent", agents, self.owner.size)
+                if (self.owner[agents] != UNOWNED).any():
+                    raise MessageError("it owns agents of other nodes")
             self.owner[agents] = number
 
     def share_rows(self, departures: DepartureQueue, side: int) -> None:
@@ -162,7 +164,8 @@ class NodePeers:
         for number, data in self._swap([ranks.data, last_s.data]):
             with reading(number):
                 theirs, at = _read(data, 0, ranks.dtype, ranks.size)
-                theirs_s, _ = _read(data, at, last_s.dtype, last_s.size)
+                theirs_s, at = _read(data, at, last_s.dtype, last_s.size)
+                _check_end(data, at)
             np.maximum(ranks, theirs.reshape(ranks.shape), out=ranks)
             np.maximum(last_s, theirs_s.reshape(last_s.shape), out=last_s)
         departures.ranks[:, :longest][asks] = ranks
@@ -182,11 +185,12 @@ class NodePeers:
                     found, at = _read(data, at, np.int64, last - first)
                     check_indices("place in the queue", found, int(departures.num_queue[w]))
                     departures.places[w, first:last] = found
+                _check_end(data, at)
 
     def share_leavers(self, departures: DepartureQueue) -> None:
         for number, data in self._swap(self._passing(departures)):
             with reading(number):
-                self._add_passing(departures, data, 0)
+                _check_end(data, self._add_passing(departures, data, 0))
 
     def _passing(self, departures: DepartureQueue) -> list[Bytes]:
         """Return the number of vehicles that pass the queue of each world, and their rows."""
@@ -220,7 +224,8 @@ class NodePeers:
                 (num,), at = _read(data, 0, np.int64, 1)
                 where, at = _read(data, at, np.int64, int(num))
                 check_indices("detector", where, seen.size)
-                found, _ = _read(data, at, np.float64, int(num))
+                found, at = _read(data, at, np.float64, int(num))
+                _check_end(data, at)
             seen.reshape(-1)[where] = found
         self._seen_s[...] = seen
 
@@ -257,6 +262,7 @@ class NodePeers:
                     for array in map(_by_agent, arrays):
                         found, at = _read(data, at, array.dtype, int(num) * array[0].size)
                         array[agents] = found.reshape(int(num), *array.shape[1:])
+                    _check_end(data, at)
             yield
 
     def _agents_of(self, side: int) -> Array:
@@ -290,6 +296,7 @@ class NodePeers:
                     rows, at = _read(data, at, zoned.rows.dtype, num)
                     self.checks.check(rows)
                     zoned.rows[side, zone, w, :num] = rows
+                _check_end(data, at)
             zoned.num_owned[zone], zoned.num_contacts[zone] = owned_there, contacts
         try:
             yield
@@ -329,6 +336,12 @@ def _by_agent(array: Array) -> Array:
 def _bytes(array: Array) -> Bytes:
     flat: NDArray[np.uint8] = array.reshape(-1).view(np.uint8)
     return flat.data
+
+
+def _check_end(data: memoryview, at: int) -> None:
+    """Raise MessageError if bytes are left."""
+    if at != len(data):
+        raise MessageError(f"a share has {len(data)} bytes, not {at}")
 
 
 def _read(data: memoryview, at: int, kind: DTypeLike, num: int) -> tuple[Array, int]:
