@@ -65,7 +65,7 @@ class _World:
         """Compare the vehicles that zones own by their rows with the records.
 
         Raises:
-            ProtocolError: the vehicles, or their epochs, differ.
+            ZonesError: the vehicles, or their epochs, differ.
         """
         self.has_begun |= any(report.began for report in reports)
         if self.on_record is None or not self.has_begun:
@@ -76,9 +76,10 @@ class _World:
             due[birth.zone] += 1
         for zone, num, total in (owned for report in reports for owned in report.owned):
             if (num, total) != (due[zone], sums[zone]):
-                raise ProtocolError(
+                raise ZonesError(
                     f"world {w}, tick {self.directory.table.tick}: zone {zone} has {num} vehicles, "
-                    f"the records {due[zone]}, or epochs differ; zones.journal shows the records"
+                    f"the records {due[zone]}, or epochs differ; zones.journal shows the records",
+                    (zone,),
                 )
 
     def is_silent(self, births: Sequence[Birth]) -> bool:
@@ -123,6 +124,7 @@ class NodeCoordinator:
         self._node_of = node_of
         self._links = links
         self.switched, self.is_late = 0, False
+        self._has_differed = False  # the rows of a zone have differed from the records
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Start; return the hostings of all zones, by worlds."""
@@ -274,7 +276,7 @@ class NodeCoordinator:
             world.movers = [(vehicle, target) for vehicle, target, _ in movers]
             digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.states.digests = digests
-            world.check_owned(w, reported)
+            self._check_owned(w, world, reported)
 
     def _check_late(self, reports: Mapping[int, Sequence[Report]]) -> None:
         """Note whether a lease of no ticks is due.
@@ -294,6 +296,22 @@ class NodeCoordinator:
         for number, has_begun in began.items():
             if has_begun != is_usual:
                 raise LinkLostError(number, MessageError(f"an episode has begun: {has_begun}"))
+
+    def _check_owned(self, w: int, world: _World, reports: Sequence[Report]) -> None:
+        """Compare the vehicles that zones own by their rows with the records.
+
+        Raises:
+            LinkLostError: the vehicles differ for the first time, so the report may be wrong.
+            ProtocolError: they differ again.
+        """
+        try:
+            world.check_owned(w, reports)
+        except ZonesError as error:
+            if self._has_differed:
+                raise
+            self._has_differed = True
+            node = self._node_of[error.zones[0]]
+            raise LinkLostError(node, MessageError(str(error))) from error
 
     def _commit(self, world: _World) -> None:
         """Commit a tick of a world. Raises LinkLostError: the DONE of a node does not fit."""

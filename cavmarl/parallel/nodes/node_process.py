@@ -331,13 +331,13 @@ class NodeProgram:
         state, mine = order["state"], zones[self._number]
         if order["begins"]:  # the SYNC that follows the replica confirms its arrival
             self._peers.drop_foreign_rows(self._worlds.simulation.everywhere)
-            self._replicas.keep(state, self._living)
+            saved = self._replicas.keep(state, self._living)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
         for node in others:
             self._await_sync(node)
         if order["begins"]:
-            self._replicas.await_replica(state, zones)
+            self._replicas.await_replica(state, zones, saved)
         if not order["begins"]:
             if len(data) > at:
                 with reading(COORDINATOR):
@@ -407,8 +407,8 @@ class NodeProgram:
             task, payload, at = command_of(frame.data)
         self._replicas.settle()
         if frame.number:
-            self._replicas.keep(frame.number, self._living)
-            self._replicas.await_replica(frame.number, self._zones_of)
+            saved = self._replicas.keep(frame.number, self._living)
+            self._replicas.await_replica(frame.number, self._zones_of, saved)
         if perform := self._of_all.get(task):
             perform(payload, frame.data, at)
         else:

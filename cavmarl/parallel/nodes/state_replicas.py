@@ -66,9 +66,10 @@ class StateReplicas:
             for old in [number for number in states if number < newest]:
                 del states[old]
 
-    def keep(self, state: int, living: Sequence[int]) -> None:
-        """Keep the present state here, and send a replica to the next living node."""
-        data = to_bytes(self._worlds.save())
+    def keep(self, state: int, living: Sequence[int]) -> list[Array]:
+        """Keep the present state here, and send a replica to the next living node; return it."""
+        saved = self._worlds.save()
+        data = to_bytes(saved)
         _add(self.own, state, data)
         self._is_settled = False
         if len(living) > 1:
@@ -77,6 +78,7 @@ class StateReplicas:
         else:
             logs = to_bytes([log.words for log in self._logs])
             self._links.send(COORDINATOR, FrameKind.KEEP, state, [logs, data])
+        return saved
 
     def resume_from(self, state: int, data: Bytes) -> None:
         """Take over a state that the coordinator has kept for the only node, which is lost.
@@ -97,7 +99,9 @@ class StateReplicas:
         """Take the replica of another node; `await_replica` reads it."""
         self._arrived[number] = frame
 
-    def await_replica(self, state: int, zones: Sequence[Sequence[int]]) -> None:
+    def await_replica(
+        self, state: int, zones: Sequence[Sequence[int]], like: Sequence[Array]
+    ) -> None:
         """Wait for the state of the previous living node, check it, and keep it.
 
         A damaged state is found while its sender still lives.
@@ -105,6 +109,7 @@ class StateReplicas:
         Args:
             state: its number.
             zones: of each node.
+            like: the same state of this node.
 
         Raises:
             LinkLostError: the previous node has not sent the state, or its state is damaged.
@@ -119,7 +124,7 @@ class StateReplicas:
             return previous in arrived and arrived[previous].number == state
 
         self._links.await_urgent(previous, has_come)
-        data, like = arrived.pop(previous).data, self._worlds.save()
+        data = arrived.pop(previous).data
         with reading(previous):
             self._check_zones(self._read(data, like), zones[previous])
         _add(self.others.setdefault(previous, {}), state, data)
@@ -128,7 +133,8 @@ class StateReplicas:
     def _check_zones(self, saved: Sequence[Array], zones: Sequence[int]) -> None:
         """Raise MessageError if a state has vehicles of other zones than these."""
         count = self._worlds.world.partition.count
-        found = {n % count for n, rows in enumerate(saved[self._first :]) if len(rows)}
+        first = len(saved) - self._worlds.simulation.num_worlds * count
+        found = {n % count for n, rows in enumerate(saved[first:]) if len(rows)}
         if not found <= {*zones}:
             raise MessageError(f"its state has vehicles of zones {sorted(found - {*zones})}")
 
