@@ -172,6 +172,8 @@ def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
         words = np.concatenate([words, np.zeros(7 * (ROOM + 1), dtype=np.int64)])
     elif harm == "less than none that leave":
         words[1 + 2 * WORLDS] = -1
+    elif harm == "less than no change of route":
+        words[1 + WORLDS] = -1
     else:
         return words[:0]
     words[0] = len(words)
@@ -191,6 +193,7 @@ def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
         "more that can touch than there are",
         "more that leave than there is room for",
         "less than none that leave",
+        "less than no change of route",
     ],
 )
 def test_bad_frames_are_refused(harm: str) -> None:
@@ -202,6 +205,7 @@ def test_bad_frames_are_refused(harm: str) -> None:
         far.read(data)
     assert (far.zoned.num_rows[THEIRS] == 2).all(), "nothing of it was put anywhere"
     assert not far.departures.num_passing.any()
+    assert not far.departures.counts.any()
 
 
 def tables(num: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -241,3 +245,18 @@ def test_bad_frames_about_agents_are_refused(change: bytes | None) -> None:
     with pytest.raises(MessageError, match="no frame about agents"):
         AgentStream(there).read(memoryview(data if change is None else change), 5, owner)
     assert (owner == -1).all()
+
+
+@pytest.mark.parametrize("taken", [2, 3])
+def test_an_agent_has_one_node(taken: int) -> None:
+    """A frame names an agent twice, or the agent of another node."""
+    here, there = tables(4), tables(4)
+    mine = np.array([False, False, True, True, False, False, False, False])
+    owner = np.full(8, -1, dtype=np.int32)
+    data = bytearray(packed(here, mine))
+    if taken == 2:
+        data[16:24] = data[8:16]
+    else:
+        owner[3] = 1
+    with pytest.raises(MessageError, match="agents of other nodes, or an agent twice"):
+        AgentStream(there).read(memoryview(data), 5, owner)

@@ -102,6 +102,8 @@ def check(
     words: str,
     after: int = 2,
     sender: int = SENDER,
+    nodes: int = 3,
+    **overrides: Any,
 ) -> None:
     """Check that a run stays equal if one node sends one wrong frame, and that this node is lost.
 
@@ -112,9 +114,12 @@ def check(
         words: part of the reason why the node is lost.
         after: number of frames that could be changed, and are sent as they are.
         sender: the node.
+        nodes: number of nodes.
+        overrides: of the configuration.
     """
     forger = Forger(patch, kind, change, after, sender)
-    found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **BUSY)
+    keys = {**BUSY, "overrides": BUSY["overrides"] | overrides}
+    found = verify_simulated_nodes("merge", [nodes], mixes=["none"], seeds=1, **keys)
     (line,) = found.lines
     assert forger.frame is not None
     assert [text for text in line.wrong if "must be tolerated" not in text] == []
@@ -328,6 +333,26 @@ def test_a_wrong_report(
     words: str,
 ) -> None:
     check(monkeypatch, FrameKind.REPORT, reported(change), words, after=0)
+
+
+def test_a_wrong_count_of_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first difference from the records is taken for a wrong report."""
+
+    def one_more_vehicle(messages: list[tuple[int, Message]], worlds: list[Any]) -> bool:
+        (zone, num, total), *rest = worlds[0][3]
+        worlds[0][3] = [(zone, num + 1, total), *rest]
+        return True
+
+    check(
+        monkeypatch, FrameKind.REPORT, reported(one_more_vehicle), "or epochs differ",
+        **{"zones.check_invariants": True},
+    )  # fmt: skip
+
+
+def test_the_only_node_does_not_send_its_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    check(
+        monkeypatch, FrameKind.KEEP, drop, "it has not sent state", after=1, sender=0, nodes=1
+    )  # fmt: skip
 
 
 # Messages about offers
