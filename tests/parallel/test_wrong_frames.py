@@ -15,7 +15,7 @@ from cavmarl.ownership.messages import COORDINATOR, Ack, Done, Message, Prepare
 from cavmarl.parallel.nodes import node_pool
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.node_process import NodeProgram
+from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.zone_endpoints import packed, packed_report, read_report, unpacked
 from cavmarl.parallel.state.world_bytes import to_bytes
 from cavmarl.verify.simulated_nodes import verify_simulated_nodes
@@ -23,6 +23,7 @@ from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 BUSY: dict[str, Any] = {
     "agents": 12, "background": 20, "zones": 8, "steps": 16, "overrides": {"clock.ctrl_dt_s": 0.4},
 }  # fmt: skip
+NEW = -1  # stands for a node that has not begun
 SENDER = 1  # the node whose frame is changed, if no other one is named
 
 
@@ -59,17 +60,19 @@ class Forger:
     ) -> None:
         self.frame: Sent | None = None
         self.lost: dict[int, str] = {}
-        self._numbers: dict[int, NodeProgram] = {}
+        self._numbers: dict[int, int] = {}  # of the nodes that have begun, by their links
         self._left = after  # frames of the kind that stay as they are
-        make, send = NodeProgram.__init__, Links.send
+        make, send = NodePeers.__init__, Links.send
 
-        def made(program: NodeProgram, system: Any, links: Links, *rest: Any) -> None:
-            self._numbers[id(links)] = program
-            make(program, system, links, *rest)
+        def made(
+            peers: NodePeers, simulation: Any, links: Links, zones: Any, number: int, *rest: Any
+        ) -> None:
+            self._numbers[id(links)] = number
+            make(peers, simulation, links, zones, number, *rest)
 
         def sent(links: Links, to: int, of: FrameKind, number: int, pieces: Any = ()) -> None:
-            program = self._numbers.get(id(links))
-            if program is not None and program._number == sender and of is kind:
+            is_node = COORDINATOR in links.numbers
+            if is_node and self._numbers.get(id(links), NEW) == sender and of is kind:
                 data = b"".join(bytes(memoryview(piece).cast("B")) for piece in pieces)
                 found = self._changed(Sent(to, of, number, data), change)
                 if found is DROPPED:
@@ -81,7 +84,7 @@ class Forger:
             if text.startswith("node %d"):
                 self.lost[values[0]] = str(values[-1])
 
-        patch.setattr(NodeProgram, "__init__", made)
+        patch.setattr(NodePeers, "__init__", made)
         patch.setattr(Links, "send", sent)
         patch.setattr(node_pool.log, "warning", note)
 
@@ -422,7 +425,7 @@ def test_a_node_that_joins_with_a_wrong_frame(
     monkeypatch: pytest.MonkeyPatch, change: Change
 ) -> None:
     """It is started again, or is lost because the other nodes cannot reach it."""
-    forger = Forger(monkeypatch, FrameKind.READY, change, sender=-1)
+    forger = Forger(monkeypatch, FrameKind.READY, change, sender=NEW)
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **BUSY)
     assert forger.frame is not None
     assert [text for text in found.lines[0].wrong if "must be tolerated" not in text] == []

@@ -504,6 +504,7 @@ class NodePool:
         self._links.drop(number)
         node = self._nodes.pop(number, None)
         self._new.pop(number, None)
+        self._present.discard(number)
         if node is None:
             return
         self._lost.append(number)

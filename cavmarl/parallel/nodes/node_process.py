@@ -96,7 +96,7 @@ class NodeProgram:
         self._number = -1  # the caller sends it with the first RECOVER
         self._generation = 0
         self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has come
-        # world, vehicle and zone of each offer that was answered since the last report
+        # world, vehicle and zone of each offer that was answered lately
         self._answered: list[tuple[int, int, int]] = []
         self._witness: int | None = None  # node that claims that a recovery is ordered
         self._actions: deque[NodeFrame] = deque()  # forwarded actions
@@ -362,7 +362,8 @@ class NodeProgram:
             if is_sync and frame.number > generation:
                 links.unread(number, frame)
                 raise RecoveryOrderedError(None, number)
-            if (is_sync and frame.data) or frame.number >> SHARE_BITS >= generation > 0:
+            is_share = frame.kind is FrameKind.SHARE
+            if (is_sync and frame.data) or (is_share and frame.number >> SHARE_BITS >= generation):
                 raise LinkLostError(number, MessageError("it has sent no SYNC"))
             if is_sync and frame.number == generation:
                 self._synchronized.add(number)

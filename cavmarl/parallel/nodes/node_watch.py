@@ -69,6 +69,8 @@ class NodeWatch:
         """Apply the answer of a node to a PING. Raises the errors of `reading`."""
         check_indices("PING", [frame.number], self._pings + 1)
         pong = Pong(*read_list(frame))
+        if not all(isinstance(part, list) for part in pong):
+            raise MessageError("a PONG has something else than lists")
         peers = [peer for peer in (*pong.awaited, *pong.witnesses) if peer != COORDINATOR]
         check_indices("node", peers, MOST_NODES)
         for agent in pong.agents:

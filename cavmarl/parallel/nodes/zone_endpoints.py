@@ -88,7 +88,8 @@ class ZoneEndpoints:
         links: Links,  # to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) actions and state of agents
         checks: IndexCheck,  # checks offered vehicles
-        # world, vehicle and zone of each offer that was answered since the last report; is changed
+        # output: world, vehicle and zone of each offer that was answered in the present lease or in
+        # the one before
         answered: list[tuple[int, int, int]],
         *,
         generation: int = 0,  # number of changes of nodes
