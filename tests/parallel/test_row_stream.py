@@ -227,7 +227,8 @@ def test_agents_arrive_as_they_were_sent() -> None:
     here[0][...], here[1][...] = drawn.random((WORLDS, 4, 3)), True
     mine = np.array([True, False, False, True, False, False, True, False])
     owner = np.full(8, -1, dtype=np.int32)
-    AgentStream(there).read(packed(here, mine), 5, owner)
+    agents = AgentStream(there).read(packed(here, mine), 5, owner)
+    assert agents.tolist() == np.flatnonzero(mine).tolist()
     assert owner.tolist() == [5, -1, -1, 5, -1, -1, 5, -1]
     for sent, taken in zip(here, there, strict=True):
         flat, other = (array.reshape(8, -1) for array in (sent, taken))
@@ -259,4 +260,13 @@ def test_an_agent_has_one_node(taken: int) -> None:
     else:
         owner[3] = 1
     with pytest.raises(MessageError, match="agents of other nodes, or an agent twice"):
+        AgentStream(there).read(memoryview(data), 5, owner)
+
+
+def test_flags_of_agents_are_true_or_false() -> None:
+    here, there = tables(4), tables(4)
+    data = bytearray(packed(here, np.ones(8, dtype=np.bool_)))
+    owner = np.full(8, -1, dtype=np.int32)
+    data[-1] = 2
+    with pytest.raises(MessageError, match="neither true nor false"):
         AgentStream(there).read(memoryview(data), 5, owner)

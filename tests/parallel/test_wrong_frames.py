@@ -23,6 +23,11 @@ from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 BUSY: dict[str, Any] = {
     "agents": 12, "background": 20, "zones": 8, "steps": 16, "overrides": {"clock.ctrl_dt_s": 0.4},
 }  # fmt: skip
+# A row of a frame about agents
+AGENT = np.dtype([
+    ("terms", "<f4", 10), ("terminated", "?"), ("present", "?"), ("acted", "?"), ("events", "<i4"),
+    ("vehicle_id", "<i8"), ("place", "<f8", 2),
+])  # fmt: skip
 NEW = -1  # stands for a node that has not begun
 SENDER = 1  # the node whose frame is changed, if no other one is named
 
@@ -196,6 +201,24 @@ def test_a_wrong_sync(monkeypatch: pytest.MonkeyPatch, change: Change) -> None:
     assert [text for text in found.lines[0].wrong if "must be tolerated" not in text] == []
     assert forger.frame is not None
     assert list(forger.lost) == [SENDER]
+
+
+def absent(frame: Sent) -> Sent | None:
+    """Change the flag of an agent that says whether it is present, in a frame about agents."""
+    num = int.from_bytes(frame.data[:8], "little")
+    row = AGENT.itemsize
+    if not num or len(frame.data) != 8 + num * (8 + row):
+        return None
+    data = bytearray(frame.data)
+    rows = np.frombuffer(data, AGENT, num, 8 + 8 * num)
+    if not rows["present"].all():
+        return None
+    rows["present"] = 0
+    return frame._replace(data=bytes(data))
+
+
+def test_an_agent_that_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    check(monkeypatch, FrameKind.SHARE, absent, "it sends agents that are absent", after=0)
 
 
 # Kept states

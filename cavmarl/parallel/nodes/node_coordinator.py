@@ -124,6 +124,7 @@ class NodeCoordinator:
         self._node_of = node_of
         self._links = links
         self.switched, self.is_late = 0, False
+        self._has_recovered = False  # since the last commit
         self._has_differed = False  # the rows of a zone have differed from the records
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
@@ -162,6 +163,7 @@ class NodeCoordinator:
             world.answered.clear()
             world.has_stepped = False
         self._node_of, self.switched, self.is_late = node_of, switched, False
+        self._has_recovered = True
         return self._hostings()
 
     def _hostings(self) -> list[list[Hosting]]:
@@ -277,6 +279,7 @@ class NodeCoordinator:
             digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.states.digests = digests
             self._check_owned(w, world, reported)
+        self._has_recovered = False
 
     def _check_late(self, reports: Mapping[int, Sequence[Report]]) -> None:
         """Note whether a lease of no ticks is due.
@@ -291,8 +294,11 @@ class NodeCoordinator:
         self.is_late = bool(late)
 
     def _check_began(self, began: Mapping[int, bool]) -> None:
-        """Raise LinkLostError if a node differs from most others in whether an episode began."""
-        is_usual = 2 * sum(began.values()) > len(began)
+        """Raise LinkLostError if a node is wrong about whether an episode has begun.
+
+        An episode begins in all nodes or in none, and in all of them after a recovery.
+        """
+        is_usual = self._has_recovered or 2 * sum(began.values()) > len(began)
         for number, has_begun in began.items():
             if has_begun != is_usual:
                 raise LinkLostError(number, MessageError(f"an episode has begun: {has_begun}"))

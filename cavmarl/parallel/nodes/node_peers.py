@@ -236,7 +236,9 @@ class NodePeers:
             self.stepped[...] = self.own
         for number, data in self._swap([frame]):
             with reading(number):
-                self._agents.read(data, number, self.owner)
+                agents = self._agents.read(data, number, self.owner)
+                if not outputs.present.reshape(-1)[agents].all():
+                    raise MessageError("it sends agents that are absent")
 
     @contextmanager
     def all_zones(self, departures: DepartureQueue, side: int) -> Iterator[None]:

@@ -19,7 +19,7 @@ from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.code_stamp import code_stamp
-from cavmarl.parallel.network.transport import Bytes, Place
+from cavmarl.parallel.network.transport import Bytes, Connection, Place
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.link import FrameKind, NeededNoMoreError, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
@@ -98,6 +98,8 @@ class NodeProgram:
         self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has come
         # world, vehicle and zone of each offer that was answered lately
         self._answered: list[tuple[int, int, int]] = []
+        # node → what is wrong with a frame of it; an earlier report may have been void
+        self._faults: dict[int, str] = {}
         self._witness: int | None = None  # node that claims that a recovery is ordered
         self._actions: deque[NodeFrame] = deque()  # forwarded actions
         # Tasks that each node does for its zones; the first node does all other tasks.
@@ -293,7 +295,9 @@ class NodeProgram:
         number = self._number if is_coordinator else lost.peer
         if not is_coordinator:
             self._links.drop(number)
-        peer, fault = number.to_bytes(4, "little"), lost.fault.encode()
+        if lost.fault:
+            self._faults[number] = lost.fault
+        peer, fault = number.to_bytes(4, "little"), self._faults.get(number, "").encode()
         self._links.send(COORDINATOR, FrameKind.MISSED, self._generation, [peer, fault])
 
     def _recover(self, frame: NodeFrame) -> None:
@@ -383,7 +387,7 @@ class NodeProgram:
         for other in others:
             if other in places and (not is_new or other < number):
                 found = call_node(self._system, places[other], self._secret, number, times, other)
-                links.add(other, found)
+                self._add(other, found)
         if is_new:
             links.wanted = callers = [
                 node for node in others if node not in places or node > number
@@ -393,7 +397,11 @@ class NodeProgram:
             )
             links.wanted = ()
             for other, connection in called.items():
-                links.add(other, connection)
+                self._add(other, connection)
+
+    def _add(self, number: int, connection: Connection) -> None:
+        self._links.add(number, connection)
+        self._faults.pop(number, None)
 
     def _check_orders(self) -> None:
         """Raise RecoveryOrderedError if the coordinator has sent a newer order."""
