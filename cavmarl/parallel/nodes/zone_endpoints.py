@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.core.records.arrays import DepartureQueue
-from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
+from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.kernels.invariant_checks import owned_sum
@@ -75,7 +75,7 @@ NOTHING = Report([], [], False, [])
 class ZoneEndpoints:
     """The endpoints of the zones of one node in W worlds."""
 
-    coordinators: tuple[LocalCoordinator, ...] = ()  # the coordinator is in another process
+    coordinators: tuple[Coordinator, ...] = ()  # the coordinator is in another process
     needs_ghosts = True
 
     def __init__(
