@@ -16,6 +16,7 @@ from cavmarl.config.population import PopulationConfig
 from cavmarl.config.rig import Rig, check_rig
 from cavmarl.config.scenario import ScenarioConfig
 from cavmarl.config.sensors import SensorsConfig
+from cavmarl.config.signals import SignalsConfig
 from cavmarl.config.sumo import SumoConfig
 from cavmarl.config.terms import TermsConfig
 from cavmarl.config.traffic import TrafficConfig
@@ -130,6 +131,7 @@ class EnvConfig(Section, key=""):
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     v2x: V2xConfig = field(default_factory=V2xConfig)
     terms: TermsConfig = field(default_factory=TermsConfig)
+    signals: SignalsConfig = field(default_factory=SignalsConfig)
     rig: Rig = field(default_factory=dict)
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     plugins: tuple[str, ...] = ()
@@ -157,6 +159,8 @@ class EnvConfig(Section, key=""):
         )
         if self.v2x.enabled:
             self.v2x.check_clock(self.clock.sim_dt_s)
+        if self.signals.are_controlled:
+            self.signals.check_clock(self.clock.sim_dt_s, self.clock.ctrl_dt_s)
         self._check_messages()
         if self.observation.mode == "messages":
             self._drop_sight()
@@ -252,6 +256,11 @@ class EnvConfig(Section, key=""):
             "population.external",
             self.population.external == 0,
             f"traffic.source = {source}: SUMO would not see such vehicles; leave the key out",
+        )
+        self.need(
+            "signals.agents",
+            not self.signals.are_controlled,
+            f"traffic.source = {source}: SUMO runs the signals; leave the key out",
         )
         self.need(
             "scenario.name",

@@ -148,7 +148,8 @@ class Simulation(WorldViews):
         tick.coordination.reset(chosen)
         tick.outside.switch_signals(tick)
         for part in tick.attached:
-            part.reset(chosen)
+            with tick.all_rows("reset" in part.reads_all, tick.division.side):
+                part.reset(chosen)
         tick.sense(chosen)
 
     def step(self, commands: Commands) -> None:

@@ -69,6 +69,8 @@ class Commands:
     # (W, E, K) EXTERNAL, new commands to vehicles that the caller poses or drives; (0, 0, K): there
     # is no room for such vehicles
     external: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, EXTERNAL_FIELDS)))
+    # (W, S) choices of the agents of signals, -1: none; (0, 0): signals have no agents
+    signal_choices: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
 
 
 COMMANDS = tuple(entry.name for entry in fields(Commands))

@@ -224,4 +224,6 @@ def _digest(commands: Commands, w: int) -> bytes:
         digest.update(commands.inserted[w].tobytes())
     if commands.external.any():
         digest.update(commands.external[w].tobytes())
+    if commands.signal_choices.size:
+        digest.update(commands.signal_choices[w].tobytes())
     return digest.digest()

@@ -395,7 +395,7 @@ class NodeWorlds(CommandedWorlds):
 
 def empty_arrays(world: World, num_worlds: int) -> StepArrays:
     """Return arrays for the inputs and outputs of a step."""
-    layout = layout_of(world.config, world.capacity, num_worlds).items()
+    layout = layout_of(world.config, world.capacity, num_worlds, world.signal_sizes).items()
     return StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
 
 
