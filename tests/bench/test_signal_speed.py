@@ -49,9 +49,7 @@ def test_rates_are_decisions_of_all_worlds_per_second(
         assert rates.low > 0.0
 
 
-def test_a_python_without_sumo_rl_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_python_without_sumo_rl_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PYTHON, sys.executable)
     with pytest.raises(ConfigError, match=f"sumo-rl ended: .*sumo_rl.*\nCure: .* {PYTHON}"):
         measure_signal_speed(config_in(tmp_path), worlds=(1,), after_s=5, turn=1, repeats=1)
