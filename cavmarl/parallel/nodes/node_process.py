@@ -98,7 +98,7 @@ class NodeProgram:
         self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has come
         # world, vehicle and zone of each offer that was answered lately
         self._answered: list[tuple[int, int, int]] = []
-        # node → what is wrong with a frame of it; an earlier report may have been void
+        # node → fault of a frame of it; an earlier report may have been void
         self._faults: dict[int, str] = {}
         self._witness: int | None = None  # node that claims that a recovery is ordered
         self._actions: deque[NodeFrame] = deque()  # forwarded actions
@@ -238,7 +238,7 @@ class NodeProgram:
         return False
 
     def _answer_ping(self, frame: NodeFrame) -> None:
-        """Say what this node awaits."""
+        """Report the frames and actions that this node awaits."""
         witnesses = [] if self._witness is None else [self._witness]
         due = self._received_actions.due()
         pong = Pong(self._links.awaited, witnesses, self._answered, due)

@@ -47,7 +47,7 @@ class NodeWatch:
     ) -> None:
         self._links, self._stopped, self._holder = links, stopped, holder
         self._missed: list[int] = []  # both ends of each connection that nodes have lost
-        # node → nodes that have got a bad frame from it, and what is wrong with the frame
+        # node → nodes that have got a bad frame from it, and the fault of the frame
         self._faults: dict[int, dict[int, str]] = {}
         self._answered: dict[int, Pong] = {}  # node → its answer to the last PING
         self._pings = 0
@@ -58,7 +58,7 @@ class NodeWatch:
         Args:
             number: of the node.
             peer: of the other one.
-            fault: what is wrong with a frame of the other one; empty if the connection has ended.
+            fault: reason why a frame of the other node is bad; empty if the connection has ended.
         """
         self._missed += (number, peer)
         if fault:

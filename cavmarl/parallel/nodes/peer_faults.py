@@ -23,7 +23,7 @@ class LinkLostError(Exception):
 
     Attributes:
         peer: the process at the other end.
-        fault: what is wrong with the frame; empty if the connection has ended.
+        fault: reason why the frame is bad; empty if the connection has ended.
     """
 
     def __init__(self, peer: int, cause: Exception | None = None) -> None:
