@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium
 
-from cavmarl.adapters.observations import WithSpec, refuse_decided
+from cavmarl.adapters.observations import WithSpec, refuse_decided, refuse_signal_agents
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.parallel import CavEnv, parallel_env
@@ -71,6 +71,7 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
             overrides={"population.mode": "closed", **wanted, "population.budget": 1},
             **arguments,
         )
+        refuse_signal_agents(self._env.config)
         self._horizon = self._env.max_cycles
         self.render_mode = render_mode
         self.metadata = self._env.metadata

@@ -11,6 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
+from cavmarl.config.signals import SIGNAL_CONTROLLERS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.spaces import named_observation, observation_parts, observation_space
 
@@ -45,6 +46,16 @@ class WithSpec:
         self._spec = spec and dataclasses.replace(spec, max_episode_steps=self._horizon)
 
 
+def refuse_signal_agents(config: EnvConfig) -> None:
+    """Raise a ConfigError if signals have agents, which the adapter would not show."""
+    if config.signals.have_agents:
+        raise ConfigError(
+            "signals.agents: this adapter gives the agents of vehicles alone; set "
+            f"signals.controller to one of {', '.join(SIGNAL_CONTROLLERS)}, or use make_vec or "
+            "parallel_env"
+        )
+
+
 class ObservationForm:
     """Converts flat observations of `CavVectorEnv` to the form of `observation.kind`.
 
@@ -55,10 +66,12 @@ class ObservationForm:
         space: space of one agent: a flat Box, or a Dict with one Box per sensor.
 
     Raises:
-        ConfigError: the observations are sensor samples in a form that is not supported.
+        ConfigError: the observations are sensor samples in a form that is not supported, or signals
+            have agents.
     """
 
     def __init__(self, config: EnvConfig) -> None:
+        refuse_signal_agents(config)
         form = config.observation
         if form.mode != "ground_truth" and form.kind != "flat":
             raise ConfigError(

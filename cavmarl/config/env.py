@@ -159,6 +159,8 @@ class EnvConfig(Section, key=""):
         )
         if self.v2x.enabled:
             self.v2x.check_clock(self.clock.sim_dt_s)
+        if self.signals.are_controlled:
+            self.signals.check_clock(self.clock.sim_dt_s, self.clock.ctrl_dt_s)
         self._check_messages()
         if self.observation.mode == "messages":
             self._drop_sight()
@@ -261,6 +263,11 @@ class EnvConfig(Section, key=""):
             f"traffic.source = {source}: SUMO runs the signals; leave the key out",
         )
         self.need(
+            "signals.agents",
+            not self.signals.are_controlled,
+            f"traffic.source = {source}: SUMO runs the signals; leave the key out",
+        )
+        self.need(
             "scenario.name",
             not self.scenario.name,
             f"traffic.source = {source}: scenarios need native traffic; leave the key out",
@@ -268,8 +275,9 @@ class EnvConfig(Section, key=""):
 
     @property
     def registered(self) -> tuple[str, ...]:
-        """The registered terms, sensors and models that the environment may use."""
-        return (*self.terms.registered, *self.sensors.registered, self.traffic.model)
+        """The registered extensions that the environment may use."""
+        simulators = (text.partition("://")[0] for text in self.zones.simulators.values())
+        return (*self.terms.registered, *self.sensors.registered, self.traffic.model, *simulators)
 
     @property
     def max_steps(self) -> int:

@@ -1,20 +1,110 @@
-"""`SignalsConfig`: signals that the caller controls."""
+"""`SignalsConfig`: signals that agents or the caller control."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
-from cavmarl.config.checks import Section, Whole
+from cavmarl.config.checks import Section, Whole, Within, check_finite
+from cavmarl.core.errors import ConfigError
+
+# The named terms of a signal's reward, in the order of every array of signal terms
+# (`signals/kernels/signal_observations.py`).
+SIGNAL_TERMS = ("diff_wait", "average_speed", "queue", "pressure")
+
+NO_SIGNALS = "none"
+ALL_SIGNALS = "all"
+
+BY_AGENTS: Literal["agents"] = "agents"
+SIGNAL_CONTROLLERS = ("program", "longest_queue", "max_pressure")  # see `signals.controllers`
 
 
 @dataclass(frozen=True)
 class SignalsConfig(Section, key="signals"):
-    """Signals that the caller controls.
+    """The signals whose greens are chosen; docs/reference/signal_agents.md describes the API.
 
     Attributes:
+        agents: `none`; `all` signals with two or more greens; or a list of ids of signals. Other
+            signals keep their programs.
+        controller: what chooses the greens of these signals: `agents` of the environment, or one of
+            `SIGNAL_CONTROLLERS`; then all agents are vehicles.
+        decide_s: time between two decisions; a whole number of steps of `clock.ctrl_dt_s`.
+        yellow_s: duration of yellow between two greens.
+        all_red_s: duration of red for all links, between yellow and the next green.
+        min_green_s: a green lasts at least this long.
+        max_green_s: at a decision, a green that has lasted this long ends; 0: no maximum.
+        action: `next_phase`: the index of the next green. `keep_or_next`: 0 keeps the green, 1
+            begins the next one in the order of the program.
+        forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
+            an ActionError (`error`).
+        terms: weights of the reward's terms; see `SIGNAL_TERMS`.
         overrides: number of links at whose signals the caller may show states of its own in a world
             at the same time (`SignalOverrides`).
     """
 
+    agents: str | tuple[str, ...] = NO_SIGNALS
+    controller: Literal["agents", "program", "longest_queue", "max_pressure"] = BY_AGENTS
+    decide_s: Annotated[float, Within(0.001, 3600.0)] = 5.0
+    yellow_s: Annotated[float, Within(0.0, 60.0)] = 2.0
+    all_red_s: Annotated[float, Within(0.0, 60.0)] = 0.0
+    min_green_s: Annotated[float, Within(0.0, 3600.0)] = 5.0
+    max_green_s: Annotated[float, Within(0.0, 3600.0)] = 60.0
+    action: Literal["next_phase", "keep_or_next"] = "next_phase"
+    forbidden: Literal["ignore", "error"] = "ignore"
+    terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
     overrides: Annotated[int, Whole(0, 100_000)] = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.need(
+            "agents",
+            self.agents in (NO_SIGNALS, ALL_SIGNALS) or isinstance(self.agents, tuple),
+            "must be none, all, or a list of ids of signals",
+        )
+        self.need("agents", len(self.agents) > 0, "names no signal; use none")
+        self.need(
+            "agents",
+            isinstance(self.agents, str) or len(set(self.agents)) == len(self.agents),
+            "names a signal twice",
+        )
+        self.need(
+            "max_green_s",
+            self.max_green_s == 0.0 or self.max_green_s >= self.min_green_s,
+            f"must be 0, or at least signals.min_green_s = {self.min_green_s:g}",
+        )
+        for name, weight in self.terms.items():
+            if name not in SIGNAL_TERMS:
+                raise ConfigError(
+                    f"signals.terms = {name!r}: no such term; must be one of "
+                    f"{', '.join(SIGNAL_TERMS)}"
+                )
+            check_finite(f"signals.terms.{name}", weight, -1e6, 1e6)
+
+    @property
+    def are_controlled(self) -> bool:
+        """Whether the greens of any signal are chosen."""
+        return self.agents != NO_SIGNALS
+
+    @property
+    def have_agents(self) -> bool:
+        """Whether agents of the environment choose them."""
+        return self.are_controlled and self.controller == BY_AGENTS
+
+    @property
+    def weight_of_each(self) -> tuple[float, ...]:
+        """The weights of all terms, in the order of `SIGNAL_TERMS`."""
+        return tuple(self.terms.get(name, 0.0) for name in SIGNAL_TERMS)
+
+    def check_clock(self, sim_dt_s: float, ctrl_dt_s: float) -> None:
+        """Raise a ConfigError for a time that is not a whole number of ticks or of steps."""
+        for name in ("yellow_s", "all_red_s", "min_green_s", "max_green_s"):
+            self._check_multiple(name, "ticks of clock.sim_dt_s", sim_dt_s)
+        self._check_multiple("decide_s", "steps of clock.ctrl_dt_s", ctrl_dt_s)
+
+    def _check_multiple(self, name: str, unit: str, unit_s: float) -> None:
+        ratio = getattr(self, name) / unit_s
+        self.need(
+            name,
+            abs(ratio - round(ratio)) < 1e-6 and (name != "decide_s" or round(ratio) >= 1),
+            f"must be a whole number of {unit} = {unit_s:g}; try {max(1, round(ratio)) * unit_s:g}",
+        )

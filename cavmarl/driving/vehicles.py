@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-RECORD_VERSION = 2
+RECORD_VERSION = 3
 
 # The fields are ordered by use: fields that drivers read of others come first and share two
 # cache lines; fields that are rarely read come last.
@@ -93,7 +93,8 @@ VEHICLE = np.dtype(
         # agents' vehicles only
         ("sensor_phase", np.int32),  # ticks until slow sensors fire; reserved: all fire each step
         ("episode_return", np.float64),  # sum of rewards since the agent got this vehicle
-        ("memory", np.int64),  # handle of a recurrent policy's state; reserved
+        # how long it has stood on its lane: LANE · 2³² + ticks; -1: not counted (`lane_counts`)
+        ("lane_stood", np.int64),
     ],
     align=True,
 )
@@ -108,7 +109,7 @@ STATE_FIELDS = tuple(name for name in VEHICLE.names or () if name not in PLACEME
 # Fields that are equal in a ghost and in its owner's row of the same tick. Contacts and rewards are
 # written after ghosts are sent, and are never read from a ghost.
 GHOST_FIELDS = tuple(
-    name for name in STATE_FIELDS if name not in ("hit", "events", "episode_return")
+    name for name in STATE_FIELDS if name not in ("hit", "events", "episode_return", "lane_stood")
 )
 
 # Fields that are -1 in a new vehicle.
@@ -122,7 +123,7 @@ _NOTHING = (
     "hit",
     "last_change",
     "due",
-    "memory",
+    "lane_stood",
     "order",
     "stop",
     "stops_end",

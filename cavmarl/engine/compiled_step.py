@@ -10,6 +10,7 @@ import numpy as np
 
 from cavmarl.core.compiled.bound_call import CallSequence, bind
 from cavmarl.core.math.counters import any_positive, clear, totals
+from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.shards.shard import Commands
 from cavmarl.shards.shard_group import ShardGroup
@@ -23,14 +24,19 @@ class CompiledStep:
         self.group = group
         self._tick = tick
         self._ticks = CallSequence()
+        self._signals = [part for part in tick.attached if isinstance(part, SignalComponent)]
         for _ in range(group.first.config.clock.ticks_per_step):
             self._add_tick(self._ticks)
+        for part in self._signals:
+            self._ticks.call(part.end_step)
         if group.calls.has_agents:
             self._add_sense(self._ticks)
 
     def run(self, commands: Commands) -> None:
         """Run the step."""
         calls = self.group.calls
+        for part in self._signals:
+            part.begin(commands)
         self._tick.begin_step(commands)
         if calls.has_agents:
             np.copyto(calls.controls, commands.controls)
@@ -53,6 +59,8 @@ class CompiledStep:
             sequence.call(calls.detect)
         if tick.shared.has_signals:
             sequence.call(tick.shared.signal_switch(tick.common))
+        for part in self._signals:
+            sequence.call(part.end_tick)
 
     def _add_leave(self, sequence: CallSequence) -> None:
         """Append the calls of `Tick.leave`."""
@@ -116,7 +124,7 @@ def compiled_step(tick: Tick, last: CompiledStep | None) -> CompiledStep | None:
         type(group) is not ShardGroup
         or len(group.shards) != 1
         or tick.coordination.needs_ghosts
-        or tick.attached
+        or not all(isinstance(part, SignalComponent) for part in tick.attached)
         or tick.outside.sumo is not None
         or tick.traffic.rerouting is not None
         or group.calls.has_registered

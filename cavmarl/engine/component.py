@@ -42,12 +42,14 @@ class Component(Protocol):
     A tick may be repeated: then `arrays` are restored to their state before the tick.
 
     Attributes:
-        reads_all: names of the methods, `begin` or `end`, that read the vehicles of all zones.
-            Other methods read the vehicles and ghosts of the zones in this process. An agent's part
-            of `arrays` is kept in the process that has its vehicle.
+        reads_all: names of the methods, `reset`, `begin` or `end`, that read the vehicles of all
+            zones; the value at the time of the call counts. Other methods read the vehicles and
+            ghosts of the zones in this process. An agent's part of `arrays` is kept in the process
+            that has its vehicle.
     """
 
-    reads_all: tuple[str, ...]
+    @property
+    def reads_all(self) -> tuple[str, ...]: ...
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,), after vehicles and signals are placed."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, SharedState
 from cavmarl.core.records.codes import (
+    CHOSEN_BY_AGENT,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     DRIVER_EXTERNAL,
@@ -32,6 +33,7 @@ from cavmarl.handoff.division import ZonedShards
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.shards.row_check import LEAST_FACTOR, MOST
 from cavmarl.shards.state import Use, names_of
+from cavmarl.signals.kernels.green_choices import NEVER_MS
 from cavmarl.traffic.departure_queue import DEPARTURE
 from cavmarl.traffic.native import NativeTraffic
 
@@ -181,7 +183,9 @@ class StateForm(NamedTuple):
             tick_ms = np.ceil(self.traffic.dt * 1e3)
             longest_ms = 1000 + max(roads.phases["min_ms"].max(), roads.phases["max_ms"].max())
             due_ms, since_ms = controllers["next_ms"], controllers["since_ms"]
-            if ((due_ms < now_ms - tick_ms) | (due_ms > now_ms + tick_ms + longest_ms)).any():
+            wrong = (due_ms < now_ms - tick_ms) | (due_ms > now_ms + tick_ms + longest_ms)
+            chosen = own["detector_gap_s"] == CHOSEN_BY_AGENT
+            if np.where(chosen, due_ms != NEVER_MS, wrong).any():
                 return "a controller has a check at an impossible time"
             if ((since_ms < 0) | (since_ms > now_ms + tick_ms)).any():
                 return "a controller has a phase that begins at an impossible time"

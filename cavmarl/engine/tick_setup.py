@@ -11,6 +11,7 @@ from cavmarl.engine.override_component import OverrideComponent
 from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.scenario_cues import Cues
 from cavmarl.engine.shared_outputs import SharedOutputs
+from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.engine.v2x_component import V2xComponent
 from cavmarl.handoff.shard_setup import divide
@@ -84,6 +85,8 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
         parts.append(ExternalComponent(host))
     if host.config.signals.overrides:
         parts.append(OverrideComponent(host))
+    if host.config.signals.are_controlled:
+        parts.append(SignalComponent(host))
     if host.config.rig:
         parts.append(RigComponent(host))
     if host.config.v2x.enabled:

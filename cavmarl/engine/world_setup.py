@@ -36,6 +36,8 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import map_name, source_hash
 from cavmarl.roads.sumo_net.signal_plans import with_outages, with_programs
 from cavmarl.roads.sumo_net.sumo_options import additional_files_of
+from cavmarl.signals.agent_programs import with_agent_programs
+from cavmarl.signals.signal_table import SignalSizes, sizes_of
 from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.native import capacity_of
@@ -67,6 +69,11 @@ class World(NamedTuple):
         if self.demand is not None and self.demand.tolerated:
             lines = "\n".join(self.demand.tolerated)
             log.warning("%s: tolerated in the demand:\n%s", self.config.name, lines)
+
+    @property
+    def signal_sizes(self) -> SignalSizes:
+        """Sizes of the arrays about signals with agents."""
+        return sizes_of(self.network) if self.config.signals.are_controlled else SignalSizes()
 
     @property
     def capacity(self) -> int:
@@ -152,6 +159,7 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     if buildings is not None:
         network = with_buildings(network, buildings)
     network = with_programs(network, _program_files(config, base_dir), config.map.program)
+    network = with_agent_programs(network, config.signals)
     if note := held_signals_note(network):
         _warn_once(network.name, network.source_hash, note)
     return network
@@ -286,5 +294,8 @@ def find_map(env: str | Path) -> Path:
 
 def check_agents(config: EnvConfig) -> None:
     """Refuse a world without agents where a caller wants to drive one."""
-    if config.population.agents == 0:
-        raise ConfigError("population.agents = 0: an environment needs at least one agent")
+    if config.population.agents == 0 and not config.signals.have_agents:
+        raise ConfigError(
+            "population.agents = 0: an environment needs at least one agent; set it higher, or let "
+            "agents control signals (signals.agents)"
+        )

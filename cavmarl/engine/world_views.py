@@ -14,6 +14,7 @@ from cavmarl.core.records.arrays import DepartureQueue, Outputs, TripTables, Wor
 from cavmarl.engine.component import Component
 from cavmarl.engine.external_component import ExternalComponent
 from cavmarl.engine.rig_component import RigComponent
+from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
 from cavmarl.engine.v2x_component import V2xComponent
@@ -22,6 +23,7 @@ from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shards.shard import Shard
+from cavmarl.signals.controllers import SignalView
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.v2x.bus import Bus
@@ -109,6 +111,29 @@ class WorldViews:
                 return part
         raise ConfigError(
             "population.external = 0: there is no room for vehicles of the caller; set it higher"
+        )
+
+    @property
+    def signals(self) -> SignalComponent:
+        """The signals that agents control."""
+        for part in self._tick.attached:
+            if isinstance(part, SignalComponent):
+                return part
+        raise ConfigError("signals.agents = none: set it to all, or to a list of ids of signals")
+
+    def signal_view(self) -> SignalView:
+        """Return what controllers of signals know; its arrays follow the worlds."""
+        part, config = self.signals, self.config
+        outputs = part.outputs
+        return SignalView(
+            config=config.signals,
+            dt=config.clock.sim_dt_s,
+            table=part.table,
+            ticks=self.ticks(),
+            counts=outputs.counts,
+            states=outputs.states,
+            masks=outputs.masks,
+            decides=outputs.decides,
         )
 
     @property

@@ -34,7 +34,7 @@ Stepped = tuple[
     dict[str, float],
     dict[str, bool],
     dict[str, bool],
-    dict[str, dict[str, float]],
+    dict[str, dict[str, Any]],
 ]
 
 
@@ -48,8 +48,9 @@ def parallel_env(
         lenient: for libraries that act for absent agents or beyond the bounds. Values are clipped,
             actions of absent agents are ignored, and a missing action repeats the agent's last one,
             or 0. Sets action.out_of_range, .missing_action, .late_actions; traffic_stats() counts.
-        world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
-            sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
+        world: zones, zone_simulators, backend, workers, nodes, sensor_workers, agents, background,
+            seed, max_cycles, sensors_of, render_mode, record and overrides, as `WorldArguments`
+            describes them.
 
     Raises:
         ConfigError: a key, a value or a combination is not possible.
@@ -107,8 +108,14 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self.metadata = {**type(self).metadata, **self.metadata}
         self.ghosts_of: int | None = None
         one_observation, one_action = observation_space(config), action_space(config.action)
-        self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
-        self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
+        cars = self.possible_agents
+        self.observation_spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(cars, one_observation)
+        self.action_spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(cars, one_action)
+        self._signals = self._session.signal_agents
+        if self._signals is not None:
+            self.possible_agents = [*cars, *self._signals.agents]
+            self.observation_spaces |= self._signals.observation_spaces()
+            self.action_spaces |= self._signals.action_spaces()
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._dicts = AgentDicts(config)
         self._seats = config.population.mode == "respawn"
@@ -117,6 +124,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._rows: NDArray[np.intp]
         self._listed: Listed  # indexes the same rows
         self._list(np.zeros(0, dtype=np.intp))
+        self.agents: list[str] = []
 
     @property
     def max_cycles(self) -> int:
@@ -138,7 +146,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._max_cycles = int(steps)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the observation space: the same object for all agents and calls.
+        """Return the observation space: the same object for all vehicles and calls.
 
         Raises:
             ActionError: there is no such agent.
@@ -149,7 +157,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             raise self._no_agent(agent) from None
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the action space: the same object for all agents and calls.
+        """Return the action space: the same object for all vehicles and calls.
 
         Raises:
             ActionError: there is no such agent.
@@ -165,7 +173,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Observation], dict[str, dict[str, float]]]:
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
         """Begin an episode.
 
         Args:
@@ -199,9 +207,13 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
                 raise EpisodeError("the episode is over: call env.reset()")
             return {}, {}, {}, {}, {}
         active = self.worlds.arrays.mask[0, self._listed]
-        needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
-        commands = self._session.decoder.from_dict(actions, self.agents, needed)
-        self._session.step(commands)
+        needed = self._cars if active.all() else list(compress(self._cars, active.tolist()))
+        choices = None
+        if self._signals is not None and isinstance(actions, Mapping):
+            choices = self._signals.from_dict(actions)
+            actions = {agent: each for agent, each in actions.items() if agent not in self._signals}
+        commands = self._session.decoder.from_dict(actions, self._cars, needed)
+        self._session.step(commands, choices)
         self._steps += 1
         return self._report()
 
@@ -213,15 +225,20 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             entered[self._listed] = False
             if entered.any():
                 self._list(np.concatenate([self._rows, np.flatnonzero(entered)]))
-        shown = self.agents
+        shown = self._cars
         ended = arrays.terminations[0, self._listed] & (not self._seats)
         observations, infos = self._observations(), self._infos()
         rewards = dict(zip(shown, arrays.rewards[0, self._listed].tolist(), strict=True))
         late = ended & arrays.truncations[0, self._listed]
         terminations = _flags(shown, ended & ~late)
         truncations = _flags(shown, late | (~ended & truncated))
+        if self._signals is not None:
+            rewards |= zip(self._signals.agents, arrays.signal_rewards[0].tolist(), strict=True)
+            terminations |= dict.fromkeys(self._signals.agents, False)
+            truncations |= dict.fromkeys(self._signals.agents, truncated)
         if truncated:
             self._list(self._rows[:0])
+            self.agents.clear()
         elif ended.any():
             self._list(self._rows[~ended])
         if not self.agents and not truncated:
@@ -238,7 +255,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
     def _list(self, rows: NDArray[np.intp]) -> None:
         """Set the agents in the episode, given by their index."""
         self._rows = rows
-        self.agents = [self.possible_agents[k] for k in rows.tolist()]
+        self._cars = [self.possible_agents[k] for k in rows.tolist()]
+        self.agents = self._cars if self._signals is None else [*self._cars, *self._signals.agents]
         # A slice takes agents in their usual order without a copy.
         in_order = bool((rows == np.arange(rows.size)).all())
         self._listed = slice(rows.size) if in_order else rows
@@ -254,10 +272,12 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
                 break
 
     def _observations(self) -> dict[str, Observation]:
-        return self._dicts.observations(self.worlds.arrays, self.agents, self._listed)
+        found = self._dicts.observations(self.worlds.arrays, self._cars, self._listed)
+        return found if self._signals is None else {**found, **self._signals.observations()}
 
-    def _infos(self) -> dict[str, dict[str, float]]:
-        return self._dicts.infos(self.worlds.arrays, self.agents, self._listed)
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        found = self._dicts.infos(self.worlds.arrays, self._cars, self._listed)
+        return found if self._signals is None else {**found, **self._signals.infos()}
 
     def declare_event(self, agent: str, cause: str) -> None:
         """Let an agent's vehicle announce an event in the next step (docs/reference/v2x.md).
@@ -329,7 +349,11 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._session.refuse_idle("suggest_actions()")
         self.worlds.suggest()
         batch = self._session.decoder.encode(self.worlds.arrays.suggested)[0]
-        return dict(zip(self.agents, batch[self._rows], strict=True))
+        found: dict[str, Any] = dict(zip(self._cars, batch[self._rows], strict=True))
+        if self._signals is not None:
+            choices = np.maximum(self._signals.suggest()[0], 0).tolist()
+            found |= zip(self._signals.agents, choices, strict=True)
+        return found
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a frame (height, width, 3) for `rgb_array`; for `human`, show a window.

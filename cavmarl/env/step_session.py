@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,13 @@ from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
 from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
+from cavmarl.env.signal_agents import SignalAgents
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.render.topdown import WorldView
 from cavmarl.shards.shard import Commands
+from cavmarl.signals.controllers import make_controller
 
 
 class StepSession:
@@ -49,7 +52,9 @@ class StepSession:
         events: the events that agents have declared for the next step.
         insertions: vehicles and barriers for the next step.
         external: commands for the next step to vehicles that the caller poses or drives.
-        signals: signals that show states of the caller.
+        overrides: signals that show states of the caller.
+        signals: the signals whose greens are chosen; None: there are none.
+        signal_agents: the same if agents choose the greens, else None.
         is_ready: whether `reset` has been called.
         simulated_s: wall time of all steps of the worlds so far.
     """
@@ -66,7 +71,18 @@ class StepSession:
         self.events = DeclaredEvents(config, num_worlds)
         self.insertions = Insertions(config, worlds.world.network, num_worlds)
         self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
-        self.signals = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
+        self.overrides = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
+        self.signals = (
+            SignalAgents(config, worlds.world.network, arrays)
+            if config.signals.are_controlled
+            else None
+        )
+        self.signal_agents = self.signals if config.signals.have_agents else None
+        self._controller = (
+            None
+            if self.signals is None or self.signal_agents is not None
+            else make_controller(config.signals.controller)
+        )
         self.is_ready = False
         self._is_closed = False
         self.simulated_s = 0.0
@@ -103,10 +119,14 @@ class StepSession:
         self.is_ready = True
         self._notify(chosen)
 
-    def step(self, commands: Commands) -> None:
+    def step(self, commands: Commands, signal_choices: NDArray[np.int64] | None = None) -> None:
         """Step the worlds with all waiting inputs. If the step fails, the inputs keep waiting."""
         began = time.perf_counter()
-        waiting = (self.events, self.insertions, self.external, self.signals)
+        if self._controller is not None and self.signals is not None:
+            signal_choices = self._controller.choose(self.signals.view)
+        if signal_choices is not None:
+            commands = replace(commands, signal_choices=signal_choices)
+        waiting = (self.events, self.insertions, self.external, self.overrides)
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)
@@ -120,7 +140,7 @@ class StepSession:
         self.decoder.forget(chosen)
         self.insertions.forget(chosen)
         self.external.forget(chosen)
-        self.signals.forget(chosen)
+        self.overrides.forget(chosen)
 
     def refuse_unready(self, call: str) -> None:
         """Raise an EpisodeError that names a call if there has been no reset yet."""
@@ -238,7 +258,7 @@ class StepSession:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Objects that refer to arrays of the worlds are created again.
-        parts = self.decoder, self.events, self.insertions, self.external, self.signals
+        parts = self.decoder, self.events, self.insertions, self.external, self.overrides
         memory = tuple(part.memory for part in parts)
         kept = self.is_ready, self.simulated_s, self._first_seed
         return (
@@ -250,7 +270,7 @@ class StepSession:
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         (self.is_ready, self.simulated_s, self._first_seed), memory = state
         self.decoder.memory, self.events.memory, *memory = memory
-        self.insertions.memory, self.external.memory, self.signals.memory = memory
+        self.insertions.memory, self.external.memory, self.overrides.memory = memory
 
 
 def _restored_session(worlds: SteppedWorlds, in_place: bool) -> StepSession:

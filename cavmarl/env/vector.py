@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias, Unpack
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
-from cavmarl.core.errors import ConfigError, EpisodeError
+from cavmarl.core.errors import ActionError, ConfigError, EpisodeError
 from cavmarl.engine.spaces import (
     action_space,
     flat_observation_space,
@@ -21,20 +23,21 @@ from cavmarl.engine.spaces import (
 )
 from cavmarl.env.autoreset import known_mode, present_mode, refuse_over, with_rows
 from cavmarl.env.saved_state import load_session, save_session
+from cavmarl.env.signal_agents import SignalAgents
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
+from cavmarl.signals.kernels.green_choices import REFUSED
 
 MAX_WORLDS = 65_536
 
 Observations: TypeAlias = Any
 """(W, A, D) float32, or for each sensor of the rig an array (W, A, …)."""
 
-StepResult = tuple[
-    Observations, NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], dict[str, NDArray[Any]]
-]
+# With agents of signals, the first four are dicts with the keys `vehicles` and `signals`.
+StepResult = tuple[Observations, Any, Any, Any, dict[str, Any]]
 
 
 def make_vec(
@@ -52,8 +55,9 @@ def make_vec(
         num_envs: number of worlds.
         autoreset_mode: when a world begins its next episode; see `CavVectorEnv`.
         copy: False returns observations without a copy; see `CavVectorEnv`.
-        world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
-            sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
+        world: zones, zone_simulators, backend, workers, nodes, sensor_workers, agents, background,
+            seed, max_cycles, sensors_of, render_mode, record and overrides, as `WorldArguments`
+            describes them.
 
     Raises:
         ConfigError: a key, a value or a combination is not possible.
@@ -139,6 +143,8 @@ class CavVectorEnv(WorldsEnvironment):
         self.action_space = batch_space(
             batch_space(self.single_action_space, self.num_agents), num_envs
         )
+        if self._session.signal_agents is not None:
+            self._add_signals(self._session.signal_agents)
         self.metadata |= {
             "autoreset_mode": present_mode(worlds.in_next_step, disabled),
             "render_modes": ["rgb_array"],
@@ -147,6 +153,19 @@ class CavVectorEnv(WorldsEnvironment):
         self._over = np.zeros(num_envs, dtype=np.bool_)  # over, and not yet reset
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._copy = copy
+
+    def _add_signals(self, signals: SignalAgents) -> None:
+        """Add the spaces of signals, padded to the largest one."""
+        seen = spaces.Box(0.0, 1.0, (signals.table.sizes.features,), np.float32)
+        counts = signals.num_choices.astype(np.int64)
+        choices = np.broadcast_to(counts, (self.num_envs, len(counts)))
+        self.observation_space = spaces.Dict(
+            vehicles=self.observation_space,
+            signals=batch_space(batch_space(seen, len(counts)), self.num_envs),
+        )
+        self.action_space = spaces.Dict(
+            vehicles=self.action_space, signals=spaces.MultiDiscrete(choices.copy())
+        )
 
     @property
     def max_cycles(self) -> int:
@@ -200,7 +219,10 @@ class CavVectorEnv(WorldsEnvironment):
         self._session.reset(seed, chosen, first_world)
         self._mask = self.worlds.arrays.mask.copy()
         self._over = self._over & ~chosen
-        return self._observations(), {"mask": self._mask.copy()}
+        infos = {"mask": self._mask.copy()}
+        if self._session.signal_agents is not None:
+            infos |= self._signal_infos()
+        return self._observations(), infos
 
     def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
         """Return the worlds (W,) that a reset affects."""
@@ -220,12 +242,12 @@ class CavVectorEnv(WorldsEnvironment):
             raise EpisodeError("reset_mask before the first reset: call vec.reset(seed=…)")
         return chosen
 
-    def step(self, actions: NDArray[Any]) -> StepResult:
+    def step(self, actions: Any) -> StepResult:
         """Let every agent of every world act.
 
         Args:
             actions: (W, A, 2) floats in [-1, 1], or (W, A) meta-actions. Not read where the mask is
-                False.
+                False. With agents of signals, a dict: `vehicles`, and `signals` (W, S).
 
         Returns:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
@@ -237,6 +259,11 @@ class CavVectorEnv(WorldsEnvironment):
             `final_observations` (W, A, D) observations before a reset, with the last ones of agents
             that left: the same array as the observations if no agent left in the step.
 
+            With agents of signals, observations, rewards, terminations and truncations are dicts:
+            `vehicles`, and `signals` (W, S, …). Their infos are `signal_mask` (W, S, G) allowed
+            choices, `signal_decides` (W,) whether the next choices count, `signal_terms`
+            (W, S, T) and `signal_refused` (W, S) choices of the episode that were not allowed.
+
         Raises:
             EpisodeError: before the first reset, after `close`, or with `DISABLED` if a world's
                 episode is over.
@@ -246,7 +273,10 @@ class CavVectorEnv(WorldsEnvironment):
         if self._disabled:
             refuse_over(self._over)
         session = self._session
-        session.step(session.decoder.from_array(actions, self._mask))
+        choices = None
+        if session.signal_agents is not None:
+            actions, choices = self._split(actions, session.signal_agents)
+        session.step(session.decoder.from_array(actions, self._mask), choices)
         arrays = self.worlds.arrays
         over = self._over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
@@ -265,9 +295,49 @@ class CavVectorEnv(WorldsEnvironment):
             "episode_over": over.copy(),
         }
         terminations &= ~arrays.truncations  # reaching the trip's own horizon is no termination
-        return observations, arrays.rewards.copy(), terminations, arrays.truncations.copy(), infos
+        rewards, truncations = arrays.rewards.copy(), arrays.truncations.copy()
+        if session.signal_agents is None:
+            return observations, rewards, terminations, truncations, infos
+        over_all = over[:, None].repeat(len(session.signal_agents.agents), axis=1)
+        return (
+            observations,
+            {"vehicles": rewards, "signals": arrays.signal_rewards.copy()},
+            {"vehicles": terminations, "signals": np.zeros_like(over_all)},
+            {"vehicles": truncations, "signals": over_all},
+            infos | self._signal_infos(),
+        )
+
+    def _split(self, actions: Any, signals: SignalAgents) -> tuple[Any, NDArray[np.int64]]:
+        """Return the actions of vehicles and the choices of signals."""
+        if not isinstance(actions, Mapping) or actions.keys() - {"vehicles", "signals"}:
+            raise ActionError(
+                "with agents of signals, actions must be a dict with the keys 'vehicles' and "
+                "'signals'"
+            )
+        if "signals" not in actions or (
+            "vehicles" not in actions and self.config.population.agents
+        ):
+            raise ActionError(f"actions lack {'signals' if 'vehicles' in actions else 'vehicles'}")
+        choices = signals.from_array(actions["signals"])
+        idle = np.zeros_like(self.worlds.arrays.suggested)  # no agents drive vehicles
+        return actions.get("vehicles", self._session.decoder.encode(idle)), choices
+
+    def _signal_infos(self) -> dict[str, NDArray[Any]]:
+        arrays = self.worlds.arrays
+        return {
+            "signal_mask": arrays.signal_masks.copy(),
+            "signal_decides": arrays.signal_decides.copy(),
+            "signal_terms": arrays.signal_terms.copy(),
+            "signal_refused": arrays.signal_states[..., REFUSED].copy(),
+        }
 
     def _observations(self) -> Observations:
+        found = self._vehicle_observations()
+        if self._session.signal_agents is None:
+            return found
+        return {"vehicles": found, "signals": self.worlds.arrays.signal_observations.copy()}
+
+    def _vehicle_observations(self) -> Observations:
         arrays = self.worlds.arrays
         if not self._senses:
             return self._given(arrays.observations)
@@ -304,6 +374,17 @@ class CavVectorEnv(WorldsEnvironment):
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """Return the observations; in the worlds `ended` (W,), those before the reset."""
+        found, arrays = self._final_vehicle_observations(ended), self.worlds.arrays
+        if self._session.signal_agents is None:
+            return found
+        last, over = arrays.final_signal_observations, arrays.episode_over
+        return {
+            "vehicles": found,
+            "signals": with_rows(arrays.signal_observations, last, over),
+        }
+
+    def _final_vehicle_observations(self, ended: NDArray[np.bool_]) -> Observations:
+        """Return the observations; in the worlds `ended` (W,), those before the reset."""
         arrays = self.worlds.arrays
         if not self._senses:
             return with_rows(arrays.observations, arrays.final_observations, ended)
@@ -331,15 +412,21 @@ class CavVectorEnv(WorldsEnvironment):
         frames = self.worlds.arrays.final_frames
         return {name: sensor.copy() for name, sensor in frames.items()}
 
-    def suggest_actions(self) -> NDArray[Any]:
+    def suggest_actions(self) -> Any:
         """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent.
+
+        With agents of signals, return a dict; signals follow the durations of the map's programs.
 
         Raises:
             EpisodeError: before the first reset, or after `close`.
         """
         self._session.refuse_idle("suggest_actions()")
         self.worlds.suggest()
-        return self._session.decoder.encode(self.worlds.arrays.suggested)
+        found = self._session.decoder.encode(self.worlds.arrays.suggested)
+        signals = self._session.signal_agents
+        if signals is None:
+            return found
+        return {"vehicles": found, "signals": np.maximum(signals.suggest(), 0)}
 
     def state(self) -> NDArray[np.float32]:
         """Return the global states (W, S), each as from `CavEnv.state`; input of a central critic.

@@ -10,11 +10,13 @@ from gymnasium import logger
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record
+from cavmarl.env.signal_agents import SignalAgents
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_copies import OwnWorlds
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
@@ -93,13 +95,26 @@ class WorldsEnvironment(OwnWorlds):
         return self._session.external
 
     @property
-    def signals(self) -> SignalOverrides:
+    def signal_overrides(self) -> SignalOverrides:
         """The signals that show states of the caller; see `signals.overrides`.
 
         Raises:
             EpisodeError: before the first reset.
         """
-        self._session.refuse_idle("signals")
+        self._session.refuse_idle("signal_overrides")
+        return self._session.overrides
+
+    @property
+    def signals(self) -> SignalAgents:
+        """The agents of signals; see docs/reference/signal_agents.md.
+
+        Raises:
+            ConfigError: `signals.agents` is none.
+        """
+        if self._session.signals is None:
+            raise ConfigError(
+                "signals.agents = none: set it to all, or to a list of ids of signals"
+            )
         return self._session.signals
 
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:

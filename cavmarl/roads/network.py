@@ -176,8 +176,10 @@ PROGRAM = record(
     ("num_phases", np.int32),
     ("offset_s", np.float64),  # delay of all phases
     ("cycle_s", np.float64),  # sum of the phases' durations
-    ("controller", np.int32),  # actuated: its index in a world's controllers
-    ("detector_gap_s", np.float64),  # actuated: time from a detector to the stop line, at the limit
+    # actuated, or chosen by an agent: its index in a world's controllers
+    ("controller", np.int32),
+    # actuated: time from a detector to the stop line, at the limit; or CHOSEN_BY_AGENT
+    ("detector_gap_s", np.float64),
     ("simplified", np.bool_),  # the program has rules in SUMO that are not implemented
 )
 

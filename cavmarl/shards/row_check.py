@@ -189,6 +189,8 @@ class RowCheck:
         end = np.where(is_external, self._num_external, num_orders)
         wrong = (rows["id"] < 0) | (rows["tick"] < 0) | (rows["order"] >= end)
         wrong |= is_external & (rows["order"] < 0)
+        stood_lane = np.where(rows["lane_stood"] < 0, 0, rows["lane_stood"] >> 32)
+        wrong |= (rows["lane_stood"] < -1) | (stood_lane >= self._num_lanes)
         if not wrong.any():
             return ""
         return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id or tick is invalid")

@@ -72,6 +72,8 @@ class Commands:
     # (W, N, 2) LINK row and 1 + SIGNAL_* code of each link whose signal the caller overrides, 0: an
     # unused place; (0, 0, 2): overrides are not configured
     overridden: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0, 2), np.int32))
+    # (W, S) choices of the agents of signals, -1: none; (0, 0): signals have no agents
+    signal_choices: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
 
 
 COMMANDS = tuple(entry.name for entry in fields(Commands))

@@ -66,13 +66,16 @@ def results_of() -> Results:
 @pytest.mark.parametrize("seed", range(20))
 def test_report_is_that_of_one_array_after_the_other(seed: int, network: RoadNetwork) -> None:
     rng = np.random.default_rng(seed)
+    has_signals = seed % 2 == 1
     outputs, departures = outputs_of(rng), gate_of(rng, network)
     steps = rng.integers(0, HORIZON + 1, WORLDS)
     expected_steps, found, expected = steps.copy(), results_of(), results_of()
     ended = report(outputs, steps, HORIZON, found)
     assert ended == naive.report(outputs, expected_steps, HORIZON, expected)
-    over = report_continuation(outputs, departures, steps, HORIZON, found)
-    assert over == naive.report_continuation(outputs, departures, expected_steps, HORIZON, expected)
+    over = report_continuation(outputs, departures, steps, HORIZON, has_signals, found)
+    assert over == naive.report_continuation(
+        outputs, departures, expected_steps, HORIZON, has_signals, expected
+    )
     np.testing.assert_array_equal(steps, expected_steps)
     for name in Results._fields:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)

@@ -40,16 +40,16 @@ def act(env: Any, step: int) -> None:
     """What a caller may ask for."""
     if step == 1:
         for index in range(8):
-            env.signals.show("B1", index, "G" if index < 4 else "r")
+            env.signal_overrides.show("B1", index, "G" if index < 4 else "r")
     if step == 6:
-        env.signals.show("C2", 0, "O")
-        env.signals.show("B1", 2, "y")
+        env.signal_overrides.show("C2", 0, "O")
+        env.signal_overrides.show("B1", 2, "y")
     if step == 15:
-        env.signals.release("B1", 3)
+        env.signal_overrides.release("B1", 3)
     if step == 22:
-        env.signals.release("B1")
+        env.signal_overrides.release("B1")
     if step == 26:
-        env.signals.show("A0", 1, "u")
+        env.signal_overrides.show("A0", 1, "u")
 
 
 def hashes(kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
@@ -117,19 +117,19 @@ def test_saved_states_include_overridden_signals() -> None:
 def test_a_signal_shows_letters_until_it_is_released() -> None:
     env = parallel_env("grid4x4", overrides=ROOM)
     env.reset(seed=1)
-    before = env.signals.letters("B1")
-    env.signals.show("B1", 4, "Y")
-    assert env.signals.letters("B1") == before, "not before the next step"
+    before = env.signal_overrides.letters("B1")
+    env.signal_overrides.show("B1", 4, "Y")
+    assert env.signal_overrides.letters("B1") == before, "not before the next step"
     env.step(env.suggest_actions())
-    assert env.signals.letters("B1") == before[:4] + "Y" + before[5:]
-    env.signals.release("B1", 4)
+    assert env.signal_overrides.letters("B1") == before[:4] + "Y" + before[5:]
+    env.signal_overrides.release("B1", 4)
     env.step(env.suggest_actions())
-    assert env.signals.letters("B1") == before
-    env.signals.show("B1", 4, "Y")
+    assert env.signal_overrides.letters("B1") == before
+    env.signal_overrides.show("B1", 4, "Y")
     env.step(env.suggest_actions())
     env.reset(seed=1)
     env.step(env.suggest_actions())
-    assert env.signals.letters("B1") == before, "a reset releases all signals"
+    assert env.signal_overrides.letters("B1") == before, "a reset releases all signals"
 
 
 def test_drivers_wait_while_all_signals_are_red() -> None:
@@ -138,9 +138,9 @@ def test_drivers_wait_while_all_signals_are_red() -> None:
         env = parallel_env("grid4x4", agents=1, background=60, overrides=overrides)
         env.reset(seed=3)
         for name in env.network.signal_ids:
-            for index, shown in enumerate(env.signals.letters(name)):
+            for index, shown in enumerate(env.signal_overrides.letters(name)):
                 if shown != "-":
-                    env.signals.show(name, index, letter)
+                    env.signal_overrides.show(name, index, letter)
         found = 0
         internal = env.network.lanes["internal"]
         for step in range(120):
@@ -164,9 +164,9 @@ def test_observed_signals_are_those_shown() -> None:
         env = parallel_env("grid4x4", agents=8, background=0, overrides=overrides)
         env.reset(seed=5)
         for name in env.network.signal_ids:
-            for index, shown in enumerate(env.signals.letters(name)):
+            for index, shown in enumerate(env.signal_overrides.letters(name)):
                 if shown != "-":
-                    env.signals.show(name, index, letter)
+                    env.signal_overrides.show(name, index, letter)
         observations, *_ = env.step(env.suggest_actions())
         codes = signal_codes(env.network, env.simulation.signal_phases())
         wanted = SIGNAL_GREEN_MAJOR if letter == "G" else SIGNAL_RED
@@ -182,9 +182,9 @@ def test_messages_have_the_states_that_are_shown() -> None:
     plain = parallel_env("grid4x4", agents=8, background=0, overrides=overrides)
     plain.reset(seed=5)
     for name in env.network.signal_ids:
-        for index, shown in enumerate(env.signals.letters(name)):
+        for index, shown in enumerate(env.signal_overrides.letters(name)):
             if shown != "-":
-                env.signals.show(name, index, "G")
+                env.signal_overrides.show(name, index, "G")
     features = feature_names(env.config.sensors).index(("messages", "signal_go"))
     for _ in range(4):
         seen = env.step(env.suggest_actions())[0]
@@ -204,10 +204,10 @@ def test_recordings_and_drawings_show_them(tmp_path: Path) -> None:
     env = parallel_env("grid4x4", overrides=ROOM, record=str(path))
     env.reset(seed=1)
     env.step(env.suggest_actions())
-    env.signals.show("B1", 4, "Y")
+    env.signal_overrides.show("B1", 4, "Y")
     for _ in range(2):
         env.step(env.suggest_actions())
-    env.signals.release("B1")
+    env.signal_overrides.release("B1")
     env.step(env.suggest_actions())
     links = env.network.links
     row = env.network.signal_ids.index("B1")
@@ -228,29 +228,29 @@ def test_recordings_and_drawings_show_them(tmp_path: Path) -> None:
 def test_wrong_commands_are_refused_with_a_fix() -> None:
     env = parallel_env("grid4x4", overrides={"signals.overrides": 2})
     with pytest.raises(EpisodeError, match="before reset"):
-        env.signals.show("A0", 0, "G")
+        env.signal_overrides.show("A0", 0, "G")
     env.reset(seed=1)
     with pytest.raises(ActionError, match=r"signal 'Z9': there is no such signal; the map has A0"):
-        env.signals.show("Z9", 0, "G")
+        env.signal_overrides.show("Z9", 0, "G")
     with pytest.raises(ActionError, match=r"signal 'A0', index 99: no link has this index; must"):
-        env.signals.show("A0", 99, "G")
+        env.signal_overrides.show("A0", 99, "G")
     with pytest.raises(ActionError, match=r"letter = 'x': must be one of rugGysoOY"):
-        env.signals.show("A0", 0, "x")
+        env.signal_overrides.show("A0", 0, "x")
     with pytest.raises(ActionError, match="letter = '': must be"):
-        env.signals.show("A0", 0, "")
+        env.signal_overrides.show("A0", 0, "")
     with pytest.raises(ActionError, match="world 1: must be from 0 to 0"):
-        env.signals.release("A0", world=1)
-    env.signals.show("A0", 0, "G")
-    env.signals.show("A0", 0, "r")
-    env.signals.show("A0", 1, "r")
+        env.signal_overrides.release("A0", world=1)
+    env.signal_overrides.show("A0", 0, "G")
+    env.signal_overrides.show("A0", 0, "r")
+    env.signal_overrides.show("A0", 1, "r")
     with pytest.raises(CapacityError, match=r"signals\.overrides = 2 links show"):
-        env.signals.show("A0", 2, "r")
-    env.signals.release("A0", 0)
-    env.signals.show("A0", 2, "r")
+        env.signal_overrides.show("A0", 2, "r")
+    env.signal_overrides.release("A0", 0)
+    env.signal_overrides.show("A0", 2, "r")
     without = parallel_env("grid4x4")
     without.reset(seed=1)
     with pytest.raises(ConfigError, match=r"set signals\.overrides to the number of links"):
-        without.signals.show("A0", 0, "G")
+        without.signal_overrides.show("A0", 0, "G")
 
 
 def test_sumo_s_traffic_refuses_them() -> None:

@@ -27,13 +27,16 @@ def report_continuation(
     departures: DepartureQueue,
     steps: NDArray[np.int64],
     horizon: int,
+    has_signals: bool,
     results: Results,
 ) -> bool:
     results.arrivals[:] = departures.counts[:, COUNT_ARRIVED]
     results.mask[:] = outputs.present & ~outputs.terminated
     for w, waiting in enumerate(departures.num_queue):
         waits = any(departures.queue["agent"][w, :waiting] >= 0)
-        results.episode_over[w] = steps[w] >= horizon or not (results.mask[w].any() or waits)
+        results.episode_over[w] = steps[w] >= horizon or not (
+            results.mask[w].any() or waits or has_signals
+        )
     return bool(results.episode_over.any())
 
 

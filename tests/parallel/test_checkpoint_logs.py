@@ -62,7 +62,7 @@ def test_worlds_that_are_reset_when_the_log_is_full(make: Make, kind: dict[str, 
 @pytest.fixture
 def checkpoint_log() -> Iterator[CheckpointLog]:
     config = load_world("merge").config
-    segments = make_segments(config, 1)
+    segments = make_segments(config, 1, 0)
     yield CheckpointLog(config, 1, [segment.fd for segment in segments])
     for segment in segments:
         segment.close()

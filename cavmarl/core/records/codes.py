@@ -84,6 +84,9 @@ SIGNAL_OFF = 7
 SIGNAL_YELLOW_MAJOR = 8
 SIGNAL_NONE = 255  # the link has no signal
 
+# PROGRAM["detector_gap_s"] of programs whose phases an agent chooses
+CHOSEN_BY_AGENT = -1.0
+
 # highway-env's five meta-actions
 ACTION_LANE_LEFT = 0
 ACTION_IDLE = 1

@@ -268,7 +268,7 @@ class TrafficLights:
             codes[own] = _CODE_OF_STATE[shown.state]
             if shown.state == GREEN:
                 codes[own[self._yields(light)]] = _GREEN_MINOR
-        self._env.signals.show_links(codes)
+        self._env.signal_overrides.show_links(codes)
 
     def _yields(self, light: int) -> NDArray[np.bool_]:
         """Return which links of a light have a green that yields, in any phase of the map."""

@@ -66,6 +66,7 @@ def report_continuation(
     departures: DepartureQueue,  # waiting vehicles, and the number of arrivals
     steps: NDArray[np.int64],  # (W,) since each world's reset
     horizon: int,  # steps of an episode
+    has_signals: bool,  # whether agents control signals; they stay until the horizon
     results: Results,  # is written
 ) -> bool:  # whether an episode is over
     """Write which agents act next and which episodes are over, after ended vehicles have left.
@@ -75,7 +76,7 @@ def report_continuation(
     some_over = False
     for w in range(steps.size):
         results.arrivals[w] = departures.counts[w, COUNT_ARRIVED]
-        goes_on = False
+        goes_on = has_signals
         for agent in range(outputs.present.shape[1]):
             acts = outputs.present[w, agent] and not outputs.terminated[w, agent]
             results.mask[w, agent] = acts

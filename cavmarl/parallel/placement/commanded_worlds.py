@@ -22,6 +22,7 @@ from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays
 from cavmarl.parallel.worlds.tasks import Task
 from cavmarl.parallel.worlds.world_errors import copy_error, network_error, original_error
 from cavmarl.shards.shard import Commands
+from cavmarl.signals.kernels.green_choices import KEEP
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
 MAX_AGENTS = 500  # limit in one request, since an answer is one message
@@ -113,6 +114,7 @@ class CommandedWorlds(ABC):
         arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
         arrays.external[:] = commands.external if commands.external.size else 0
         arrays.overridden[:] = commands.overridden if commands.overridden.size else 0
+        arrays.signal_choices[:] = commands.signal_choices if commands.signal_choices.size else KEEP
         self._command(Task.STEP)
         self._steps += 1
 

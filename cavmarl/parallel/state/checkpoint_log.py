@@ -24,14 +24,14 @@ STEPS = 16  # most steps from one image to the next, which a successor repeats
 _FIRST_IMAGE_BYTES = 1 << 12
 
 
-def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
+def make_segments(config: EnvConfig, num_worlds: int, num_signals: int) -> list[Segment]:
     """Make the memory of a checkpoint log, which outlives the writers of the log.
 
     Raises:
         WorkerError: there is not enough memory.
     """
     images = [Segment.make(_FIRST_IMAGE_BYTES) for _ in range(2)]
-    steps = Segment.make(size_of(_layout(config, num_worlds)))
+    steps = Segment.make(size_of(_layout(config, num_worlds, num_signals)))
     num_logs = num_worlds if config.traffic.source == "sumo-traffic" else 0
     return [*images, steps, *(Segment.make(FIRST_LOG_BYTES) for _ in range(2 * num_logs))]
 
@@ -47,14 +47,16 @@ class CheckpointLog:
         entries: commands of all steps for which there is room, for the first and the second image.
     """
 
-    def __init__(self, config: EnvConfig, num_worlds: int, descriptors: list[int]) -> None:
+    def __init__(
+        self, config: EnvConfig, num_worlds: int, num_signals: int, descriptors: list[int]
+    ) -> None:
         *images, steps = (Segment(fd, 0) for fd in descriptors[:3])
         self.place = np.zeros(2, dtype=np.int64)
         self.is_prepared = False  # the other image has the state at the end of the log
         self._images = [Image(segment) for segment in images]
         kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
         self._logs = kept[::2], kept[1::2]  # for each image, by world
-        arrays = arrays_in(steps.map(), _layout(config, num_worlds))
+        arrays = arrays_in(steps.map(), _layout(config, num_worlds, num_signals))
         self.entries = tuple(map(Commands, *(arrays[name] for name in COMMANDS)))
 
     def __len__(self) -> int:
@@ -115,7 +117,7 @@ class CheckpointLog:
         return self.entries[first : first + len(self)]
 
 
-def _layout(config: EnvConfig, num_worlds: int) -> Layout:
+def _layout(config: EnvConfig, num_worlds: int, num_signals: int) -> Layout:
     worlds: tuple[int, ...] = (2 * STEPS, num_worlds)
     agents = (*worlds, config.population.num_ids)
     inserted = (*worlds, config.population.insertions, 3)
@@ -128,5 +130,6 @@ def _layout(config: EnvConfig, num_worlds: int) -> Layout:
         ("<f8", inserted),
         ("<f8", external),
         ("<i4", overridden),
+        ("<i8", (*worlds, num_signals)),
     )
     return dict(zip(COMMANDS, kinds, strict=True))

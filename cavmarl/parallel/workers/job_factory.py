@@ -34,7 +34,7 @@ def make_jobs(message: Mapping[str, Any]) -> list[Job]:
     """
     world = world_of(message, CHANGED)
     config = world.config
-    layout = layout_of(config, message["capacity"], message["num_worlds"])
+    layout = layout_of(config, message["capacity"], message["num_worlds"], world.signal_sizes)
     arrays = StepArrays.of(arrays_in(Segment(message["arrays"], 0).map(), layout))
     one = LocalWorlds(without_journals(world), 1, warm=True)
     parts = [Part(*given) for given in message["parts"]]
@@ -84,7 +84,9 @@ def make_jobs(message: Mapping[str, Any]) -> list[Job]:
             ]
     jobs: list[Job] = []
     for part, descriptors, memory in zip(parts, message["checkpoint_logs"], saved, strict=True):
-        checkpoint_log = CheckpointLog(config, part.last - part.first, descriptors)
+        checkpoint_log = CheckpointLog(
+            config, part.last - part.first, world.signal_sizes.signals, descriptors
+        )
         is_team = len(part.zones) > 1
         worlds = make_shared(part.first) if is_team else make(part.first, part.last)
         attach_sensors(worlds, part)

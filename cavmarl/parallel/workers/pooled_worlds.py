@@ -8,7 +8,6 @@ from itertools import accumulate, chain, pairwise
 from pathlib import Path
 from typing import Any
 
-from cavmarl.config.env import EnvConfig
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
 from cavmarl.engine.compilation import compiled_before
@@ -71,7 +70,7 @@ class PooledWorlds(CommandedWorlds):
         if not compiled_before():
             LocalWorlds(without_journals(world), 1, warm=True)
         capacity = world.capacity
-        layout = layout_of(config, capacity, num_worlds)
+        layout = layout_of(config, capacity, num_worlds, world.signal_sizes)
         segment = Segment.make(size_of(layout))
         try:
             self.arrays = StepArrays.of(arrays_in(segment.map(), layout))
@@ -84,7 +83,7 @@ class PooledWorlds(CommandedWorlds):
             segment.close()
             raise _sensors_belong_to_a_worker(config.workers)
         warn_if_crowded(config.workers.sensors, len(parts))
-        logs = [_log_segments(config, part, may_change) for part in parts]
+        logs = [_log_segments(world, part, may_change) for part in parts]
         saved = [Segment.make(0) for _ in parts]
         message = make_world_message(
             world,
@@ -175,11 +174,11 @@ def _sensors_belong_to_a_worker(workers: WorkersConfig) -> ConfigError:
     )
 
 
-def _log_segments(config: EnvConfig, part: Part, may_change: bool) -> list[Segment]:
+def _log_segments(world: World, part: Part, may_change: bool) -> list[Segment]:
     """Make the memory for the checkpoints of a worker."""
     if may_change:
         return []
-    return make_segments(config, part.last - part.first)
+    return make_segments(world.config, part.last - part.first, world.signal_sizes.signals)
 
 
 def _names(parts: list[Part]) -> tuple[str, ...]:

@@ -30,6 +30,7 @@ from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
 from cavmarl.shards.shard import Commands
+from cavmarl.signals.signal_table import sizes_of
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
@@ -59,6 +60,8 @@ class LocalWorlds:
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
+        self._shows_signals = world.config.signals.are_controlled
+        self._has_signals = world.config.signals.have_agents
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
@@ -113,7 +116,7 @@ class LocalWorlds:
         arrays.vehicle_done[chosen] = False
         arrays.terms[chosen] = outputs.terms[chosen]
         arrays.ticks[:] = self.simulation.ticks()
-        goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come()
+        goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come() | self._has_signals
         arrays.episode_over[chosen] = ~goes_on[chosen]
         if not chosen.all():
             arrays.observations[~arrays.mask] = 0.0
@@ -127,6 +130,7 @@ class LocalWorlds:
             waiting = self._waiting.copy()
             self._begin(waiting)
             self._steps[waiting] = -1  # their first step comes next
+            arrays.signal_rewards[waiting] = arrays.signal_terms[waiting] = 0.0
         some_ended = self._write_results()
         if some_ended:
             simulation.retire_agents()
@@ -144,7 +148,12 @@ class LocalWorlds:
         """Write which agents act next; return whether an episode is over."""
         simulation = self.simulation
         return self._report_continuation(
-            simulation.outputs, simulation.departures, self._steps, self._horizon, self._results
+            simulation.outputs,
+            simulation.departures,
+            self._steps,
+            self._horizon,
+            self._has_signals,
+            self._results,
         )
 
     def _end(self, over: NDArray[np.bool_], some_over: bool) -> None:
@@ -156,6 +165,7 @@ class LocalWorlds:
             for name, frames in arrays.frames.items():
                 for final, array in zip(arrays.final_frames[name], frames, strict=True):
                     final[ended] = array[ended]
+        arrays.final_signal_observations[over] = arrays.signal_observations[over]
         if self.in_next_step:
             self._waiting[over] = True
             arrays.mask[over] = False
@@ -176,9 +186,13 @@ class LocalWorlds:
         self._waiting[chosen] = False
 
     def _show(self, chosen: NDArray[np.bool_]) -> None:
-        """Write the sensed frames of the chosen worlds (W,) to the observations."""
+        """Write what the agents of the chosen worlds (W,) observe."""
         if self._senses and self._is_flat:
             write_sensed(self.arrays.frames, chosen, self.arrays.observations)
+        if self._shows_signals:
+            found = self.simulation.signals.outputs
+            for name, values in found._asdict().items():
+                getattr(self.arrays, f"signal_{name}")[chosen] = values[chosen]
 
     def suggest(self) -> None:
         """Write the actions of the built-in driver for all agents."""
@@ -403,6 +417,7 @@ def kept_elsewhere(config: EnvConfig) -> str:
     kept = {
         "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
         "workers.sensors": config.workers.sensors,
+        "zones.simulators": config.zones.simulators,
     }
     return next((key for key, is_so in kept.items() if is_so), "")
 
@@ -416,7 +431,8 @@ def every_array(arrays: StepArrays) -> Iterator[NDArray[Any]]:
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
-    layout = layout_of(simulation.config, simulation.capacity, num_worlds)
+    sizes = sizes_of(simulation.network)
+    layout = layout_of(simulation.config, simulation.capacity, num_worlds, sizes)
     sensed = frame_layout(simulation.config, num_worlds)
     made = {
         name: np.zeros(shape, dtype)

@@ -19,7 +19,7 @@ def make_sensor_jobs(message: Mapping[str, Any]) -> list[SensorJob]:
     world = world_of(message)
     config = world.config
     shape = SceneShape(*message["shape"])
-    layout = layout_of(config, shape.capacity, message["num_worlds"])
+    layout = layout_of(config, shape.capacity, message["num_worlds"], world.signal_sizes)
     arrays = StepArrays.of(arrays_in(Segment(message["frames"], 0).map(), layout))
     frames = arrays.part(*message["part"]).frames
     shared = SceneArrays.of(Segment(message["scene"], 0), shape)

@@ -34,7 +34,7 @@ def local_worlds(
     if not config.workers.sensors:
         return LocalWorlds(world, num_worlds, in_next_step=in_next_step)
     warn_if_crowded(config.workers.sensors, 1)
-    layout = layout_of(config, world.capacity, num_worlds)
+    layout = layout_of(config, world.capacity, num_worlds, world.signal_sizes)
     segment = Segment.make(size_of(layout))
     arrays = StepArrays.of(arrays_in(segment.map(), layout))
     worlds = LocalWorlds(world, num_worlds, arrays, in_next_step=in_next_step)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.config.env import EnvConfig
+from cavmarl.config.signals import SIGNAL_TERMS
 from cavmarl.core.records.external_records import EXTERNAL_FIELDS
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import flat_observation_space, state_space
@@ -18,6 +19,9 @@ from cavmarl.parallel.memory.shared_memory import Layout
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.registry import frame_layout, frames_in
 from cavmarl.shards.shard import Commands
+from cavmarl.signals.kernels.green_choices import HELD
+from cavmarl.signals.kernels.lane_counts import COUNTS
+from cavmarl.signals.signal_table import SignalSizes
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
 FINAL_FRAMES = "final_rig."  # prefix of the names of final frames in a layout
@@ -50,6 +54,15 @@ class StepArrays(NamedTuple):
     inserted: NDArray[np.float64]  # (W, I, 3)
     external: NDArray[np.float64]  # (W, E, K)
     overridden: NDArray[np.int32]  # (W, N, 2)
+    signal_choices: NDArray[np.int64]  # (W, S)
+    signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, like the next six
+    signal_rewards: NDArray[np.float32]  # (W, S)
+    signal_terms: NDArray[np.float32]  # (W, S, T)
+    signal_masks: NDArray[np.bool_]  # (W, S, G)
+    signal_decides: NDArray[np.bool_]  # (W,)
+    signal_counts: NDArray[np.int64]  # (W, N, COUNTS)
+    signal_states: NDArray[np.int64]  # (W, S, HELD)
+    final_signal_observations: NDArray[np.float32]  # (W, S, D) last ones of an episode that ended
     suggested: NDArray[np.float64]  # (W, A, 2) actions of the built-in driver
     states: NDArray[np.float32]  # (W, S) global states at the last request
     frames: Frames  # of mounted sensors
@@ -70,8 +83,10 @@ class StepArrays(NamedTuple):
         return StepArrays(*parts)
 
 
-def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
+def layout_of(config: EnvConfig, capacity: int, num_worlds: int, signals: SignalSizes) -> Layout:
     """Return name → dtype and shape of the `StepArrays` of worlds with room for `capacity`."""
+    of_signals = (num_worlds, signals.signals)
+    observed = ("<f4", (*of_signals, signals.features))
     agents = (num_worlds, config.population.num_ids)
     observations = ("<f4", (*agents, flat_observation_space(config).shape[0]))
     flags = ("|b1", agents)
@@ -92,6 +107,15 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "inserted": ("<f8", (num_worlds, config.population.insertions, 3)),
         "external": ("<f8", (num_worlds, config.population.external, EXTERNAL_FIELDS)),
         "overridden": ("<i4", (num_worlds, config.signals.overrides, 2)),
+        "signal_choices": ("<i8", of_signals),
+        "signal_observations": observed,
+        "final_signal_observations": observed,
+        "signal_rewards": ("<f4", of_signals),
+        "signal_terms": ("<f4", (*of_signals, len(SIGNAL_TERMS))),
+        "signal_masks": ("|b1", (*of_signals, signals.greens)),
+        "signal_decides": ("|b1", (num_worlds,)),
+        "signal_counts": ("<i8", (num_worlds, signals.lanes, COUNTS)),
+        "signal_states": ("<i8", (*of_signals, HELD)),
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
         **frame_layout(config, num_worlds),

@@ -1,5 +1,7 @@
 """Signals: the present phase of fixed-time programs and of actuated programs.
 
+Agents choose the phases of other programs; see `signals.kernels.green_choices`.
+
 The phase of a fixed-time program is a function of the tick. An actuated program is SUMO's gap-based
 control: a green phase is prolonged while vehicles follow one another over its detectors, up to its
 maximum duration. Its times are whole milliseconds, as in SUMO. Its state is part of the world: the
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import CHOSEN_BY_AGENT
 from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.roads.kernels.map_choice import map_of
 
@@ -170,9 +173,9 @@ def _control(
     rows = roads.maps[own_map]
     for program in range(rows["first_program"], rows["first_program"] + rows["num_programs"]):
         controller = roads.programs[program]["controller"]
-        if controller >= 0:
+        gap_s = roads.programs[program]["detector_gap_s"]
+        if controller >= 0 and gap_s != CHOSEN_BY_AGENT:
             state = controllers[controller]
-            gap_s = roads.programs[program]["detector_gap_s"]
             while state["next_ms"] < end_ms:
                 state["next_ms"] += _check(roads, state, detected_s, gap_s, now_ms)
 

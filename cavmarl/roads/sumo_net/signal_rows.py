@@ -6,12 +6,14 @@ Rows are only appended, so programs of additional files can be added to those of
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.records.codes import CHOSEN_BY_AGENT
 from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
 from cavmarl.roads.sumo_net.programs import ProgramPhase, SignalProgram
 
@@ -36,6 +38,17 @@ class SignalArrays(NamedTuple):
     phase_states: NDArray[np.uint8]  # (num_letters,)
     switches: NDArray[np.void]  # SWITCH (num_switches,)
     program_ids: tuple[str, ...]
+
+
+class ControlledPhase(NamedTuple):
+    """A phase that an agent chooses, or that comes between two such phases."""
+
+    letters: str
+    duration_s: float  # in the map's program
+    min_ms: int
+    max_ms: int
+    following: int  # number of the next phase in the program
+    green: bool
 
 
 class SignalRows:
@@ -131,6 +144,33 @@ class SignalRows:
         self.program_ids.append(program.program_id)
         self.program_row[signal_id, program.program_id] = row
         self.signals[signal][0] = row
+
+    def add_controlled(
+        self,
+        signal_id: str,
+        program_id: str,
+        phases: Sequence[ControlledPhase],
+        cycle_s: float,
+    ) -> None:
+        """Append a program whose phases an agent chooses, and let it run.
+
+        `cycle_s`: duration of a cycle, for estimates of travel times.
+        """
+        signal, first = self.row[signal_id], len(self.phases)
+        num_links = self.signals[signal][1]
+        for letters, duration_s, min_ms, max_ms, following, green in phases:
+            state = len(self.letters)
+            self.phases.append((duration_s, min_ms, max_ms, first + following, green, state, 0, 0))
+            self.letters.extend(map(SIGNAL_STATES.index, letters[:num_links]))
+        row = len(self.programs)
+        controller = self._next_controller()
+        self.programs.append(
+            (signal, first, len(phases), 0.0, cycle_s, controller, CHOSEN_BY_AGENT, False)
+        )
+        self.program_ids.append(program_id)
+        self.program_row[signal_id, program_id] = row
+        self.signals[signal][0] = row
+        self.switches = [switch for switch in self.switches if switch[0] != signal]
 
     def _next_controller(self) -> int:
         self.num_controllers += 1

@@ -1,0 +1,183 @@
+"""`SignalAgents`: the agents of signals, with their spaces, and the check of their choices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.signals import SIGNAL_TERMS
+from cavmarl.core.errors import ActionError
+from cavmarl.parallel.worlds.step_arrays import StepArrays
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.signals.controllers import ProgramController, SignalView
+from cavmarl.signals.kernels.green_choices import GREEN, KEEP, REFUSED
+from cavmarl.signals.signal_table import SignalTable
+
+PREFIX = "signal_"  # of the ids of these agents, followed by the id of the signal
+
+
+class SignalAgents:
+    """The agents of S signals in W worlds, and their results.
+
+    Args:
+        config: configuration of the worlds.
+        network: map of the worlds.
+        arrays: inputs and outputs of a step.
+
+    Attributes:
+        table: the signals with their greens, lanes and movements.
+        agents: ids of the agents (S,).
+    """
+
+    def __init__(self, config: EnvConfig, network: RoadNetwork, arrays: StepArrays) -> None:
+        self._config = config.signals
+        self._dt = config.clock.sim_dt_s
+        self._is_strict = config.action.missing_action == "error"
+        self._arrays = arrays
+        self.table = SignalTable(network)
+        self.agents = tuple(f"{PREFIX}{name}" for name in self.table.ids)
+        self._index = {agent: s for s, agent in enumerate(self.agents)}
+        cyclic = self._config.action == "keep_or_next"
+        greens = self.table.arrays.num_greens
+        self.num_choices: NDArray[np.int32] = np.minimum(greens, 2) if cyclic else greens
+        self._keep = np.full(arrays.signal_choices.shape, KEEP, dtype=np.int64)
+
+    def __contains__(self, agent: object) -> bool:
+        return agent in self._index
+
+    @property
+    def view(self) -> SignalView:
+        """What controllers know; see `signals.controllers`."""
+        arrays = self._arrays
+        return SignalView(
+            config=self._config,
+            dt=self._dt,
+            table=self.table,
+            ticks=arrays.ticks,
+            counts=arrays.signal_counts,
+            states=arrays.signal_states,
+            masks=arrays.signal_masks,
+            decides=arrays.signal_decides,
+        )
+
+    def suggest(self) -> NDArray[np.int64]:
+        """Return the choices (W, S) that follow the durations of the map's programs."""
+        return ProgramController().choose(self.view)
+
+    def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """Return the space of each agent's observation: a Box of its own size."""
+        return {
+            agent: spaces.Box(0.0, 1.0, (size,), np.float32)
+            for agent, size in zip(self.agents, self.table.features, strict=True)
+        }
+
+    def action_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """Return the space of each agent's choices."""
+        return {
+            agent: spaces.Discrete(count)
+            for agent, count in zip(self.agents, self.num_choices.tolist(), strict=True)
+        }
+
+    def from_dict(self, actions: Mapping[str, Any]) -> NDArray[np.int64]:
+        """Return the choices (1, S) of one world's agents.
+
+        Raises:
+            ActionError: an action is missing or invalid.
+        """
+        if not self._arrays.signal_decides[0]:
+            return self._keep
+        missing = [agent for agent in self.agents if agent not in actions]
+        if missing and self._is_strict:
+            raise ActionError(
+                f"no action for {', '.join(missing)}: pass one for each signal when "
+                "infos[id]['decides'] is 1, or set action.missing_action = hold"
+            )
+        given = [actions.get(agent, KEEP) for agent in self.agents]
+        for agent, value in zip(self.agents, given, strict=True):
+            if not isinstance(value, int | np.integer) and np.shape(value) != ():
+                raise ActionError(
+                    f"{agent}: the action has shape {np.shape(value)}: must be one whole number"
+                )
+        is_given = np.array([agent in actions for agent in self.agents])
+        return self._checked(np.array([given]), is_given[None])
+
+    def from_array(self, choices: Any) -> NDArray[np.int64]:
+        """Return the choices (W, S) of all worlds.
+
+        Raises:
+            ActionError: the shape, the dtype or a value is wrong.
+        """
+        found = np.asarray(choices)
+        if found.shape != self._keep.shape:
+            raise ActionError(
+                f"choices of signals have shape {found.shape}: must be {self._keep.shape}, "
+                "(num_envs, number of signals)"
+            )
+        return self._checked(found, np.ones(found.shape, dtype=np.bool_))
+
+    def _checked(self, choices: NDArray[Any], is_given: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the choices; KEEP in worlds in which it is not time for a decision."""
+        if choices.dtype.kind not in "iu":
+            raise ActionError(
+                f"choices of signals have dtype {choices.dtype}: pass whole numbers (int64)"
+            )
+        reads = is_given & self._arrays.signal_decides[:, None]
+        wrong = reads & ((choices < 0) | (choices >= self.num_choices))
+        if wrong.any():
+            w, s = np.argwhere(wrong)[0].tolist()
+            raise ActionError(
+                f"world {w}, {self.agents[s]}: the action is {choices[w, s]}, must be from 0 to "
+                f"{self.num_choices[s] - 1}"
+            )
+        decoded = np.where(reads, choices, KEEP).astype(np.int64)
+        if self._config.forbidden == "error":
+            self._refuse_forbidden(decoded)
+        return decoded
+
+    def _refuse_forbidden(self, choices: NDArray[np.int64]) -> None:
+        index = np.maximum(choices, 0)[..., None]
+        allowed = np.take_along_axis(self._arrays.signal_masks, index, axis=2)[..., 0]
+        wrong = (choices != KEEP) & ~allowed
+        if wrong.any():
+            w, s = np.argwhere(wrong)[0].tolist()
+            raise ActionError(
+                f"world {w}, {self.agents[s]}: the action {choices[w, s]} is not allowed now; "
+                "choose one of the action mask, or set signals.forbidden = ignore"
+            )
+
+    def infos(self) -> dict[str, dict[str, Any]]:
+        """Return the info of each agent of the first world.
+
+        `decides`: whether its next action counts. `action_mask`: allowed choices, int8. `green`:
+        index of the present green. `refused`: choices of the episode that were not allowed. And
+        each term of the reward.
+        """
+        arrays = self._arrays
+        decides = int(arrays.signal_decides[0])
+        masks = arrays.signal_masks[0].astype(np.int8)
+        states = arrays.signal_states[0].tolist()
+        found: dict[str, dict[str, Any]] = {}
+        for s, (agent, terms) in enumerate(
+            zip(self.agents, arrays.signal_terms[0].tolist(), strict=True)
+        ):
+            found[agent] = {
+                **dict(zip(SIGNAL_TERMS, terms, strict=True)),
+                "decides": decides,
+                "action_mask": masks[s, : self.num_choices[s]],
+                "green": states[s][GREEN],
+                "refused": states[s][REFUSED],
+            }
+        return found
+
+    def observations(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of each agent's observation in the first world."""
+        found = self._arrays.signal_observations[0].copy()
+        return {
+            agent: found[s, :size]
+            for s, (agent, size) in enumerate(zip(self.agents, self.table.features, strict=True))
+        }

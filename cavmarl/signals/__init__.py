@@ -1,0 +1,1 @@
+"""Signals that agents control: their programs, tables, observations and rewards."""

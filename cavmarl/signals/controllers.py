@@ -1,0 +1,145 @@
+"""Controllers of signals: they choose greens from what agents know about the lanes.
+
+Each controller is for W worlds, and keeps no state of its own. Choices that the mask excludes are
+replaced by the present green.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.signals import SignalsConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.signals.kernels.green_choices import GREEN, KEEP, SINCE
+from cavmarl.signals.kernels.green_scores import LaneWeights, choose_best
+from cavmarl.signals.kernels.lane_counts import VEHICLES
+from cavmarl.signals.signal_table import SignalTable
+
+
+class SignalView(NamedTuple):
+    """What controllers know, in W worlds.
+
+    Attributes:
+        config: durations and kind of action.
+        dt: length of a tick in s.
+        table: greens, lanes and movements of S signals.
+        ticks: (W,) since the reset.
+        counts: (W, N, COUNTS) of the watched lanes; see `signals.kernels.lane_counts`.
+        states: (W, S, HELD) of the signals; see `signals.kernels.green_choices`.
+        masks: (W, S, G) allowed choices.
+        decides: (W,) whether it is time for a decision.
+    """
+
+    config: SignalsConfig
+    dt: float
+    table: SignalTable
+    ticks: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    states: NDArray[np.int64]
+    masks: NDArray[np.bool_]
+    decides: NDArray[np.bool_]
+
+
+class SignalController(Protocol):
+    """A controller of all signals."""
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Return the choice (W, S) of each agent; KEEP where it is not time for a decision."""
+        ...
+
+
+class ProgramController:
+    """Follows the order and the durations of the greens in the map's programs."""
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Begin the next green when the present green has lasted as long as in the program."""
+        green = view.states[..., GREEN]
+        num_greens = view.table.arrays.num_greens
+        change_s = view.config.yellow_s + view.config.all_red_s
+        lasted_s = (view.ticks[:, None] - view.states[..., SINCE]) * view.dt - change_s
+        due_s = view.table.green_s[np.arange(len(num_greens)), green]
+        wanted = np.where(lasted_s >= due_s - 0.5 * view.dt, (green + 1) % num_greens, green)
+        return _choices(view, wanted)
+
+
+class LongestQueue:
+    """Chooses the green that opens lanes with most vehicles, as RESCO's controller "greedy"."""
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Choose the green with most vehicles on lanes that it opens; the present one on a tie."""
+        return _best(view, view.table.served)
+
+
+class MaxPressure:
+    """Chooses the green with the greatest pressure of the movements that it opens.
+
+    Source: Varaiya, "Max pressure control of a network of signalized intersections" (2013), with
+        equal capacities, and the vehicles on a lane as its queue.
+    """
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Choose the green whose movements have most vehicles before and fewest behind them."""
+        return _best(view, view.table.pressure)
+
+
+CONTROLLERS: dict[str, Callable[[], SignalController]] = {  # the names of SIGNAL_CONTROLLERS
+    "program": ProgramController,
+    "longest_queue": LongestQueue,
+    "max_pressure": MaxPressure,
+}
+
+
+def make_controller(name: str) -> SignalController:
+    """Return a controller by its name.
+
+    Raises:
+        ConfigError: there is no such controller.
+    """
+    if name not in CONTROLLERS:
+        raise ConfigError(
+            f"no controller of signals {name!r}: must be one of {', '.join(CONTROLLERS)}"
+        )
+    return CONTROLLERS[name]()
+
+
+def _best(view: SignalView, weights: LaneWeights) -> NDArray[np.int64]:
+    """Choose the allowed green whose lanes have most vehicles, weighted."""
+    choices = np.empty(view.states.shape[:2], dtype=np.int64)
+    choose_best(
+        weights,
+        VEHICLES,
+        view.config.action == "keep_or_next",
+        view.table.arrays.num_greens,
+        view.counts,
+        view.states,
+        view.masks,
+        view.decides,
+        choices,
+    )
+    return choices
+
+
+def _keeps(view: SignalView) -> NDArray[np.bool_]:
+    """Return whether each present green (W, S) may stay."""
+    index = view.states[..., GREEN] if view.config.action == "next_phase" else 0
+    index = np.broadcast_to(index, view.states.shape[:2])[..., None]
+    found: NDArray[np.bool_] = np.take_along_axis(view.masks, index, axis=2)[..., 0]
+    return found
+
+
+def _choices(view: SignalView, wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the choices for wanted greens (W, S), as far as they are allowed."""
+    green = view.states[..., GREEN]
+    if view.config.action == "next_phase":
+        choices, keep = wanted, green
+        change = (green + 1) % view.table.arrays.num_greens
+    else:
+        choices, keep = (wanted != green).astype(np.int64), np.zeros_like(green)
+        change = np.ones_like(green)
+    may = np.take_along_axis(view.masks, choices[..., None], axis=2)[..., 0]
+    fallback = np.where(_keeps(view), keep, change)
+    return np.where(view.decides[:, None], np.where(may, choices, fallback), KEEP)

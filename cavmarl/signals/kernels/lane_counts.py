@@ -1,0 +1,83 @@
+"""Counts of vehicles on lanes near signals.
+
+All counts are whole numbers, so their sums do not depend on the order or the owners of vehicles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import kernel
+from cavmarl.core.records.rows import is_off_lanes
+from cavmarl.signals.kernels.controlled_signals import ControlledSignals
+
+# Columns of the counts (W, N, COUNTS) of lanes.
+VEHICLES = 0
+STANDING = 1
+STOOD_TICKS = 2  # sum of the ticks for which vehicles have stood on this lane
+SPEED_PPM = 3  # sum of speeds as shares of the desired speed, in millionths
+LENGTH_MM = 4  # sum of the lengths of vehicles
+COUNTS = 5
+
+STANDING_MPS = 0.1  # below this speed a vehicle stands, as in SUMO
+NOT_COUNTED = -1
+
+_LANE_SHIFT = 32
+
+
+@kernel
+def count_standing(
+    rows: NDArray[np.void],  # VEHICLE (k, W, C), "lane_stood" is updated
+    num_owned: NDArray[np.int64],  # (k, W)
+    lane_index: NDArray[np.int32],  # see `ControlledSignals`
+) -> None:
+    """Count for each vehicle how long it has stood on its lane, if the lane is watched."""
+    for zone in range(rows.shape[0]):
+        for w in range(rows.shape[1]):
+            for i in range(num_owned[zone, w]):
+                row = rows[zone, w, i]
+                if is_off_lanes(row) or lane_index[row["lane"]] < 0:
+                    row["lane_stood"] = NOT_COUNTED
+                    continue
+                lane = np.int64(row["lane"])
+                stood = row["lane_stood"]
+                if stood < 0 or stood >> _LANE_SHIFT != lane:
+                    stood = lane << _LANE_SHIFT
+                if abs(row["speed"]) < STANDING_MPS:
+                    stood += 1
+                row["lane_stood"] = stood
+
+
+@kernel
+def count_lanes(
+    controlled: ControlledSignals,
+    rows: NDArray[np.void],  # VEHICLE (k, W, C)
+    num_owned: NDArray[np.int64],  # (k, W)
+    chosen: NDArray[np.bool_],  # (W,)
+    counts: NDArray[np.int64],  # (W, N, COUNTS), overwritten in the chosen worlds
+) -> None:
+    """Count the vehicles on the watched lanes of the chosen worlds."""
+    for w in range(rows.shape[1]):
+        if not chosen[w]:
+            continue
+        counts[w] = 0
+        for zone in range(rows.shape[0]):
+            for i in range(num_owned[zone, w]):
+                row = rows[zone, w, i]
+                if is_off_lanes(row):
+                    continue
+                n = controlled.lane_index[row["lane"]]
+                if n < 0:
+                    continue
+                found = counts[w, n]
+                speed = abs(row["speed"])
+                desired = controlled.speed_mps[n] * max(row["speed_factor"], 1e-3)
+                found[VEHICLES] += 1
+                found[STANDING] += speed < STANDING_MPS
+                if row["lane_stood"] >= 0:
+                    found[STOOD_TICKS] += row["lane_stood"] & ((1 << _LANE_SHIFT) - 1)
+                found[SPEED_PPM] += math.floor(speed / desired * 1e6 + 0.5)
+                found[LENGTH_MM] += math.floor(row["length"] * 1e3 + 0.5)

@@ -1,0 +1,134 @@
+"""The part of a tick that concerns signals whose greens are chosen, as three calls."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import kernel
+from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
+from cavmarl.signals.kernels.green_choices import choose_greens, mask_choices, show_greens
+from cavmarl.signals.kernels.lane_counts import count_lanes, count_standing
+from cavmarl.signals.kernels.signal_observations import observe_signals, reward_signals
+
+
+class SignalRules(NamedTuple):
+    """The signals whose greens are chosen, and the rules for choices, for kernels."""
+
+    controlled: ControlledSignals
+    durations: SignalTicks
+    cyclic: bool  # choices are 0: keep, 1: the next green; else the index of a green
+    dt: float
+    weights: NDArray[np.float64]  # (T,) of SIGNAL_TERMS
+
+
+class SignalWorlds(NamedTuple):
+    """The state of W worlds that these signals read and write."""
+
+    ticks: NDArray[np.int64]  # (W,)
+    controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers)
+    signal_phase: NDArray[np.int32]  # (W, num_signals)
+    rows: NDArray[np.void]  # VEHICLE (2, k, W, C), see `ZoneState`
+    sides: NDArray[np.int64]  # (2,) the half of the rows with the committed rows; another number
+    num_owned: NDArray[np.int64]  # (k, W)
+
+
+class SignalOutputs(NamedTuple):
+    """State and outputs of S signals.
+
+    Observations and counts are those of the last decision. G is the number of greens of the signal
+    that has most, N the number of watched lanes, T the number of terms.
+    """
+
+    observations: NDArray[np.float32]  # (W, S, D)
+    rewards: NDArray[np.float32]  # (W, S) 0 in steps that do not end an interval of decisions
+    terms: NDArray[np.float32]  # (W, S, T)
+    masks: NDArray[np.bool_]  # (W, S, G) choices that are allowed in the next step
+    decides: NDArray[np.bool_]  # (W,) whether choices count in the next step
+    counts: NDArray[np.int64]  # (W, N, COUNTS) see `signals.kernels.lane_counts`
+    states: NDArray[np.int64]  # (W, S, HELD) see `signals.kernels.green_choices`
+
+
+@kernel
+def begin_signal_step(
+    rules: SignalRules,
+    worlds: SignalWorlds,
+    outputs: SignalOutputs,
+    choices: NDArray[np.int64],  # (W, S), see `choose_greens`
+) -> None:
+    """Change the greens as chosen, and set the phases of the present tick."""
+    choose_greens(
+        rules.controlled, rules.durations, rules.cyclic, choices, worlds.ticks, outputs.states
+    )
+    _show(rules, worlds, outputs)
+
+
+@kernel
+def end_signal_tick(rules: SignalRules, worlds: SignalWorlds, outputs: SignalOutputs) -> None:
+    """Set the phases of the present tick, and count how long vehicles have stood."""
+    _show(rules, worlds, outputs)
+    rows = worlds.rows[worlds.sides[0]]
+    count_standing(rows, worlds.num_owned, rules.controlled.lane_index)
+
+
+@kernel
+def end_signal_step(
+    rules: SignalRules,
+    worlds: SignalWorlds,
+    outputs: SignalOutputs,
+    chosen: NDArray[np.bool_],  # (W,) worlds to observe, if it is time for a decision
+    stood: NDArray[np.int64],  # (W, S) see `reward_signals`
+    observed: NDArray[np.bool_],  # (W,) output
+    rewarded: NDArray[np.bool_],  # (1,) whether an interval between decisions has ended
+) -> None:
+    """Write the outputs of a step, or of a reset."""
+    controlled, durations = rules.controlled, rules.durations
+    mask_choices(
+        controlled,
+        durations,
+        rules.cyclic,
+        worlds.ticks,
+        outputs.states,
+        outputs.decides,
+        outputs.masks,
+    )
+    for w in range(chosen.size):
+        observed[w] = chosen[w] and outputs.decides[w]
+    rows = worlds.rows[worlds.sides[0]]
+    count_lanes(controlled, rows, worlds.num_owned, observed, outputs.counts)
+    observe_signals(
+        controlled,
+        durations,
+        worlds.ticks,
+        observed,
+        outputs.states,
+        outputs.counts,
+        outputs.observations,
+    )
+    reward_signals(
+        controlled,
+        rules.dt,
+        rules.weights,
+        chosen,
+        observed,
+        rewarded[0],
+        outputs.counts,
+        stood,
+        outputs.terms,
+        outputs.rewards,
+    )
+
+
+@kernel
+def _show(rules: SignalRules, worlds: SignalWorlds, outputs: SignalOutputs) -> None:
+    show_greens(
+        rules.controlled,
+        rules.durations,
+        rules.dt,
+        worlds.ticks,
+        outputs.states,
+        worlds.controllers,
+        worlds.signal_phase,
+    )
