@@ -77,8 +77,8 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     """Return a network in which agents choose the phases of signals.
 
     The greens of a signal are the phases of its program with a green and no yellow letter, in the
-    order of the program; equal ones count once. Other programs and timetables of these signals do
-    not run.
+    order of the program; see `signals.equal_greens`. Other programs and timetables of these signals
+    do not run.
 
     Args:
         network: the map.
@@ -94,7 +94,7 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     if not config.are_controlled:
         return network
     greens = {
-        name: greens_of(network, row)[: MAX_GREENS + 1]
+        name: greens_of(network, row, config.equal_greens == "each")[: MAX_GREENS + 1]
         for row, name in enumerate(network.signal_ids)
     }
     chosen = _chosen(network, config, greens)
@@ -110,22 +110,28 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     )
 
 
-def greens_of(network: RoadNetwork, signal: int) -> tuple[tuple[str, float], ...]:
-    """Return the greens of a signal's present program: letters, and duration in s; each once."""
+def greens_of(
+    network: RoadNetwork, signal: int, keeps_equal: bool = False
+) -> tuple[tuple[str, float], ...]:
+    """Return the greens of a signal's present program: letters, and duration in s.
+
+    Equal greens count once unless `keeps_equal` is set.
+    """
     links = network.links[network.links["signal"] == signal]
     used = sorted({int(index) for index in links["signal_index"]})
     program = network.programs[network.signals["program"][signal]]
     num_links = int(network.signals["num_links"][signal])
     first = int(program["first_phase"])
-    found: dict[str, float] = {}
+    found: list[tuple[str, float]] = []
     for phase in network.phases[first : first + program["num_phases"]]:
         start = int(phase["first_state"])
         codes = network.phase_states[start : start + num_links].tolist()
         letters = "".join(SIGNAL_STATES[code] for code in codes)
         shown = {letters[index] for index in used}
         if shown & set(_GREENS) and not shown & set(_YELLOWS):
-            found.setdefault(letters, float(phase["duration_s"]))
-    return tuple(found.items())
+            if keeps_equal or letters not in dict(found):
+                found.append((letters, float(phase["duration_s"])))
+    return tuple(found)
 
 
 def _chosen(
