@@ -49,7 +49,7 @@ class AgentProgram(NamedTuple):
         pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
         found = [*greens]
         for is_used, duration_s, make in (
-            (self.yellow, config.yellow_s, _yellow),
+            (self.yellow, config.yellow_s, between_greens),
             (self.all_red, config.all_red_s, _all_red),
         ):
             if not is_used:
@@ -176,7 +176,7 @@ def _tell_once(source_hash: str, name: str, count: int, shown: str) -> None:
     )  # fmt: skip
 
 
-def _yellow(before: str, after: str) -> str:
+def between_greens(before: str, after: str) -> str:
     """Return the letters between two greens: green links that become red show yellow."""
     return "".join(
         "y" if old in _GREENS and new in "rs" else old

@@ -28,9 +28,7 @@ class EpsilonGreedy:
         self.decay = decay
         self.epsilon = initial_epsilon
 
-    def choose(
-        self, q_table: Mapping[Any, Sequence[float]], state: Any, action_space: Any
-    ) -> int:
+    def choose(self, q_table: Mapping[Any, Sequence[float]], state: Any, action_space: Any) -> int:
         """Return an action for a state whose action values are in `q_table`."""
         explores = np.random.random() < self.epsilon
         self.epsilon = max(self.min_epsilon, self.epsilon * self.decay)

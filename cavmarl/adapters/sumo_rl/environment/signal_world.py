@@ -1,4 +1,4 @@
-"""`SignalWorld`: the world of a `SumoEnvironment`, with the vehicles on the lanes of its signals."""
+"""`SignalWorld`: the world of a `SumoEnvironment`, with counts of vehicles near its signals."""
 
 from __future__ import annotations
 
@@ -53,7 +53,6 @@ class WorldSettings:
     decide_s: float
     yellow_s: float
     min_green_s: float
-    max_green_s: float  # 0: no maximum
     follows_programs: bool  # instead of choices
     sumo_options: str  # of SUMO's command line
     render_mode: str | None
@@ -93,7 +92,7 @@ class WorldSettings:
             "decide_s": float(self.decide_s),
             "yellow_s": float(self.yellow_s),
             "min_green_s": float(self.min_green_s),
-            "max_green_s": float(self.max_green_s),
+            "max_green_s": 0.0,
             "equal_greens": "each",
         }
 
@@ -160,8 +159,7 @@ class SignalWorld:
     @property
     def time_s(self) -> float:
         """Time since the episode began."""
-        ticks = int(self._session.worlds.arrays.ticks[0])
-        return ticks * self._session.config.clock.sim_dt_s
+        return self._steps * self._settings.decide_s
 
     @property
     def is_over(self) -> bool:
@@ -179,12 +177,8 @@ class SignalWorld:
         """Advance to the next decision; `choices` (S,) are greens or KEEP."""
         idle = self._session.decoder.idle()
         for _ in range(self._settings.parts):
-            if self._settings.follows_programs:
-                self._session.step(idle)
-                self._count()
-            else:
-                self._session.step(idle, choices[None])
-                self._count()
+            self._session.step(idle, None if self._settings.follows_programs else choices[None])
+            self._count()
         self._steps += 1
 
     def no_choices(self) -> NDArray[np.int64]:
@@ -202,6 +196,11 @@ class SignalWorld:
         state = arrays.signal_states[0, signal].tolist()
         ticks = int(arrays.ticks[0]) - state[SINCE]
         return state[PREVIOUS], state[GREEN], ticks * self._session.config.clock.sim_dt_s
+
+    def num_phases(self, signal: str) -> int:
+        """Return the number of phases of a signal's present program."""
+        row = self.network.signal_ids.index(signal)
+        return int(self.network.programs[self.network.signals["program"][row]]["num_phases"])
 
     def stood_s(self, lanes: Sequence[int]) -> list[float]:
         """Return for each lane how long its vehicles have stood on it, in total."""
@@ -237,9 +236,7 @@ class SignalWorld:
         stands = speed < STANDING_MPS
         before, self._stood = self._stood, {}
         stood = np.zeros(len(rows), dtype=np.int64)
-        for k, (vehicle, lane) in enumerate(
-            zip(rows["id"].tolist(), lanes.tolist(), strict=True)
-        ):
+        for k, (vehicle, lane) in enumerate(zip(rows["id"].tolist(), lanes.tolist(), strict=True)):
             last_lane, steps = before.get(vehicle, (lane, 0))
             stood[k] = (steps if last_lane == lane else 0) + bool(stands[k])
             self._stood[vehicle] = lane, int(stood[k])
