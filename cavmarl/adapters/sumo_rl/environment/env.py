@@ -202,7 +202,7 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
     def sim_step(self) -> float:
         """Present time in s."""
         passed_s = 0.0 if self._world is None else self._world.time_s
-        return round(self.begin_time + passed_s, 6)
+        return float(round(self.begin_time + passed_s, 6))
 
     @property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override] # depends on the map

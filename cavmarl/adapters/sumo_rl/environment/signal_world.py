@@ -6,7 +6,7 @@ import math
 import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,12 +19,15 @@ from numpy.typing import NDArray
 from cavmarl.config.registry import load_config
 from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.errors import ConfigError, DemandError, MapError
+from cavmarl.core.seeds import first_seed
+from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.drawn_worlds import RENDER_MODES, check_rendering
-from cavmarl.env.step_session import StepSession
-from cavmarl.parallel.backends import find_backend, make_worlds
+from cavmarl.parallel.backends import find_backend
+from cavmarl.render.topdown import WorldView
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.sumo_options import known_options
+from cavmarl.shards.shard import Commands
 from cavmarl.signals.agent_programs import with_agent_programs
 from cavmarl.signals.kernels.green_choices import GREEN, KEEP, PREVIOUS, SINCE
 from cavmarl.signals.kernels.lane_counts import (
@@ -137,16 +140,20 @@ class SignalWorld:
     """
 
     def __init__(self, settings: WorldSettings) -> None:
-        backend = find_backend(None, None, None)
         with TemporaryDirectory(prefix="cavmarl-") as folder:
             file = Path(folder) / "world.sumocfg"
             settings.write_config(file)
             config, base_dir = load_config(file, agents=0, overrides=settings.keys)
+            backend = find_backend(None, None, None)
             check_rendering(config, settings.render_mode, backend, RENDER_MODES)
             world = make_world(config, base_dir)
         world.tell_tolerated()
         self._settings = settings
-        self._session = StepSession(make_worlds(world, base_dir, 1, backend, True))
+        # Without agents there is no environment, so the simulation is driven directly.
+        self._simulation = Simulation(
+            config, world.network, demand=world.demand, partition=world.partition
+        )
+        self._clock = config.clock
         self.network: RoadNetwork = world.network
         controlled = self.network
         if settings.follows_programs:
@@ -155,6 +162,8 @@ class SignalWorld:
         self.counts: NDArray[np.int64] = np.zeros((len(self.table.lanes), COUNTS), dtype=np.int64)
         self._stood: dict[int, tuple[int, int]] = {}  # vehicle → lane, and steps stood on it
         self._steps = 0
+        self._is_seeded = False
+        self._view: WorldView | None = None
 
     @property
     def time_s(self) -> float:
@@ -168,16 +177,21 @@ class SignalWorld:
 
     def reset(self, seed: int | None) -> None:
         """Begin an episode; None: the next one, or a random one."""
-        self._session.reset(seed, np.ones(1, dtype=np.bool_))
+        if seed is not None or not self._is_seeded:
+            self._simulation.seed(first_seed(seed, None))
+            self._is_seeded = True
+        self._simulation.reset()
         self._stood.clear()
         self._steps = 0
         self._count()
 
     def step(self, choices: NDArray[np.int64]) -> None:
         """Advance to the next decision; `choices` (S,) are greens or KEEP."""
-        idle = self._session.decoder.idle()
+        commands = Commands(np.zeros((1, 0, 2)), np.zeros((1, 0), dtype=np.int64))
+        if not self._settings.follows_programs:
+            commands = replace(commands, signal_choices=choices[None])
         for _ in range(self._settings.parts):
-            self._session.step(idle, None if self._settings.follows_programs else choices[None])
+            self._simulation.step(commands)
             self._count()
         self._steps += 1
 
@@ -192,10 +206,9 @@ class SignalWorld:
         """
         if self._settings.follows_programs:
             return 0, 0, 0.0
-        arrays = self._session.worlds.arrays
-        state = arrays.signal_states[0, signal].tolist()
-        ticks = int(arrays.ticks[0]) - state[SINCE]
-        return state[PREVIOUS], state[GREEN], ticks * self._session.config.clock.sim_dt_s
+        state = self._simulation.signals.outputs.states[0, signal].tolist()
+        ticks = int(self._simulation.ticks()[0]) - state[SINCE]
+        return state[PREVIOUS], state[GREEN], round(ticks * self._clock.sim_dt_s, 6)
 
     def num_phases(self, signal: str) -> int:
         """Return the number of phases of a signal's present program."""
@@ -204,32 +217,36 @@ class SignalWorld:
 
     def stood_s(self, lanes: Sequence[int]) -> list[float]:
         """Return for each lane how long its vehicles have stood on it, in total."""
-        unit_s = self._session.config.clock.sim_dt_s
+        unit_s = self._clock.sim_dt_s
         if self._settings.follows_programs:
-            unit_s = self._session.config.clock.ctrl_dt_s
+            unit_s = self._clock.ctrl_dt_s
         found: list[float] = (self.counts[lanes, STOOD_TICKS] * unit_s).tolist()
         return found
 
     def vehicles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the speed of each vehicle in m/s, and the time in s since it stopped."""
-        rows = self._session.present().vehicles(0)
+        rows = self._simulation.vehicles(0)
         return np.abs(rows["speed"]), rows["wait_s"]
 
     def picture(self, mode: str) -> NDArray[np.uint8] | None:
         """Return a frame of the world, or show it in a window; see `CavEnv.render`."""
-        fps = max(1, round(1.0 / self._session.config.clock.ctrl_dt_s))
-        return self._session.picture(0, None, mode, self.network.name, fps)
+        if self._view is None:
+            fps = max(1, round(1.0 / self._clock.ctrl_dt_s))
+            self._view = WorldView(self._simulation, mode, self.network.name, fps)
+        return self._view.show()
 
     def close(self) -> None:
         """End the world."""
-        self._session.close()
+        if self._view is not None:
+            self._view.close()
+        self._simulation.close()
 
     def _count(self) -> None:
         """Count the vehicles on the lanes of signals."""
         if not self._settings.follows_programs:
-            self.counts = self._session.worlds.arrays.signal_counts[0]
+            self.counts = self._simulation.signals.outputs.counts[0]
             return
-        rows = self._session.present().vehicles(0)
+        rows = self._simulation.vehicles(0)
         lanes = self.table.arrays.lane_index[rows["lane"]]
         rows, lanes = rows[lanes >= 0], lanes[lanes >= 0]
         speed = np.abs(rows["speed"])
