@@ -60,11 +60,6 @@ class AgentProgram(NamedTuple):
                 following = j if is_last else n + len(pairs) + place
                 state = make(self.greens[i][0], self.greens[j][0])
                 found.append(ControlledPhase(state, duration_s, ms, ms, following, False))
-        # The next phase of a green is known only if its agent changes it in the next decision.
-        first_change = {i: n + place for place, (i, j) in reversed([*enumerate(pairs)])}
-        if len(found) > n:
-            for i in range(n):
-                found[i] = found[i]._replace(following=first_change[i])
         return found
 
     def cycle_s(self, config: SignalsConfig) -> float:

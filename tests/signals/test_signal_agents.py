@@ -19,6 +19,7 @@ from cavmarl import ActionError, CavEnv, CavVectorEnv, ConfigError, make_vec, pa
 from cavmarl.adapters.gymnasium_env import CavEgoEnv
 from cavmarl.adapters.gymnasium_rows import CavAgentRows
 from cavmarl.core.errors import PolicyError
+from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.policies.loading import load_policy
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.signals.controllers import make_controller
@@ -409,7 +410,7 @@ def arrived(name: str) -> tuple[int, float]:
     with closing(vec):
         vec.reset(seed=1)
         stands = 0.0
-        for _ in range(120):
+        for _ in range(70):
             *_, infos = vec.step({"signals": controller.choose(vec.signals.view)})
             stands += vec.worlds.arrays.signal_counts[..., STANDING].sum() / 120.0
         assert not infos["signal_refused"].any()
@@ -458,3 +459,39 @@ def test_drivers_of_vehicles_refuse_agents_of_signals() -> None:
 def test_adapters_that_show_vehicles_alone_refuse_agents_of_signals(adapter: Any) -> None:
     with pytest.raises(ConfigError, match="this adapter gives the agents of vehicles alone"):
         adapter("grid4x4", overrides=ALL)
+
+
+@pytest.mark.parametrize("change", [(2.0, 1.0), (0.0, 0.0), (3.0, 0.0)])
+def test_the_time_to_a_change_is_never_later_than_the_change(change: tuple[float, float]) -> None:
+    yellow_s, all_red_s = change
+    times: dict[str, Any] = {"yellow_s": yellow_s, "all_red_s": all_red_s, "min_green_s": 4.0}
+    with closing(world(decide_s=1.0, **times)) as env:
+        env.reset()
+        rng = np.random.default_rng(0)
+        network, common = env.network, env.simulation._tick.common
+        links = np.flatnonzero(network.links["signal"] == env.signals.table.arrays.row[0])
+        shown: list[NDArray[np.int64]] = []
+        expected = []
+        for tick in range(70):
+            phase = common.signal_phase[0]
+            signals, places = network.links["signal"][links], network.links["signal_index"][links]
+            starts = network.phases["first_state"][phase[signals]]
+            shown.append(network.phase_states[starts + places].astype(np.int64))
+            expected.append(
+                [
+                    time_to_change(
+                        network.arrays, common.controllers[0], int(link), phase, float(tick), 0.2
+                    )
+                    for link in links
+                ]
+            )
+            env.step(choose(env, int(rng.integers(2))))
+        is_exact = 0
+        for tick, (now, soonest) in enumerate(zip(shown, expected, strict=True)):
+            for k in range(len(links)):
+                later = [n for n in range(tick, 70) if shown[n][k] != now[k]]
+                if later:
+                    # The letter at `later` has changed at some time in the second before.
+                    assert soonest[k] <= later[0] - tick + 1e-9
+                    is_exact += soonest[k] >= later[0] - tick - 1.0 - 1e-9
+        assert is_exact > 100

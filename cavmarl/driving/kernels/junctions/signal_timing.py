@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import CHOSEN_BY_AGENT
 from cavmarl.roads.kernels.signal_phases import program_at
 
 
@@ -22,8 +25,9 @@ def time_to_change(
 ) -> float:
     """Return the time in s until the signal of a link changes its state.
 
-    If the state never changes, the result is the length of the cycle. For an actuated program it is
-    the earliest possible time: each phase counts with its minimum duration.
+    If the state never changes, the result is the length of the cycle. For an actuated program, and
+    for one whose greens are chosen, it is the earliest possible time: each phase counts with its
+    minimum duration, and any green may be chosen next.
     """
     index = roads.links[link]["signal_index"]
     signal = roads.links[link]["signal"]
@@ -37,6 +41,9 @@ def time_to_change(
         left = -((time - program["offset_s"]) % program["cycle_s"])
         for earlier in range(program["first_phase"], row):
             left += roads.phases[earlier]["duration_s"]
+    if program["detector_gap_s"] == CHOSEN_BY_AGENT:
+        soonest = _soonest_choice(roads, program, row, index, left)
+        return float(max(soonest, 0.0)) if soonest < math.inf else float(program["cycle_s"])
     # Add the phases from the start of the active phase to the first phase with another state.
     for _ in range(program["num_phases"]):
         if roads.phase_states[roads.phases[row]["first_state"] + index] != letter:
@@ -50,3 +57,45 @@ def time_to_change(
             if row == program["first_phase"] + program["num_phases"]:
                 row = program["first_phase"]
     return float(program["cycle_s"])
+
+
+@kernel
+def _soonest_choice(
+    roads: RoadArrays, program: np.void, row: int, index: int, begin_s: float
+) -> float:
+    """Return the earliest time in s at which a letter changes if greens are chosen; inf: never.
+
+    `row`: active PHASE row, which began at `begin_s`. The phases of such a program are its greens,
+    and for each pair of greens the phases between them; see `signals.agent_programs`.
+    """
+    letter = roads.phase_states[roads.phases[row]["first_state"] + index]
+    left = begin_s
+    while not roads.phases[row]["green"]:
+        left += 1e-3 * roads.phases[row]["min_ms"]
+        row = roads.phases[row]["following"]
+        if roads.phase_states[roads.phases[row]["first_state"] + index] != letter:
+            return float(left)
+    # The green may end after its minimum, and any other green may follow.
+    left += 1e-3 * roads.phases[row]["min_ms"]
+    first = program["first_phase"]
+    num_greens = 0
+    while num_greens < program["num_phases"] and roads.phases[first + num_greens]["green"]:
+        num_greens += 1
+    soonest = math.inf
+    for other in range(num_greens):
+        if first + other == row:
+            continue
+        after, next_row = left, first + other
+        if program["num_phases"] > num_greens:
+            green = row - first
+            pair = green * (num_greens - 1) + (other if other < green else other - 1)
+            next_row = first + num_greens + pair
+        for _ in range(3):  # yellow, red for all, green
+            if roads.phase_states[roads.phases[next_row]["first_state"] + index] != letter:
+                soonest = min(soonest, after)
+                break
+            if roads.phases[next_row]["green"]:
+                break
+            after += 1e-3 * roads.phases[next_row]["min_ms"]
+            next_row = roads.phases[next_row]["following"]
+    return soonest
