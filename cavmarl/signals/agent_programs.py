@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.signal_rows import ControlledPhase, SignalRows
 
 AGENT_PROGRAM = "agent"
 MAX_GREENS = 64
-_GREENS, _YELLOWS = "gG", "yYu"
+_GREENS, _YELLOWS, _REDS = "gG", "yYu", "rs"
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     """Return a network in which agents choose the phases of signals.
 
     The greens of a signal are the phases of its program with a green and no yellow letter, in the
-    order of the program; see `signals.equal_greens`. Other programs and timetables of these signals
+    order of the program; see `signals.greens`. Other programs and timetables of these signals
     do not run.
 
     Args:
@@ -89,7 +89,7 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     if not config.are_controlled:
         return network
     greens = {
-        name: greens_of(network, row, config.equal_greens == "each")[: MAX_GREENS + 1]
+        name: greens_of(network, row, config.greens == "all")[: MAX_GREENS + 1]
         for row, name in enumerate(network.signal_ids)
     }
     chosen = _chosen(network, config, greens)
@@ -106,11 +106,11 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
 
 
 def greens_of(
-    network: RoadNetwork, signal: int, keeps_equal: bool = False
+    network: RoadNetwork, signal: int, every: bool = False
 ) -> tuple[tuple[str, float], ...]:
     """Return the greens of a signal's present program: letters, and duration in s.
 
-    Equal greens count once unless `keeps_equal` is set.
+    `every`: whether the greens are those of `signals.greens = all`.
     """
     links = network.links[network.links["signal"] == signal]
     used = sorted({int(index) for index in links["signal_index"]})
@@ -122,10 +122,14 @@ def greens_of(
         start = int(phase["first_state"])
         codes = network.phase_states[start : start + num_links].tolist()
         letters = "".join(SIGNAL_STATES[code] for code in codes)
-        shown = {letters[index] for index in used}
-        if shown & set(_GREENS) and not shown & set(_YELLOWS):
-            if keeps_equal or letters not in dict(found):
-                found.append((letters, float(phase["duration_s"])))
+        if every:
+            is_green = "y" not in letters and bool(set(letters) - set(_REDS))
+        else:
+            shown = {letters[index] for index in used}
+            is_green = bool(shown & set(_GREENS)) and not shown & set(_YELLOWS)
+            is_green = is_green and letters not in dict(found)
+        if is_green:
+            found.append((letters, float(phase["duration_s"])))
     return tuple(found)
 
 
@@ -174,7 +178,7 @@ def _tell_once(source_hash: str, name: str, count: int, shown: str) -> None:
 def between_greens(before: str, after: str) -> str:
     """Return the letters between two greens: green links that become red show yellow."""
     return "".join(
-        "y" if old in _GREENS and new in "rs" else old
+        "y" if old in _GREENS and new in _REDS else old
         for old, new in zip(before, after, strict=True)
     )
 

@@ -171,8 +171,8 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
             return given[name]
         if name in ("sumo", "vehicles"):
             raise NoSumoError(
-                f"{name}: SUMO does not run, so there is no TraCI; read the methods and attributes "
-                "of TrafficSignal, which docs/guides/signal_control.md lists"
+                f"{name}: SUMO does not run, so there is no TraCI; read the methods of "
+                "TrafficSignal, or the vehicles of env.world.simulation"
             )
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
@@ -192,6 +192,17 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
                 overrides=self.overrides or {},
             )
         )
+
+    @property
+    def world(self) -> SignalWorld:
+        """The world, whose `simulation` has the vehicles.
+
+        Raises:
+            EpisodeError: after `close`.
+        """
+        if self._world is None:
+            raise EpisodeError("the environment is closed: call reset() first")
+        return self._world
 
     @property
     def sim_max_time(self) -> float:
@@ -287,9 +298,9 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
 
     def advance(self, actions: Mapping[str, Any]) -> None:
         """Carry out actions by id, and advance the world by `delta_time`; see `step`."""
-        world = self._world
-        if world is None or not self.episode:
-            raise EpisodeError("step() before reset() or after close(): call reset() first")
+        world = self.world
+        if not self.episode:
+            raise EpisodeError("step() before reset(): call reset() first")
         if world.is_over:
             raise EpisodeError("the episode is over: call reset()")
         if not isinstance(actions, Mapping):
@@ -331,8 +342,7 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
         return info
 
     def _system_info(self) -> dict[str, Any]:
-        assert self._world is not None, "infos belong to an episode"
-        speeds, waits_s = self._world.vehicles()
+        speeds, waits_s = self.world.vehicles()
         return {
             "system_total_stopped": int(np.count_nonzero(speeds < STANDING_MPS)),
             "system_total_waiting_time": float(waits_s.sum()),

@@ -96,7 +96,7 @@ class WorldSettings:
             "yellow_s": float(self.yellow_s),
             "min_green_s": float(self.min_green_s),
             "max_green_s": 0.0,
-            "equal_greens": "each",
+            "greens": "all",
         }
 
     def write_config(self, path: Path) -> None:
@@ -133,6 +133,8 @@ class SignalWorld:
     Attributes:
         table: the signals with two or more greens.
         counts: (N, COUNTS) of the lanes of `table`; see `signals.kernels.lane_counts`.
+        simulation: the vehicles and signals of the world, as number 0.
+        network: the map, with the programs that run.
 
     Raises:
         MapError, DemandError, RouteError, CapacityError: a file is missing or wrong.
@@ -150,7 +152,7 @@ class SignalWorld:
         world.tell_tolerated()
         self._settings = settings
         # Without agents there is no environment, so the simulation is driven directly.
-        self._simulation = Simulation(
+        self.simulation = Simulation(
             config, world.network, demand=world.demand, partition=world.partition
         )
         self._clock = config.clock
@@ -178,9 +180,9 @@ class SignalWorld:
     def reset(self, seed: int | None) -> None:
         """Begin an episode; None: the next one, or a random one."""
         if seed is not None or not self._is_seeded:
-            self._simulation.seed(first_seed(seed, None))
+            self.simulation.seed(first_seed(seed, None))
             self._is_seeded = True
-        self._simulation.reset()
+        self.simulation.reset()
         self._stood.clear()
         self._steps = 0
         self._count()
@@ -191,7 +193,7 @@ class SignalWorld:
         if not self._settings.follows_programs:
             commands = replace(commands, signal_choices=choices[None])
         for _ in range(self._settings.parts):
-            self._simulation.step(commands)
+            self.simulation.step(commands)
             self._count()
         self._steps += 1
 
@@ -206,9 +208,20 @@ class SignalWorld:
         """
         if self._settings.follows_programs:
             return 0, 0, 0.0
-        state = self._simulation.signals.outputs.states[0, signal].tolist()
-        ticks = int(self._simulation.ticks()[0]) - state[SINCE]
+        state = self.simulation.signals.outputs.states[0, signal].tolist()
+        ticks = int(self.simulation.ticks()[0]) - state[SINCE]
         return state[PREVIOUS], state[GREEN], round(ticks * self._clock.sim_dt_s, 6)
+
+    def out_lanes(self, signal: str) -> list[int]:
+        """Return the lanes behind a signal, as indices of the table's lanes.
+
+        As in sumo-rl, only the first link of each letter counts.
+        """
+        links = self.network.links
+        links = links[links["signal"] == self.network.signal_ids.index(signal)]
+        _, first = np.unique(links["signal_index"], return_index=True)
+        lanes = self.table.arrays.lane_index[links["to_lane"][first]].tolist()
+        return [*dict.fromkeys(lanes)]
 
     def num_phases(self, signal: str) -> int:
         """Return the number of phases of a signal's present program."""
@@ -225,28 +238,28 @@ class SignalWorld:
 
     def vehicles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the speed of each vehicle in m/s, and the time in s since it stopped."""
-        rows = self._simulation.vehicles(0)
+        rows = self.simulation.vehicles(0)
         return np.abs(rows["speed"]), rows["wait_s"]
 
     def picture(self, mode: str) -> NDArray[np.uint8] | None:
         """Return a frame of the world, or show it in a window; see `CavEnv.render`."""
         if self._view is None:
             fps = max(1, round(1.0 / self._clock.ctrl_dt_s))
-            self._view = WorldView(self._simulation, mode, self.network.name, fps)
+            self._view = WorldView(self.simulation, mode, self.network.name, fps)
         return self._view.show()
 
     def close(self) -> None:
         """End the world."""
         if self._view is not None:
             self._view.close()
-        self._simulation.close()
+        self.simulation.close()
 
     def _count(self) -> None:
         """Count the vehicles on the lanes of signals."""
         if not self._settings.follows_programs:
-            self.counts = self._simulation.signals.outputs.counts[0]
+            self.counts = self.simulation.signals.outputs.counts[0]
             return
-        rows = self._simulation.vehicles(0)
+        rows = self.simulation.vehicles(0)
         lanes = self.table.arrays.lane_index[rows["lane"]]
         rows, lanes = rows[lanes >= 0], lanes[lanes >= 0]
         speed = np.abs(rows["speed"])

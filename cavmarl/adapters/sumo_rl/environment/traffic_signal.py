@@ -74,9 +74,9 @@ class TrafficSignal:
         self._world = world
         self._signal = world.table.ids.index(ts_id)
         arrays = world.table.arrays
-        incoming, outgoing = arrays.incoming[self._signal], arrays.outgoing[self._signal]
+        incoming = arrays.incoming[self._signal]
         self._in: list[int] = incoming[incoming >= 0].tolist()
-        self._out: list[int] = outgoing[outgoing >= 0].tolist()
+        self._out = world.out_lanes(ts_id)
         names, lengths = world.table.lanes, arrays.length_m.tolist()
         self.lanes = [names[n] for n in self._in]
         self.out_lanes = [names[n] for n in self._out]
