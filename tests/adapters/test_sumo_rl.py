@@ -83,7 +83,8 @@ def test_signals_lanes_and_phases_are_those_of_the_file(routes: str) -> None:
             for lane in {lane for link in links for lane in link[:2]}:
                 assert signal.lanes_length[lane.getID()] == pytest.approx(lane.getLength(), abs=0.1)
             (program,) = light.getPrograms().values()
-            greens = [phase.state for phase in program.getPhases() if "y" not in phase.state]
+            states = [phase.state for phase in program.getPhases()]
+            greens = [state for state in states if "y" not in state and set(state) - {"r"}]
             assert [phase.state for phase in signal.green_phases] == greens
             assert signal.num_green_phases == len(greens)
             for (i, j), row in signal.yellow_dict.items():
@@ -403,7 +404,7 @@ def test_dqn_learns_on_one_signal(routes: str) -> None:
     library = pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     with closing(grid(routes, single_agent=True)) as env:
         model = library.DQN("MlpPolicy", env, learning_starts=0, train_freq=1, seed=1)
-        model.learn(total_timesteps=60)
+        model.learn(total_timesteps=50)
         assert env.episode >= 3
         assert env.world.simulation.traffic_stats().departed > 0
 
@@ -417,7 +418,7 @@ def test_ppo_learns_with_one_policy_for_all_signals(routes: str) -> None:
     env = supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env))
     env = supersuit.pettingzoo_env_to_vec_env_v1(env)
     env = supersuit.concat_vec_envs_v1(env, 2, num_cpus=1, base_class="stable_baselines3")
-    model = library.PPO("MlpPolicy", env, n_steps=10, batch_size=64, n_epochs=1, seed=1)
+    model = library.PPO("MlpPolicy", env, n_steps=10, batch_size=64, n_epochs=1)
     model.learn(total_timesteps=10 * env.num_envs)
     assert env.num_envs == 32
     assert model.num_timesteps == 320

@@ -25,7 +25,7 @@ GREEN_S = 60.0  # duration of a green in `all_phases`; without a meaning, as gre
 WAIT_SCALE_S = 100.0  # of the reward diff-waiting-time
 
 
-class Phase(NamedTuple):
+class SignalPhase(NamedTuple):
     """A phase of a signal."""
 
     duration: float  # in s
@@ -95,7 +95,7 @@ class TrafficSignal:
             "".join(SIGNAL_STATES[code] for code in letters)
             for letters in self._world.table.greens[self._signal].tolist()
         ]
-        self.green_phases = [Phase(GREEN_S, letters) for letters in greens]
+        self.green_phases = [SignalPhase(GREEN_S, letters) for letters in greens]
         self.all_phases = [*self.green_phases]
         self.yellow_dict: dict[tuple[int, int], int] = {}
         for i, before in enumerate(greens):
@@ -103,7 +103,7 @@ class TrafficSignal:
                 if i != j:
                     self.yellow_dict[i, j] = len(self.all_phases)
                     yellow = between_greens(before, after)
-                    self.all_phases.append(Phase(self.env.yellow_time, yellow))
+                    self.all_phases.append(SignalPhase(self.env.yellow_time, yellow))
         self.num_green_phases = len(greens)
         if self.env.fixed_ts:
             self.num_green_phases = self._world.num_phases(self.id) // 2
