@@ -20,6 +20,7 @@ from cavmarl.bench.harness import check_range
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
 from cavmarl.core.processes import start_python
+from cavmarl.cosim.carla.carla_session import OtherTicks
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Unpaced
 from cavmarl.env.parallel import parallel_env
@@ -53,7 +54,7 @@ class ClockDrift:
     environment: str  # name of the environment
     dt_s: float  # seconds per tick; a step is one tick
     rogue: float  # share of steps in which the follower ticked on its own
-    answer: OwnTicks  # the master's reaction to such ticks
+    answer: OwnTicks | OtherTicks  # the master's reaction to such ticks
     pace: float | None  # simulated seconds per second of the master; None: unpaced
     rows: tuple[DriftRow, ...]  # at steps 100, 500, 1000, 5000, …, and the last one
     own_ticks: int  # number of its own ticks counted by the follower

@@ -14,13 +14,9 @@ import sys
 import time
 from fractions import Fraction
 
+from benchmarks.carla_clock_client import is_due
 from cavmarl.core.errors import ClockError
 from cavmarl.cosim.followers.follower_client import Follower
-
-
-def is_due(step: int, share: Fraction) -> bool:
-    """Return whether to tick in a step, from 1; of the first n steps, floor(n · share) are due."""
-    return int(step * share) > int((step - 1) * share)
 
 
 def _main(place: str, share: Fraction) -> None:

@@ -51,6 +51,7 @@ from cavmarl.core.errors import (
     WorkerDeathError,
     WorkerError,
     WorkerFailureError,
+    ZoneSimulatorError,
 )
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from cavmarl.env.registration import env, raw_env
     from cavmarl.env.vector import CavVectorEnv, make_vec
     from cavmarl.env.world_arguments import WorldArguments
+    from cavmarl.handoff.simulators.simulator_kinds import register_zone_simulator
     from cavmarl.parallel.backends import register_backend
     from cavmarl.policies.loading import load_policy
     from cavmarl.policies.policy import Policy
@@ -113,6 +115,7 @@ __all__ = [
     "WorkerError",
     "WorkerFailureError",
     "WorldArguments",
+    "ZoneSimulatorError",
     "entries",
     "env",
     "load_policy",
@@ -123,6 +126,7 @@ __all__ = [
     "register_driver_model",
     "register_sensor",
     "register_term",
+    "register_zone_simulator",
     "show",
 ]
 
@@ -144,6 +148,7 @@ _LATE = {
     "register_driver_model": "driving.driver_models",
     "register_sensor": "sensors.registry",
     "register_term": "rewards.registered_terms",
+    "register_zone_simulator": "handoff.simulators.simulator_kinds",
     "show": "viewer.live_env",
 }
 

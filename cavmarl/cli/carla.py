@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from rich.console import Console
 
@@ -33,6 +33,14 @@ def carla(
     client_version: Annotated[
         str, about("Version of the clients: 0.9.15, 0.9.16 or 0.10.0.", metavar="VERSION")
     ] = "0.9.16",
+    other_ticks: Annotated[
+        Literal["obey", "refuse", "follow"],
+        about(
+            "What happens if a client ticks that is not the first one that ticks: the world "
+            "advances (obey), the client gets an error (refuse), or it waits for the next tick "
+            "of the first one (follow)."
+        ),
+    ] = "obey",
     max_clients: Annotated[
         int, about("Number of clients at a time.", metavar="N", panel=SERVICE)
     ] = 64,
@@ -69,5 +77,6 @@ def carla(
         any_host=any_host,
         client=client_version,
         limits=limits,
+        other_ticks=other_ticks,
         told=tell,
     )

@@ -25,6 +25,7 @@ add_command(
     map_check.check,
     "cavmarl map check city.net.xml --page check.html",
     "cavmarl map check city.net.xml --fix repaired.net.xml",
+    "cavmarl map check city.xodr --carla",
 )
 add_command(
     app,

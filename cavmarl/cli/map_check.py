@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavmarl.cli.output import Environment, JsonPath, about, about_file, grid, write_json
+from cavmarl.cli.output import Environment, JsonPath, about, about_file, flag, grid, write_json
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import in_stages
 from cavmarl.engine.world_setup import find_map
@@ -22,8 +22,11 @@ from cavmarl.maps.defects import SEARCHES, Defect, find_defects
 from cavmarl.maps.repair import mend
 from cavmarl.roads.cache import load_network
 
+if TYPE_CHECKING:
+    from cavmarl.cosim.carla.client_map_check import ClientMapReport
+
 _SHOWN = 12
-_READ, _COUNT, _PAGE, _REPAIR = "reading", "figures", "page", "repair"
+_READ, _COUNT, _CLIENT, _PAGE, _REPAIR = "reading", "figures", "CARLA's client", "page", "repair"
 
 
 def check(
@@ -39,6 +42,13 @@ def check(
     fix: Annotated[
         Path | None, about_file("Write a repaired network to this .net.xml file.")
     ] = None,
+    carla: Annotated[
+        bool,
+        flag(
+            "Also read the map with CARLA's client (CAVMARL_CARLA_PYTHON: a Python that has it), "
+            "and compare."
+        ),
+    ] = False,
     page: Annotated[
         Path | None, about_file("Write a page with a picture in which defects are marked.")
     ] = None,
@@ -46,20 +56,29 @@ def check(
 ) -> None:
     """Print the statistics and defects of a map.
 
-    If the map cannot be driven, exit with 1.
+    If the map cannot be driven, or CARLA's client reads something else, exit with 1.
     """
     if fix is not None and not fix.name.endswith(".net.xml"):
         raise ConfigError(f"--fix {fix}: must end in .net.xml")
+    if carla:
+        from cavmarl.cosim.carla.client_map_check import check_with_client
+        from cavmarl.cosim.carla.client_process import client_python
+
+        client_python()  # raises an error before any work if there is none
     console = Console()
     done: list[str] = []
     left: list[Defect] = []
-    with in_stages(console, [_READ, _COUNT, *SEARCHES, _PAGE, _REPAIR]) as told:
+    reading: ClientMapReport | None = None
+    with in_stages(console, [_READ, _COUNT, *SEARCHES, _CLIENT, _PAGE, _REPAIR]) as told:
         told(_READ)
         path = find_map(env)
         network = load_network(path)
         told(_COUNT)
         report = check_map(network)
         defects = find_defects(network, path, buildings, told)
+        if carla:
+            told(_CLIENT)
+            reading = check_with_client(network, path, Path(env) if Path(env).is_file() else path)
         if page is not None:
             told(_PAGE)
             write_check_page(page, network, defects)
@@ -69,6 +88,9 @@ def check(
     print_report(console, report)
     _print_defects(console, defects)
     document = report.to_dict() | {"defects": [defect.to_dict() for defect in defects]}
+    if reading is not None:
+        _print_reading(console, env, reading)
+        document["carla"] = reading.to_dict()
     if fix is not None:
         for line in done:
             console.print(Text(f"repaired: {line}"))
@@ -77,7 +99,33 @@ def check(
         )
         document |= {"repaired": done, "left": [defect.to_dict() for defect in left]}
     write_json(json_path, document)
-    raise typer.Exit(0 if report.drivable else 1)
+    is_read = reading is None or not reading.problems
+    raise typer.Exit(0 if report.drivable and is_read else 1)
+
+
+def _print_reading(console: Console, env: str, reading: ClientMapReport) -> None:
+    from cavmarl.cosim.carla.client_map_check import OFF_LIMIT_M, SHARE_LIMIT, TURN_LIMIT_DEG
+
+    rows = [
+        [
+            "95 % of the points on lanes are off by",
+            f"{reading.off_m.usual:.2f} m",
+            f"{OFF_LIMIT_M:g} m",
+        ],
+        [
+            "95 % of the points on lanes are turned by",
+            f"{reading.turned_deg.usual:.1f}°",
+            f"{TURN_LIMIT_DEG:g}°",
+        ],
+    ]
+    rows += [
+        [name, f"{share.found} of {share.total}", f"{SHARE_LIMIT:.0%}"]
+        for name, share in reading.shares.items()
+    ]
+    rows.append(["traffic lights", str(reading.landmarks), ""])
+    console.print(grid([f"{env}: read by CARLA's client", "found", "limit"], rows))
+    for problem in reading.problems:
+        console.print(Text(f"CARLA: {problem}", style="red"))
 
 
 def _print_defects(console: Console, defects: Sequence[Defect]) -> None:

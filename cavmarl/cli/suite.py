@@ -1,10 +1,13 @@
-"""`cavmarl suite`: evaluates drivers on several maps with several numbers of agents."""
+"""`cavmarl suite`: evaluates drivers or controllers of signals on several maps."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -26,11 +29,28 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.config.registry import find_settings
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
+    from cavmarl.evaluate.signals.signal_meter import SignalFigures
 
+# Figures of controllers of signals, and their names in tables.
+SIGNAL_FIGURES = {
+    "arrived": "arrived",
+    "never_departed": "never departed",
+    "delay_s": "delay, s",
+    "delay_of_all_s": "delay of all trips, s",
+    "trip_s": "travel time, s",
+    "waiting_s": "waiting, s",
+    "stops": "stops of a vehicle",
+    "queue": "queue",
+    "most_queued": "longest queue",
+    "co2_g_per_km": "CO₂, g/km",
+    "switches_per_h": "switches/h",
+    "longest_red_s": "longest red, s",
+}
 SHOWN = ("success", "collision", "off_road", "delay_s")  # metrics that fit eighty columns
 
 
@@ -53,17 +73,35 @@ def suite(
     ] = Path("runs/suite"),
     json_path: JsonPath = None,
 ) -> None:
-    """Evaluate drivers in every world of a suite.
+    """Evaluate drivers, or controllers of signals, in every world of a suite.
 
-    `cavmarl report` shows all results of one world.
+    `cavmarl report` shows all results of drivers in one world.
     """
-    from cavmarl.evaluate.suite import load_suite, run_suite, worlds_of
+    from cavmarl.evaluate.suite import left_out, load_suite, run_signals, run_suite, worlds_of
 
     loaded = load_suite(find_settings("suite", name))
     worlds = worlds_of(loaded, maps)
-    make_folder(out)
     console = Console()
     places = {world.label: k for k, world in enumerate(worlds)}
+    if missing := left_out(loaded, maps):
+        console.print(f"not in {maps}, left out: {', '.join(missing)}", highlight=False)
+    if loaded.controllers is not None:
+        if policy:
+            raise ConfigError(f"--policy: the suite {name} evaluates controllers of signals")
+        with counting(console, f"worlds of {name}") as told:
+            figures = run_signals(
+                loaded,
+                worlds,
+                repeats=repeats,
+                seed=seed,
+                overrides=parse_settings(None, imports),
+                began=lambda world: told(places[world.label], len(worlds)),
+            )
+        for label, found in figures.items():
+            console.print(_signal_table(label, found))
+        write_json(json_path, _as_numbers(figures))
+        return
+    make_folder(out)
     with counting(console, f"worlds of {name}") as told:
         reports = run_suite(
             loaded,
@@ -78,6 +116,33 @@ def suite(
         )
     console.print(_table(reports))
     write_json(json_path, {label: found.to_dict() for label, found in reports.items()})
+
+
+def _signal_table(label: str, found: Mapping[str, Sequence[SignalFigures]]) -> Table:
+    """Return a table of mean figures on one map, with the half width of their 95 % interval."""
+    rows = [
+        (title, *(_mean_cell(runs, name) for runs in found.values()))
+        for name, title in SIGNAL_FIGURES.items()
+    ]
+    return grid((escape(label), *found), rows)
+
+
+def _mean_cell(runs: Sequence[SignalFigures], name: str) -> str:
+    from cavmarl.evaluate.statistics import mean_interval
+
+    values = np.array([getattr(run, name) for run in runs], dtype=np.float64)
+    if np.isnan(values).all():
+        return "-"
+    interval = mean_interval(values)
+    spread = "" if interval is None else f" ± {0.5 * (interval.high - interval.low):.1f}"
+    return f"{values.mean():.1f}{spread}"
+
+
+def _as_numbers(figures: Mapping[str, Mapping[str, Sequence[SignalFigures]]]) -> dict[str, Any]:
+    return {
+        label: {name: [asdict(run) for run in runs] for name, runs in found.items()}
+        for label, found in figures.items()
+    }
 
 
 def _table(reports: dict[str, EvaluationReport]) -> Table:

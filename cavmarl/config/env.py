@@ -270,8 +270,9 @@ class EnvConfig(Section, key=""):
 
     @property
     def registered(self) -> tuple[str, ...]:
-        """The registered terms, sensors and models that the environment may use."""
-        return (*self.terms.registered, *self.sensors.registered, self.traffic.model)
+        """The registered extensions that the environment may use."""
+        simulators = (text.partition("://")[0] for text in self.zones.simulators.values())
+        return (*self.terms.registered, *self.sensors.registered, self.traffic.model, *simulators)
 
     @property
     def max_steps(self) -> int:

@@ -118,6 +118,7 @@ def load_config(
     env: str | Path,
     *,
     zones: int | None = None,
+    zone_simulators: Mapping[int, str] | None = None,
     sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
@@ -131,6 +132,7 @@ def load_config(
             map: see `make_world`. A configuration of SUMO also sets `traffic.demand`, and no
             background vehicles are generated.
         zones: sets `zones.count`.
+        zone_simulators: sets `zones.simulators`.
         sensor_workers: sets `workers.sensors`.
         agents: sets `population.agents`.
         background: sets `population.background`.
@@ -160,6 +162,7 @@ def load_config(
         config = _config_of_file(found)
     keywords = {
         "zones.count": zones,
+        "zones.simulators": zone_simulators,
         "workers.sensors": sensor_workers,
         "population.agents": agents,
         "population.background": background,
@@ -236,13 +239,19 @@ def find_settings(what: str, name: str) -> Path:
 
 
 def _refuse_code(keys: object, where: str) -> None:
-    """Raise an error if an env.yaml names a file of code, which only the caller may do."""
+    """Raise an error if an env.yaml names code or programs, which only the caller may do."""
     scenario = keys.get("scenario") if isinstance(keys, dict) else None
     name = scenario.get("name") if isinstance(scenario, dict) else None
     if isinstance(name, str) and path_of_code(name):
         raise ConfigError(
             f"{where}: scenario.name = {name!r} is code, which a folder of data must not run; if "
             f"you trust it, pass overrides={{'scenario.name': {name!r}}} or --set scenario.name"
+        )
+    zones = keys.get("zones") if isinstance(keys, dict) else None
+    if isinstance(zones, dict) and zones.get("simulators"):
+        raise ConfigError(
+            f"{where}: zones.simulators names other programs, which a folder of data must not use; "
+            "pass zone_simulators, or --set zones.simulators"
         )
 
 

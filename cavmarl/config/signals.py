@@ -26,7 +26,7 @@ class SignalsConfig(Section, key="signals"):
     Attributes:
         agents: `none`; `all` signals with two or more greens; or a list of ids of signals. Other
             signals keep their programs.
-        controller: who chooses the greens of these signals: `agents` of the environment, or one of
+        controller: what chooses the greens of these signals: `agents` of the environment, or one of
             `SIGNAL_CONTROLLERS`; then all agents are vehicles.
         decide_s: time between two decisions; a whole number of steps of `clock.ctrl_dt_s`.
         yellow_s: duration of yellow between two greens.

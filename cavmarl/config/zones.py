@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within
@@ -35,6 +35,10 @@ class ZonesConfig(Section, key="zones"):
         repartition_steps: steps between two checks whether a bisection by the positions of vehicles
             would distribute them better. Results do not depend on it. 0: zones stay.
         repartition_tolerance: share of the mean by which the fullest zone must shrink.
+        simulators: zones that other simulators run, by number: `carla://HOST:PORT`, or the name of
+            a registered simulator (docs/guides/zone_simulators.md).
+        simulator_failure: consequence of a simulator that fails or refuses a vehicle for too long:
+            `error`, or `return`: cavmarl runs the zone until the episode ends.
     """
 
     layout: str = "bisection"
@@ -50,9 +54,16 @@ class ZonesConfig(Section, key="zones"):
     check_invariants: bool = False
     repartition_steps: Annotated[int, Whole(0, 1_000_000)] = 0
     repartition_tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
+    simulators: dict[int, str] = field(default_factory=dict)
+    simulator_failure: Literal["error", "return"] = "error"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.need(
+            "simulators",
+            not (self.simulators and self.repartition_steps),
+            "other simulators cannot change their zones: set zones.repartition_steps to 0",
+        )
         self.need(
             "layout",
             self.layout in ZONE_LAYOUTS or self.layout.endswith(ZONE_FILE_SUFFIXES),

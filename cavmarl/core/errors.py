@@ -31,6 +31,7 @@
     ├── FollowerError          an external stack that sends invalid data
     │   └── FollowerLostError     a stack that has ended, or has not answered in time
     ├── ServiceError           the coordination service, one of its nodes, or a request failed
+    ├── ZoneSimulatorError     another simulator that runs a zone cannot continue, or refuses
     └── SumoError              SUMO as global traffic cannot continue
 
 Each message says what is wrong, where, and what to do.
@@ -255,6 +256,20 @@ class FollowerLostError(FollowerError):
     def __init__(self, message: str, is_late: bool = False) -> None:
         super().__init__(message)
         self.is_late = is_late
+
+
+class ZoneSimulatorError(CavmarlError):
+    """Another simulator that runs a zone cannot start or continue, or sends invalid data.
+
+    The step is not finished; the next reset starts the simulators again.
+
+    Attributes:
+        zone: number of the zone.
+    """
+
+    def __init__(self, message: str, zone: int) -> None:
+        super().__init__(message)
+        self.zone = zone
 
 
 class ServiceError(CavmarlError):

@@ -118,8 +118,14 @@ REGISTERED_TERMS: Registry[Any] = Registry("term")
 REGISTERED_SENSORS: Registry[Any] = Registry("sensor")
 REGISTERED_MODELS: Registry[int] = Registry("driver_model")
 REGISTERED_BACKENDS: Registry[Any] = Registry("backend")
+REGISTERED_ZONE_SIMULATORS: Registry[Any] = Registry("zone_simulator")
 
-_OF_WORLDS = (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS)
+_OF_WORLDS = (
+    REGISTERED_TERMS,
+    REGISTERED_SENSORS,
+    REGISTERED_MODELS,
+    REGISTERED_ZONE_SIMULATORS,
+)
 
 
 def load_plugins(modules: Iterable[str], failure: type[CavmarlError] = ConfigError) -> None:

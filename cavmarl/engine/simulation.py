@@ -21,6 +21,7 @@ from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.simulation_setup import (
     add_coordinators,
     add_external,
+    add_simulators,
     add_sumo,
     call_rare_kernels,
 )
@@ -76,6 +77,8 @@ class Simulation(WorldViews):
         self._compiled_step: CompiledStep | None = None
         prepare_kernels()
         partition = cut_zones(config, network) if partition is None else partition
+        if config.zones.simulators:  # they may refuse a vehicle for some ticks
+            late_ticks = max(late_ticks, config.zones.max_deferred_ticks)
         tick = make_tick(
             config,
             network,
@@ -93,7 +96,8 @@ class Simulation(WorldViews):
                 self._call_every_kernel()
         add_sumo(tick, demand, network)
         add_external(tick)
-        self.transfers = add_coordinators(tick, config, network, runs)
+        hosted = add_simulators(tick, config, network)
+        self.transfers = add_coordinators(tick, config, network, runs, hosted)
         self.zones.let_zones_change(network, config.zones)
 
     def _call_every_kernel(self) -> None:

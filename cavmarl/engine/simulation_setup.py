@@ -10,9 +10,11 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.external_component import ExternalComponent, ExternalPhases
 from cavmarl.engine.outside_traffic import SumoPhases
+from cavmarl.engine.simulator_component import SimulatorComponent, SimulatorPhases
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
+from cavmarl.handoff.simulators.simulator_kinds import hosted_zones
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
@@ -36,8 +38,29 @@ def add_external(tick: Tick) -> None:
             tick.outside = ExternalPhases(part, tick)
 
 
+def add_simulators(
+    tick: Tick, config: EnvConfig, network: RoadNetwork
+) -> SimulatorComponent | None:
+    """Let other simulators run zones, if `zones.simulators` names any."""
+    hosted = hosted_zones(config.zones.simulators, tick.division.count)
+    if not hosted:
+        return None
+    num_worlds = tick.division.num_worlds
+    if num_worlds > 1 and any(one.is_single for one in hosted):
+        raise ConfigError(
+            f"num_envs = {num_worlds}: a CARLA server runs a zone of one world; set num_envs = 1"
+        )
+    part = SimulatorComponent(tick, config, network, hosted)
+    tick.attached, tick.outside = (*tick.attached, part), SimulatorPhases(part)
+    return part
+
+
 def add_coordinators(
-    tick: Tick, config: EnvConfig, network: RoadNetwork, runs: Sequence[OpenRun] | None
+    tick: Tick,
+    config: EnvConfig,
+    network: RoadNetwork,
+    runs: Sequence[OpenRun] | None,
+    hosted: SimulatorComponent | None = None,
 ) -> tuple[TransferLog, ...]:
     """Let coordinators decide ownership, if there are several zones, a journal or checks.
 
@@ -45,11 +68,14 @@ def add_coordinators(
         One log of transfers per world; none without coordinators.
     """
     zones = config.zones
-    if tick.division.count == 1 and not (zones.journal or zones.check_invariants):
+    is_plain = not (zones.journal or zones.check_invariants or hosted)
+    if tick.division.count == 1 and is_plain:
         return ()
     reach_m = longest_move_m(network, tick.traffic.travel, config.clock.sim_dt_s)
-    setup = make_coordinators(zones, tick.division, reach_m, runs=runs)
+    setup = make_coordinators(zones, tick.division, reach_m, runs=runs, gate=hosted)
     tick.coordination = setup.coordination
+    if hosted is not None:
+        hosted.coordinators = setup.coordination.coordinators
     return setup.transfers
 
 

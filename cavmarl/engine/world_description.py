@@ -10,6 +10,7 @@ from typing import Any
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import sources_digest
 from cavmarl.core.extensions import plugin_hashes
+from cavmarl.handoff.simulators.simulator_kinds import describe_simulators
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
@@ -42,6 +43,7 @@ def describe_world(
         "kernels": sources_digest(),
         "plugins": plugin_hashes(config.registered, config.plugins),  # SHA-256 by module
         "zones": partition.count,
+        "zone_simulators": describe_simulators(config.zones.simulators, partition.count),
         "zones_content_sha256": partition.content_hash,
         "channel": asdict(config.v2x.channel)
         if config.v2x.enabled

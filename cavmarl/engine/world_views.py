@@ -23,6 +23,7 @@ from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.shards.shard import Shard
+from cavmarl.signals.controllers import SignalView
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.v2x.bus import Bus
@@ -119,6 +120,21 @@ class WorldViews:
             if isinstance(part, SignalComponent):
                 return part
         raise ConfigError("signals.agents = none: set it to all, or to a list of ids of signals")
+
+    def signal_view(self) -> SignalView:
+        """Return what controllers of signals know; its arrays follow the worlds."""
+        part, config = self.signals, self.config
+        outputs = part.outputs
+        return SignalView(
+            config=config.signals,
+            dt=config.clock.sim_dt_s,
+            table=part.table,
+            ticks=self.ticks(),
+            counts=outputs.counts,
+            states=outputs.states,
+            masks=outputs.masks,
+            decides=outputs.decides,
+        )
 
     @property
     def travel(self) -> TripTables:

@@ -48,8 +48,9 @@ def parallel_env(
         lenient: for libraries that act for absent agents or beyond the bounds. Values are clipped,
             actions of absent agents are ignored, and a missing action repeats the agent's last one,
             or 0. Sets action.out_of_range, .missing_action, .late_actions; traffic_stats() counts.
-        world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
-            sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
+        world: zones, zone_simulators, backend, workers, nodes, sensor_workers, agents, background,
+            seed, max_cycles, sensors_of, render_mode, record and overrides, as `WorldArguments`
+            describes them.
 
     Raises:
         ConfigError: a key, a value or a combination is not possible.

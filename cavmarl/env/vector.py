@@ -55,8 +55,9 @@ def make_vec(
         num_envs: number of worlds.
         autoreset_mode: when a world begins its next episode; see `CavVectorEnv`.
         copy: False returns observations without a copy; see `CavVectorEnv`.
-        world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
-            sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
+        world: zones, zone_simulators, backend, workers, nodes, sensor_workers, agents, background,
+            seed, max_cycles, sensors_of, render_mode, record and overrides, as `WorldArguments`
+            describes them.
 
     Raises:
         ConfigError: a key, a value or a combination is not possible.

@@ -24,6 +24,9 @@ class WorldArguments(TypedDict, total=False):
 
     Attributes:
         zones: sets zones.count, the number of shards of the world. Results do not depend on it.
+        zone_simulators: sets zones.simulators, the zones that other simulators run, by number:
+            `{2: "carla://HOST:PORT"}`, or the name of a registered simulator
+            (docs/guides/zone_simulators.md).
         backend: where the worlds run (docs/guides/divide_a_world.md). Results do not depend on it.
             "local": in the caller's process. "processes:N": in N worker processes of this machine.
             "nodes:N": in N processes without shared memory, started on this machine
@@ -47,6 +50,7 @@ class WorldArguments(TypedDict, total=False):
     """
 
     zones: int | None
+    zone_simulators: Mapping[int, str] | None
     backend: str | None
     workers: int | None
     nodes: int | None
@@ -97,6 +101,7 @@ def start_worlds(
     config, base_dir = load_config(
         env,
         zones=given.get("zones"),
+        zone_simulators=given.get("zone_simulators"),
         sensor_workers=given.get("sensor_workers"),
         agents=given.get("agents"),
         background=given.get("background"),

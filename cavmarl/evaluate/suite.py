@@ -1,9 +1,9 @@
-"""A suite: the same policies on several maps with several numbers of agents."""
+"""A suite: the same policies, or controllers of signals, on several maps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cavmarl.config.io import read_yaml, validate
@@ -11,6 +11,13 @@ from cavmarl.config.registry import entries
 from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.report import EvaluationReport
+from cavmarl.evaluate.signals.signal_meter import SignalFigures
+from cavmarl.evaluate.signals.signal_runs import TICK_S, run_controller, run_sumo
+from cavmarl.evaluate.traffic.sumo_side import SumoJob
+from cavmarl.maps.netconvert import map_file
+from cavmarl.traffic.sumo.sumo_input import read_input
+
+SUMO = "SUMO"  # name of SUMO's row, with the map's own programs
 
 
 @dataclass(frozen=True)
@@ -24,9 +31,12 @@ class Suite:
     agents: tuple[int, ...] | None = None  # numbers of agents
     background: int | None = None  # background vehicles of every world
     horizon_s: float | None = None  # of every episode
+    # controllers of all signals, see `run_controller`; None: the suite evaluates policies
+    controllers: tuple[str, ...] | None = None
+    more_maps: tuple[str, ...] = ()  # maps that are left out if the folder does not have them
 
     def __post_init__(self) -> None:
-        for name in ("maps", "agents"):
+        for name in ("maps", "agents", "controllers"):
             values = getattr(self, name)
             if values is not None and (not values or len(set(values)) < len(values)):
                 raise ConfigError(
@@ -48,8 +58,9 @@ def load_suite(path: Path) -> Suite:
 
 
 def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
-    found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
-    if len(found) < len(suite.maps):
+    listed = [*_found(suite, maps)]
+    found = {Path(name).name.split(".")[0]: env for name, env in listed}
+    if len(found) < len(listed):
         raise ConfigError(f"maps = {suite.maps!r}: two maps have the same name; rename a file")
     if suite.agents is None:
         return [SuiteWorld(name, env, None) for name, env in found.items()]
@@ -72,6 +83,14 @@ def _found(suite: Suite, maps: Path) -> Iterator[tuple[str, str]]:
                 f"maps: '{name}' is no environment and no file in {maps}: give the folder of the "
                 "maps with --maps, or a suite of your own"
             )
+    for name in suite.more_maps:
+        if (maps / name).is_file():
+            yield name, str(maps / name)
+
+
+def left_out(suite: Suite, maps: Path) -> tuple[str, ...]:
+    """Return the `more_maps` that are not in the folder."""
+    return tuple(name for name in suite.more_maps if not (maps / name).is_file())
 
 
 def run_suite(
@@ -113,3 +132,49 @@ def run_suite(
             overrides=keys,
         )
     return reports
+
+
+def run_signals(
+    suite: Suite,
+    worlds: Sequence[SuiteWorld],
+    *,
+    repeats: int,
+    seed: int,
+    began: Callable[[SuiteWorld], None],
+    overrides: Mapping[str, object] | None = None,
+) -> dict[str, dict[str, list[SignalFigures]]]:
+    """Run each controller of signals in every world, and SUMO beside it if the map is a .sumocfg.
+
+    Args:
+        suite: has `controllers`.
+        worlds: its worlds.
+        repeats: number of runs, with the seeds from `seed` on.
+        seed: first seed.
+        began: called before each world.
+        overrides: values of further keys of every world.
+
+    Returns:
+        For each world and each controller, the figures of all runs.
+    """
+    seconds = round(suite.horizon_s or 3600.0)
+    seeds = range(seed, seed + repeats)
+    keys: dict[str, object] = {"population.mode": "open", **(overrides or {})}
+    found: dict[str, dict[str, list[SignalFigures]]] = {}
+    for world in worlds:
+        began(world)
+        own = dict(keys)
+        is_sumo = world.env.endswith(".sumocfg")
+        if suite.background is not None or is_sumo:
+            own["population.background"] = 0 if is_sumo else suite.background
+        figures = {
+            controller: run_controller(
+                world.env, controller, seconds=seconds, seeds=seeds, overrides=own
+            )
+            for controller in suite.controllers or ()
+        }
+        if is_sumo:
+            demand = read_input([Path(world.env)])
+            job = SumoJob(map_file(world.env), demand, seconds, TICK_S, seed)
+            figures[SUMO] = [run_sumo(replace(job, seed=number)) for number in seeds]
+        found[world.label] = figures
+    return found

@@ -75,8 +75,15 @@ class NetDocument:
         location = self.root.find("location")
         if location is None or location.get("projParameter", "!") in ("!", "-", "."):
             return None
-        x, y = map(float, location.get("netOffset", "0,0").split(","))
-        return GeoReference(location.get("projParameter", ""), x, y)
+        return GeoReference(location.get("projParameter", ""), *self.offset_m)
+
+    @property
+    def offset_m(self) -> tuple[float, float]:
+        """By how much netconvert has moved the source's coordinates to x and y of the network."""
+        location = self.root.find("location")
+        words = "0,0" if location is None else location.get("netOffset", "0,0")
+        x, y = map(float, words.split(","))
+        return x, y
 
     def junctions(self) -> Iterator[Element]:
         return self.root.iter("junction")

@@ -13,16 +13,34 @@ from cavmarl.roads.network import GeoReference
 
 Places = NDArray[np.float64]
 
+_OF_HEIGHTS = ("+geoidgrids=", "+geoid_crs=", "+vunits=", "+vto_meter=")
+
+
+def projection_of(geo: GeoReference) -> Any:
+    """Return pyproj's projection of a map, without the vertical part, which may need extra files.
+
+    Raises:
+        MapError: PROJ does not know the projection.
+        MissingExtraError: pyproj is not installed.
+    """
+    pyproj: Any = require("pyproj", "maps")
+    words = geo.projection.split()
+    in_the_plane = " ".join(word for word in words if not word.startswith(_OF_HEIGHTS))
+    try:
+        return pyproj.Proj(projparams=in_the_plane)
+    except pyproj.exceptions.ProjError as error:
+        raise MapError(f"projection {geo.projection!r}: {error}") from error
+
 
 def project(source: Path | str, degrees: Places, geo: GeoReference) -> Places:
     """Return x and y in m (n, 2) of longitudes and latitudes (n, 2).
 
     Raises:
-        MapError: a place cannot be projected; `source` is its file, for the message.
+        MapError: a place cannot be projected; `source` is its file, for the message; or PROJ does
+            not know the projection.
         MissingExtraError: pyproj is not installed.
     """
-    pyproj: Any = require("pyproj", "maps")
-    x, y = pyproj.Proj(projparams=geo.projection)(degrees[:, 0], degrees[:, 1])
+    x, y = projection_of(geo)(degrees[:, 0], degrees[:, 1])
     placed: Places = np.stack([x + geo.offset_x_m, y + geo.offset_y_m], axis=1)
     if not np.isfinite(placed).all():
         lost = int(np.flatnonzero(~np.isfinite(placed).all(axis=1))[0])
@@ -36,8 +54,9 @@ def project(source: Path | str, degrees: Places, geo: GeoReference) -> Places:
 def unproject(places: Places, geo: GeoReference) -> Places:
     """Return longitudes and latitudes (n, 2) of x and y in m (n, 2).
 
-    Raises MissingExtraError: pyproj is not installed.
+    Raises:
+        MapError: PROJ does not know the projection.
+        MissingExtraError: pyproj is not installed.
     """
-    pyproj: Any = require("pyproj", "maps")
     east, north = places[:, 0] - geo.offset_x_m, places[:, 1] - geo.offset_y_m
-    return np.stack(pyproj.Proj(projparams=geo.projection)(east, north, inverse=True), axis=1)
+    return np.stack(projection_of(geo)(east, north, inverse=True), axis=1)

@@ -45,12 +45,27 @@ from cavmarl.ownership.transitions import State
 SILENCE = Output()
 
 
-class StoreError(ProtocolError):
-    """The rows in the store differ from the rows that zones reported."""
+class ZonesError(ProtocolError):
+    """Zones have sent no DONE, or a wrong one.
+
+    Attributes:
+        zones: these zones.
+    """
+
+    def __init__(self, text: str, zones: tuple[int, ...]) -> None:
+        super().__init__(text)
+        self.zones = zones
+
+
+class StoreError(ZonesError):
+    """The rows in the store differ from the rows that zones reported.
+
+    The zones need a new host, which repeats the tick.
+    """
 
     def __init__(self, zones: tuple[int, ...]) -> None:
-        super().__init__(f"zones {list(zones)}: stored and reported rows differ; host them anew")
-        self.zones = zones  # zones that need a new host, which repeats the tick
+        text = f"zones {list(zones)}: stored and reported rows differ; host them anew"
+        super().__init__(text, zones)
 
 
 class Directory:
@@ -208,11 +223,13 @@ class Directory:
 
         Raises:
             StoreError: the stored rows of a zone differ from its report. Fence it and host it anew.
+            ZonesError: a zone has not sent a DONE, or it does not fit the decisions of this tick.
         """
         table = self.table
         if table.plan is None or self.waiting_for():
-            raise ProtocolError(
-                f"no tick is complete: zones {list(self.waiting_for())} have not answered"
+            raise ZonesError(
+                f"no tick is complete: zones {list(self.waiting_for())} have not answered",
+                self.waiting_for(),
             )
         self._check_dones(rows)
         dones = [self.dones[zone] for zone in table.hosts]
@@ -322,7 +339,10 @@ class Directory:
         if wrong:
             raise StoreError(tuple(sorted(wrong)))
         for done in self.dones.values():
-            check_done(self.run, self.table.planned, done, self.table.owners)
+            try:
+                check_done(self.run, self.table.planned, done, self.table.owners)
+            except ProtocolError as error:
+                raise ZonesError(str(error), (done.zone,)) from error
 
     def _step(self, zone: int) -> Step:
         return make_step(self.table, zone, self._store, self._payloads.get(zone, b""))

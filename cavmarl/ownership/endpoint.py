@@ -137,14 +137,12 @@ class Endpoint:
         offers = self.offers.again()
         return tuple(self._prepare(target, offers[target]) for target in offers)
 
-    def refuse(self, message: Prepare) -> Reaction:
-        """Answer a PREPARE with a NACK, because the host has no room."""
+    def refuse(self, message: Prepare, reason: Refusal = Refusal.LOAD) -> Reaction:
+        """Answer a PREPARE with a NACK, by default because the host has no room."""
         if self._reason_to_drop(message) is not None:
             return self.on_message(message)
         refused = tuple(
-            Refused(
-                offer.vehicle, offer.epoch, self.replicas.refuse(offer, message.tick, Refusal.LOAD)
-            )
+            Refused(offer.vehicle, offer.epoch, self.replicas.refuse(offer, message.tick, reason))
             for offer in message.entries
         )
         return Reaction((Nack(*self._answer_header(message), refused),))

@@ -32,6 +32,7 @@ class Refusal(IntEnum):
     LOAD = 1
     SCHEMA = 2
     DIGEST = 3
+    SIMULATOR = 4  # the simulator that runs the zone does not accept the vehicle now
 
 
 class In(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_BACKENDS
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.nodes.node_groups import NodeGroups
@@ -79,6 +80,11 @@ def make_worlds(
         WorkerError: a process or cluster cannot be started, or there is not enough memory.
     """
     count = backend.count
+    if world.config.zones.simulators and backend.kind != LOCAL:
+        raise ConfigError(
+            f"zones.simulators: the backend '{backend.kind}' does not support zones of other "
+            "simulators; use backend='local'"
+        )
     if backend.kind == LOCAL:
         return local_worlds(world, base_dir, num_worlds, in_next_step)
     if backend.kind == PROCESSES:

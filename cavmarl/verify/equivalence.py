@@ -1,12 +1,14 @@
 """Check that divided worlds equal the undivided world, step by step.
 
 All worlds use the public interface, with the same seed and a driver of their own. After every step,
-the hashes of all worlds and all results of `step` are compared.
+the hashes of all worlds and all results of `step` are compared. A world in which another simulator
+runs a zone with a tolerance is run, but not compared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Unpack
@@ -17,8 +19,9 @@ from numpy.typing import NDArray
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.config.zones import MAX_ZONES, ZONE_FILE_SUFFIXES
-from cavmarl.core.errors import ConfigError, ProtocolError
+from cavmarl.core.errors import ConfigError, ProtocolError, ZoneSimulatorError
 from cavmarl.env.vector import make_vec
+from cavmarl.handoff.simulators.simulator_kinds import hosted_zones
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import Difference, DrivenRun, find_difference, same_bytes, snapshot
 from cavmarl.zones.kernels.zone_lookup import zones_of
@@ -37,6 +40,9 @@ class ZoneResult:
     vehicles: float  # number in all worlds, averaged over the steps
     world: int | None  # the first world that differs; None if all were equal
     difference: Difference | None  # in this world; None if all were equal
+    # the largest tolerance of a simulator of a zone, see `register_zone_simulator`; if it is above
+    # 0, the worlds are not compared
+    tolerance_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -96,29 +102,31 @@ def verify_zones(
     divided = _divided(spec, layout, check)
     plain = {key: value for key, value in divided.items() if not key.startswith("zones.")}
 
-    def run(count: int, settings: Mapping[str, Any]) -> DrivenRun:
-        wanted = spec.keywords | {"overrides": settings}
-        return DrivenRun(
-            make_vec(spec.env, num_envs=worlds, zones=count, **wanted), policy, spec.seed
-        )
+    with ExitStack() as opened:
 
-    whole = run(1, plain)
-    compared = [
-        _Compared(run(count, divided | _journal(journals, count) if count > 1 else plain))
-        for count in _counts(zones, divided)
-    ]
-    for step in range(steps + 1):
-        if step > 0:
-            whole.step()
-        for other in compared:
-            other.follow(step, whole)
-        if progress is not None:
-            progress(step, steps)
-        if all(other.difference is not None for other in compared):
-            break
-    ticks = int(whole.vec.simulation.ticks()[0])
-    hashes = tuple(whole.vec.state_hash(w) for w in range(worlds))
-    results = tuple(other.result() for other in compared)
+        def run(count: int, settings: Mapping[str, Any]) -> DrivenRun:
+            wanted = spec.keywords | {"overrides": settings}
+            vec = make_vec(spec.env, num_envs=worlds, zones=count, **wanted)
+            opened.callback(vec.close)
+            return DrivenRun(vec, policy, spec.seed)
+
+        whole = run(1, plain)
+        compared = [
+            _Compared(run(count, divided | _journal(journals, count) if count > 1 else plain))
+            for count in _counts(zones, divided)
+        ]
+        for step in range(steps + 1):
+            if step > 0:
+                whole.step()
+            for other in compared:
+                other.follow(step, whole)
+            if progress is not None:
+                progress(step, steps)
+            if all(other.difference is not None for other in compared):
+                break
+        ticks = int(whole.vec.simulation.ticks()[0])
+        hashes = tuple(whole.vec.state_hash(w) for w in range(worlds))
+        results = tuple(other.result() for other in compared)
     return Equivalence(spec.env, worlds, steps, ticks, hashes, results)
 
 
@@ -166,6 +174,9 @@ class _Compared:
         self._vehicles = 0
         self._zones: list[dict[int, int]] = [{} for _ in range(run.vec.num_envs)]
         self._world: int | None = None
+        config = run.vec.config
+        hosted = hosted_zones(config.zones.simulators, run.vec.simulation.partition.count)
+        self._tolerance_m = max((one.tolerance_m for one in hosted), default=0.0)
         self.difference: Difference | None = None
 
     def follow(self, step: int, whole: DrivenRun) -> None:
@@ -175,14 +186,15 @@ class _Compared:
         try:
             if step > 0:
                 self._run.step()
-        except (ProtocolError, ConfigError) as error:
+        except (ProtocolError, ConfigError, ZoneSimulatorError) as error:
             tick = int(whole.vec.simulation.ticks()[0])
             self._world = 0
             self.difference = Difference(step, tick, "error", None, "", (None, str(error)))
             return
         self._steps = step
         self._count_crossings()
-        self._compare(step, whole)
+        if self._tolerance_m == 0.0:
+            self._compare(step, whole)
 
     def result(self) -> ZoneResult:
         simulation = self._run.vec.simulation
@@ -193,6 +205,7 @@ class _Compared:
             self._vehicles / (self._steps + 1),
             self._world,
             self.difference,
+            self._tolerance_m,
         )
 
     def _compare(self, step: int, whole: DrivenRun) -> None:

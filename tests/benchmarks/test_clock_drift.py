@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.carla_clock_client import is_due
 from benchmarks.clock_drift import ClockDrift, measure_drift, rows_of, write_rows
-from benchmarks.clock_reader import is_due
 from cavmarl.core.errors import ConfigError
 from cavmarl.cosim.time_master import OwnTicks
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -13,17 +14,18 @@ from xxhash import xxh3_64_intdigest
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import Done
+from cavmarl.ownership.messages import COORDINATOR, Done
 from cavmarl.parallel.network.encryption import encrypted
 from cavmarl.parallel.network.tcp_transport import TcpConnection
 from cavmarl.parallel.network.transport import READS
 from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, read_list
-from cavmarl.parallel.nodes.links import Links
+from cavmarl.parallel.nodes.links import Links, SilenceError
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_handshake import accept_nodes, call_node
 from cavmarl.parallel.nodes.node_system import MACHINE
+from cavmarl.parallel.nodes.node_watch import NodeWatch, Pong, SilentNodeError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
-from cavmarl.parallel.nodes.zone_endpoints import packed
+from cavmarl.parallel.nodes.zone_endpoints import Report, packed
 from tests.parallel.test_node_joining import WAIT_S
 
 
@@ -205,3 +207,76 @@ def test_a_call_of_an_earlier_generation_is_rejected() -> None:
         found_now[2].close()
         with pytest.raises(LinkLostError, match="node 3"):
             accept_nodes(MACHINE, listener, [3], 7, 0.0, lambda: None)
+
+
+def watch(links: Links) -> NodeWatch:
+    return NodeWatch(links, set, lambda agent: [0, 1][agent])
+
+
+def test_the_sender_of_a_bad_frame_is_lost_and_not_its_receiver() -> None:
+    links, far = pair()
+    with far:
+        seen = watch(links)
+        for number, peer, fault in ((2, 0, ""), (0, 2, "it is late"), (1, 0, "")):
+            with pytest.raises(LinkLostError, match=f"node {peer}"):
+                seen.report_missed(number, peer, fault)
+        lost = seen.most_missed(LinkLostError(0), 0)
+        assert (lost.peer, lost.fault) == (2, "node 0 reports: it is late")
+    links.close()
+
+
+def test_of_two_nodes_that_miss_each_other_either_is_lost_in_turn() -> None:
+    links, far = pair()
+    with far:
+        found = []
+        for generation in range(4):
+            seen = watch(links)
+            with pytest.raises(LinkLostError):
+                seen.report_missed(3, 0, "")
+            found.append(seen.most_missed(LinkLostError(0), generation).peer)
+    links.close()
+    assert found == [3, 0, 3, 0]
+
+
+def test_whoever_has_the_action_of_an_agent_is_lost() -> None:
+    """A node waits for the action of an agent, which another node has got and not refused."""
+    links, far = pair()
+    seen = watch(links)
+
+    def answer(number: int, frame: NodeFrame) -> None:
+        seen.receive_pong(number, frame)
+
+    def wait(left_s: float) -> None:
+        raise SilenceError("nothing comes")
+
+    links.urgent = answer
+    others = Links(lambda number, frame: None)
+    others.add(0, TcpConnection(far))
+    pong = Pong([COORDINATOR], [], [], [0])
+    others.send(0, FrameKind.PONG, 1, [json.dumps(pong).encode()])
+    with pytest.raises(SilentNodeError, match="it has not refused others' actions") as lost:
+        seen.wait([0], 0.0, wait)
+    assert lost.value.peer == 0
+    others.send(0, FrameKind.PONG, 1, [json.dumps(pong._replace(agents=[2])).encode()])
+    with pytest.raises(LinkLostError, match="cannot be read: IndexError"):
+        links.pump(1000.0)
+    others.close()
+
+
+def test_a_node_is_late_only_once() -> None:
+    """A lease of no ticks records the new vehicles of all nodes."""
+    links, far = pair()
+    coordinator = NodeCoordinator([bytes(16)], [0, 1], Limits(), links, [None])
+    coordinator.host(Neighbours((frozenset((1,)), frozenset((0,)))))
+    late = Report([], [], False, [], is_late=True)
+    for _ in range(2):
+        coordinator.commit({0: ([], []), 1: ([], [late])})
+        assert coordinator.is_late
+        coordinator.commit({0: ([], []), 1: ([], [])})
+        assert not coordinator.is_late
+    coordinator.commit({0: ([], []), 1: ([], [late])})
+    with pytest.raises(LinkLostError, match="it has not reported new vehicles") as lost:
+        coordinator.commit({0: ([], []), 1: ([], [late])})
+    assert lost.value.peer == 1
+    far.close()
+    links.close()

@@ -172,6 +172,8 @@ def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
         words = np.concatenate([words, np.zeros(7 * (ROOM + 1), dtype=np.int64)])
     elif harm == "less than none that leave":
         words[1 + 2 * WORLDS] = -1
+    elif harm == "less than no change of route":
+        words[1 + WORLDS] = -1
     else:
         return words[:0]
     words[0] = len(words)
@@ -191,6 +193,7 @@ def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
         "more that can touch than there are",
         "more that leave than there is room for",
         "less than none that leave",
+        "less than no change of route",
     ],
 )
 def test_bad_frames_are_refused(harm: str) -> None:
@@ -202,6 +205,7 @@ def test_bad_frames_are_refused(harm: str) -> None:
         far.read(data)
     assert (far.zoned.num_rows[THEIRS] == 2).all(), "nothing of it was put anywhere"
     assert not far.departures.num_passing.any()
+    assert not far.departures.counts.any()
 
 
 def tables(num: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -223,7 +227,8 @@ def test_agents_arrive_as_they_were_sent() -> None:
     here[0][...], here[1][...] = drawn.random((WORLDS, 4, 3)), True
     mine = np.array([True, False, False, True, False, False, True, False])
     owner = np.full(8, -1, dtype=np.int32)
-    AgentStream(there).read(packed(here, mine), 5, owner)
+    agents = AgentStream(there).read(packed(here, mine), 5, owner)
+    assert agents.tolist() == np.flatnonzero(mine).tolist()
     assert owner.tolist() == [5, -1, -1, 5, -1, -1, 5, -1]
     for sent, taken in zip(here, there, strict=True):
         flat, other = (array.reshape(8, -1) for array in (sent, taken))
@@ -241,3 +246,27 @@ def test_bad_frames_about_agents_are_refused(change: bytes | None) -> None:
     with pytest.raises(MessageError, match="no frame about agents"):
         AgentStream(there).read(memoryview(data if change is None else change), 5, owner)
     assert (owner == -1).all()
+
+
+@pytest.mark.parametrize("taken", [2, 3])
+def test_an_agent_has_one_node(taken: int) -> None:
+    """A frame names an agent twice, or the agent of another node."""
+    here, there = tables(4), tables(4)
+    mine = np.array([False, False, True, True, False, False, False, False])
+    owner = np.full(8, -1, dtype=np.int32)
+    data = bytearray(packed(here, mine))
+    if taken == 2:
+        data[16:24] = data[8:16]
+    else:
+        owner[3] = 1
+    with pytest.raises(MessageError, match="agents of other nodes, or an agent twice"):
+        AgentStream(there).read(memoryview(data), 5, owner)
+
+
+def test_flags_of_agents_are_true_or_false() -> None:
+    here, there = tables(4), tables(4)
+    data = bytearray(packed(here, np.ones(8, dtype=np.bool_)))
+    owner = np.full(8, -1, dtype=np.int32)
+    data[-1] = 2
+    with pytest.raises(MessageError, match="neither true nor false"):
+        AgentStream(there).read(memoryview(data), 5, owner)

@@ -21,6 +21,7 @@ from cavmarl.traffic.departure_queue import DEPARTURE
 from tests.support.actuated import actuated_grid
 from tests.support.replayed import BUSY
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
+from tests.support.signal_worlds import common_of_worlds
 from tests.support.vec_runs import Make
 
 Array = NDArray[Any]
@@ -30,6 +31,7 @@ Forge = Callable[[State], None]
 MANY = 1 << 30
 ROW = {
     "lane": (-1, MANY),
+    "lane_stood": (-2, MANY << 32),
     "side_lane": (-2, MANY),
     "target_lane": (-2, MANY),
     "vtype": (-1, 1),
@@ -331,6 +333,40 @@ def test_external_vehicles_and_slots_that_do_not_match(make: Make) -> None:
                     rows[name][rows["id"] == ids[0]] = value
 
         _refused(vec, forge)
+
+
+def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> None:
+    vec = make("grid4x4", num_envs=2, zones=2, overrides={"signals.agents": "all"})
+    vec.reset(seed=1)
+    for _ in range(12):
+        vec.step(vec.suggest_actions())
+    outputs = _worlds(vec).simulation.signals.outputs
+    arrays = _worlds(vec).save()
+
+    def place(wanted: Array) -> int:
+        (at,) = [n for n, array in enumerate(arrays) if _content(array) == _content(wanted)]
+        return at
+
+    at, seen, counts = map(place, (outputs.states, outputs.observations, outputs.counts))
+    for column, value in ((0, -1), (0, 2), (1, 2), (1, MANY), (2, -1), (2, 1 << 41), (3, -1)):
+        _refused(vec, with_value(at, (1, 3, column), value))
+    _refused(vec, with_value(at + 1, (0, 2), -1))  # sums of waiting
+    for wrong in (-0.5, 1.5, np.nan):
+        _refused(vec, with_value(seen, (0, 0, 0), wrong))
+    _refused(vec, with_value(counts, (0, 0, 0), -1))
+    controllers = place(common_of_worlds(_worlds(vec).simulation).controllers)
+
+    def due(state: State) -> None:
+        state[controllers]["next_ms"][0, 0] = 5000
+
+    _refused(vec, due)
+
+
+def with_value(at: int, place: tuple[int, ...], value: float) -> Forge:
+    def forge(state: State) -> None:
+        state[at][place] = value
+
+    return forge
 
 
 def ids_of(vec: CavVectorEnv) -> Array:

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from io import BytesIO
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
+from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from cavmarl.parallel.nodes.state_replicas import StateReplicas
 from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 
 
 class Worlds:
+    """Worlds with two zones, of which a state has the numbers and the rows of each zone."""
+
+    simulation = SimpleNamespace(num_worlds=1)
+    world = SimpleNamespace(partition=SimpleNamespace(count=2))
+
     def save(self) -> list[np.ndarray[Any, Any]]:
-        return [np.arange(3)]
+        return [np.arange(3), np.zeros(0), np.ones(2)]
+
+    def check(self, saved: list[np.ndarray[Any, Any]]) -> None:
+        if len(saved[0]) != 3:
+            raise ConfigError("the state has other numbers")
 
 
 class Wires:
@@ -25,19 +39,56 @@ class Wires:
         assert kind is FrameKind.KEEP
         self.sent.append((to, number))
 
+    def await_urgent(self, number: int, has_come: Callable[[], bool]) -> None:
+        if not has_come():
+            raise LinkLostError(number, MessageError("it has not come"))
+
+
+ZONES = [[0], [1], [], [], []]
+
+
+def replica(state: int, arrays: list[np.ndarray[Any, Any]]) -> NodeFrame:
+    return NodeFrame(FrameKind.KEEP, state, memoryview(to_bytes(arrays)))
+
+
+THEIRS = [np.arange(3), np.ones(5), np.zeros(0)]
+
 
 def test_older_states_are_dropped_when_the_newest_has_arrived_everywhere() -> None:
     worlds, wires = Worlds(), Wires()
     kept = StateReplicas(worlds, (), wires, 1)  # type: ignore[arg-type]
     for state in (1, 2, 3):
-        kept.receive(0, NodeFrame(FrameKind.KEEP, state, memoryview(b"theirs")))
-        kept.keep(state, [0, 1, 4])
+        kept.receive(0, replica(state, THEIRS))
+        saved = kept.keep(state, [0, 1, 4])
+        kept.await_replica(state, ZONES, saved)
     assert wires.sent == [(4, 1), (4, 2), (4, 3)]
     assert (list(kept.own), list(kept.others[0])) == ([2, 3], [2, 3])
     kept.settle()
-    kept.receive(0, NodeFrame(FrameKind.KEEP, 4, memoryview(b"theirs")))  # ahead of this node
+    kept.receive(0, replica(4, THEIRS))  # ahead of this node
     kept.settle()
-    assert (list(kept.own), list(kept.others[0])) == ([3], [3, 4]), "all may go back to 3"
+    assert (list(kept.own), list(kept.others[0])) == ([3], [3]), "all may go back to 3"
+    kept.await_replica(4, ZONES, saved)
+    assert list(kept.others[0]) == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("state", "arrays", "words"),
+    [
+        (2, THEIRS, "it has not come"),
+        (1, [*THEIRS, np.ones(1)], "there are more arrays"),
+        (1, [np.arange(4), *THEIRS[1:]], "the state has other numbers"),
+        (1, [np.arange(3), np.ones(5), np.ones(2)], r"vehicles of zones \[1\]"),
+    ],
+)
+def test_a_wrong_replica_is_the_fault_of_its_sender(
+    state: int, arrays: list[np.ndarray[Any, Any]], words: str
+) -> None:
+    kept = StateReplicas(Worlds(), (), Wires(), 1)  # type: ignore[arg-type]
+    kept.receive(0, replica(state, arrays))
+    with pytest.raises(LinkLostError, match=words) as lost:
+        kept.await_replica(1, ZONES, Worlds().save())
+    assert lost.value.peer == 0
+    assert not kept.others
 
 
 def test_arrays_have_the_format_of_numpy() -> None:

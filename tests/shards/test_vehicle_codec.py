@@ -273,7 +273,7 @@ RECORD_AT = 44
 
 def test_refusals_have_their_types() -> None:
     state, vehicle = a_state()
-    header = bytearray(state)
+    header, other = bytearray(state), RECORD_VERSION + 1
     for length in range(len(state)):
         with pytest.raises(MessageError):
             unpacked(state[:length], vehicle, TICK)
@@ -281,8 +281,10 @@ def test_refusals_have_their_types() -> None:
         unpacked(state + b"\0", vehicle, TICK)
     with pytest.raises(MessageError, match="begins with"):
         unpacked(b"CVMO" + state[4:], vehicle, TICK)
-    with pytest.raises(MessageError, match=r"version 3\.0, but this build reads 2\."):
-        unpacked(state[:4] + struct.pack("<H", 3) + state[6:], vehicle, TICK)
+    with pytest.raises(
+        MessageError, match=rf"version {other}\.0, but this build reads {RECORD_VERSION}\."
+    ):
+        unpacked(state[:4] + struct.pack("<H", other) + state[6:], vehicle, TICK)
     with pytest.raises(MessageError, match=f"expected vehicle {vehicle + 1}"):
         unpacked(state, vehicle + 1, TICK)
     with pytest.raises(MessageError, match=f"at tick {TICK + 1}"):
@@ -310,7 +312,7 @@ def test_an_unknown_status_and_a_foreign_agent_are_refused() -> None:
 
 def test_another_record_or_environment_is_refused() -> None:
     state, vehicle = a_state()
-    renamed = np.dtype([(name if name != "memory" else "recall", kind)
+    renamed = np.dtype([(name if name != "lane_stood" else "recall", kind)
                         for name, kind in VEHICLE.descr])  # fmt: skip
     codec, rows, _, _ = arrays(renamed)
     assert codec.schema != arrays()[0].schema

@@ -25,6 +25,7 @@ from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.signals.controllers import make_controller
 from cavmarl.signals.kernels.green_choices import GREEN, REFUSED, SINCE
 from cavmarl.signals.kernels.lane_counts import STANDING, STOOD_TICKS, VEHICLES
+from tests.support.signal_worlds import common_of_worlds
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -468,7 +469,7 @@ def test_the_time_to_a_change_is_never_later_than_the_change(change: tuple[float
     with closing(world(decide_s=1.0, **times)) as env:
         env.reset()
         rng = np.random.default_rng(0)
-        network, common = env.network, env.simulation._tick.common
+        network, common = env.network, common_of_worlds(env.simulation)
         links = np.flatnonzero(network.links["signal"] == env.signals.table.arrays.row[0])
         shown: list[NDArray[np.int64]] = []
         expected = []

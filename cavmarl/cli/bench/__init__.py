@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from cavmarl.cli.bench import step, traffic, train
+from cavmarl.cli.bench import signals, step, traffic, train
 from cavmarl.cli.output import add_command
 from cavmarl.cli.report_command import report_command
 from cavmarl.core.errors import ConfigError
@@ -53,6 +53,12 @@ add_command(
     "step",
     report_command(step.step),
     "cavmarl bench step --agents 20 --repeats 3",
+)
+add_command(
+    app,
+    "signals",
+    report_command(signals.signals),
+    "cavmarl bench signals grid4x4.sumocfg --worlds 1 --worlds 16",
 )
 add_command(
     app,

@@ -99,7 +99,7 @@ def _table(found: Equivalence, seed: int) -> Table:
             str(result.steps),
             f"{result.vehicles:,.0f}",
             f"{result.crossings:,}",
-            "[green]equal[/]" if result.difference is None else "[red]different[/]",
+            _verdict(result),
         )
         for result in found.results
     )
@@ -107,6 +107,14 @@ def _table(found: Equivalence, seed: int) -> Table:
         f"{Path(found.env).name}, {many}, seed {seed}: compared with the undivided world"
     )
     return grid(("zones", "steps", "vehicles", "crossings", ""), rows, title, lefts=0)
+
+
+def _verdict(result: ZoneResult) -> str:
+    if result.difference is not None:
+        return "[red]different[/]"
+    if result.tolerance_m > 0.0:
+        return f"[yellow]not compared: a simulator declares {result.tolerance_m:g} m[/]"
+    return "[green]equal[/]"
 
 
 def _sentence(result: ZoneResult, worlds: int) -> str:

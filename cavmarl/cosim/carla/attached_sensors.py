@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 GRAVITY_MPS2 = 9.81
 _SOON_S = 1e-6  # a sample that is due within this time is taken
 _FIRST_STREAM = 2
+_LISTENERS_DUE_S = 1.0  # clients listen to a new sensor within this time
 _IMPULSE_PER_MPS = 1500.0  # kg: impulse of a collision per m/s of difference in speed
 
 
@@ -196,6 +198,8 @@ class _Mounted:
     every_s: float
     due_s: float = 0.0
     last_s: float | None = None
+    is_heard: bool = False  # it has had a listener
+    added_wall_s: float = field(default_factory=time.monotonic)
 
 
 class SensorSuite:
@@ -206,12 +210,18 @@ class SensorSuite:
         self._streams = streams
         self._mounted: dict[int, _Mounted] = {}
         self._next_stream = _FIRST_STREAM
+        self._added = 0  # in this episode
+
+    def begin_episode(self) -> None:
+        """Let the next sensors draw the random numbers of a first episode."""
+        self._added = 0
 
     def add(self, actor: CarlaActor) -> None:
         """Mount the sensor of a new actor; raise CallRefused if an attribute is invalid."""
         if actor.type_id in _OF_THE_CLIENT:
             return
-        settings = SensorSettings(actor)
+        settings = SensorSettings(actor, self._added)
+        self._added += 1
         every_s = settings.number("sensor_tick", 0.0, 1e6)
         sensor = _SENSORS[actor.type_id](settings)
         self._mounted[actor.number] = _Mounted(actor, sensor, self._next_stream, every_s)
@@ -223,6 +233,15 @@ class SensorSuite:
         mounted = self._mounted.pop(actor.number, None)
         if mounted is not None:
             self._streams.end(mounted.stream)
+
+    def are_listeners_due(self) -> bool:
+        """Return whether a client may be about to listen to a sensor that it has just spawned."""
+        now_s = time.monotonic()
+        for mounted in self._mounted.values():
+            mounted.is_heard = mounted.is_heard or self._streams.is_wanted(mounted.stream)
+            if not mounted.is_heard and now_s - mounted.added_wall_s < _LISTENERS_DUE_S:
+                return True
+        return False
 
     def last_collisions(self, actor: CarlaActor) -> Iterator[tuple[int, CarlaActor, int, bytes]]:
         """Yield frames, as `sense`, of a vehicle that leaves the world after a collision.

@@ -63,7 +63,10 @@ def apply_batch(
 ) -> list[Any]:
     answers = [_answer(caller, session, index, body) for index, body in commands]
     if do_tick and session.settings.synchronous:
-        session.tick()
+        try:
+            session.tick_for(caller)
+        except CallRefused as problem:  # the answers of the commands are those of the call
+            session.tell(f"{caller.name}: apply_batch: {problem}")
     return answers
 
 

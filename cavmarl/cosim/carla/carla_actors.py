@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, DRIVER_EXTERNAL
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_blueprints import BLUEPRINT_OF_CLASS, BLUEPRINTS, Blueprint
-from cavmarl.cosim.carla.carla_geometry import ZERO, CarlaPose, Vector, compose
+from cavmarl.cosim.carla.carla_geometry import ZERO, CarlaPose, Vector, axes_of, compose
 from cavmarl.cosim.carla.carla_map import CarlaMap
 from cavmarl.cosim.carla.carla_snapshots import (
     ACTIVE,
@@ -22,6 +22,7 @@ from cavmarl.cosim.carla.carla_snapshots import (
     WALKER_STATE,
     place_state,
 )
+from cavmarl.cosim.carla.external_vehicles import ExternalBody
 from cavmarl.cosim.carla.hosted_world import HostedWorld
 from cavmarl.cosim.carla.vehicle_controls import (
     BRAKE_MPS2,
@@ -98,6 +99,11 @@ class CarlaActor:
     def is_walker(self) -> bool:
         return self.type_id.startswith("walker.")
 
+    @property
+    def is_attached(self) -> bool:
+        """Whether this is a sensor or a controller."""
+        return self.type_id.startswith(("sensor.", "controller."))
+
     def attribute(self, name: str) -> str:
         return self.attributes.get(name) or BLUEPRINTS[self.type_id].default(name)
 
@@ -106,15 +112,16 @@ class ActorTable:
     """The actors of one episode, and their states as records of a snapshot.
 
     `first_number`: number of the first actor, larger than all numbers of earlier episodes, because
-    clients keep what they know of a number.
+    clients keep what they know of a number. `next_number`: least number of the first vehicle.
     """
 
-    def __init__(self, world: HostedWorld, first_number: int) -> None:
+    def __init__(self, world: HostedWorld, first_number: int, next_number: int = 0) -> None:
         self._next = first_number
         self.actors: dict[int, CarlaActor] = {}
         self._by_vehicle: dict[int, CarlaActor] = {}
         self.spectator = self.add("spectator", SPECTATOR_POSE)
         self._light_states = self._make_lights(world.map)
+        self._next = max(self._next, next_number)
         self._light_since = np.zeros(len(self._light_states))
         self._ids = np.zeros(0, np.int64)
         self._listed: list[CarlaActor] = []
@@ -211,10 +218,40 @@ class ActorTable:
             slot=slot,
         )
 
+    def keep_spawned(self, world: HostedWorld, before: ActorTable) -> list[CarlaActor]:
+        """Take over what clients have spawned into an earlier world of the same map.
+
+        Return the actors that could not be kept: their places are occupied, or their parents gone.
+        """
+        self.spectator.pose = before.spectator.pose
+        gone = []
+        for actor in before.actors.values():
+            if actor.slot >= 0:
+                state = before.state_of(actor)
+                pose, speed = before.pose_of(actor), 0.0
+                if state is not None:
+                    speed = float(state["velocity"] @ axes_of(pose)[:, 0])
+                base_type = BLUEPRINTS[actor.type_id].default("base_type")
+                length, width, height = (2.0 * half for half in actor.half_m)
+                body = ExternalBody(actor.type_id, base_type, pose, (length, width, height), speed)
+                try:
+                    actor.slot, _ = world.external.spawn(body)
+                except CallRefused:
+                    gone.append(actor)
+                    continue
+                actor.pose, actor.vehicle = pose, -1
+            elif not actor.is_attached:
+                continue
+            elif actor.parent and actor.parent not in self.actors:
+                gone.append(actor)
+                continue
+            self.actors[actor.number] = actor
+        return gone
+
     def attached(self) -> Iterator[CarlaActor]:
         """Yield sensors and controllers."""
         for actor in self.actors.values():
-            if actor.type_id.startswith(("sensor.", "controller.")):
+            if actor.is_attached:
                 yield actor
 
     def take(self, world: HostedWorld, time_s: float) -> list[CarlaActor]:

@@ -211,26 +211,68 @@ _IMU = _floats(
     }
 )
 
+_CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)
+# Programs look these up, but a server refuses to spawn them.
+_OTHER_CAMERAS = (
+    "camera.optical_flow",
+    "camera.normals",
+    "camera.dvs",
+    "camera.cosmos_visualization",
+)
+UNAVAILABLE = frozenset(f"sensor.{name}" for name in _OTHER_CAMERAS)
+
 BLUEPRINTS = {
     blueprint.type_id: blueprint
     for blueprint in (
-        _vehicle("tesla.model3", "car", (4.79, 2.16, 1.49)),
-        _vehicle("audi.tt", "car", (4.18, 1.99, 1.39)),
+        _vehicle("tesla.model3", "car", (4.79, 2.16, 1.49), special_type="electric"),
         _vehicle("audi.a2", "car", (3.71, 1.79, 1.55)),
-        _vehicle("lincoln.mkz_2020", "car", (4.89, 1.84, 1.49)),
-        _vehicle("mercedes.coupe_2020", "car", (4.67, 1.82, 1.42)),
-        _vehicle("nissan.micra", "car", (3.63, 1.85, 1.5)),
+        _vehicle("audi.etron", "car", (4.86, 2.03, 1.65), special_type="electric"),
+        _vehicle("audi.tt", "car", (4.18, 1.99, 1.39)),
+        _vehicle("bmw.grandtourer", "car", (4.61, 2.24, 1.67)),
+        _vehicle("chevrolet.impala", "car", (5.36, 2.03, 1.41)),
+        _vehicle("citroen.c3", "car", (3.99, 1.85, 1.62)),
+        _vehicle("dodge.charger_2020", "car", (5.01, 1.88, 1.54)),
+        _vehicle("dodge.charger_police", "car", (4.97, 2.04, 1.55), special_type="emergency"),
+        _vehicle("dodge.charger_police_2020", "car", (5.24, 2.03, 1.64), special_type="emergency"),
+        _vehicle("ford.crown", "car", (5.37, 1.8, 1.58), special_type="taxi"),
         _vehicle("ford.mustang", "car", (4.72, 1.89, 1.3)),
+        _vehicle("jeep.wrangler_rubicon", "car", (3.87, 1.91, 1.88)),
+        _vehicle("lincoln.mkz_2017", "car", (4.9, 2.06, 1.48)),
+        _vehicle("lincoln.mkz_2020", "car", (4.89, 1.84, 1.49)),
+        _vehicle("mercedes.coupe", "car", (5.03, 2.15, 1.64)),
+        _vehicle("mercedes.coupe_2020", "car", (4.67, 1.82, 1.42)),
+        _vehicle("micro.microlino", "car", (2.21, 1.48, 1.38), special_type="electric"),
+        _vehicle("mini.cooper_s", "car", (3.81, 1.97, 1.48)),
         _vehicle("mini.cooper_s_2021", "car", (4.55, 2.1, 1.77)),
-        _vehicle("volkswagen.t2", "van", (4.48, 2.07, 2.04)),
+        _vehicle("nissan.micra", "car", (3.63, 1.85, 1.5)),
+        _vehicle("nissan.patrol", "car", (4.6, 1.93, 1.86)),
+        _vehicle("nissan.patrol_2021", "car", (5.57, 2.15, 2.05)),
+        _vehicle("seat.leon", "car", (4.19, 1.82, 1.47)),
+        _vehicle("toyota.prius", "car", (4.51, 2.01, 1.52), special_type="electric"),
         _vehicle("ford.ambulance", "van", (6.36, 2.35, 2.43), special_type="emergency"),
+        _vehicle("mercedes.sprinter", "van", (5.92, 1.99, 2.56)),
+        _vehicle("volkswagen.t2", "van", (4.48, 2.07, 2.04)),
+        _vehicle("volkswagen.t2_2021", "van", (4.44, 1.77, 1.99)),
         _vehicle("carlamotors.carlacola", "truck", (5.2, 2.61, 2.47)),
+        _vehicle("carlamotors.european_hgv", "truck", (7.94, 2.89, 3.46)),
+        _vehicle("carlamotors.firetruck", "truck", (8.47, 2.89, 3.83), special_type="emergency"),
+        _vehicle("tesla.cybertruck", "truck", (6.27, 2.39, 2.1), special_type="electric"),
         _vehicle("mitsubishi.fusorosa", "bus", (10.27, 3.94, 4.25)),
+        _vehicle("harley-davidson.low_rider", "motorcycle", (2.35, 0.76, 1.48), wheels=2),
         _vehicle("kawasaki.ninja", "motorcycle", (2.04, 0.8, 1.45), wheels=2),
+        _vehicle("vespa.zx125", "motorcycle", (1.81, 0.87, 1.23), wheels=2),
+        _vehicle("yamaha.yzf", "motorcycle", (2.21, 0.87, 1.25), wheels=2),
+        _vehicle("bh.crossbike", "bicycle", (1.51, 0.86, 1.62), wheels=2),
         _vehicle("diamondback.century", "bicycle", (1.65, 0.37, 1.59), wheels=2),
-        _walker(1, "adult", "female"),
-        _walker(2, "adult", "male"),
-        _walker(9, "child", "female"),
+        _vehicle("gazelle.omafiets", "bicycle", (1.83, 0.45, 1.76), wheels=2),
+        *(
+            _walker(
+                number,
+                "child" if number in _CHILDREN else "adult",
+                "female" if number % 2 else "male",
+            )
+            for number in range(1, 53)
+        ),
         Blueprint("controller.ai.walker", (BlueprintAttribute("role_name", "string", "default"),)),
         _sensor("camera.rgb", *_RGB),
         _sensor("camera.depth", *_CAMERA),
@@ -248,6 +290,7 @@ BLUEPRINTS = {
         _sensor("other.imu", *_IMU, *_SEED),
         _sensor("other.collision"),
         _sensor("other.lane_invasion"),
+        *(_sensor(name, *_CAMERA) for name in _OTHER_CAMERAS),
         _sensor(
             "other.obstacle",
             *_floats(distance=5.0, hit_radius=0.5),

@@ -7,11 +7,12 @@ Its state is green only if all movements from these lanes are green.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import unescape
 from typing import NamedTuple
 
-import defusedxml.ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +29,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MINOR,
 )
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, carla_pose
+from cavmarl.maps.components import strong_components
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 
 RED, YELLOW, GREEN, OFF = 0, 1, 2, 3  # CARLA's numbers of states of traffic lights
@@ -42,7 +44,9 @@ SPAWN_HEIGHT_M = 0.3  # spawn points are this far above the road
 _SPAWN_EVERY_M = 40.0
 _FIRST_SPAWN_M = 15.0  # from the start of a longer lane
 _SHORTEST_M = 12.0  # a shorter lane has no spawn point
-_CAR = 1 << VEHICLE_CLASSES.index("passenger")
+CAR = 1 << VEHICLE_CLASSES.index("passenger")
+_SIGNAL = re.compile(r"<signal\s([^>]*)>")
+_ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
 _BOX_BEFORE_LINE_M = 2.0  # centre of the trigger volume, before the stop line
 
 
@@ -109,9 +113,7 @@ def make_carla_map(
     """
     if len(network.maps) > 1:
         raise MapError(f"{name}: {len(network.maps)} maps; a server for CARLA's clients has one")
-    root = defusedxml.ElementTree.fromstring(document.encode(), forbid_dtd=True)
-    ids = {signal.get("name", ""): signal.get("id", "") for signal in root.iter("signal")}
-    approaches = _approaches(network, ids)
+    approaches = _approaches(network, _ids_of_signals(document))
     at_end = np.full(len(network.lanes), -1, np.int32)
     for number, approach in enumerate(approaches):
         at_end[list(approach.lanes)] = number
@@ -119,7 +121,7 @@ def make_carla_map(
         name,
         document,
         network,
-        tuple(_spawn_points(network)),
+        tuple(spawn_points(network)),
         approaches,
         _states(network, approaches),
         at_end,
@@ -128,17 +130,49 @@ def make_carla_map(
     )
 
 
-def _spawn_points(network: RoadNetwork) -> list[CarlaPose]:
-    found = []
+def _ids_of_signals(document: str) -> dict[str, str]:
+    """Return the ids of signals by their names. Parsing a whole town would take seconds."""
+    found = {}
+    for signal in _SIGNAL.finditer(document):
+        values = dict(_ATTRIBUTE.findall(signal[1]))
+        found[unescape(values.get("name", ""))] = unescape(values.get("id", ""))
+    return found
+
+
+def spawn_points(network: RoadNetwork) -> list[CarlaPose]:
+    """Return poses on lanes that cars may use, `SPAWN_HEIGHT_M` above the road.
+
+    Programs draw starts and destinations from them. If the lanes that lead to each other have at
+    least half of the poses, there are no poses on other lanes, such as those that leave the map.
+    """
+    found: list[CarlaPose] = []
+    lanes: list[int] = []
     for lane, row in enumerate(network.lanes):
         length = float(row["length_m"])
-        if row["internal"] or not row["permissions"] & _CAR or length < _SHORTEST_M:
+        if row["internal"] or not row["permissions"] & CAR or length < _SHORTEST_M:
             continue
         places = np.arange(_FIRST_SPAWN_M, length - _FIRST_SPAWN_M, _SPAWN_EVERY_M).tolist()
         for s in places or [0.5 * length]:
             x, y, z, cos, sin, slope = network.pose_on(lane, s)
             pose = carla_pose(x, y, z, math.atan2(sin, cos), math.atan(slope))
             found.append(pose.at((pose.x, pose.y, pose.z + SPAWN_HEIGHT_M)))
+            lanes.append(lane)
+    connected = np.flatnonzero(_in_largest_part(network)[lanes]).tolist()
+    return [found[row] for row in connected] if 2 * len(connected) >= len(found) else found
+
+
+def _in_largest_part(network: RoadNetwork) -> NDArray[np.bool_]:
+    """Return (lanes,) whether a lane is in the largest part in which cars can reach each lane."""
+    lanes, links = network.lanes, network.links
+    for_cars = (lanes["permissions"] & CAR) != 0
+    arcs = [np.stack([links["from_lane"], links["to_lane"]], axis=1)]
+    for side in ("left", "right"):
+        there = np.flatnonzero(lanes[side] >= 0)
+        arcs.append(np.stack([there, lanes[side][there]], axis=1))
+    joined = np.concatenate(arcs).astype(np.int32)
+    part = strong_components(len(lanes), joined[for_cars[joined].all(axis=1)])
+    part[lanes["internal"] | ~for_cars] = len(lanes)  # in no part
+    found: NDArray[np.bool_] = part == np.bincount(part)[: len(lanes)].argmax()
     return found
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -21,11 +22,16 @@ from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.core.server_address import is_loopback, listen
 from cavmarl.cosim.carla import actor_calls, batch_calls, episode_calls
 from cavmarl.cosim.carla.call_table import Caller, answer
-from cavmarl.cosim.carla.carla_session import DEFAULT_LIMITS, CarlaSession, SessionLimits
+from cavmarl.cosim.carla.carla_session import (
+    DEFAULT_LIMITS,
+    CarlaSession,
+    OtherTicks,
+    SessionLimits,
+)
 from cavmarl.cosim.carla.carla_streams import StreamConnection, StreamHub, without_delay
 from cavmarl.cosim.carla.carla_versions import DEFAULT_VERSION, client_version
 from cavmarl.cosim.carla.hosted_world import STEP_S, GivenWorld, LoadedWorlds, WorldSource
-from cavmarl.cosim.carla.rpc_messages import RequestReader, pack_answer
+from cavmarl.cosim.carla.rpc_messages import Request, RequestReader, pack_answer
 from cavmarl.engine.world_setup import find_map
 from cavmarl.env.parallel import CavEnv
 
@@ -35,17 +41,27 @@ PORT = 2000
 LOOPBACK = "127.0.0.1"
 CALL_MODULES = (actor_calls, batch_calls, episode_calls)  # they fill the table of calls
 _LATE_S = 0.5  # a free-running world that is later than this does not catch up
+_PATIENCE_S = 0.01  # how long a tick waits for listeners of new sensors
+_LOOK_S = 0.0005
 _MAX_PORT = 65534  # the streams have the next port
 
 
 class ClientConnection(asyncio.Protocol):
-    """The RPC connection of one client."""
+    """The RPC connection of one client.
+
+    A tick waits a moment for listeners that may be on their way to new sensors: a client that calls
+    `listen` and then `tick` expects the frame of this tick, but connects to the stream port without
+    waiting.
+    """
 
     def __init__(self, session: CarlaSession, connections: set[ClientConnection]) -> None:
         self._session, self._connections = session, connections
         self._reader = RequestReader(session.limits.max_message)
         self._caller = Caller("a client")
         self._transport: asyncio.Transport | None = None
+        self._requests: deque[Request] = deque()
+        self._patience_s: float | None = None  # time until which the first request waits
+        self._next_look: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
@@ -67,16 +83,46 @@ class ClientConnection(asyncio.Protocol):
             transport.abort()
             return
         try:
-            for request in self._reader.read(data):
-                error, result = answer(self._caller, self._session, request.name, request.arguments)
-                transport.write(pack_answer(request.number, error, result))
+            self._requests.extend(self._reader.read(data))
         except MessageError as problem:
             log.warning("%s is dropped: %s", self._caller.name, problem)
             transport.abort()
+            return
+        if self._next_look is None:
+            self._answer_requests()
+
+    def _answer_requests(self) -> None:
+        self._next_look = None
+        transport = self._transport
+        assert transport is not None
+        while self._requests:
+            if self._must_wait(self._requests[0]):
+                loop = asyncio.get_running_loop()
+                self._next_look = loop.call_later(_LOOK_S, self._answer_requests)
+                return
+            self._patience_s = None
+            request = self._requests.popleft()
+            error, result = answer(self._caller, self._session, request.name, request.arguments)
+            transport.write(pack_answer(request.number, error, result))
+
+    def _must_wait(self, request: Request) -> bool:
+        """Return whether a request is a tick for which listeners may still come."""
+        is_tick = request.name == "tick_cue" or (
+            request.name == "apply_batch" and request.arguments[-1:] == [True]
+        )
+        session = self._session
+        if not (is_tick and session.settings.synchronous and session.sensors.are_listeners_due()):
+            return False
+        now_s = asyncio.get_running_loop().time()
+        if self._patience_s is None:
+            self._patience_s = now_s + _PATIENCE_S
+        return now_s < self._patience_s
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._connections.discard(self)
-        self._session.release(self._caller.agents)
+        if self._next_look is not None:
+            self._next_look.cancel()
+        self._session.release(self._caller)
 
     def close(self) -> None:
         if self._transport is not None:
@@ -93,6 +139,7 @@ class CarlaServer:
         client: version of the clients.
         limits: limits of what clients may demand.
         step_s: length of a step before a client has set one.
+        other_ticks: see `CarlaSession`.
 
     Attributes:
         session: the state that clients share.
@@ -112,6 +159,7 @@ class CarlaServer:
         client: str = DEFAULT_VERSION,
         limits: SessionLimits = DEFAULT_LIMITS,
         step_s: float = STEP_S,
+        other_ticks: OtherTicks = "obey",
     ) -> None:
         if not 0 <= port <= _MAX_PORT:
             raise ConfigError(f"port = {port}: must be from 0 to {_MAX_PORT}")
@@ -121,7 +169,7 @@ class CarlaServer:
         self._streams = StreamHub(stream_port, limits.max_unsent)
         self._connections: set[ClientConnection] = set()
         try:
-            self.session = CarlaSession(source, version, self._streams, limits, step_s)
+            self.session = CarlaSession(source, version, self._streams, limits, step_s, other_ticks)
         except BaseException:
             self._close_sockets()
             source.close()
@@ -214,6 +262,7 @@ def serve(
     client: str = DEFAULT_VERSION,
     limits: SessionLimits = DEFAULT_LIMITS,
     map_file: Path | None = None,
+    other_ticks: OtherTicks = "obey",
     told: Callable[[CarlaServer], None] = lambda server: None,
 ) -> None:
     """Let CARLA's clients use a world, until an interrupt.
@@ -226,6 +275,7 @@ def serve(
         any_host: must be set for an address that other machines can reach.
         client: version of the clients: `0.9.15`, `0.9.16` or `0.10.0`.
         limits: limits of what clients may demand.
+        other_ticks: what happens if a client ticks that is not the first one; see `CarlaSession`.
         map_file: the map of `env`, if it is an environment that is not in the library.
         told: called with the server when it listens.
 
@@ -247,7 +297,15 @@ def serve(
         step_s = env.step_s
     else:
         source = LoadedWorlds(WorldSpec.of(env))
-    server = CarlaServer(source, port=port, host=host, client=client, limits=limits, step_s=step_s)
+    server = CarlaServer(
+        source,
+        port=port,
+        host=host,
+        client=client,
+        limits=limits,
+        step_s=step_s,
+        other_ticks=other_ticks,
+    )
     with server:
         told(server)
         server.run()

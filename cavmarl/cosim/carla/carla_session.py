@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ClockError, ConfigError
 from cavmarl.cosim.carla.attached_sensors import SensorSuite
 from cavmarl.cosim.carla.call_arguments import CallRefused
+from cavmarl.cosim.carla.call_table import Caller
 from cavmarl.cosim.carla.carla_actors import ActorTable, CarlaActor
-from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, Blueprint
+from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, UNAVAILABLE, Blueprint
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose
 from cavmarl.cosim.carla.carla_map import CarlaMap
 from cavmarl.cosim.carla.carla_snapshots import frame_head, snapshot_body
@@ -71,6 +73,7 @@ class SessionLimits:
 
 
 DEFAULT_LIMITS = SessionLimits()
+OtherTicks = Literal["obey", "refuse", "follow"]
 
 
 class CarlaSession:
@@ -82,6 +85,10 @@ class CarlaSession:
         streams: where snapshots and sensor frames are sent.
         limits: limits of what clients may demand.
         step_s: length of a step of the first world.
+        other_ticks: what happens in a synchronous world if a client ticks that is not the time
+            master: the client that has ticked first, until it disconnects. `obey`: the world
+            advances, as CARLA's does. `refuse`: the client gets an error. `follow`: the client
+            waits for the next tick of the master.
 
     Attributes:
         frame: number of ticks since the server has started; it numbers the snapshots.
@@ -97,9 +104,12 @@ class CarlaSession:
         streams: StreamHub,
         limits: SessionLimits = DEFAULT_LIMITS,
         step_s: float = STEP_S,
+        other_ticks: OtherTicks = "obey",
     ) -> None:
         self.source, self.version, self.streams, self.limits = source, version, streams, limits
         self.settings = EpisodeSettings()
+        self.other_ticks = other_ticks
+        self._ticking: Caller | None = None
         self.weather, self.gravity = list(_WEATHER), 9.81
         self.managers: dict[int, str] = {}
         self.frame = 0
@@ -138,6 +148,30 @@ class CarlaSession:
         self.publish()
         return self.frame
 
+    def tick_for(self, caller: Caller) -> int:
+        """Handle the tick of a client; return the number of the frame that the client waits for.
+
+        Ticks of other clients than the time master are events of the world's `TimeMaster`.
+
+        Raises CallRefused: another client is the time master, and `other_ticks` is `refuse`.
+        """
+        if self._ticking is None:
+            self._ticking = caller
+        if caller is not self._ticking:
+            follower = self.world.master.follow(caller.name)
+            with suppress(ClockError):  # the event is recorded
+                follower.tick()
+            follower.leave()
+            self.tell(f"{caller.name} ticks, but {self._ticking.name} has ticked first")
+            if self.other_ticks == "refuse":
+                raise CallRefused(
+                    f"{caller.name} ticks, but {self._ticking.name} is the time master: wait for "
+                    "its ticks (wait_for_tick), or start the server with --other-ticks follow"
+                )
+            if self.other_ticks == "follow":
+                return self.frame + 1
+        return self.tick()
+
     def _tell_end(self, ended: EndedVehicle) -> None:
         """Log why a vehicle that a client drives has left, and report its collision."""
         actor = self.actors.of_agent(ended.agent)
@@ -174,6 +208,8 @@ class CarlaSession:
     def change_settings(self, settings: EpisodeSettings) -> None:
         """Apply settings; a step length that does not fit the world restarts the world.
 
+        What clients have spawned is kept; the other vehicles are new ones.
+
         Raises CavmarlError: the world cannot have steps of this length. Nothing has changed.
         """
         wanted = settings.fixed_delta_s or self.first_step_s
@@ -181,8 +217,24 @@ class CarlaSession:
         is_whole = round(steps) >= 1 and abs(steps - round(steps)) * self.world.step_s < _SAME_S
         if not is_whole:
             log.info("the world restarts with steps of %g s", wanted)
-            self._take_world(self.source.load("", wanted))
+            self._restart(wanted)
         self.settings = settings
+
+    def _restart(self, step_s: float) -> None:
+        before, controls = self.actors, self.world.external.controls
+        driven = {
+            actor.number: controls[actor.slot]
+            for actor in before.actors.values()
+            if actor.slot in controls
+        }
+        self.world = self.source.load("", step_s)
+        self.actors = ActorTable(self.world, before.spectator.number, before.next_number)
+        for actor in self.actors.keep_spawned(self.world, before):
+            log.warning("actor %d (%s) could not be kept", actor.number, actor.type_id)
+            self._forget(actor)
+        for number, control in driven.items():
+            if number in self.actors.actors:
+                self.world.external.control(self.actors.actors[number].slot, control)
 
     def load(self, name: str, reset_settings: bool) -> None:
         """Begin a new episode on a map; raise CavmarlError if there is no such map."""
@@ -194,6 +246,7 @@ class CarlaSession:
         self.time_s = 0.0
         self._map_changed = True
         self._take_world(world)
+        self.sensors.begin_episode()
 
     def _take_world(self, world: HostedWorld) -> None:
         for actor in list(self.actors.attached()):
@@ -211,6 +264,8 @@ class CarlaSession:
         blueprint = BLUEPRINTS.get(type_id)
         if blueprint is None:
             raise CallRefused(f"actor definition not found: {type_id}")
+        if type_id in UNAVAILABLE:
+            raise CallRefused(f"{type_id} is not available")
         if sum(1 for _ in self.actors.spawned()) >= self.limits.max_actors:
             raise CallRefused(f"{self.limits.max_actors} actors are spawned; destroy some first")
         if parent and parent not in self.actors.actors:
@@ -250,14 +305,16 @@ class CarlaSession:
             raise CallRefused("unable to destroy actor: not found")
         if actor.slot >= 0:
             self.world.external.destroy(actor.slot)
-        elif not actor.type_id.startswith(("sensor.", "controller.")):
+        elif not actor.is_attached:
             raise CallRefused(f"unable to destroy actor: {actor.type_id} belongs to the world")
         for one in self.actors.remove(number):
             self._forget(one)
 
-    def release(self, agents: set[int]) -> None:
-        """Give agents back to the built-in driver."""
-        for agent in agents:
+    def release(self, caller: Caller) -> None:
+        """Give the agents of a client that has left back to the built-in driver."""
+        if caller is self._ticking:
+            self._ticking = None
+        for agent in caller.agents:
             self.world.controls.pop(agent, None)
 
     def tell(self, message: str) -> None:

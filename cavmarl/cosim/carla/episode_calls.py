@@ -91,9 +91,12 @@ def set_episode_settings(caller: Caller, session: CarlaSession, given: tuple[Any
     return session.frame
 
 
-@call("tick_cue", note="each cue of each client is a tick; without synchronous mode only an answer")
+@call(
+    "tick_cue",
+    note="by default, each cue of each client is a tick; without synchronous mode only an answer",
+)
 def tick_cue(caller: Caller, session: CarlaSession) -> int:
-    return session.tick() if session.settings.synchronous else session.frame + 1
+    return session.tick_for(caller) if session.settings.synchronous else session.frame + 1
 
 
 @call("get_map_info")

@@ -27,6 +27,7 @@ class ExternalBody(NamedTuple):
     base_type: str  # CARLA's attribute: car, van, truck, bus, motorcycle, bicycle
     pose: CarlaPose
     size_m: tuple[float, float, float]  # length, width, height
+    speed_mps: float = 0.0
 
 
 class ExternalVehicles:
@@ -64,6 +65,7 @@ class ExternalVehicles:
                 -math.radians(pose.yaw),
                 vtype=vtype,
                 size_m=(length, width, height),
+                speed=body.speed_mps,
             )
         except ActionError as error:
             if "occupied" in str(error):

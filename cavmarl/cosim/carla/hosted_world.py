@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.registry import entries
+from cavmarl.config.registry import entries, load_config, resolve_maps
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED, EVENT_OFF_ROAD
@@ -236,31 +236,42 @@ class GivenWorld:
 
 
 class LoadedWorlds:
-    """The source of a server that loads environments by name. `spec`: the first world."""
+    """The source of a server that loads environments by name.
+
+    `spec`: the first world, whose options hold whenever a client loads its map.
+    """
 
     def __init__(self, spec: WorldSpec) -> None:
-        self._spec = spec
+        self._first = self._spec = spec
         self._env: CavEnv | None = None
         self._folder: TemporaryDirectory[str] | None = None
-        self._name = Path(spec.env).name.split(".")[0]
+        self._first_name = self._name = Path(spec.env).name.split(".")[0]
         self._file: Path | None = None
 
     @property
     def map_names(self) -> list[str]:
-        return sorted({self._name, *entries()})
+        single = (name for name in entries() if len(resolve_maps(*load_config(name))) == 1)
+        return sorted({self._first_name, self._name, *single})
 
     def load(self, name: str, step_s: float) -> HostedWorld:
         spec, shown = self._spec, self._name
         if name == GENERATED_MAP and self._file is not None:
             spec, shown = replace(spec, env=str(self._file)), GENERATED_MAP
+        elif name == self._first_name:
+            spec, shown = self._first, name
         elif name not in ("", shown):
             if name not in entries():
                 raise ConfigError(f"Map '{name}' not found")
             spec, shown = WorldSpec(env=name, seed=spec.seed), name
         tick_s = round(step_s, _DIGITS)
         ticks = max(1, -int(-tick_s // _LONGEST_TICK_S))
+        config, _ = load_config(spec.env, overrides=spec.overrides)
+        if config.traffic.source == "sumo-traffic":
+            served = {**SERVED_WORLD, "population.external": 0}  # SUMO would not see such vehicles
+        else:
+            served = SERVED_WORLD
         overrides = {
-            **SERVED_WORLD,
+            **served,
             "horizon_s": tick_s * round(_HORIZON_S / tick_s),
             **spec.overrides,
             "clock.sim_dt_s": tick_s / ticks,

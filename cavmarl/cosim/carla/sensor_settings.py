@@ -17,10 +17,13 @@ if TYPE_CHECKING:
 
 
 class SensorSettings:
-    """The attributes of a sensor as numbers. Raises CallRefused for other values."""
+    """The attributes of a sensor as numbers. Raises CallRefused for other values.
 
-    def __init__(self, actor: CarlaActor) -> None:
-        self._actor = actor
+    `order`: number of sensors that the episode had before; it separates their random numbers.
+    """
+
+    def __init__(self, actor: CarlaActor, order: int) -> None:
+        self._actor, self._order = actor, order
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float:
         written = self._actor.attribute(name)
@@ -39,9 +42,9 @@ class SensorSettings:
         return int(self.number(name, low, high))
 
     def generator(self) -> np.random.Generator:
-        """Return the random numbers of a sensor."""
+        """Return the random numbers of a sensor, which are the same in each episode."""
         seed = self.whole("noise_seed", 0, 1 << 31)
-        return np.random.default_rng([seed, self._actor.number])
+        return np.random.default_rng([seed, self._order])
 
 
 class SensorContext:

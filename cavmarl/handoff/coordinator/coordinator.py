@@ -3,18 +3,23 @@
 A coordinator decides which zone advances each vehicle to the next tick, and checks the result. The
 division moves the rows.
 
-`LocalCoordinator` runs in one process with all its zones, `NodeCoordinator` over nodes.
+`LocalCoordinator` runs in one process with all its zones, `MessageCoordinator` too if other
+simulators run some of them, `NodeCoordinator` over nodes.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.messages import Birth, Record, Removed
+
+if TYPE_CHECKING:
+    from cavmarl.handoff.coordinator.invariant_monitor import Departed
+    from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 
 
 class Near(NamedTuple):
@@ -84,6 +89,22 @@ class Coordinator(ABC):
     @abstractmethod
     def reset(self) -> None:
         """Begin an episode without vehicles."""
+
+    @abstractmethod
+    def save(self) -> SavedOwnership:
+        """Return the state between two ticks, except zones and their rows."""
+
+    @abstractmethod
+    def go_on(
+        self,
+        saved: SavedOwnership,  # the result of `save`
+        rows: Mapping[int, tuple[int, int]],  # (zone, epoch) of all owned rows, by vehicle id
+    ) -> list[Departed]:  # the vehicles that have left since the last recorded tick
+        """Resume from a saved state.
+
+        Raises:
+            JournalError: the journal does not contain the position that the state names.
+        """
 
     @abstractmethod
     def begin(

@@ -10,11 +10,13 @@ from typing import NamedTuple
 
 from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ProtocolError
+from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.coordinators import WorldCoordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
 from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor, OwnersOnRecord
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
+from cavmarl.handoff.coordinator.message_coordinator import MessageCoordinator, ZoneGate
 from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.shard_setup import limits_of
@@ -73,6 +75,7 @@ def make_coordinators(
     longest_move_m: float,  # longest move of a vehicle in a tick
     # run of each world; None: new runs, whose journals must not exist
     runs: Sequence[OpenRun] | None = None,
+    gate: ZoneGate | None = None,  # the simulators that run zones; None: there are none
 ) -> CoordinatorSetup:
     """Make the coordinators of divided worlds.
 
@@ -82,7 +85,9 @@ def make_coordinators(
     limits = limits_of(settings, division.codec.schema)
     transfers = tuple(TransferLog(limits.lifetime) for _ in range(division.num_worlds))
     coordinators = [
-        _coordinator(settings, w, division, limits, transfers[w], None if runs is None else runs[w])
+        _coordinator(
+            settings, w, division, limits, transfers[w], None if runs is None else runs[w], gate
+        )
         for w in range(division.num_worlds)
     ]
     digests = RowDigests() if settings.journal else None
@@ -111,13 +116,16 @@ def _coordinator(
     limits: Limits,
     transfers: TransferLog,
     given: OpenRun | None,
-) -> LocalCoordinator:
+    gate: ZoneGate | None,
+) -> Coordinator:
     """Make the coordinator of one world."""
     if given is None:
         journal = None
         if settings.journal:
             journal = Journal(journal_path(settings.journal, w, division.num_worlds))
         given = OpenRun(secrets.token_bytes(RUN_BYTES), journal)
+    if gate is not None:
+        return MessageCoordinator(given.run, given.journal, division, w, limits, transfers, gate)
     directory = Directory(given.run, range(division.count), _OwnersRows(), limits)
     counts = partial(division.counts, w)
     return LocalCoordinator(directory, given.journal, HandoffLog(division, w), counts, transfers)
@@ -125,7 +133,7 @@ def _coordinator(
 
 def _monitor(
     division: ZonedShards,
-    coordinators: Sequence[LocalCoordinator],
+    coordinators: Sequence[Coordinator],
     limits: Limits,
     longest_move_m: float,
 ) -> InvariantMonitor:
@@ -133,7 +141,8 @@ def _monitor(
     records = [OwnersOnRecord(division.count, limits) for _ in coordinators]
     for coordinator, record in zip(coordinators, records, strict=True):
         coordinator.watch(record)
-        coordinator.foretell, record.ask = record.foretold, coordinator.catch_up
+        if isinstance(coordinator, LocalCoordinator):
+            coordinator.foretell, record.ask = record.foretold, coordinator.catch_up
     return InvariantMonitor(division, records, longest_move_m)
 
 

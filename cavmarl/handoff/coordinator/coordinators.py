@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import DepartureQueue
+from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.invariant_monitor import Departed, InvariantMonitor
-from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
 from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import ZonedShards
@@ -28,7 +28,7 @@ class OwnershipRuntime(Protocol):
         needs_ghosts: whether each tick must find ghosts and vehicles near borders.
     """
 
-    coordinators: tuple[LocalCoordinator, ...]
+    coordinators: tuple[Coordinator, ...]
     needs_ghosts: bool
 
     def reset(self, chosen: NDArray[np.bool_]) -> None: ...
@@ -63,7 +63,7 @@ class OwnershipRuntime(Protocol):
 class NoOwnershipRuntime:
     """The `OwnershipRuntime` where one zone owns all vehicles."""
 
-    coordinators: tuple[LocalCoordinator, ...] = ()
+    coordinators: tuple[Coordinator, ...] = ()
     needs_ghosts = False
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
@@ -100,7 +100,7 @@ class WorldCoordinators:
     def __init__(
         self,
         division: ZonedShards,
-        coordinators: Sequence[LocalCoordinator],  # one per world
+        coordinators: Sequence[Coordinator],  # one per world
         digests: RowDigests | None = None,  # of zones' rows; None: not needed
         monitor: InvariantMonitor | None = None,  # checks every committed tick; None: no checks
     ) -> None:

@@ -108,7 +108,6 @@ class LocalCoordinator(Coordinator):
                 self._record(*directory.host(zone, worker=0).records)
 
     def save(self) -> SavedOwnership:
-        """Return the state between two ticks, except zones and their rows."""
         table, borders = self.directory.table, self._book.save()
         born = {birth.vehicle: (birth.zone, 0) for birth in self._births}
         births = [(birth.vehicle, birth.zone) for birth in self._births]
@@ -145,18 +144,6 @@ class LocalCoordinator(Coordinator):
         )
 
     def go_on(self, saved: SavedOwnership, rows: Mapping[int, tuple[int, int]]) -> list[Departed]:
-        """Resume from a saved state.
-
-        Args:
-            saved: the result of `save`.
-            rows: (zone, epoch) of all owned rows, by vehicle id.
-
-        Returns:
-            The vehicles that have left since the last recorded tick.
-
-        Raises:
-            JournalError: the journal does not contain the position that the state names.
-        """
         numbers = saved.numbers
         if self.journal is not None:
             self.journal.go_to(numbers.journal)

@@ -25,7 +25,7 @@ from cavmarl.roads.sumo_net.reader import read_network, source_hash
 
 _HEAD = b'<?xml version="1.0" encoding="UTF-8"?>\n'
 STAGES = ("reading", "netconvert writes", "ASAM's rules", "netconvert reads", "comparison")
-_CARLA_FORMAT = 2  # increase this if `carla_document` returns another text for a map
+_CARLA_FORMAT = 3  # increase this if `carla_document` returns another text for a map
 _MINOR = "8"  # OpenDRIVE 1.8, which ASAM's checker verifies
 
 

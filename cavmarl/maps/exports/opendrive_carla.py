@@ -71,6 +71,7 @@ def fit_to_carla(root: Element, origin: tuple[float, float]) -> None:
                 controller.remove(control)
         if len(controller) == 0:
             root.remove(controller)
+    _remove_paths_without_cars(root)
     header = root.find("header")
     if header is not None:
         header.set("revMinor", _MINOR)
@@ -83,6 +84,24 @@ def fit_to_carla(root: Element, origin: tuple[float, float]) -> None:
             "+datum=WGS84 +units=m +no_defs"
         )
         header.insert(0, place)
+
+
+def _remove_paths_without_cars(root: Element) -> None:
+    """Remove connections of junctions to lanes of other types, at which CARLA's planners fail."""
+    driving = {
+        (road.get("id"), lane.get("id"))
+        for road in root.iterfind("road")
+        for lane in road.iter("lane")
+        if lane.get("type") == "driving"
+    }
+    for junction in root.iterfind("junction"):
+        for connection in junction.findall("connection"):
+            road = connection.get("connectingRoad")
+            for link in connection.findall("laneLink"):
+                if (road, link.get("to")) not in driving:
+                    connection.remove(link)
+            if connection.find("laneLink") is None:
+                junction.remove(connection)
 
 
 def _traffic_lights(signals: Element) -> Iterator[Element]:

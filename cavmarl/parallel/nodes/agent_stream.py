@@ -13,6 +13,7 @@ from cavmarl.core.errors import MessageError
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import (
+    UNOWNED,
     Outcome,
     note_own,
     pack_agents,
@@ -68,6 +69,11 @@ class AgentStream:
 
     def __init__(self, tables: Sequence[Array]) -> None:  # (W, A, …)
         self._tables = _tables(tables)
+        self._flags = [
+            part
+            for part, table in zip(self._tables, tables, strict=True)
+            if table.dtype == np.bool_
+        ]
         self._room = _Room(_size(self._tables))
         self._mine = np.zeros(len(self._tables[0]), dtype=np.bool_)
         self._note = specialized(note_own, checks=False)
@@ -87,14 +93,26 @@ class AgentStream:
         self._note(present, chosen, number, own, self._mine, owner)
         return room.data[: self._pack(self._mine, self._tables, room.words, room.data)].data
 
-    def read(self, data: memoryview, number: int, owner: NDArray[np.int32]) -> None:
+    def read(self, data: memoryview, number: int, owner: NDArray[np.int32]) -> NDArray[np.int64]:
         """Write the frame of node `number` to the tables, and note that it owns these agents.
 
+        Returns:
+            these agents.
+
         Raises:
-            MessageError: the bytes are no such frame, or name unknown agents.
+            MessageError: the bytes are no such frame, or name unknown agents, or those of another
+                node.
         """
-        if self._unpack(self._tables, *_read(data), number, owner) != len(data):
+        words, content = _read(data)
+        unowned = np.count_nonzero(owner == UNOWNED)
+        if self._unpack(self._tables, words, content, number, owner) != len(data):
             raise MessageError(f"{len(data)} bytes are no frame about agents")
+        if np.count_nonzero(owner == UNOWNED) != unowned - words.item(0):
+            raise MessageError("a frame names agents of other nodes, or an agent twice")
+        agents = words[1 : 1 + words.item(0)]
+        if any(flags[agents].max(initial=0) > 1 for flags in self._flags):
+            raise MessageError("a flag of an agent is neither true nor false")
+        return agents
 
 
 class ResultStream:

@@ -25,6 +25,7 @@ log = logging.getLogger("cavmarl.nodes")
 
 LOOK_MS = 20.0  # time between checks for callers, before the worlds start
 END_S = 1.0  # time for waiting nodes to end
+MOST_PORTS = 1 << 16
 ANYONE = (1 << 32) - 1  # number of a node that accepts any number
 
 
@@ -48,6 +49,7 @@ class JoiningNodes:
         ready: nodes that have loaded the world, by their numbers here.
         refused: why other nodes were rejected.
         failures: exceptions of nodes that loaded the world.
+        dropped: accepted nodes that have sent a bad frame, and have to be started again.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class JoiningNodes:
         self.ready: list[int] = []
         self.refused: list[str] = []
         self.failures: list[WorkerFailureError] = []
+        self.dropped: list[JoiningNode] = []
 
     def look(self, wait_ms: float) -> None:
         """Accept calls, and receive frames of earlier callers."""
@@ -84,7 +87,7 @@ class JoiningNodes:
                 if frame is not None:
                     self._receive(number, frame)
         except LinkLostError as lost:
-            self._forget(lost.peer)
+            self._drop(lost)
 
     def await_ready(
         self,
@@ -133,9 +136,9 @@ class JoiningNodes:
         try:
             with reading(number):
                 self._apply(number, node, frame)
-        except LinkLostError as lost:  # the caller is not a node
+        except LinkLostError as lost:
             log.warning("a caller is rejected: %s", lost)
-            self._forget(number)
+            self._drop(lost)
 
     def _apply(self, number: int, node: JoiningNode, frame: NodeFrame) -> None:
         match frame.kind:
@@ -146,7 +149,8 @@ class JoiningNodes:
             case FrameKind.READY if node.is_accepted and node.place is None:
                 host, port, near, may_teleport = read_list(frame)
                 node.neighbours = read_neighbours([near, may_teleport], self._zones)
-                node.place = str(host), int(port)
+                check_indices("port", [port], MOST_PORTS)
+                node.place = str(host), port
                 self.ready.append(number)
             case FrameKind.FAILED:
                 name, text, trace = map(str, read_list(frame))
@@ -185,6 +189,13 @@ class JoiningNodes:
         head = json.dumps([len(content) for content in contents]).encode()
         size = len(head).to_bytes(8, "little")
         self._links.send(number, FrameKind.FILES, 0, [size, head, *contents])
+
+    def _drop(self, lost: LinkLostError) -> None:
+        """Forget a caller; note it if it is a node that has sent a bad frame."""
+        node = self._all.get(lost.peer)
+        if node is not None and node.is_accepted and lost.fault:
+            self.dropped.append(node)
+        self._forget(lost.peer)
 
     def _forget(self, number: int) -> None:
         self._links.drop(number)

@@ -24,6 +24,7 @@ import numpy as np
 from xxhash import xxh3_64_intdigest
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
+from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.transport import MOST_PIECES, Bytes, Connection
 from cavmarl.parallel.nodes.peer_faults import read_json
 
@@ -61,7 +62,7 @@ class FrameKind(IntEnum):
     AGENT = 15  # N → N: state of an agent whose vehicle changes its node
     WANTED = 16  # N → C: files that the node does not have
     FILES = 17  # C → N: these files
-    MISSED = 18  # N → C: the connection to another node has ended
+    MISSED = 18  # N → C: the connection to another node has ended, or has carried a bad frame
     REFUSED = 19  # C → N: why the node is rejected
     END = 20  # C → N: the node is not needed any more
     GIVE = 21  # N → N: the state of zones that move to another node
@@ -202,7 +203,7 @@ class Link:
         frame: NodeFrame,
         summed: int,  # checksum in the head
         urgent: deque[tuple[int, NodeFrame]],
-        number: int,
+        number: int,  # of the link
     ) -> None:
         """Check a complete frame, and queue it."""
         if xxh3_64_intdigest(frame.data) != summed:
@@ -212,6 +213,8 @@ class Link:
             self.frames.append(frame)
         elif kind in URGENT:
             urgent.append((number, frame))
+        elif number != COORDINATOR:
+            raise MessageError(f"it must not send frames of kind {kind.name}")
         elif kind is FrameKind.END:
             raise NeededNoMoreError
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.messages import COORDINATOR
@@ -23,24 +23,39 @@ An error in the handler is the fault of the sender. `pump` raises an error that 
 handler returns."""
 
 
+class AwaitedOffer(NamedTuple):
+    """An offer of a vehicle that has no answer."""
+
+    world: int
+    vehicle: int
+    zone: int  # that has to answer
+    source: int  # node that has to offer the vehicle
+    target: int  # node of the zone
+
+
 class SilenceError(Exception):
     """An awaited frame has not come in time.
 
     Attributes:
-        awaited: nodes that owe another node an answer.
+        offers: offers whose answers are awaited.
     """
 
-    def __init__(self, text: str, awaited: Collection[int] = ()) -> None:
+    def __init__(self, text: str, offers: Collection[AwaitedOffer] = ()) -> None:
         super().__init__(text)
-        self.awaited = awaited
+        self.offers = frozenset(offers)
 
 
 class RecoveryOrderedError(Exception):
-    """A node has to go back to a kept state; `frame` is the order, if it has been received."""
+    """A node has to go back to a kept state.
 
-    def __init__(self, frame: NodeFrame | None) -> None:
+    Attributes:
+        frame: the order, if it has been received.
+        witness: node that claims to have got the order.
+    """
+
+    def __init__(self, frame: NodeFrame | None, witness: int | None = None) -> None:
         super().__init__("other nodes are lost")
-        self.frame = frame
+        self.frame, self.witness = frame, witness
 
 
 class Links:
@@ -162,6 +177,31 @@ class Links:
         """Return the next frame of a sender, if it has come."""
         frames = self._links[number].frames
         return frames.popleft() if frames else None
+
+    def await_urgent(self, number: int, has_come: Callable[[], bool]) -> None:
+        """Wait until a sender has sent an urgent frame, which comes before its next frame.
+
+        Args:
+            number: of the sender, another node.
+            has_come: whether the frame has come; an urgent frame is handled as soon as it comes.
+
+        Raises:
+            LinkLostError: the sender has gone, or has not sent the frame.
+            RecoveryOrderedError: the coordinator has ordered a recovery.
+        """
+        self.wanted = (number,)
+        while not has_come():
+            self.check_recovery()
+            link = self._links.get(number)
+            if link is None:
+                raise LinkLostError(number)
+            if link.frames and link.frames[0].kind is FrameKind.SYNC:
+                raise RecoveryOrderedError(None, number)
+            if link.frames:
+                error = MessageError(f"it sends {link.frames[0].kind.name} before an awaited frame")
+                raise LinkLostError(number, error)
+            self.pump(None)
+        self.wanted = ()
 
     def has(self, number: int) -> bool:
         """Return whether a frame of a sender waits here."""

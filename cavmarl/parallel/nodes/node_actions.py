@@ -90,6 +90,10 @@ class ReceivedActions:
         self._unpack = specialized(take_actions, checks=False)
         self.are_due = False  # actions of agents of this node are missing
 
+    def due(self) -> list[int]:
+        """Return the agents of this node whose actions are missing in the present step."""
+        return np.flatnonzero(self._missing).tolist() if self.are_due else []
+
     def begin(self, owner: NDArray[np.int32]) -> None:
         """Start a step; `owner`: (W · A,) node of each agent."""
         np.equal(owner, self._number, out=self._missing)

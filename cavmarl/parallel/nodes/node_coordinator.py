@@ -10,15 +10,15 @@ from cavmarl.handoff.coordinator.invariant_monitor import OwnersOnRecord
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.decisions import Neighbours
-from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.directory import Directory, ZonesError
 from cavmarl.ownership.ledger import DIGEST_BYTES
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Begin, Birth, Message, Nack, Output
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
-from cavmarl.parallel.nodes.links import Links, SilenceError
-from cavmarl.parallel.nodes.peer_faults import check_indices, reading
+from cavmarl.parallel.nodes.links import AwaitedOffer, Links, SilenceError
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, reading
 from cavmarl.parallel.nodes.zone_endpoints import NOTHING, Report, packed, unpacked
 from cavmarl.shards.row_check import MOST_IDS
 
@@ -65,7 +65,7 @@ class _World:
         """Compare the vehicles that zones own by their rows with the records.
 
         Raises:
-            ProtocolError: the vehicles, or their epochs, differ.
+            ZonesError: the vehicles, or their epochs, differ.
         """
         self.has_begun |= any(report.began for report in reports)
         if self.on_record is None or not self.has_begun:
@@ -76,9 +76,10 @@ class _World:
             due[birth.zone] += 1
         for zone, num, total in (owned for report in reports for owned in report.owned):
             if (num, total) != (due[zone], sums[zone]):
-                raise ProtocolError(
+                raise ZonesError(
                     f"world {w}, tick {self.directory.table.tick}: zone {zone} has {num} vehicles, "
-                    f"the records {due[zone]}, or epochs differ; zones.journal shows the records"
+                    f"the records {due[zone]}, or epochs differ; zones.journal shows the records",
+                    (zone,),
                 )
 
     def is_silent(self, births: Sequence[Birth]) -> bool:
@@ -123,6 +124,8 @@ class NodeCoordinator:
         self._node_of = node_of
         self._links = links
         self.switched, self.is_late = 0, False
+        self._has_recovered = False  # since the last commit
+        self._has_differed = False  # the rows of a zone have differed from the records
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Start; return the hostings of all zones, by worlds."""
@@ -135,6 +138,7 @@ class NodeCoordinator:
 
     def set_neighbours(self, neighbours: Neighbours) -> None:
         """From now on, allow changes of owner only between these pairs of zones."""
+        self._neighbours = neighbours
         for world in self.worlds:
             world.directory.set_neighbours(neighbours)
 
@@ -158,7 +162,8 @@ class NodeCoordinator:
             world.births, world.movers = [], []
             world.answered.clear()
             world.has_stepped = False
-        self._node_of, self.switched = node_of, switched
+        self._node_of, self.switched, self.is_late = node_of, switched, False
+        self._has_recovered = True
         return self._hostings()
 
     def _hostings(self) -> list[list[Hosting]]:
@@ -174,7 +179,18 @@ class NodeCoordinator:
         messages = unpacked(frame.data)
         self.check(number, messages)
         for w, message in messages:
-            self._apply(w, message)
+            self._take(w, message)
+
+    def _take(self, w: int, message: Message) -> None:
+        """Apply a message of a node. Raises MessageError: it does not fit the present tick."""
+        dropped = self.worlds[w].directory.dropped
+        before = dropped.total()
+        self._apply(w, message)
+        if dropped.total() > before:
+            raise MessageError(
+                f"a {type(message).__name__} of tick {message.tick} does not fit tick "
+                f"{self.worlds[w].directory.table.tick} of world {w}"
+            )
 
     def check(
         self,
@@ -190,10 +206,8 @@ class NodeCoordinator:
         check_indices("world", (w for w, _ in messages), len(self.worlds))
         for report in reports:
             self._check_report(number, report)
-        for w, message in messages:
-            zone, table = getattr(message, "zone", None), self.worlds[w].directory.table
-            if zone is None or message.episode != table.episode or message.tick < table.tick:
-                continue
+        for _, message in messages:
+            zone = getattr(message, "zone", -1)
             if not 0 <= zone < len(self._node_of) or self._node_of[zone] != number:
                 raise MessageError(f"node {number} sends for zone {zone}, which it does not host")
 
@@ -208,11 +222,23 @@ class NodeCoordinator:
             if len(bytes.fromhex(digest)) != DIGEST_BYTES:
                 raise MessageError(f"{digest!r} is not a digest of vehicle {vehicle}")
 
-    def _check_movers(self, number: int, w: int, report: Report) -> None:
-        owners = self.worlds[w].directory.table.owners
-        for vehicle, *_ in report.movers:
+    def _take_report(self, number: int, w: int, report: Report) -> None:
+        """Take the new vehicles of a node.
+
+        Raises:
+            ProtocolError: the node offers or reports vehicles that it cannot have.
+        """
+        world = self.worlds[w]
+        owners = world.directory.table.owners
+        for vehicle, target, _ in report.movers:
             if vehicle not in owners or self._node_of[owners[vehicle][0]] != number:
                 raise MessageError(f"node {number} offers vehicle {vehicle}, which it does not own")
+            self._neighbours.is_teleport(vehicle, owners[vehicle][0], target)
+        if len({vehicle for vehicle, *_ in report.movers}) < len(report.movers):
+            raise MessageError(f"node {number} offers a vehicle twice")
+        world.births += [Birth(vehicle, zone, b"") for vehicle, zone in report.births]
+        if report.births:
+            world.directory.check_births(world.births)
 
     def _apply(self, w: int, message: Message) -> None:
         world = self.worlds[w]
@@ -230,7 +256,7 @@ class NodeCoordinator:
         if any(messages for messages, _ in reports.values()):
             self._apply_all({number: messages for number, (messages, _) in reports.items()})
         every = [report for _, report in reports.values() if report]
-        self.is_late = any(one.is_late for report in every for one in report)
+        self._check_late({number: report for number, (_, report) in reports.items()})
         for w, world in enumerate(self.worlds):
             reported = [report[w] for report in every]
             if world.directory.is_quiet:
@@ -238,21 +264,67 @@ class NodeCoordinator:
                 if not reported:
                     continue
             elif world.directory.table.plan is not None:
-                world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
+                self._commit(world)
             if any(report.began for report in reported):
+                self._check_began(
+                    {n: bool(all_of) and all_of[w].began for n, (_, all_of) in reports.items()}
+                )
                 world.write(world.directory.reset())
                 world.births, world.has_stepped = [], False
             for number, (_, report) in reports.items():
                 with reading(number):
-                    self._check_movers(number, w, report[w] if report else NOTHING)
+                    self._take_report(number, w, report[w] if report else NOTHING)
             movers = [mover for report in reported for mover in report.movers]
             world.movers = [(vehicle, target) for vehicle, target, _ in movers]
             digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.states.digests = digests
-            world.births += [
-                Birth(v, zone, b"") for report in reported for v, zone in report.births
-            ]
-            world.check_owned(w, reported)
+            self._check_owned(w, world, reported)
+        self._has_recovered = False
+
+    def _check_late(self, reports: Mapping[int, Sequence[Report]]) -> None:
+        """Note whether a lease of no ticks is due.
+
+        Raises:
+            LinkLostError: vehicles of a node are without a record, but the previous lease was for
+                their records.
+        """
+        late = [number for number, report in reports.items() if any(one.is_late for one in report)]
+        if late and self.is_late:
+            raise LinkLostError(late[0], MessageError("it has not reported new vehicles"))
+        self.is_late = bool(late)
+
+    def _check_began(self, began: Mapping[int, bool]) -> None:
+        """Raise LinkLostError if a node is wrong about whether an episode has begun.
+
+        An episode begins in all nodes or in none, and in all of them after a recovery.
+        """
+        is_usual = self._has_recovered or 2 * sum(began.values()) > len(began)
+        for number, has_begun in began.items():
+            if has_begun != is_usual:
+                raise LinkLostError(number, MessageError(f"an episode has begun: {has_begun}"))
+
+    def _check_owned(self, w: int, world: _World, reports: Sequence[Report]) -> None:
+        """Compare the vehicles that zones own by their rows with the records.
+
+        Raises:
+            LinkLostError: the vehicles differ for the first time, so the report may be wrong.
+            ProtocolError: they differ again.
+        """
+        try:
+            world.check_owned(w, reports)
+        except ZonesError as error:
+            if self._has_differed:
+                raise
+            self._has_differed = True
+            node = self._node_of[error.zones[0]]
+            raise LinkLostError(node, MessageError(str(error))) from error
+
+    def _commit(self, world: _World) -> None:
+        """Commit a tick of a world. Raises LinkLostError: the DONE of a node does not fit."""
+        try:
+            world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
+        except ZonesError as error:
+            raise LinkLostError(self._node_of[error.zones[0]], MessageError(str(error))) from error
 
     def _apply_all(self, messages_of: Mapping[int, Sequence[tuple[int, Message]]]) -> None:
         """Apply messages about a tick; zones without a message have changed nothing."""
@@ -263,7 +335,7 @@ class NodeCoordinator:
         for number, messages in messages_of.items():
             with reading(number):
                 for w, message in messages:
-                    self._apply(w, message)
+                    self._take(w, message)
         for w in disturbed:
             self.worlds[w].directory.answer_for_silent()
 
@@ -277,14 +349,29 @@ class NodeCoordinator:
             SilenceError: an offer is not answered in time.
         """
         until_s = self._links.now_s() + timeout_s
-        for world in self.worlds:
+        for w, world in enumerate(self.worlds):
             while missing := set(world.movers) - world.answered:
                 if self._links.now_s() > until_s:
-                    targets = {self._node_of[zone] for _, zone in missing}
-                    raise SilenceError(f"offers are not answered within {timeout_s:g} s", targets)
+                    offers = [self._awaited(w, *mover) for mover in missing]
+                    raise SilenceError(f"offers are not answered within {timeout_s:g} s", offers)
                 self._links.pump(1e3 * timeout_s)
+            self._check_answers(w, world)
         lease, messages = dict.fromkeys(self._node_of, b""), self._decide()
         return lease | self._by_node(messages) if messages else lease
+
+    def _check_answers(self, w: int, world: _World) -> None:
+        """Raise LinkLostError if a node has offered another state than it has reported."""
+        held = world.directory.readiness.held.get(world.directory.table.tick, {})
+        for vehicle, zone in world.movers:
+            answer = held.get((vehicle, zone))
+            if answer is not None and answer[2] != world.states.digest_of(vehicle):
+                source = self._awaited(w, vehicle, zone).source
+                why = f"it has offered another state of vehicle {vehicle} than it has reported"
+                raise LinkLostError(source, MessageError(why))
+
+    def _awaited(self, w: int, vehicle: int, zone: int) -> AwaitedOffer:
+        source, _ = self.worlds[w].directory.table.owners[vehicle]
+        return AwaitedOffer(w, vehicle, zone, self._node_of[source], self._node_of[zone])
 
     def _decide(self) -> list[tuple[int, Message]]:
         messages = []

@@ -65,5 +65,5 @@ def call_node(
     """
     try:
         return system.open(place, secret, caller_number(number, generation), ANSWER_S)
-    except (OSError, EOFError, MessageError) as error:
+    except (OSError, EOFError, MessageError, ValueError) as error:  # `place` may be anything
         raise LinkLostError(of) from error

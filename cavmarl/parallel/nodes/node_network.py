@@ -46,13 +46,14 @@ class RemoteNetwork:
     def __init__(self, links: Links, bus: Bus) -> None:
         self._links, self._bus = links, bus
         self._generation = 0
-        self._is_reporter = False
+        self._is_reporter, self._reporter = False, COORDINATOR
         self._answers: deque[NodeFrame] = deque()
         bus.connect(self)
 
-    def begin(self, generation: int, is_reporter: bool) -> None:
-        """Start a new generation of nodes. One of these nodes is the reporter."""
-        self._generation, self._is_reporter = generation, is_reporter
+    def begin(self, generation: int, number: int, reporter: int) -> None:
+        """Start a new generation of nodes, with the numbers of this node and of the reporter."""
+        self._generation, self._is_reporter = generation, number == reporter
+        self._reporter = COORDINATOR if self._is_reporter else reporter
 
     def receive(self, frame: NodeFrame) -> None:
         self._answers.append(frame)
@@ -67,11 +68,13 @@ class RemoteNetwork:
         if self._is_reporter:
             asked = request_of(sent, self._bus.mail.num_packets[sent.world])
             links.send(COORDINATOR, FrameKind.EXCHANGE, self._generation, asked)
+        links.wanted = (self._reporter,)
         while True:
             while self._answers:
                 frame = self._answers.popleft()
                 if frame.number == self._generation:
                     with reading(COORDINATOR):
+                        links.wanted = ()
                         found = np.frombuffer(frame.data, RECEPTION)
                         latency = len(self._bus.mail.num_packets[sent.world]) - 1
                         return check_receptions(

@@ -33,6 +33,7 @@ from cavmarl.zones.kernels.row_frames import Passing, count_own
 
 Array = NDArray[Any]
 _SHARE = FrameKind.SHARE
+SHARE_BITS = 32  # the number of a share has the generation above them
 PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "places")
 
 
@@ -54,7 +55,7 @@ class NodePeers:
         links: Links,  # to all other nodes
         zones: Sequence[Sequence[int]],  # of each node
         number: int,  # of this node
-        first_share: int = 0,  # number of the first share, the same at all nodes
+        generation: int = 0,  # number of changes of nodes
     ) -> None:
         shard = simulation.shards[0]
         self._zoned = shard.zoned
@@ -84,7 +85,7 @@ class NodePeers:
         }
         self._count_own = specialized(count_own)
         self._agents = AgentStream([getattr(simulation.outputs, name) for name in PIECES])
-        self._sent = first_share
+        self._sent = generation << SHARE_BITS  # number of the last share
         self._is_stepping = False
         self._gate: DepartureQueue | None = None
         self._leaving: Passing  # vehicles that pass `_gate`
@@ -125,6 +126,8 @@ class NodePeers:
             with reading(number):
                 agents = np.frombuffer(data, np.int64)
                 check_indices("agent", agents, self.owner.size)
+                if (self.owner[agents] != UNOWNED).any():
+                    raise MessageError("it owns agents of other nodes")
             self.owner[agents] = number
 
     def share_rows(self, departures: DepartureQueue, side: int) -> None:
@@ -161,7 +164,8 @@ class NodePeers:
         for number, data in self._swap([ranks.data, last_s.data]):
             with reading(number):
                 theirs, at = _read(data, 0, ranks.dtype, ranks.size)
-                theirs_s, _ = _read(data, at, last_s.dtype, last_s.size)
+                theirs_s, at = _read(data, at, last_s.dtype, last_s.size)
+                _check_end(data, at)
             np.maximum(ranks, theirs.reshape(ranks.shape), out=ranks)
             np.maximum(last_s, theirs_s.reshape(last_s.shape), out=last_s)
         departures.ranks[:, :longest][asks] = ranks
@@ -181,11 +185,12 @@ class NodePeers:
                     found, at = _read(data, at, np.int64, last - first)
                     check_indices("place in the queue", found, int(departures.num_queue[w]))
                     departures.places[w, first:last] = found
+                _check_end(data, at)
 
     def share_leavers(self, departures: DepartureQueue) -> None:
         for number, data in self._swap(self._passing(departures)):
             with reading(number):
-                self._add_passing(departures, data, 0)
+                _check_end(data, self._add_passing(departures, data, 0))
 
     def _passing(self, departures: DepartureQueue) -> list[Bytes]:
         """Return the number of vehicles that pass the queue of each world, and their rows."""
@@ -219,7 +224,8 @@ class NodePeers:
                 (num,), at = _read(data, 0, np.int64, 1)
                 where, at = _read(data, at, np.int64, int(num))
                 check_indices("detector", where, seen.size)
-                found, _ = _read(data, at, np.float64, int(num))
+                found, at = _read(data, at, np.float64, int(num))
+                _check_end(data, at)
             seen.reshape(-1)[where] = found
         self._seen_s[...] = seen
 
@@ -230,7 +236,9 @@ class NodePeers:
             self.stepped[...] = self.own
         for number, data in self._swap([frame]):
             with reading(number):
-                self._agents.read(data, number, self.owner)
+                agents = self._agents.read(data, number, self.owner)
+                if not outputs.present.reshape(-1)[agents].all():
+                    raise MessageError("it sends agents that are absent")
 
     @contextmanager
     def all_zones(self, departures: DepartureQueue, side: int) -> Iterator[None]:
@@ -256,6 +264,7 @@ class NodePeers:
                     for array in map(_by_agent, arrays):
                         found, at = _read(data, at, array.dtype, int(num) * array[0].size)
                         array[agents] = found.reshape(int(num), *array.shape[1:])
+                    _check_end(data, at)
             yield
 
     def _agents_of(self, side: int) -> Array:
@@ -289,6 +298,7 @@ class NodePeers:
                     rows, at = _read(data, at, zoned.rows.dtype, num)
                     self.checks.check(rows)
                     zoned.rows[side, zone, w, :num] = rows
+                _check_end(data, at)
             zoned.num_owned[zone], zoned.num_contacts[zone] = owned_there, contacts
         try:
             yield
@@ -313,9 +323,9 @@ class NodePeers:
         kind, which, data = self._links.receive_next(number)
         if kind is _SHARE and which == self._sent:
             return data
-        if kind is FrameKind.SYNC:
+        if kind is FrameKind.SYNC and which << SHARE_BITS > self._sent:
             self._links.unread(number, NodeFrame(kind, which, data))
-            raise RecoveryOrderedError(None)
+            raise RecoveryOrderedError(None, number)
         error = MessageError(f"it is at {kind.name} {which}, not at share {self._sent}")
         raise LinkLostError(number, error)
 
@@ -328,6 +338,12 @@ def _by_agent(array: Array) -> Array:
 def _bytes(array: Array) -> Bytes:
     flat: NDArray[np.uint8] = array.reshape(-1).view(np.uint8)
     return flat.data
+
+
+def _check_end(data: memoryview, at: int) -> None:
+    """Raise MessageError if bytes are left."""
+    if at != len(data):
+        raise MessageError(f"a share has {len(data)} bytes, not {at}")
 
 
 def _read(data: memoryview, at: int, kind: DTypeLike, num: int) -> tuple[Array, int]:

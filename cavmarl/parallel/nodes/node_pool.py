@@ -33,7 +33,7 @@ from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
-from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
+from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices, read_json, reading
 from cavmarl.parallel.nodes.state_replicas import KEPT
 from cavmarl.parallel.nodes.zone_endpoints import hostings_as_json, read_report
 from cavmarl.parallel.nodes.zone_moves import (
@@ -112,8 +112,10 @@ class NodePool:
         self._partition = zones_as_json(world.partition)
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
-        self._watch = NodeWatch(self._links, self._stopped)
+        self._refused: dict[int, int] = {}  # agent → node that has refused its action
+        self._watch = NodeWatch(self._links, self._stopped, self._holder)
         self._nodes: dict[int, JoiningNode] = {}  # living nodes
+        self._present: set[int] = set()  # nodes that have answered in this generation
         self._new: dict[int, tuple[str, int]] = {}  # new nodes → where other nodes can call
         self._lease_ticks, self._settings = lease_ticks(config), config.zones
         self._links.urgent = self._receive
@@ -155,7 +157,7 @@ class NodePool:
             WorkerError: too many nodes were lost.
         """
         self.coordinator.close()
-        self.generation += 1
+        self._begin_generation()
         self._prepare(runs)
         self._begin()
 
@@ -173,13 +175,19 @@ class NodePool:
                 hostings = hostings or self.coordinator.host(neighbours)
                 self.send_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
                 self.commit()
+                self._check_kept(self._state.number)
             except LinkLostError as lost:
                 self._lose(lost, has_begun=False)
-                self.generation += 1  # frames of this attempt are void
+                self._begin_generation()  # frames of this attempt are void
             else:
                 self._new.clear()
                 self._is_torn = False
                 return
+
+    def _begin_generation(self) -> None:
+        """Count a change of nodes. Earlier frames of nodes are void from now on."""
+        self.generation += 1
+        self._present.clear()
 
     def _pump(self) -> None:
         """Serve the connected nodes. Raises LinkLostError: a node is lost."""
@@ -233,13 +241,37 @@ class NodePool:
         found: dict[int, NodeFrame] = {}
         while missing := [n for n in self._living if n not in found] if found else self._living:
             wait = partial(self._links.receive, missing)
-            for number, frame in self._watch.wait(self._living, self._timeout_s, wait).items():
-                if frame.number == self.generation:
-                    found[number] = frame
-        for number, frame in found.items():
-            if frame.kind is not kind:
-                raise LinkLostError(number, MessageError(f"{frame.kind.name}, not {kind.name}"))
+            for number, frame in self._wait(wait).items():
+                with reading(number):
+                    if self._is_present(number, frame):
+                        if frame.kind is not kind:
+                            raise MessageError(f"{frame.kind.name}, not {kind.name}")
+                        found[number] = frame
+        self._present.update(found)
         return dict(sorted(found.items()))
+
+    def _is_present(self, number: int, frame: NodeFrame) -> bool:
+        """Return whether a frame is of the present generation of nodes, and not an earlier one.
+
+        Raises:
+            MessageError: the node cannot have sent the frame in an earlier generation.
+        """
+        if frame.number == self.generation:
+            return True
+        if frame.number > self.generation or number in self._present:
+            raise MessageError(
+                f"a frame of kind {frame.kind.name} is of generation {frame.number}, not "
+                f"{self.generation}"
+            )
+        return False
+
+    def _wait(self, wait: Callable[[float], Found]) -> Found:
+        """Wait until `wait` succeeds. Raises the errors of `NodeWatch.wait`."""
+        return self._watch.wait(self._living, self._timeout_s, wait)
+
+    def _holder(self, agent: int) -> int:
+        """Return the node that has got the action of an agent, or has refused it."""
+        return self._refused.get(agent, self.owner.item(agent))
 
     # Commands, and their repetition when nodes are lost
 
@@ -340,6 +372,7 @@ class NodePool:
         """Carry out a command once; return the results. Raises LinkLostError: a node is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         self._performed, self._exchanged = command, 0
+        self._refused.clear()
         leases = leases_of(command.ticks, self._lease_ticks)
         lease = self._begin_lease() if leases else {}
         for number in self._living:
@@ -348,6 +381,8 @@ class NodePool:
         if not command.changes:
             return {n: frame.data for n, frame in self._receive_all(FrameKind.RESULT).items()}
         results = self.commit()
+        if kept:
+            self._check_kept(kept)
         for _ in range(1, leases):
             self.coordinator.lease(self._begin_lease(), self._ticks_per_step)
             results = self.commit()
@@ -360,7 +395,7 @@ class NodePool:
 
     def _begin_lease(self) -> dict[int, bytes]:
         """Return the lease of each node for the next ticks."""
-        decide = partial(self._watch.wait, self._living, self._timeout_s, self.coordinator.begin)
+        decide = partial(self._wait, self.coordinator.begin)
         lease = decide()
         while self.coordinator.is_late:
             self.coordinator.lease(lease, 0)
@@ -374,12 +409,15 @@ class NodePool:
         Returns:
             an error of a node, for the caller.
         """
-        is_present = frame.number == self.generation
         match frame.kind:
-            case FrameKind.MISSED:
-                peer = int.from_bytes(frame.data, "little")
-                if is_present and peer in self._nodes:
-                    self._watch.report_missed(number, peer)
+            case FrameKind.PONG:
+                self._watch.receive_pong(number, frame)
+                return None
+            case FrameKind.KEEP if self._living == [number]:
+                self._keep(frame)
+                return None
+        is_present = self._is_present(number, frame)
+        match frame.kind:
             case FrameKind.FAILED:
                 name, text, trace = map(str, read_list(frame))
                 part = name_of(self._homes[number])
@@ -387,23 +425,36 @@ class NodePool:
                 found = original_error(failure)
                 found.__cause__ = None if found is failure else failure
                 return found
-            case FrameKind.PONG:
-                self._watch.receive_pong(number, frame)
-            case FrameKind.KEEP:
-                self._kept[frame.number] = frame.data
-                for old in sorted(self._kept)[:-KEPT]:
-                    del self._kept[old]
-            case FrameKind.EXCHANGE:
+            case FrameKind.MISSED:
+                peer, fault = int.from_bytes(frame.data[:4], "little"), bytes(frame.data[4:])
+                check_indices("node", [peer], self.num_nodes)
+                if is_present and peer in self._nodes:
+                    self._watch.report_missed(number, peer, fault.decode())
+            case FrameKind.EXCHANGE if number == self.reporter:
                 if is_present:
                     self._exchange(frame)
             case FrameKind.NOT_MINE:
                 if is_present:
-                    self._forward(frame)
+                    self._forward(number, frame)
             case FrameKind.MESSAGES:
-                self.coordinator.receive(number, frame)
+                if is_present:
+                    self.coordinator.receive(number, frame)
             case _:
                 raise MessageError(f"a node must not send frames of kind {frame.kind.name}")
         return None
+
+    def _keep(self, frame: NodeFrame) -> None:
+        """Keep a replica of the state of the only node. Raises MessageError: there is no state."""
+        check_indices("state", [frame.number], self._next_state)
+        if frame.number == (self._opened or self._state).number:
+            self._kept[frame.number] = frame.data
+            for old in sorted(self._kept)[:-KEPT]:
+                del self._kept[old]
+
+    def _check_kept(self, state: int) -> None:
+        """Raise LinkLostError if the only node has not sent a replica of its state."""
+        if len(self._living) == 1 and state not in self._kept:
+            raise LinkLostError(self.first, MessageError(f"it has not sent state {state}"))
 
     def _exchange(self, frame: NodeFrame) -> None:
         """Send the receptions to all nodes; in a repeated step, send the same receptions again.
@@ -421,18 +472,21 @@ class NodePool:
             self._links.send(node, FrameKind.RECEPTIONS, self.generation, [answer])
         self._exchanged += 1
 
-    def _forward(self, frame: NodeFrame) -> None:
+    def _forward(self, number: int, frame: NodeFrame) -> None:
         """Forward actions that a node has refused to their owners.
 
         Raises:
-            MessageError: the agents or owners are unknown.
+            MessageError: the agents or owners are unknown, or the node was not to get the actions.
         """
-        found = read_refusal(frame.data, self.owner.size, set(self._living))
+        found = read_refusal(frame.data, self.owner.size, {*self._living} - {number})
+        if (self.owner[found[0]] != number).any():
+            raise MessageError("it refuses actions that it has not received")
         if self._performed is None or (actions := self._performed.actions) is None:
             raise MessageError("it refuses actions without a step")
         for owner in np.unique(found[1]).tolist():
             agents = found[0, found[1] == owner]
             self.owner[agents] = owner
+            self._refused |= dict.fromkeys(agents.tolist(), number)
             self.redirected += len(agents)
             self._links.send(owner, FrameKind.ACTIONS, self.generation, [actions.some(agents)])
 
@@ -443,13 +497,14 @@ class NodePool:
             WorkerError: the node had not begun, and too many nodes were lost before they had begun.
         """
         is_silent = isinstance(lost, SilentNodeError)
-        lost = lost if is_silent else self._watch.most_missed(lost)
+        lost = lost if is_silent else self._watch.most_missed(lost, self.generation)
         number = lost.peer
         self._is_torn = True
         self._watch.forget_missed()
         self._links.drop(number)
         node = self._nodes.pop(number, None)
         self._new.pop(number, None)
+        self._present.discard(number)
         if node is None:
             return
         self._lost.append(number)
@@ -475,7 +530,7 @@ class NodePool:
         moves, kept = self._moves()
         self.zones, self._living = moves.zones, living_of(moves.zones)
         self.owner[~np.isin(self.owner, self._living)] = UNOWNED  # the owner may be any node
-        self.generation += 1
+        self._begin_generation()
         self._cut = state.cut
         self.coordinator.set_neighbours(state.cut.neighbours)
         hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)

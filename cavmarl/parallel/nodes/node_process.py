@@ -19,7 +19,7 @@ from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.code_stamp import code_stamp
-from cavmarl.parallel.network.transport import Bytes, Place
+from cavmarl.parallel.network.transport import Bytes, Connection, Place
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.link import FrameKind, NeededNoMoreError, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
@@ -36,8 +36,9 @@ from cavmarl.parallel.nodes.node_frames import (
 from cavmarl.parallel.nodes.node_handshake import accept_nodes, call_node
 from cavmarl.parallel.nodes.node_loads import load_report
 from cavmarl.parallel.nodes.node_network import RemoteNetwork
-from cavmarl.parallel.nodes.node_peers import NodePeers
+from cavmarl.parallel.nodes.node_peers import SHARE_BITS, NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
+from cavmarl.parallel.nodes.node_watch import Pong
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, read_json, reading
 from cavmarl.parallel.nodes.state_replicas import StateReplicas
 from cavmarl.parallel.nodes.zone_endpoints import ZoneEndpoints, hosting_of, unpacked
@@ -94,6 +95,12 @@ class NodeProgram:
         self._network: RemoteNetwork | None = None
         self._number = -1  # the caller sends it with the first RECOVER
         self._generation = 0
+        self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has come
+        # world, vehicle and zone of each offer that was answered lately
+        self._answered: list[tuple[int, int, int]] = []
+        # node → fault of a frame of it; an earlier report may have been void
+        self._faults: dict[int, str] = {}
+        self._witness: int | None = None  # node that claims that a recovery is ordered
         self._actions: deque[NodeFrame] = deque()  # forwarded actions
         # Tasks that each node does for its zones; the first node does all other tasks.
         self._of_all: dict[Task, Callable[[Any, memoryview, int], None]] = {
@@ -161,12 +168,12 @@ class NodeProgram:
         """Host the zones of this node, as the caller has assigned them."""
         simulation, mine = self._worlds.simulation, zones[self._number]
         self.zones = tuple(mine)
-        self._living = living_of(zones)
+        self._zones_of, self._living = zones, living_of(zones)
         own_hostings = [
             [hosting_of(bytes.fromhex(run), some[zone]) for zone in mine]
             for run, some in zip(runs, hostings, strict=True)
         ]
-        self._peers = NodePeers(simulation, self._links, zones, self._number, generation << 32)
+        self._peers = NodePeers(simulation, self._links, zones, self._number, generation)
         mounted = simulation.mounted
         arrays = self._worlds.arrays
         carried = [arrays.controls, arrays.meta_actions]
@@ -175,7 +182,7 @@ class NodeProgram:
         limits = limits_of(settings, division.codec.schema)
         self._endpoints = ZoneEndpoints(
             division, mine, nodes_of(zones), own_hostings, limits,
-            self._links, carried, self._peers.checks, generation=generation,
+            self._links, carried, self._peers.checks, self._answered, generation=generation,
             is_checked=settings.check_invariants, ticks=self._lease_ticks,
         )  # fmt: skip
         self._run_own()
@@ -195,23 +202,47 @@ class NodeProgram:
         """Apply an urgent frame."""
         is_caller = number == COORDINATOR
         match frame.kind:
-            case FrameKind.MESSAGES:
-                self._endpoints.receive(frame)
+            case FrameKind.MESSAGES if not is_caller:
+                if self._is_present(number, frame):
+                    self._endpoints.receive(number, frame)
             case FrameKind.KEEP if not is_caller:
                 self._replicas.receive(number, frame)
             case FrameKind.AGENT if not is_caller:
-                self._endpoints.receive_agent(frame)
+                if self._is_present(number, frame):
+                    self._endpoints.receive_agent(number, frame)
             case FrameKind.GIVE if not is_caller:
-                self._replicas.receive_given(number, frame)
+                if self._is_present(number, frame):
+                    self._replicas.receive_given(number, frame)
             case FrameKind.ACTIONS if is_caller:
                 self._actions.append(frame)
             case FrameKind.RECEPTIONS if is_caller and self._network is not None:
                 self._network.receive(frame)
             case FrameKind.PING if is_caller:
-                awaited = json.dumps(self._links.awaited).encode()
-                self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [awaited])
+                self._answer_ping(frame)
             case _:
                 raise MessageError(f"it must not send frames of kind {frame.kind.name}")
+
+    def _is_present(self, number: int, frame: NodeFrame) -> bool:
+        """Return whether a frame of another node is of this generation, and not an earlier one.
+
+        Raises:
+            MessageError: the node cannot have sent the frame in an earlier generation.
+        """
+        if frame.number == self._generation:
+            return True
+        if frame.number > self._generation or number in self._synchronized:
+            raise MessageError(
+                f"a frame of kind {frame.kind.name} is of generation {frame.number}, not "
+                f"{self._generation}"
+            )
+        return False
+
+    def _answer_ping(self, frame: NodeFrame) -> None:
+        """Report the frames and actions that this node awaits."""
+        witnesses = [] if self._witness is None else [self._witness]
+        due = self._received_actions.due()
+        pong = Pong(self._links.awaited, witnesses, self._answered, due)
+        self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [json.dumps(pong).encode()])
 
     def serve(self) -> NoReturn:
         """Carry out the commands of the coordinator.
@@ -232,6 +263,7 @@ class NodeProgram:
                 else:
                     self._perform(frame)
             except RecoveryOrderedError as ordered:
+                self._witness = ordered.witness
                 self._go_back(ordered.frame)
             except LinkLostError as lost:
                 self._report_missed(lost)
@@ -243,21 +275,30 @@ class NodeProgram:
             try:
                 while frame is None or frame.kind is not FrameKind.RECOVER:
                     frame = self._links.receive_next(COORDINATOR)
+                self._witness = None
                 self._recover(frame)
                 return
             except RecoveryOrderedError as ordered:
-                frame = ordered.frame
+                frame, self._witness = ordered.frame, ordered.witness
             except LinkLostError as lost:
                 self._report_missed(lost)
                 frame = None
 
     def _report_missed(self, lost: LinkLostError) -> None:
-        """Tell the coordinator, which may not have noticed, that a node cannot be reached."""
-        if lost.peer == COORDINATOR:
+        """Tell the coordinator that a node cannot be reached, or has sent a bad frame.
+
+        If a frame of the coordinator does not fit, the state of this node is wrong.
+        """
+        is_coordinator = lost.peer == COORDINATOR
+        if is_coordinator and (not lost.fault or self._number < 0):
             raise lost
-        self._links.drop(lost.peer)
-        peer = lost.peer.to_bytes(4, "little")
-        self._links.send(COORDINATOR, FrameKind.MISSED, self._generation, [peer])
+        number = self._number if is_coordinator else lost.peer
+        if not is_coordinator:
+            self._links.drop(number)
+        if lost.fault:
+            self._faults[number] = lost.fault
+        peer, fault = number.to_bytes(4, "little"), self._faults.get(number, "").encode()
+        self._links.send(COORDINATOR, FrameKind.MISSED, self._generation, [peer, fault])
 
     def _recover(self, frame: NodeFrame) -> None:
         """Start, or go back to a kept state, with the zones that the coordinator assigns."""
@@ -267,6 +308,7 @@ class NodeProgram:
             order = read_order(data[8:at], before.world.partition.count)
             partition = read_zones(order["partition"])
         self._generation = frame.number
+        self._synchronized.clear()
         is_new, num_worlds = self._number < 0, order["num_worlds"]
         if num_worlds != len(before.arrays.mask) or (order["begins"] and not is_new):
             self._run_worlds(before.of_number(num_worlds))
@@ -276,12 +318,13 @@ class NodeProgram:
         if is_new or self._worlds is not before:
             self._number = order["number"]
             self._received_actions = ReceivedActions(self._worlds.arrays, self._number)
+        self._received_actions.are_due = False
         if is_new:
             self._replicas = StateReplicas(self._worlds, self._logs, links, self._number)
             links.urgent = self._receive
         self._is_reporter = order["first"] == self._number
         if self._network is not None:
-            self._network.begin(frame.number, self._is_reporter)
+            self._network.begin(frame.number, self._number, order["first"])
         for number in order["lost"]:
             links.drop(number)
         zones = order["zones"]
@@ -292,14 +335,13 @@ class NodeProgram:
         state, mine = order["state"], zones[self._number]
         if order["begins"]:  # the SYNC that follows the replica confirms its arrival
             self._peers.drop_foreign_rows(self._worlds.simulation.everywhere)
-            self._replicas.keep(state, self._living)
+            saved = self._replicas.keep(state, self._living)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
         for node in others:
-            while True:
-                found = links.receive_next(node)
-                if found.kind is FrameKind.SYNC and found.number == frame.number:
-                    break
+            self._await_sync(node)
+        if order["begins"]:
+            self._replicas.await_replica(state, zones, saved)
         if not order["begins"]:
             if len(data) > at:
                 with reading(COORDINATOR):
@@ -307,10 +349,29 @@ class NodeProgram:
             adopted = [number for number, heir in order["heirs"] if heir == self._number]
             donors = [donor for donor, taker in order["donors"] if taker == self._number]
             takers = [taker for donor, taker in order["donors"] if donor == self._number]
-            self._replicas.load(
-                state, adopted, donors, takers, mine, self._generation, self._check_orders
-            )
+            self._replicas.load(state, adopted, donors, takers, mine, self._generation)
         self._endpoints.report()
+
+    def _await_sync(self, number: int) -> None:
+        """Drop the frames of earlier generations of another node.
+
+        Raises:
+            LinkLostError: the node has gone, or has sent no SYNC.
+            RecoveryOrderedError: the coordinator has ordered another recovery.
+        """
+        links, generation = self._links, self._generation
+        while True:
+            frame = links.receive_next(number)
+            is_sync = frame.kind is FrameKind.SYNC
+            if is_sync and frame.number > generation:
+                links.unread(number, frame)
+                raise RecoveryOrderedError(None, number)
+            is_share = frame.kind is FrameKind.SHARE
+            if (is_sync and frame.data) or (is_share and frame.number >> SHARE_BITS >= generation):
+                raise LinkLostError(number, MessageError("it has sent no SYNC"))
+            if is_sync and frame.number == generation:
+                self._synchronized.add(number)
+                return
 
     def _connect(self, places: Mapping[int, Place], others: Sequence[int]) -> None:
         """Connect to new nodes; of two new nodes, the one with the higher number calls.
@@ -326,7 +387,7 @@ class NodeProgram:
         for other in others:
             if other in places and (not is_new or other < number):
                 found = call_node(self._system, places[other], self._secret, number, times, other)
-                links.add(other, found)
+                self._add(other, found)
         if is_new:
             links.wanted = callers = [
                 node for node in others if node not in places or node > number
@@ -336,7 +397,11 @@ class NodeProgram:
             )
             links.wanted = ()
             for other, connection in called.items():
-                links.add(other, connection)
+                self._add(other, connection)
+
+    def _add(self, number: int, connection: Connection) -> None:
+        self._links.add(number, connection)
+        self._faults.pop(number, None)
 
     def _check_orders(self) -> None:
         """Raise RecoveryOrderedError if the coordinator has sent a newer order."""
@@ -351,7 +416,8 @@ class NodeProgram:
             task, payload, at = command_of(frame.data)
         self._replicas.settle()
         if frame.number:
-            self._replicas.keep(frame.number, self._living)
+            saved = self._replicas.keep(frame.number, self._living)
+            self._replicas.await_replica(frame.number, self._zones_of, saved)
         if perform := self._of_all.get(task):
             perform(payload, frame.data, at)
         else:
@@ -419,6 +485,7 @@ class NodeProgram:
         if len(wrong):
             refused = refusal(wrong, owner)
             self._links.send(COORDINATOR, FrameKind.NOT_MINE, self._generation, refused)
+        self._links.wanted = (COORDINATOR,)
         while received.are_due:
             while self._actions:
                 late = self._actions.popleft()
@@ -428,6 +495,7 @@ class NodeProgram:
             if received.are_due:
                 self._links.check_recovery()
                 self._links.pump(None)
+        self._links.wanted = ()
         return end
 
     def _results_of(self, chosen: NDArray[np.bool_], of_step: bool) -> Bytes:

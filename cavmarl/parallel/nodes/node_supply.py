@@ -82,6 +82,7 @@ class NodeSupply:
         """Serve joining nodes; return whether one is ready."""
         with self._lock:
             self.joining_nodes.look(0.0)
+            self._restart_dropped()  # if it is impossible, the lost node stays lost
             return bool(self.joining_nodes.ready)
 
     def take(
@@ -101,7 +102,7 @@ class NodeSupply:
 
         def why() -> str | None:
             trouble()
-            return self._starter.trouble(self._begun)
+            return self._restart_dropped() or self._starter.trouble(self._begun)
 
         with self._lock:
             joining_nodes, wanted = self.joining_nodes, num
@@ -112,6 +113,15 @@ class NodeSupply:
             self._begun += [joining_node.pid for joining_node, _ in found]
             self._are_complete |= len(self._begun) == self.count
             return found
+
+    def _restart_dropped(self) -> str | None:
+        """Restart nodes that joined and sent a bad frame; return why that is impossible."""
+        dropped = self.joining_nodes.dropped
+        while dropped:
+            node = dropped.pop()
+            if why := self._starter.retry(node.asked, node.pid, False):
+                return why
+        return None
 
     def _usable(self) -> list[int]:
         """Return the ready nodes; spare ones count only once the pools were complete."""

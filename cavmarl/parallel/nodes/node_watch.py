@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from cavmarl.core.errors import MessageError, WorkerError
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, read_list
-from cavmarl.parallel.nodes.links import Links, SilenceError
+from cavmarl.parallel.nodes.links import AwaitedOffer, Links, SilenceError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices
 
 LOOK_S = 0.5  # time between checks; a process that is stopped at two checks is given up
@@ -20,6 +20,15 @@ VAIN = 5  # number of PINGs that all nodes answer before an unfinished command f
 MOST_NODES = 1 << 32
 
 Found = TypeVar("Found")
+
+
+class Pong(NamedTuple):
+    """The answer of a node to a PING."""
+
+    awaited: list[int]  # nodes whose frames it awaits, or COORDINATOR
+    witnesses: list[int]  # node that claims that a recovery is ordered, if it waits for the order
+    answered: Sequence[Sequence[int]]  # world, vehicle and zone of each offer that it has answered
+    agents: list[int]  # whose actions it awaits
 
 
 class SilentNodeError(LinkLostError):
@@ -33,24 +42,41 @@ class NodeWatch:
         self,
         links: Links,
         stopped: Callable[[], set[int]],  # returns the nodes whose processes are stopped
+        # agent → node that has got its action, or has refused it; raises IndexError
+        holder: Callable[[int], int],
     ) -> None:
-        self._links, self._stopped = links, stopped
+        self._links, self._stopped, self._holder = links, stopped, holder
         self._missed: list[int] = []  # both ends of each connection that nodes have lost
-        # node that answered the last PING → nodes whose frames it awaits
-        self._answered: dict[int, list[int]] = {}
+        # node → nodes that have got a bad frame from it, and the fault of the frame
+        self._faults: dict[int, dict[int, str]] = {}
+        self._answered: dict[int, Pong] = {}  # node → its answer to the last PING
         self._pings = 0
 
-    def report_missed(self, number: int, peer: int) -> None:
-        """Note that a node has lost its connection to another one. Raises LinkLostError."""
+    def report_missed(self, number: int, peer: int, fault: str) -> None:
+        """Note that a node has lost its connection to another one. Raises LinkLostError.
+
+        Args:
+            number: of the node.
+            peer: of the other one.
+            fault: reason why a frame of the other node is bad; empty if the connection has ended.
+        """
         self._missed += (number, peer)
+        if fault:
+            self._faults.setdefault(peer, {})[number] = fault
         raise LinkLostError(peer)
 
     def receive_pong(self, number: int, frame: NodeFrame) -> None:
-        """Apply the answer of a node to a PING."""
+        """Apply the answer of a node to a PING. Raises the errors of `reading`."""
+        check_indices("PING", [frame.number], self._pings + 1)
+        pong = Pong(*read_list(frame))
+        if not all(isinstance(part, list) for part in pong):
+            raise MessageError("a PONG has something else than lists")
+        peers = [peer for peer in (*pong.awaited, *pong.witnesses) if peer != COORDINATOR]
+        check_indices("node", peers, MOST_NODES)
+        for agent in pong.agents:
+            self._holder(agent)
         if frame.number == self._pings:
-            awaited = read_list(frame)
-            check_indices("node", (peer for peer in awaited if peer != COORDINATOR), MOST_NODES)
-            self._answered[number] = awaited
+            self._answered[number] = pong
 
     def wait(
         self,
@@ -61,8 +87,8 @@ class NodeWatch:
         """Call `wait` until it succeeds, as long as all nodes answer meanwhile.
 
         Raises:
-            SilentNodeError: a node does not answer, or its process is stopped, or another node
-                waits for it in vain, or it owes another node an answer after two timeouts.
+            SilentNodeError: a node does not answer, or its process is stopped, or it owes a frame
+                to another node or to this process, or an offer or its answer after two timeouts.
             WorkerError: all nodes answer, but `wait` does not succeed.
         """
         silence: SilenceError | None = None
@@ -72,10 +98,8 @@ class NodeWatch:
             except SilenceError as error:
                 before, silence = silence, error
                 self._ask(living)
-                for number in sorted(set(before.awaited if before else ()) & set(error.awaited)):
-                    raise SilentNodeError(
-                        number, MessageError("it does not answer offers")
-                    ) from error
+                for offer in sorted(error.offers & before.offers if before else ()):
+                    raise self._without_answer(offer) from error
         raise WorkerError(
             f"{silence}, {VAIN} times, although all nodes are alive; raise workers.timeout_s = "
             f"{timeout_s:g}"
@@ -97,7 +121,14 @@ class NodeWatch:
             return wait(left_s)
         except SilenceError as silence:
             text = f"no frame has come for {timeout_s:g} s"
-            raise SilenceError(text, silence.awaited) from silence
+            raise SilenceError(text, silence.offers) from silence
+
+    def _without_answer(self, offer: AwaitedOffer) -> SilentNodeError:
+        """Return which node is at fault for an offer without an answer."""
+        if [offer.world, offer.vehicle, offer.zone] in self._answered[offer.target].answered:
+            return SilentNodeError(offer.target, MessageError("its answer to an offer is missing"))
+        why = f"it has not offered vehicle {offer.vehicle}, which it reports as offered"
+        return SilentNodeError(offer.source, MessageError(why))
 
     def _ask(self, living: Sequence[int]) -> None:
         """Send a PING to all nodes, and evaluate the answers.
@@ -116,13 +147,36 @@ class NodeWatch:
         for number in living:
             if number not in self._answered:
                 raise SilentNodeError(number, MessageError("it does not answer"))
-        awaited = Counter(peer for peers in self._answered.values() for peer in peers)
-        for number, _ in awaited.most_common():
+        witnesses = (number for pong in self._answered.values() for number in pong.witnesses)
+        for number in witnesses:  # an order would have come before the PING
             if number in living:
+                raise SilentNodeError(number, MessageError("it claims an order to recover"))
+        for pong in self._answered.values():
+            for number in {self._holder(agent) for agent in pong.agents} & {*living}:
+                raise SilentNodeError(number, MessageError("it has not refused others' actions"))
+        awaited = Counter(peer for pong in self._answered.values() for peer in pong.awaited)
+        for number in sorted(living, key=lambda n: (self._waits(n, living), -awaited[n])):
+            if awaited[number]:
                 raise SilentNodeError(number, MessageError("others wait for it"))
+        for number in links.awaited:  # it has sent all it will send, before its answer
+            if number in living and COORDINATOR in self._answered[number].awaited:
+                raise SilentNodeError(number, MessageError("its frame is missing"))
 
-    def most_missed(self, lost: LinkLostError) -> LinkLostError:
-        """Return the node that has ended, or else the node that most nodes cannot reach."""
+    def _waits(self, number: int, living: Sequence[int]) -> bool:
+        """Return whether a node waits for another one."""
+        return not {*living}.isdisjoint(self._answered[number].awaited)
+
+    def most_missed(self, lost: LinkLostError, generation: int) -> LinkLostError:
+        """Return the node that is lost, after nodes have reported lost connections.
+
+        It is the node that has ended, or else the node from which most nodes have got a bad frame,
+        or else the node that most nodes cannot reach. If two nodes miss each other, either may be
+        at fault, so they are given up in turn.
+
+        Args:
+            lost: the first report.
+            generation: number of changes of nodes.
+        """
         links = self._links
         if not self._missed:  # the node has sent a bad frame
             return lost
@@ -134,9 +188,15 @@ class NodeWatch:
                 lost = more
         if lost.peer not in links.numbers:
             return lost
-        worst = max(self._missed, key=lambda number: (self._missed.count(number), number))
+        sign = -1 if generation % 2 else 1
+        if self._faults:
+            worst = max(self._faults, key=lambda n: (len(self._faults[n]), sign * n))
+            witness, fault = next(iter(self._faults[worst].items()))
+            return LinkLostError(worst, MessageError(f"node {witness} reports: {fault}"))
+        worst = max(self._missed, key=lambda n: (self._missed.count(n), sign * n))
         return LinkLostError(worst, MessageError("other nodes do not reach it"))
 
     def forget_missed(self) -> None:
         """Drop reports of lost connections after a node was given up."""
         self._missed.clear()
+        self._faults.clear()

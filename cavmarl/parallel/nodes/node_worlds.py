@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -55,6 +56,8 @@ from cavmarl.parallel.worlds.tasks import Task
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator, check_external
 from cavmarl.zones.partition.zone_partition import ZonePartition
+
+HASH = re.compile("[0-9a-f]{32}")  # the hash of a state
 
 
 class WorldShare(NamedTuple):
@@ -278,7 +281,15 @@ class NodeWorlds(CommandedWorlds):
 
     def _of_first(self, read: Callable[[memoryview], Any]) -> Read[Any]:
         """Return a reader of the answer of the first node; other nodes send no answer."""
-        return lambda number, data: read(data) if number == self.pool.first else None
+
+        def read_first(number: int, data: memoryview) -> Any:
+            if number == self.pool.first:
+                return read(data)
+            if len(data):
+                raise MessageError(f"it answers with {len(data)} bytes, but is not the first node")
+            return None
+
+        return read_first
 
     def _read_begun(self, number: int, data: memoryview) -> None:
         self._write(self.arrays.chosen, False, number, data)
@@ -388,8 +399,15 @@ def empty_arrays(world: World, num_worlds: int) -> StepArrays:
     return StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
 
 
+def _read_hash(found: Any) -> str:
+    """Read the hash of a state. Raises MessageError: it is something else."""
+    if not isinstance(found, str) or not HASH.fullmatch(found):
+        raise MessageError(f"it has {found!r} in place of a hash")
+    return found
+
+
 _ANSWERS: Mapping[Task, Callable[[Any], Any]] = {
-    Task.STATE_HASH: str,
+    Task.STATE_HASH: _read_hash,
     Task.TRAFFIC_STATS: dict,
     Task.DRIVEN: lambda rows: [Driven(*row) for row in rows],
     Task.SIGNAL_PHASES: lambda rows: np.array(rows, dtype=np.int32),

@@ -19,10 +19,16 @@ FAULTS = (
 
 
 class LinkLostError(Exception):
-    """A connection has ended, or has carried a bad frame."""
+    """A connection has ended, or has carried a bad frame.
+
+    Attributes:
+        peer: the process at the other end.
+        fault: reason why the frame is bad; empty if the connection has ended.
+    """
 
     def __init__(self, peer: int, cause: Exception | None = None) -> None:
-        why = f": {cause}" if isinstance(cause, MessageError) else ""
+        self.fault = str(cause) if isinstance(cause, MessageError) else ""
+        why = f": {self.fault}" if self.fault else ""
         super().__init__(f"the connection to node {peer} has ended{why}")
         self.peer = peer
 

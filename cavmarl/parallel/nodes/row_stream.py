@@ -153,7 +153,8 @@ class RowStream:
         if data and not len(data) % 8:
             frame = np.frombuffer(data, np.int64)
             args = self._both, side, passing, self._law, received.before
-            num = self._unpack(*args, received.now, frame)
+            if frame[1 : 1 + 3 * self._both.running.size].min(initial=0) >= 0:  # numbers
+                num = self._unpack(*args, received.now, frame)
             if NO_FRAME < num < 0:
                 received.make(-1 - num)
                 num = self._unpack(*args, received.now, frame)

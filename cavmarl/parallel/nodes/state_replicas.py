@@ -8,17 +8,19 @@ zones move to another node, for example a new node, all nodes also go back to a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import WorkerError
+from cavmarl.core.errors import MessageError, WorkerError
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.peer_faults import FAULTS, reading
+from cavmarl.parallel.nodes.peer_faults import reading
+from cavmarl.parallel.nodes.zone_moves import living_of
 from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.traffic.sumo.sumo_history import ToldLog
@@ -44,6 +46,7 @@ class StateReplicas:
         self._number = number
         self.own: dict[int, Bytes] = {}
         self.others: dict[int, dict[int, Bytes]] = {}
+        self._arrived: dict[int, NodeFrame] = {}  # newest replica of each sender, unread
         self._given: dict[int, NodeFrame] = {}  # state of each node that gives zones away
         self._is_settled = True  # no state was kept since `settle`
 
@@ -63,9 +66,10 @@ class StateReplicas:
             for old in [number for number in states if number < newest]:
                 del states[old]
 
-    def keep(self, state: int, living: Sequence[int]) -> None:
-        """Keep the present state here, and send a replica to the next living node."""
-        data = to_bytes(self._worlds.save())
+    def keep(self, state: int, living: Sequence[int]) -> list[Array]:
+        """Keep the present state here, and send a replica to the next living node; return it."""
+        saved = self._worlds.save()
+        data = to_bytes(saved)
         _add(self.own, state, data)
         self._is_settled = False
         if len(living) > 1:
@@ -74,6 +78,7 @@ class StateReplicas:
         else:
             logs = to_bytes([log.words for log in self._logs])
             self._links.send(COORDINATOR, FrameKind.KEEP, state, [logs, data])
+        return saved
 
     def resume_from(self, state: int, data: Bytes) -> None:
         """Take over a state that the coordinator has kept for the only node, which is lost.
@@ -91,9 +96,47 @@ class StateReplicas:
         self.own[state] = to_bytes(saved)
 
     def receive(self, number: int, frame: NodeFrame) -> None:
-        """Keep the replica of another node."""
-        _add(self.others.setdefault(number, {}), frame.number, frame.data)
+        """Take the replica of another node; `await_replica` reads it."""
+        self._arrived[number] = frame
+
+    def await_replica(
+        self, state: int, zones: Sequence[Sequence[int]], like: Sequence[Array]
+    ) -> None:
+        """Wait for the state of the previous living node, check it, and keep it.
+
+        A damaged state is found while its sender still lives.
+
+        Args:
+            state: its number.
+            zones: of each node.
+            like: the same state of this node.
+
+        Raises:
+            LinkLostError: the previous node has not sent the state, or its state is damaged.
+            RecoveryOrderedError: the coordinator has ordered a recovery.
+        """
+        living, arrived = living_of(zones), self._arrived
+        previous = living[living.index(self._number) - 1]
+        if previous == self._number:
+            return
+
+        def has_come() -> bool:
+            return previous in arrived and arrived[previous].number == state
+
+        self._links.await_urgent(previous, has_come)
+        data = arrived.pop(previous).data
+        with reading(previous):
+            self._check_zones(self._read(data, like), zones[previous])
+        _add(self.others.setdefault(previous, {}), state, data)
         self._is_settled = False
+
+    def _check_zones(self, saved: Sequence[Array], zones: Sequence[int]) -> None:
+        """Raise MessageError if a state has vehicles of other zones than these."""
+        count = self._worlds.world.partition.count
+        first = len(saved) - self._worlds.simulation.num_worlds * count
+        found = {n % count for n, rows in enumerate(saved[first:]) if len(rows)}
+        if not found <= {*zones}:
+            raise MessageError(f"its state has vehicles of zones {sorted(found - {*zones})}")
 
     def receive_given(self, number: int, frame: NodeFrame) -> None:
         """Take the state of another node, some of whose zones this node will host."""
@@ -107,13 +150,14 @@ class StateReplicas:
         takers: Sequence[int],  # nodes that get zones of this node
         zones: Sequence[int],  # of this node from now on
         generation: int,  # number of changes of nodes
-        check: Callable[[], None],  # raises if the awaited frames will never come
     ) -> None:
         """Resume from a kept state.
 
         Later states are dropped: otherwise they would count as the newest ones.
 
         Raises:
+            LinkLostError: a donor has gone, or its state is damaged.
+            RecoveryOrderedError: the coordinator has ordered another recovery.
             WorkerError: the state of a lost node is not here.
         """
         for states in (self.own, *self.others.values()):
@@ -125,29 +169,20 @@ class StateReplicas:
             found = self.others.get(number, {}).get(state)
             if saved is None or found is None:
                 raise WorkerError(f"there is no replica of the state of node {number}")
-            try:
-                theirs = self._read(found, like)
-            except FAULTS as error:
-                raise WorkerError(f"the state of node {number} is damaged: {error}") from error
-            saved[self._first - 1] += self._join(saved, theirs, like)
+            saved[self._first - 1] += self._join(saved, self._read(found, like), like)
         if takers and saved is not None:
             data = to_bytes(saved)
             for taker in takers:
                 self._links.send(taker, FrameKind.GIVE, generation, [data])
         for donor in donors:
-            check()
-            self._links.wanted = (donor,)
-            while donor not in self._given or self._given[donor].number != generation:
-                self._links.pump(None)
-                check()  # this call may receive the awaited frame
-            self._links.wanted = ()
+            self._links.await_urgent(donor, partial(self._has_given, donor, generation))
             with reading(donor):
                 given = self._read(self._given.pop(donor).data, like)
+                if saved is not None:
+                    self._join(saved, given, like)
             if saved is None:
                 saved = given
                 saved[self._first - 1][...] = 0  # contacts stay with the node that counted them
-            else:
-                self._join(saved, given, like)
         if saved is None:
             raise WorkerError(f"there is no replica of state {state}")
         count = self._worlds.world.partition.count
@@ -155,6 +190,9 @@ class StateReplicas:
             if (n - self._first) % count not in zones:
                 saved[n] = saved[n][:0]
         self._worlds.load_own(saved, zones[0])
+
+    def _has_given(self, donor: int, generation: int) -> bool:
+        return donor in self._given and self._given[donor].number == generation
 
     def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
         """Read a kept state. Raises ConfigError: the worlds cannot resume from it."""
@@ -173,6 +211,9 @@ class StateReplicas:
 
         Returns:
             (W,) contacts that the other node has counted.
+
+        Raises:
+            MessageError: both states have vehicles of a zone.
         """
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
         first = self._first
@@ -181,6 +222,8 @@ class StateReplicas:
         for n in range(first, len(saved)):
             if not len(other[n]):
                 continue
+            if len(saved[n]):
+                raise MessageError(f"its state has vehicles of zone {(n - first) % zones}, too")
             saved[n] = other[n]
             w = (n - first) // zones
             agents = other[n]["agent"][other[n]["agent"] >= 0]

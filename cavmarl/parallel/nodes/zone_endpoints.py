@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
-from cavmarl.core.errors import MessageError
+from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.core.records.arrays import DepartureQueue
-from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
+from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.kernels.invariant_checks import owned_sum
@@ -28,7 +28,16 @@ from cavmarl.ownership.codec import decode, encode
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import COORDINATOR, Done, Message, Prepare, Removed
+from cavmarl.ownership.messages import (
+    COORDINATOR,
+    Abort,
+    Ack,
+    Done,
+    Message,
+    Nack,
+    Prepare,
+    Removed,
+)
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
 from cavmarl.parallel.network.transport import Bytes
@@ -66,7 +75,7 @@ NOTHING = Report([], [], False, [])
 class ZoneEndpoints:
     """The endpoints of the zones of one node in W worlds."""
 
-    coordinators: tuple[LocalCoordinator, ...] = ()  # the coordinator is in another process
+    coordinators: tuple[Coordinator, ...] = ()  # the coordinator is in another process
     needs_ghosts = True
 
     def __init__(
@@ -79,6 +88,9 @@ class ZoneEndpoints:
         links: Links,  # to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) actions and state of agents
         checks: IndexCheck,  # checks offered vehicles
+        # output: world, vehicle and zone of each offer that was answered in the present lease or in
+        # the one before
+        answered: list[tuple[int, int, int]],
         *,
         generation: int = 0,  # number of changes of nodes
         is_checked: bool = False,  # the caller checks the vehicles that zones own
@@ -88,9 +100,13 @@ class ZoneEndpoints:
         self._generation, self._is_checked = generation, is_checked
         self._owned_sum = specialized(owned_sum)
         self._carried = carried
-        # world, vehicle → state of its agent
-        self._arrived_agents: dict[tuple[int, int], memoryview] = {}
+        # world, vehicle → node that has sent the state of its agent, and the state
+        self._arrived_agents: dict[tuple[int, int], tuple[int, memoryview]] = {}
+        # world, vehicle → node that has offered it last
+        self._sources: dict[tuple[int, int], int] = {}
         self._division, self._checks = division, checks
+        self._answered, self._num_answered = answered, 0  # number before the present lease
+        answered.clear()
         self._zones = frozenset(zones)
         self._node_of = node_of
         self._links = links
@@ -103,8 +119,8 @@ class ZoneEndpoints:
         self._gone: list[dict[int, int]] = [{} for _ in range(num_worlds)]
         # target zones of offered vehicles that have not left
         self._targets: list[dict[int, int]] = [{} for _ in range(num_worlds)]
-        # messages for an episode that starts with the next lease
-        self._early: list[tuple[int, Message]] = []
+        # messages for an episode that starts with the next lease, and their senders
+        self._early: list[tuple[int, int, Message]] = []
         self._began = [False] * num_worlds
         self._stirred = [True] * num_worlds
         self._is_quiet = [False] * num_worlds  # the lease has come without a STEP
@@ -140,16 +156,19 @@ class ZoneEndpoints:
         addressed = {w for w, _ in messages}
         with reading(COORDINATOR):
             check_indices("world", addressed, len(self._endpoints))
-        for w, message in messages:
-            self._apply(w, message)
-        for w, endpoints in enumerate(self._endpoints):
-            if not (w in addressed or self._leases[w] or self._is_quiet[w]):
-                self._is_quiet[w] = True
-                for endpoint in endpoints.values():
-                    endpoint.go_on()
+            for w, message in messages:
+                self._apply(w, message)
+            for w, endpoints in enumerate(self._endpoints):
+                if not (w in addressed or self._leases[w] or self._is_quiet[w]):
+                    self._is_quiet[w] = True
+                    for endpoint in endpoints.values():
+                        endpoint.go_on()
         early, self._early = self._early, []
-        for w, message in early:
-            self._apply(w, message)
+        for number, w, message in early:
+            with reading(number):
+                self._receive_message(number, w, message)
+        del self._answered[: self._num_answered]
+        self._num_answered = len(self._answered)
 
     def _is_leased(self, w: int) -> bool:
         return self._is_quiet[w] or len(self._leases[w]) == len(self._zones)
@@ -164,7 +183,8 @@ class ZoneEndpoints:
     def _enter_lease(self) -> None:
         for w, leases in enumerate(self._leases):
             if leases:
-                self._change_owners(w, leases)
+                with reading(COORDINATOR):
+                    self._change_owners(w, leases)
                 self._leases[w] = {}
         self._is_open = True
 
@@ -295,23 +315,59 @@ class ZoneEndpoints:
                     self._send(w, message)
         return movers, is_late
 
-    def receive(self, frame: NodeFrame) -> None:
-        """Apply messages of other nodes as soon as they come."""
+    def receive(self, number: int, frame: NodeFrame) -> None:
+        """Apply messages of another node as soon as they come."""
         messages = unpacked(frame.data)
         check_indices("world", (w for w, _ in messages), len(self._endpoints))
         for w, message in messages:
+            self._check_zones(number, message)
             for offer in message.entries if isinstance(message, Prepare) else ():
                 record = self._division.codec.record(offer.state, offer.vehicle)
                 self._checks.check_state(record)
-            self._apply(w, message)
+            self._receive_message(number, w, message)
+
+    def _check_zones(self, number: int, message: Message) -> None:
+        """Raise MessageError if a node must not send this message to this node."""
+        if isinstance(message, Prepare | Abort):
+            zone = message.source
+        elif isinstance(message, Ack | Nack):
+            zone = message.zone
+        else:
+            raise MessageError(f"it must not send messages of kind {type(message).__name__}")
+        check_indices("zone", [zone], len(self._node_of))
+        if self._node_of[zone] != number:
+            raise MessageError(f"it sends for zone {zone}, which it does not host")
+        if self._zones.isdisjoint(message.destinations()):
+            raise MessageError(f"it sends for zones {message.destinations()} to another node")
+
+    def _receive_message(self, number: int, w: int, message: Message) -> None:
+        """Apply a message of another node.
+
+        Raises:
+            MessageError: the message does not fit the present tick.
+        """
+        (zone,) = self._zones.intersection(message.destinations())
+        endpoint = self._endpoints[w][zone]
+        if isinstance(message, Prepare):
+            if message.episode == endpoint.episode + 1:
+                self._early.append((number, w, message))  # the other node got its lease first
+                return
+            self._sources |= {(w, offer.vehicle): number for offer in message.entries}
+        elif isinstance(message, Abort):
+            for vehicle, _ in message.entries:
+                self._sources.pop((w, vehicle), None)
+        dropped = endpoint.dropped.total()
+        self._apply(w, message)
+        if endpoint.dropped.total() > dropped and not isinstance(message, Abort):
+            raise MessageError(
+                f"a {type(message).__name__} of tick {message.tick} does not fit zone {zone} at "
+                f"tick {endpoint.tick}"
+            )
 
     def _apply(self, w: int, message: Message) -> None:
         for zone in message.destinations():
             endpoint = self._endpoints[w].get(zone)
             if endpoint is None:
-                continue
-            if isinstance(message, Prepare) and message.episode > endpoint.episode:
-                self._early.append((w, message))  # the other node got its lease first
                 continue
             reaction = endpoint.on_message(message)
             if reaction.advance is not None:
@@ -321,12 +377,14 @@ class ZoneEndpoints:
 
     def _send(self, w: int, message: Message) -> None:
         """Send a message to its zones, in this process or others, and to the coordinator."""
+        if isinstance(message, Ack | Nack):
+            self._answered += [(w, entry.vehicle, message.zone) for entry in message.entries]
         for destination in message.destinations():
             if destination in self._zones:
                 self._apply_own(w, destination, message)
             else:
                 to = COORDINATOR if destination == COORDINATOR else self._node_of[destination]
-                self._links.send(to, FrameKind.MESSAGES, 0, [packed([(w, message)])])
+                self._links.send(to, FrameKind.MESSAGES, self._generation, [packed([(w, message)])])
 
     def _apply_own(self, w: int, zone: int, message: Message) -> None:
         reaction = self._endpoints[w][zone].on_message(message)
@@ -345,8 +403,9 @@ class ZoneEndpoints:
             owned = self._endpoints[w][zone].owned
             for vehicle, state in advance.enter:
                 division.changes.take_over(w, zone, vehicle, owned[vehicle], state)
+                source = self._sources.pop((w, vehicle), None)
                 if vehicle not in left:
-                    self._await_agent(w, vehicle)
+                    self._await_agent(w, vehicle, source)
 
     def _agent(self, w: int, vehicle: int) -> int:
         """Return the agent of a vehicle; -1: none."""
@@ -364,34 +423,33 @@ class ZoneEndpoints:
             pieces = [_LENGTH.pack(w, 0), np.int64(vehicle).tobytes(), *kept]
             self._links.send(self._node_of[target], FrameKind.AGENT, self._generation, pieces)
 
-    def _await_agent(self, w: int, vehicle: int) -> None:
+    def _await_agent(self, w: int, vehicle: int, source: int | None) -> None:
         """Wait for the state of an agent from the node that its vehicle comes from."""
-        agent = self._agent(w, vehicle)
+        agent, arrived = self._agent(w, vehicle), self._arrived_agents
         if agent < 0:
             return
-        if (w, vehicle) not in self._arrived_agents:
-            others = {node for zone, node in enumerate(self._node_of) if zone not in self._zones}
-            self._links.wanted = others  # only a silent node has not sent its next share
-            while (w, vehicle) not in self._arrived_agents:
-                self._links.check_recovery()
-                self._links.pump(None)
-            self._links.wanted = ()
-        data, at = self._arrived_agents.pop((w, vehicle)), 0
+        if source is None:
+            raise ProtocolError(f"vehicle {vehicle} enters, but no node has offered it")
+        self._links.await_urgent(source, lambda: (w, vehicle) in arrived)
+        number, data = arrived.pop((w, vehicle))
+        if number != source:
+            error = MessageError(f"it sends the agent of vehicle {vehicle}, which it does not own")
+            raise LinkLostError(number, error)
+        at = 0
         for array in self._carried:
             kept = array[w, agent : agent + 1]
             kept[...] = np.frombuffer(data, array.dtype, kept.size, at).reshape(kept.shape)
             at += kept.nbytes
 
-    def receive_agent(self, frame: NodeFrame) -> None:
+    def receive_agent(self, number: int, frame: NodeFrame) -> None:
         """Keep the state of an agent from another node until its vehicle comes."""
-        if frame.number == self._generation:
-            w, _ = _LENGTH.unpack_from(frame.data)
-            vehicle = int(np.frombuffer(frame.data, np.int64, 1, _LENGTH.size)[0])
-            check_indices("world", [w], len(self._endpoints))
-            size = sum(array[0, 0].nbytes for array in self._carried)
-            if len(frame.data) != _LENGTH.size + 8 + size:
-                raise MessageError(f"{len(frame.data)} bytes are not the state of an agent")
-            self._arrived_agents[w, vehicle] = frame.data[_LENGTH.size + 8 :]
+        w, _ = _LENGTH.unpack_from(frame.data)
+        vehicle = int(np.frombuffer(frame.data, np.int64, 1, _LENGTH.size)[0])
+        check_indices("world", [w], len(self._endpoints))
+        size = sum(array[0, 0].nbytes for array in self._carried)
+        if len(frame.data) != _LENGTH.size + 8 + size:
+            raise MessageError(f"{len(frame.data)} bytes are not the state of an agent")
+        self._arrived_agents[w, vehicle] = number, frame.data[_LENGTH.size + 8 :]
 
 
 def hostings_as_json(hostings: Sequence[Sequence[Hosting]]) -> list[list[list[int]]]:

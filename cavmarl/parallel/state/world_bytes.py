@@ -70,7 +70,8 @@ def _read(file: BytesIO, end: int) -> Array:
     """
     if np.lib.format.read_magic(file) != (1, 0):
         raise ValueError("an array has another header")
-    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    size = file.read(2)
+    shape, is_fortran, dtype = _parsed(size + file.read(int.from_bytes(size, "little")))
     count = prod(shape)
     if is_fortran or dtype.hasobject or count < 0 or count * dtype.itemsize > end - file.tell():
         raise ValueError(f"an array of {dtype} and the shape {shape}")
@@ -79,6 +80,12 @@ def _read(file: BytesIO, end: int) -> Array:
     if dtype == np.bool_ and (array.view(np.uint8) > 1).any():
         raise ValueError("a flag is neither true nor false")
     return array
+
+
+@lru_cache(maxsize=1024)
+def _parsed(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return the shape, the order and the type in a header. Parsing is slow, so it is cached."""
+    return np.lib.format.read_array_header_1_0(BytesIO(header))
 
 
 class SavedWorlds:

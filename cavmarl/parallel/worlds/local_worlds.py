@@ -416,6 +416,7 @@ def kept_elsewhere(config: EnvConfig) -> str:
     kept = {
         "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
         "workers.sensors": config.workers.sensors,
+        "zones.simulators": config.zones.simulators,
     }
     return next((key for key, is_so in kept.items() if is_so), "")
 

@@ -7,15 +7,15 @@ ellipsoid at an origin. z is the height above the origin.
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.rig import GnssConfig
-from cavmarl.core.errors import MapError, require
 from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.elementary_arrays import atan2_all, cos_all, hypot_all, sin_all
+from cavmarl.maps.projection import projection_of
 from cavmarl.roads.network import GeoReference, RoadNetwork
 
 Points = NDArray[np.float64]
@@ -24,7 +24,6 @@ Points = NDArray[np.float64]
 _AXIS_M = 6_378_137.0
 _FLATTENING = 1.0 / 298.257223563
 _SQUARED_ECCENTRICITY = _FLATTENING * (2.0 - _FLATTENING)
-_OF_HEIGHTS = ("+geoidgrids=", "+geoid_crs=", "+vunits=", "+vto_meter=")
 _ROUNDS = 6  # fixed-point iterations for the height; each adds at least two digits
 
 
@@ -58,11 +57,7 @@ class ProjectedMap:
     """
 
     def __init__(self, geo: GeoReference, height_m: float) -> None:
-        pyproj: Any = require("pyproj", "maps")
-        try:
-            self._project = pyproj.Proj(projparams=_in_the_plane(geo.projection))
-        except pyproj.exceptions.ProjError as error:
-            raise MapError(f"projection {geo.projection!r}: {error}") from error
+        self._project = projection_of(geo)
         self._offset_m = np.array([geo.offset_x_m, geo.offset_y_m, -height_m])
 
     def to_earth(self, points: Points) -> Points:
@@ -105,12 +100,6 @@ class TangentPlane:
 
     def to_map(self, places: Points) -> Points:
         return _turned(_to_centred(places) - self._origin_m, self._axes.T)
-
-
-def _in_the_plane(projection: str) -> str:
-    """Remove the vertical part of a PROJ string, for which PROJ may need extra files."""
-    words = projection.split()
-    return " ".join(word for word in words if not word.startswith(_OF_HEIGHTS))
 
 
 def _turned(points: Points, axes: Points) -> Points:

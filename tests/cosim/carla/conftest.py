@@ -29,8 +29,10 @@ from cavmarl.cosim.carla.hosted_world import LoadedWorlds
 Call = Callable[..., Any]
 
 
-def make_server(agents: int = 3, background: int = 8, **options: Any) -> CarlaServer:
-    spec = WorldSpec.of("grid4x4", agents=agents, background=background)
+def make_server(
+    agents: int = 3, background: int = 8, env: str = "grid4x4", **options: Any
+) -> CarlaServer:
+    spec = WorldSpec.of(env, agents=agents, background=background)
     return CarlaServer(LoadedWorlds(spec), port=0, **options)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.call_table import CALLS, Caller, Returns, answer
 from cavmarl.cosim.carla.carla_geometry import CarlaPose
-from cavmarl.cosim.carla.carla_session import CarlaSession, SessionLimits
+from cavmarl.cosim.carla.carla_session import CarlaSession, OtherTicks, SessionLimits
 from tests.cosim.carla.conftest import Call, make_server
 
 POSE = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
@@ -85,6 +86,11 @@ def test_blueprints_have_recommended_values_for_what_can_be_changed(call: Call) 
             assert not can_change or recommended, f"{type_id}: {name} = {default}"
 
 
+def test_sensors_that_are_not_available_are_refused_by_name(call: Call) -> None:
+    with pytest.raises(RuntimeError, match=r"sensor\.camera\.dvs is not available"):
+        call("spawn_actor", [1, "sensor.camera.dvs", []], POSE)
+
+
 def test_a_sensor_lives_until_it_is_destroyed(session: CarlaSession, call: Call) -> None:
     parent = car_0(session)
     number, attached_to, (_, type_id, _), _, _, token = call(
@@ -131,18 +137,17 @@ def test_an_unknown_actor_is_named(call: Call) -> None:
         call("apply_control_to_vehicle", 10**6, [0.0, 0.0, 0.0, False, False, False, 0])
 
 
-def test_a_control_drives_an_agent_until_its_client_leaves(
-    session: CarlaSession, call: Call
-) -> None:
-    number = car_0(session)
+def test_a_control_drives_an_agent_until_its_client_leaves(session: CarlaSession) -> None:
+    number, caller = car_0(session), Caller("a client that leaves")
+    control = [0.0, 0.0, 1.0, False, False, False, 0]
     for _ in range(60):
-        call("apply_control_to_vehicle", number, [0.0, 0.0, 1.0, False, False, False, 0])
+        answer(caller, session, "apply_control_to_vehicle", [number, control])
         session.tick()
     state = session.actors.state_of(session.actors.actors[number])
     assert state is not None
     assert state["brake"] == 1.0
     assert np.linalg.norm(state["velocity"]) < 0.1
-    session.release({0})
+    session.release(caller)
     assert 0 not in session.world.controls
 
 
@@ -179,13 +184,44 @@ def test_settings_are_kept_and_impossible_steps_refused(session: CarlaSession, c
     assert call("tick_cue") == session.frame + 1
 
 
+@pytest.mark.parametrize("other_ticks", ["obey", "refuse", "follow"])
+def test_ticks_of_a_second_client_are_noticed(
+    other_ticks: OtherTicks, caplog: pytest.LogCaptureFixture
+) -> None:
+    with make_server(agents=1, background=0, other_ticks=other_ticks) as server:
+        session = server.session
+        session.settings = replace(session.settings, synchronous=True)
+        first, second = Caller("first"), Caller("second")
+        assert answer(first, session, "tick_cue", [])[1] == [[1, 1]]
+        world_tick = session.world.master.tick
+        told = answer(second, session, "tick_cue", [])[1]
+        master = session.world.master
+        assert [(one.kind, one.follower) for one in master.events] == [("own_tick", "second")]
+        assert master.followers == ()
+        assert "second ticks, but first has ticked first" in caplog.text
+        if other_ticks == "obey":
+            assert (told, session.frame) == ([[1, 2]], 2)
+            assert master.tick > world_tick
+        elif other_ticks == "follow":
+            assert (told, session.frame, master.tick) == ([[1, 2]], 1, world_tick)
+        else:
+            assert told[0][0] == 0
+            assert "second ticks, but first is the time master: wait for its ticks" in told[0][1][0]
+            assert (session.frame, master.tick) == (1, world_tick)
+        answer(first, session, "tick_cue", [])
+        assert master.own_ticks == 1
+        session.release(first)
+        answer(second, session, "tick_cue", [])  # it is the master now
+        assert master.own_ticks == 1
+
+
 def test_a_step_that_does_not_fit_restarts_the_world(session: CarlaSession, call: Call) -> None:
     rest = [True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
     episode, lights = session.episode, session.actors.lights["id"].tolist()
     call("set_episode_settings", [True, False, [True, 0.02], *rest])
     assert session.world.step_s == pytest.approx(0.02)
     assert session.episode == episode
-    assert not set(lights) & set(session.actors.lights["id"].tolist())
+    assert session.actors.lights["id"].tolist() == lights
     session.tick()
     assert session.world.master.dt_s == pytest.approx(0.02)
     call("set_episode_settings", [False, False, [False], *rest])
@@ -201,6 +237,10 @@ def test_a_map_is_loaded_by_its_name(session: CarlaSession, call: Call) -> None:
     call("load_new_episode", "", True, 0)
     assert session.map.path == "Carla/Maps/intersection"
     call("load_new_episode", "grid4x4", True, 0)
+    assert len(session.world.env.agents) == 3  # as the server was started
+    assert not {"cities", "cities_validation"} & {
+        name.rpartition("/")[2] for name in call("get_available_maps")
+    }
 
 
 def test_managers_are_listed(call: Call) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element, fromstring
 
@@ -19,7 +20,7 @@ from cavmarl.maps.exports.opendrive_carla import (
     origin_of,
 )
 from cavmarl.roads.cache import load_network
-from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.network import SIGNAL_STATES, GeoReference, RoadNetwork
 
 
 @pytest.fixture(scope="module")
@@ -76,12 +77,38 @@ def test_long_ids_of_signals_are_replaced() -> None:
     assert [one.get("id") for one in root.iterfind("junction/controller")] == ["c"]
 
 
+def test_junctions_lead_only_to_lanes_for_cars() -> None:
+    root = fromstring(
+        '<OpenDRIVE><road id="1"><lanes><laneSection><right><lane id="-1" type="restricted"/>'
+        '<lane id="-2" type="driving"/></right></laneSection></lanes></road><road id="2"><lanes>'
+        '<laneSection><right><lane id="-1" type="biking"/></right></laneSection></lanes></road>'
+        '<junction id="9"><connection id="0" connectingRoad="1"><laneLink from="-1" to="-1"/>'
+        '<laneLink from="-2" to="-2"/></connection><connection id="1" connectingRoad="2">'
+        '<laneLink from="-1" to="-1"/></connection></junction></OpenDRIVE>'
+    )
+    fit_to_carla(root, DEFAULT_ORIGIN)
+    (connection,) = root.iter("connection")
+    assert connection.get("connectingRoad") == "1"
+    assert [link.get("to") for link in connection] == ["-2"]
+
+
 def test_the_header_has_a_place_on_the_earth(root: Element) -> None:
     header = root.find("header")
     assert header is not None
     assert header.get("revMinor") == "4"
     place = header.findtext("geoReference", "")
     assert f"+lat_0={DEFAULT_ORIGIN[0]:.9f} +lon_0={DEFAULT_ORIGIN[1]:.9f}" in place
+
+
+def test_the_origin_of_a_map_needs_no_files_of_heights(network: RoadNetwork) -> None:
+    """CARLA's towns name a geoid, for which PROJ would need a file."""
+    pytest.importorskip("pyproj", reason="needs the extra 'maps'")
+    projection = (
+        "+proj=tmerc +lat_0=49 +lon_0=8 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m "
+        "+geoidgrids=egm96_15.gtx +vunits=m +no_defs"
+    )
+    there = replace(network, geo=GeoReference(projection, 0.0, 0.0))
+    assert origin_of(there) == pytest.approx((49.0, 8.0))
 
 
 def test_the_file_for_carla_has_the_same_roads(tmp_path: Path) -> None:
@@ -129,6 +156,33 @@ def test_spawn_points_are_on_lanes_in_their_direction(
         away, heading = min(found)
         assert away < 0.01
         assert math.remainder(heading + pose.yaw, 360.0) == pytest.approx(0.0, abs=0.1)
+
+
+def test_spawn_points_lead_to_each_other(carla_map: CarlaMap, network: RoadNetwork) -> None:
+    """Lanes that lead out of the map, or come from outside, have no spawn points."""
+    lanes = [
+        lane
+        for lane in np.flatnonzero(~network.lanes["internal"]).tolist()
+        for pose in carla_map.spawn_points
+        for s, d, _, _ in [network.beside(lane, pose.x, -pose.y)]
+        if abs(d) < 0.5 and 0.0 < s < network.lanes["length_m"][lane]
+    ]
+    edges = set(network.lanes["edge"][lanes].tolist())
+    after = {
+        edge: set(
+            network.lanes["edge"][
+                network.links["to_lane"][network.lanes["edge"][network.links["from_lane"]] == edge]
+            ].tolist()
+        )
+        & edges
+        for edge in edges
+    }
+    assert len(edges) == 48
+    for first in edges:
+        seen = {first}
+        while new := set().union(*(after[edge] for edge in seen)) - seen:
+            seen |= new
+        assert seen == edges
 
 
 def test_a_light_stands_at_its_stop_line(carla_map: CarlaMap, network: RoadNetwork) -> None:

@@ -90,7 +90,7 @@ found["off_lane"] = max(
         + FREE,
     )
     assert found["name"] == "Carla/Maps/grid4x4"
-    assert found["points"] == 320
+    assert found["points"] == 192
     assert found["away"] == pytest.approx(0.3, abs=0.3)
     assert found["turned"] < 1.0
     assert found["lights"] == [64, 64]

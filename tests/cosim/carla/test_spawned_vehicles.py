@@ -169,3 +169,74 @@ def test_bad_spawns_are_refused(call: Call, session: CarlaSession) -> None:
         assert call("destroy_actor", number)
     session.tick()
     assert not any(number in session.actors.actors for number in made)
+
+
+def test_spawned_actors_outlive_a_change_of_the_step() -> None:
+    """CARLA's examples spawn first, and then choose a step that restarts the world."""
+    with running_server(agents=2, background=2) as port:
+        found = run_client(
+            port,
+            FIND_FREE
+            + """
+start = points[0]
+car = world.spawn_actor(library.find("vehicle.tesla.model3"), start)
+gnss = world.spawn_actor(library.find("sensor.other.gnss"), carla.Transform(), attach_to=car)
+lights = [one.id for one in world.get_actors().filter("traffic.traffic_light")]
+fixes = queue.Queue()
+settings = world.get_settings()
+settings.synchronous_mode, settings.fixed_delta_seconds = True, 1.0 / 30.0
+world.apply_settings(settings)
+gnss.listen(fixes.put)
+frame = world.tick()
+found["late"] = fixes.get(timeout=10.0).frame - frame
+found["moved"] = car.get_location().distance(start.location)
+found["lights"] = lights == [one.id for one in world.get_actors().filter("traffic.traffic_light")]
+car.apply_control(carla.VehicleControl(throttle=0.8))
+for _ in range(45):
+    world.tick()
+before = car.get_location()
+found["speed"] = car.get_velocity().length()
+settings.fixed_delta_seconds = 0.02
+world.apply_settings(settings)
+frame = world.tick()
+while fixes.get(timeout=10.0).frame < frame:
+    pass
+found["kept"] = [car.get_velocity().length(), car.get_location().distance(before)]
+found["throttle"] = car.get_control().throttle
+gnss.stop()
+found["destroyed"] = [gnss.destroy(), car.destroy()]
+"""
+            + FREE,
+        )
+    assert found["late"] == 0
+    assert found["moved"] < 0.5
+    assert found["lights"]
+    assert found["speed"] > 3.0
+    assert found["kept"][0] >= found["speed"]
+    assert 0.0 < found["kept"][1] < 2.0
+    assert found["throttle"] == pytest.approx(0.8)
+    assert found["destroyed"] == [True, True]
+
+
+def test_a_tick_waits_for_the_listener_of_a_new_sensor() -> None:
+    with running_server(agents=1, background=0) as port:
+        found = run_client(
+            port,
+            SYNCHRONOUS
+            + """
+blueprint = world.get_blueprint_library().find("sensor.other.imu")
+vehicle = next(iter(world.get_actors().filter("vehicle.*")))
+late = []
+for _ in range(20):
+    sensor = world.spawn_actor(blueprint, carla.Transform(), attach_to=vehicle)
+    frames = queue.Queue()
+    sensor.listen(frames.put)
+    frame = world.tick()
+    late.append(frames.get(timeout=10.0).frame - frame)
+    sensor.stop()
+    sensor.destroy()
+found["late"] = late
+"""
+            + FREE,
+        )
+    assert found["late"] == [0] * 20

@@ -1,0 +1,1 @@
+"""Measures controllers of signals, beside SUMO with the map's own programs."""

@@ -1,0 +1,308 @@
+"""The program of a process that runs a zone with CARLA's official client.
+
+It is run by its file name, possibly by another Python, and imports nothing of this package: CARLA's
+client supports only some versions of Python, and it can abort its process. Requests come as lines
+of JSON on standard input; each line is answered with one line.
+
+CARLA's frame is left-handed: y and yaw have the opposite sign.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+SPAWN_HEIGHT_M = 0.3  # above the ground, so that the wheels do not touch it
+LARGE_M = 7.0  # longer vehicles are buses or trucks
+WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles
+MOST_SLIP = 0.6  # largest sine of the slip angle
+PLACED_TICKS = 2  # ticks for which a vehicle is placed, before it drives by its own physics
+SEEN_LANES = 0.5  # least share of the sent places that must be on a road of CARLA's map
+STATES = {"r": "Red", "y": "Yellow", "u": "Yellow", "g": "Green", "G": "Green", "s": "Red"}
+
+Row = Sequence[float]
+
+
+class CarState(NamedTuple):
+    """The state of a vehicle in cavmarl's frame: m, rad, m/s."""
+
+    x: float
+    y: float
+    z: float
+    heading: float
+    speed: float
+
+    @classmethod
+    def of(cls, row: Row) -> CarState:
+        return cls(*row[1:6])
+
+    def after(self, dt: float) -> CarState:
+        """Return the state after a tick straight on."""
+        step_m = self.speed * dt
+        x, y = self.x + step_m * math.cos(self.heading), self.y + step_m * math.sin(self.heading)
+        return self._replace(x=x, y=y)
+
+
+class Car:
+    """An actor that stands for a vehicle."""
+
+    def __init__(self, actor: Any, pose: CarState) -> None:
+        self.actor = actor
+        self.pose = pose  # where it was placed last
+        self.length_m = 2.0 * actor.bounding_box.extent.x
+        self.is_owned = False
+        self.is_seen = False  # a snapshot has had it; before, it reads as place (0, 0, 0)
+        self.left = PLACED_TICKS  # ticks for which it is still placed
+
+
+class Zone:
+    """The vehicles of a zone in CARLA's world.
+
+    Args:
+        start: host, port, timeout in s, length of a tick in s, and places on lanes.
+    """
+
+    def __init__(self, start: dict[str, Any]) -> None:
+        self._carla: Any = importlib.import_module("carla")
+        self._client = self._carla.Client(start["host"], start["port"])
+        self._client.set_timeout(start["timeout_s"])
+        self._dt, self._timeout_s = start["dt"], start["timeout_s"]
+        self._world = self._client.get_world()
+        self._map = self._world.get_map()
+        self._check_map(start["places"])
+        self._before = self._world.get_settings()
+        settings = self._world.get_settings()
+        settings.synchronous_mode, settings.fixed_delta_seconds = True, self._dt
+        self._world.apply_settings(settings)
+        self._cars: dict[int, Car] = {}
+        lights = {
+            light.get_opendrive_id(): light
+            for light in self._world.get_actors().filter("traffic.traffic_light")
+        }
+        id_of = _signal_ids(self._map.to_opendrive())
+        self._lights = {name: lights[one] for name, one in id_of.items() if one in lights}
+        self._shown: dict[str, str] = {}
+        self._world.freeze_all_traffic_lights(True)  # their own programs do not run
+        library = self._world.get_blueprint_library().filter("vehicle.*")
+        self._blueprints = sorted(library, key=lambda one: str(one.id))
+
+    def _check_map(self, places: Sequence[Sequence[float]]) -> None:
+        on_road = sum(
+            self._map.get_waypoint(self._carla.Location(x, -y, z), project_to_road=False)
+            is not None
+            for x, y, z in places
+        )
+        if on_road < SEEN_LANES * len(places):
+            raise ValueError(
+                f"its map {self._map.name} is another one: {len(places) - on_road} of "
+                f"{len(places)} places on lanes are beside its roads; load the map of this world "
+                "(cavmarl map export NAME --carla --opendrive FILE)"
+            )
+
+    def prepare(self, rows: Sequence[Row]) -> dict[int, str]:
+        refused = {}
+        for row in rows:
+            vehicle = int(row[0])
+            reason = "" if vehicle in self._cars else self._place(vehicle, row)
+            if reason:
+                refused[vehicle] = reason
+        return refused
+
+    def spawn(self, rows: Sequence[Row]) -> None:
+        for row in rows:
+            vehicle = int(row[0])
+            if vehicle not in self._cars and (reason := self._place(vehicle, row)):
+                raise ValueError(f"vehicle {vehicle}, which CARLA had accepted: {reason}")
+            car = self._cars[vehicle]
+            car.is_owned, car.left = True, 0 if car.is_seen else PLACED_TICKS
+            car.actor.set_simulate_physics(True)
+            car.actor.set_target_velocity(self._velocity(CarState.of(row)))
+
+    def _place(self, vehicle: int, row: Row) -> str:
+        """Add an actor without physics. Return the reason if CARLA refuses it, else ""."""
+        pose = CarState.of(row)
+        there = self._transform(pose._replace(z=pose.z + SPAWN_HEIGHT_M))
+        try:
+            actor = self._world.spawn_actor(self._blueprint(row[6]), there)
+        except RuntimeError as error:
+            return str(error)
+        actor.set_simulate_physics(False)
+        self._cars[vehicle] = Car(actor, pose)
+        return ""
+
+    def _blueprint(self, length_m: float) -> Any:
+        bases = ("bus", "truck") if length_m > LARGE_M else ("car",)
+        fitting = [
+            one
+            for one in self._blueprints
+            if one.has_attribute("base_type") and str(one.get_attribute("base_type")) in bases
+        ]
+        return (fitting or self._blueprints)[0]
+
+    def drop(self, vehicles: Sequence[int]) -> None:
+        """Give vehicles up. Those that remain visible become ghosts in `show`."""
+        for vehicle in vehicles:
+            car = self._cars[vehicle]
+            car.is_owned = False
+            car.actor.set_simulate_physics(False)
+
+    def show(self, ghosts: Sequence[Row], signals: dict[str, str]) -> None:
+        near = {int(row[0]): row for row in ghosts}
+        for vehicle in [one for one, car in self._cars.items() if not car.is_owned]:
+            if vehicle not in near:
+                self._cars.pop(vehicle).actor.destroy()
+        moves = []
+        for vehicle, row in near.items():
+            if vehicle not in self._cars:
+                self._place(vehicle, row)  # if CARLA refuses it, it is not shown now
+                continue
+            car = self._cars[vehicle]
+            car.pose = CarState.of(row).after(self._dt)  # where it is at the end of the tick
+            moves.append(self._move(car))
+        if moves:
+            self._client.apply_batch_sync(moves, False)
+        for name, letter in signals.items():
+            light = self._lights.get(name)
+            if light is not None and self._shown.get(name) != letter:
+                self._shown[name] = letter
+                light.set_state(getattr(self._carla.TrafficLightState, STATES.get(letter, "Off")))
+
+    def advance(
+        self, wanted: Sequence[Row], aims: Sequence[Sequence[float] | None]
+    ) -> list[list[float]]:
+        """Run a tick. Return (id, x, y, heading, speed) of the owned vehicles."""
+        commands = []
+        before = self._world.get_snapshot()
+        for row, aim in zip(wanted, aims, strict=True):
+            car, pose = self._cars[int(row[0])], CarState.of(row)
+            now = self._find(before, int(row[0]))
+            if now is not None and car.left == 0:
+                commands.append(self._drive(car, now, pose, aim))
+            else:
+                commands.append(self._move(car, pose))
+            car.pose = pose
+        self._client.apply_batch_sync(commands, False)
+        self._world.tick(self._timeout_s)
+        after = self._world.get_snapshot()
+        found = []
+        for row in wanted:
+            car, now = self._cars[int(row[0])], self._find(after, int(row[0]))
+            pose = now if now is not None and car.is_seen and car.left == 0 else car.pose
+            found.append([row[0], pose.x, pose.y, pose.heading, pose.speed])
+        for car in self._cars.values():
+            if car.is_seen:
+                car.left = max(0, car.left - 1)
+            car.is_seen |= after.find(car.actor.id) is not None
+        return found
+
+    def _find(self, snapshot: Any, vehicle: int) -> CarState | None:
+        """Return the state of a vehicle in a snapshot; None if no snapshot has had it yet."""
+        car = self._cars[vehicle]
+        state = snapshot.find(car.actor.id)
+        if state is None and car.is_seen:
+            raise ValueError(f"CARLA no longer has the actor of vehicle {vehicle}")
+        return None if state is None else self._read(state)
+
+    def _move(self, car: Car, pose: CarState | None = None) -> Any:
+        there = self._transform(car.pose if pose is None else pose)
+        return self._carla.command.ApplyTransform(car.actor, there)
+
+    def _drive(self, car: Car, now: CarState, wanted: CarState, aim: Sequence[float] | None) -> Any:
+        """Return the control by which a vehicle reaches its wanted speed, and steers.
+
+        It steers to its aim by pure pursuit (Coulter 1992). An agent turns as it is commanded.
+        """
+        accel = (wanted.speed - now.speed) / self._dt
+        if aim is None:
+            turn = math.remainder(wanted.heading - now.heading, 2.0 * math.pi)
+            curvature = turn / (max(now.speed, 0.1) * self._dt)
+        else:
+            dx, dy = aim[0] - now.x, aim[1] - now.y
+            angle = math.atan2(dy, dx) - now.heading
+            curvature = 2.0 * math.sin(angle) / max(math.hypot(dx, dy), 1.0)
+        slip = 0.5 * WHEELBASE_SHARE * car.length_m * curvature
+        slip = min(max(slip, -MOST_SLIP), MOST_SLIP)
+        steer = math.atan(2.0 * math.tan(math.asin(slip)))
+        control = self._carla.VehicleAckermannControl(
+            steer=-steer, speed=max(0.0, now.speed + 0.5 * accel), acceleration=abs(accel)
+        )
+        return self._carla.command.ApplyVehicleAckermannControl(car.actor, control)
+
+    def _read(self, state: Any) -> CarState:
+        there, velocity = state.get_transform(), state.get_velocity()
+        heading = -math.radians(there.rotation.yaw)
+        speed = velocity.x * math.cos(heading) - velocity.y * math.sin(heading)
+        place = there.location
+        return CarState(place.x, -place.y, place.z, math.remainder(heading, 2.0 * math.pi), speed)
+
+    def _transform(self, pose: CarState) -> Any:
+        yaw = -math.degrees(pose.heading)
+        place = self._carla.Location(pose.x, -pose.y, pose.z)
+        return self._carla.Transform(place, self._carla.Rotation(yaw=yaw))
+
+    def _velocity(self, pose: CarState) -> Any:
+        cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+        return self._carla.Vector3D(pose.speed * cos, -pose.speed * sin, 0.0)
+
+    def close(self) -> None:
+        """Remove all actors, and restore the settings of CARLA's world."""
+        for car in self._cars.values():
+            car.actor.destroy()
+        self._cars.clear()
+        self._world.freeze_all_traffic_lights(False)
+        self._world.apply_settings(self._before)
+
+
+def _signal_ids(document: str) -> dict[str, str]:
+    """Return the ids of the signals in an OpenDRIVE document, by name."""
+    found = {}
+    for element in re.findall(r"<signal\s[^>]*>", document):
+        values = dict(re.findall(r'(\w+)="([^"]*)"', element))
+        found[values.get("name", "")] = values.get("id", "")
+    return found
+
+
+def answer(zone: Zone, kind: str, content: dict[str, Any]) -> Any:
+    """Return the result of a request."""
+    calls: dict[str, Callable[..., Any]] = {
+        "prepare": zone.prepare,
+        "spawn": zone.spawn,
+        "drop": zone.drop,
+        "show": zone.show,
+        "advance": zone.advance,
+        "close": zone.close,
+    }
+    return calls[kind](**content)
+
+
+def main() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what CARLA's client prints is no answer
+    zone: Zone | None = None
+    for line in sys.stdin:
+        content = json.loads(line)
+        kind = content.pop("do")
+        try:
+            if zone is None:
+                zone, result = Zone(content), None
+            else:
+                result = answer(zone, kind, content)
+            text = json.dumps({"result": result})
+        except Exception as error:  # the client raises many kinds of exceptions
+            text = json.dumps({"error": f"{type(error).__name__}: {error}"})
+        answers.write(text + "\n")
+        answers.flush()
+    if zone is not None:  # the process that has started this one has ended
+        zone.close()
+
+
+if __name__ == "__main__":
+    main()

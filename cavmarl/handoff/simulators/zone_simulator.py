@@ -1,0 +1,114 @@
+"""`ZoneSimulator`: the interface of another simulator that moves the vehicles of one zone.
+
+The rows of such a zone are ordinary rows of a shard. cavmarl's drivers decide in them, and its
+signals, contacts, sensors and messages read them. In each tick, the simulator receives the state
+that each vehicle should reach, and reports the state that the vehicle has reached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.roads.network import RoadNetwork
+
+MOTION = np.dtype(
+    [
+        ("id", np.int64),
+        ("x", np.float64),
+        ("y", np.float64),
+        ("heading", np.float64),  # rad, counter-clockwise from east
+        ("speed", np.float64),  # m/s along the heading
+    ],
+    align=True,
+)
+"""The state of a vehicle that a simulator reports, in the frame of `driving.vehicles`."""
+
+
+class ZoneSetup(NamedTuple):
+    """The zone that a simulator runs."""
+
+    world: int  # number of the world
+    zone: int
+    # min_x, min_y, max_x, max_y of the zone in m; zones at the rim of the map extend to infinity
+    rect: tuple[float, float, float, float]
+    network: RoadNetwork
+    dt_s: float  # length of a tick
+    wheelbases: NDArray[np.float64]  # m, by `VEHICLE["vtype"]`
+    place: str  # the text after `NAME://` in `zones.simulators`, without options; may be empty
+    options: Mapping[str, str]  # the options after `?`
+
+
+class ZoneSimulator(Protocol):
+    """Another simulator that moves the vehicles of one zone of one world.
+
+    Calls raise any exception if the simulator cannot go on; the world then ends with a
+    `ZoneSimulatorError`, or cavmarl takes the zone back. Vehicles are records
+    `driving.vehicles.VEHICLE`.
+    """
+
+    def prepare(self, vehicles: NDArray[np.void]) -> Mapping[int, str]:
+        """Make room for vehicles VEHICLE (n,) that may enter the zone now.
+
+        Returns:
+            Vehicle → reason, for each vehicle that cannot enter now.
+        """
+        ...
+
+    def spawn(self, vehicles: NDArray[np.void]) -> None:
+        """Own vehicles VEHICLE (n,) from now on, after `prepare` has accepted them."""
+        ...
+
+    def drop(self, vehicles: Sequence[int]) -> None:
+        """Give vehicles up, by id: they have left the world or the zone."""
+        ...
+
+    def show(self, ghosts: NDArray[np.void], signals: Sequence[str]) -> None:
+        """Show what surrounds the vehicles in the next tick.
+
+        Args:
+            ghosts: VEHICLE (n,), all vehicles of other zones near this zone. They have no physics.
+            signals: the state of each signal, one of SUMO's letters per link index, in the order of
+                `network.signal_ids`.
+        """
+        ...
+
+    def advance(self, wanted: NDArray[np.void], aims: NDArray[np.float64]) -> None:
+        """Begin a tick, and possibly return before it ends.
+
+        Args:
+            wanted: VEHICLE (n,), the owned vehicles as they would be after the tick if cavmarl
+                moved them, with the commanded `throttle` and `steering`.
+            aims: (n, 2), a point in m ahead on the way of each vehicle, for simulators that steer;
+                NaN for agents, whose `steering` is theirs.
+        """
+        ...
+
+    def read(self) -> NDArray[np.void]:
+        """Wait for the end of the tick. Return the owned vehicles, MOTION (n,) in any order."""
+        ...
+
+    def close(self) -> None:
+        """End the simulator's part: remove all its vehicles, and end its processes."""
+        ...
+
+
+MakeSimulator = Callable[[ZoneSetup], ZoneSimulator]
+
+
+def number_option(options: Mapping[str, str], name: str, default: float, most: float) -> float:
+    """Return the value of an option. Raises ConfigError unless it is above 0 and at most `most`."""
+    try:
+        value = float(options.get(name, default))
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value <= most:  # false for NaN
+        raise ConfigError(
+            f"zones.simulators: {name} = {options[name]!r}: must be a number above 0 and at most "
+            f"{most:g}"
+        )
+    return value

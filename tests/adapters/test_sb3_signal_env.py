@@ -1,0 +1,85 @@
+"""Signals as rows for stable-baselines3, against the worlds that they show."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.env.vector import make_vec
+
+sb3 = pytest.importorskip("stable_baselines3")
+
+KEYS = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 2.5, "horizon_s": 40.0}
+
+
+def make(env: str = "grid4x4", **more: Any) -> Any:
+    from cavmarl.adapters.sb3_signal_env import CavSb3SignalEnv
+
+    return CavSb3SignalEnv(env, num_worlds=2, background=60, **{"overrides": KEYS, **more})
+
+
+def test_a_step_lasts_from_decision_to_decision() -> None:
+    vec = make_vec(
+        "grid4x4",
+        num_envs=2,
+        agents=0,
+        background=60,
+        overrides=KEYS | {"signals.agents": "all"},
+    )
+    rows = make()
+    with closing(vec), closing(rows):
+        rows.seed(3)
+        seen = rows.reset()
+        expected, _ = vec.reset(seed=3)
+        assert seen.shape == (32, rows.observation_space.shape[0])
+        np.testing.assert_array_equal(seen, expected["signals"].reshape(32, -1))
+        rng = np.random.default_rng(0)
+        ends = 0
+        for _ in range(20):
+            actions = rng.integers(0, 2, 32)
+            seen, rewards, done, infos = rows.step(actions)
+            total = np.zeros((2, 16), np.float32)
+            over = np.zeros((2, 16), np.bool_)
+            for _ in range(2):  # 5 s between decisions
+                expected, gained, _, truncated, _ = vec.step({"signals": actions.reshape(2, 16)})
+                total += gained["signals"]
+                over |= truncated["signals"]
+            np.testing.assert_array_equal(seen, expected["signals"].reshape(32, -1))
+            np.testing.assert_array_equal(rewards, total.reshape(-1))
+            np.testing.assert_array_equal(done, over.reshape(-1))
+            np.testing.assert_array_equal(infos[5]["action_mask"], rows.action_masks()[5])
+            for row in np.flatnonzero(done):
+                assert infos[row]["TimeLimit.truncated"]
+                assert infos[row]["terminal_observation"].shape == seen[row].shape
+            ends += done.sum()
+        assert ends == 2 * 32
+
+
+def test_an_action_beyond_the_greens_keeps_the_green() -> None:
+    beyond, kept = make(), make()
+    with closing(beyond), closing(kept):
+        for rows in (beyond, kept):
+            rows.seed(1)
+            rows.reset()
+        for _ in range(5):
+            one, other = beyond.step(np.full(32, 7)), kept.step(np.zeros(32, int))
+            np.testing.assert_array_equal(one[0], other[0])
+
+
+def test_ppo_learns_from_the_rows() -> None:
+    rows = make()
+    with closing(rows):
+        model = sb3.PPO("MlpPolicy", rows, n_steps=8, batch_size=64, n_epochs=1, device="cpu")
+        model.learn(8 * 32)
+        assert model.num_timesteps == 8 * 32
+
+
+def test_what_the_adapter_decides_is_refused() -> None:
+    with pytest.raises(ConfigError, match="autoreset_mode"):
+        make(autoreset_mode="next_step")
+    with pytest.raises(ConfigError, match="no signal of this map"):
+        make("merge")

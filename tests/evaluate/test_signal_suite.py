@@ -1,0 +1,132 @@
+"""Figures of controllers of signals, and the suite that compares them."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cavmarl import ConfigError
+from cavmarl.cli import app
+from cavmarl.driving.vehicles import VEHICLE
+from cavmarl.evaluate.signals.emissions import co2_mg_per_s
+from cavmarl.evaluate.signals.signal_meter import SignalFigures, SignalMeter
+from cavmarl.evaluate.signals.signal_runs import run_controller, run_sumo
+from cavmarl.evaluate.traffic.sumo_side import SumoJob
+from cavmarl.roads.cache import load_network
+from cavmarl.traffic.sumo.sumo_input import read_input
+
+MAP = Path("envs/grid4x4/map/map.net.xml")
+NUMBERS = np.random.default_rng(0)
+
+
+def test_co2_is_that_of_sumo(tmp_path: Path) -> None:
+    sumo = pytest.importorskip("sumo")
+    speed, accel = NUMBERS.uniform(0.0, 40.0, 3000), NUMBERS.uniform(-4.0, 3.0, 3000)
+    # SUMO's numbers have five digits. Near the speed or the deceleration of coasting, they may be
+    # on its other side.
+    speed, accel = np.round(speed, 4), np.round(accel, 4)
+    cycle, found = tmp_path / "cycle.csv", tmp_path / "found.csv"
+    pairs = enumerate(zip(speed, accel, strict=True))
+    cycle.write_text("\n".join(f"{k};{v};{a};0" for k, (v, a) in pairs))
+    subprocess.run(
+        [
+            Path(sumo.SUMO_HOME, "bin", "emissionsDrivingCycle"), "--have-slope",
+            "-t", cycle, "-o", found, "-e", "HBEFA4/PC_petrol_Euro-4",
+        ],
+        check=True, env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME}, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    with found.open() as file:
+        expected = np.array([float(row[5]) for row in csv.reader(file, delimiter=";")])
+    ours = co2_mg_per_s(speed, accel)
+    coasting = -np.minimum(0.0515 * speed, 0.1065 + 0.013 * speed)
+    near = (np.abs(accel - coasting) < 0.003) | (np.abs(speed - 0.5) < 0.1)
+    assert np.count_nonzero(near) < 60
+    np.testing.assert_allclose(ours[~near], expected[~near], atol=1.0)
+    assert np.count_nonzero(expected) > 1000
+
+
+def test_the_meter_counts_waiting_stops_and_red() -> None:
+    """One vehicle stands three seconds before a red line, drives, and stands again."""
+    network = load_network(MAP)
+    meter = SignalMeter(network, 0.5)
+    link = int(np.flatnonzero(network.links["signal"] >= 0)[0])
+    rows = np.zeros(1, VEHICLE)
+    rows["lane"], rows["departed"], rows["order"] = network.links["from_lane"][link], 8, 0
+    red = np.zeros(len(network.links), np.uint8)
+    green = np.full(len(network.links), 3, np.uint8)
+    due = np.array([4])
+    shown = [(0.0, red), (0.0, red), (0.0, red), (5.0, red), (0.0, red), (0.0, green)]
+    for second, (speed, codes) in enumerate(shown, start=5):
+        rows["speed"], rows["free_s"] = speed, 0.25
+        meter.sample(rows, 2 * second, due, codes)
+    figures = meter.result(
+        arrived=0, trip_s=0.0, delay_s=0.0, waiting_s=np.array([7.0]), switches_per_h=None
+    )
+    assert figures.waiting_s == 5.0
+    assert figures.stops == 2.0
+    assert figures.longest_red_s == 3.0
+    assert figures.most_queued == 1
+    assert figures.queue == pytest.approx(5 / 6)
+    assert figures.never_departed == 1
+    assert figures.delay_s is None
+    # Lost: (20 - 8) / 2 - 0.25 s on the way and 2 s before it; and 7 s of the one that waits.
+    assert figures.delay_of_all_s == pytest.approx((6.0 - 0.25 + 2.0 + 7.0) / 2)
+
+
+def test_controllers_and_sumo_are_measured_alike(tmp_path: Path) -> None:
+    demand = tmp_path / "regular.rou.xml"
+    demand.write_text(
+        '<routes><vType id="car" sigma="0" speedDev="0"/>'
+        '<route id="along" edges="left0A0 A0B0 B0C0 C0D0 D0right0"/>'
+        '<route id="across" edges="bottom1B0 B0B1 B1B2 B2B3 B3top1"/>'
+        '<flow id="a" type="car" route="along" begin="0" end="200" period="6"/>'
+        '<flow id="b" type="car" route="across" begin="0" end="200" period="8"/>'
+        "</routes>"
+    )
+    keys = {"traffic.demand": [str(demand)], "population.background": 0}
+    ours = run_controller("grid4x4", "map", seconds=400, seeds=[1], overrides=keys)
+    chosen = run_controller("grid4x4", "max_pressure", seconds=400, seeds=[1], overrides=keys)
+    sumo = run_sumo(SumoJob(MAP, read_input([demand]), 400, 0.2, 1))
+    assert ours[0].departed == chosen[0].departed == sumo.departed > 0
+    assert ours[0].arrived == sumo.arrived > 0
+    assert ours[0].trip_s == pytest.approx(sumo.trip_s, rel=0.15)
+    assert ours[0].co2_g_per_km == pytest.approx(sumo.co2_g_per_km, rel=0.25)
+    assert ours[0].switches_per_h is None
+    assert chosen[0].switches_per_h is not None
+    assert chosen[0].switches_per_h > 0.0
+    assert sumo.queue is None
+
+
+def test_a_step_of_another_length_and_an_unknown_controller_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"clock\.ctrl_dt_s: figures are sampled every second"):
+        run_controller(
+            "grid4x4", "program", seconds=9, seeds=[1], overrides={"clock.ctrl_dt_s": 0.2}
+        )
+    with pytest.raises(ConfigError, match=r"signals\.controller = 'greedy'"):
+        run_controller("grid4x4", "greedy", seconds=9, seeds=[1])
+
+
+def test_the_suite_prints_a_table(tmp_path: Path) -> None:
+    suite = tmp_path / "small.yaml"
+    suite.write_text(
+        "maps: [grid4x4]\nmore_maps: [none.sumocfg]\ncontrollers: [map, longest_queue]\n"
+        "background: 60\nhorizon_s: 120\n"
+    )
+    found = CliRunner().invoke(
+        app, ["suite", str(suite), "--repeats", "2", "--json", str(tmp_path / "all.json")]
+    )
+    assert found.exit_code == 0, found.output
+    assert "left out: none.sumocfg" in found.output
+    assert "longest_queue" in found.output
+    content = (tmp_path / "all.json").read_text()
+    for name in asdict(SignalFigures(0, 0, 0, None, 0.0, None, 0.0, 0.0, *[None] * 5)):
+        assert f'"{name}"' in content
+    refused = CliRunner().invoke(app, ["suite", str(suite), "--policy", "idm"])
+    assert refused.exit_code != 0
