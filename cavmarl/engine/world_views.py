@@ -129,6 +129,7 @@ class WorldViews:
             config=config.signals,
             dt=config.clock.sim_dt_s,
             table=part.table,
+            observations=outputs.observations,
             ticks=self.ticks(),
             counts=outputs.counts,
             states=outputs.states,

@@ -333,12 +333,13 @@ class NativeTraffic:
         if self.file is None or own.agents + own.background + own.insertions + own.external > 0:
             return VIEW_M
         fast_mps = FAST_FACTOR * float(self.network.lanes["speed_mps"].max())
-        return max(
+        looks_m = [
             VIEW_M
             if not kind["as_sumo"]
             else min(look_m(kind, min(fast_mps, float(kind["max_speed"]))), VIEW_M)
             for kind in self.file.types
-        )
+        ]
+        return max(looks_m, default=VIEW_M)  # a file may have no vehicles
 
     @cached_property
     def slots(self) -> WaySlots | None:
