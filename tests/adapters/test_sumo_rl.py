@@ -614,9 +614,7 @@ def test_there_is_no_connection_to_sumo(routes: str) -> None:
     with closing(grid(routes)) as env:
         for owner in (env, env.traffic_signals["A0"]):
             assert not hasattr(owner, "sumo")
-            with pytest.raises(
-                ConfigError, match=r"there is no TraCI; read the methods of"
-            ):
+            with pytest.raises(ConfigError, match=r"there is no TraCI; read the methods of"):
                 _ = owner.sumo
         with pytest.raises(AttributeError, match="no attribute 'wings'"):
             _ = env.wings
