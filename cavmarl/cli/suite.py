@@ -41,10 +41,10 @@ SIGNAL_FIGURES = {
     "arrived": "arrived",
     "never_departed": "never departed",
     "delay_s": "delay, s",
-    "delay_of_all_s": "delay of all trips, s",
-    "trip_s": "travel time, s",
+    "delay_of_all_s": "delay of all, s",
+    "trip_s": "trip, s",
     "waiting_s": "waiting, s",
-    "stops": "stops of a vehicle",
+    "stops": "stops",
     "queue": "queue",
     "most_queued": "longest queue",
     "co2_g_per_km": "CO₂, g/km",
@@ -98,7 +98,7 @@ def suite(
                 began=lambda world: told(places[world.label], len(worlds)),
             )
         for label, found in figures.items():
-            console.print(_signal_table(label, found))
+            console.print(signal_table(label, found))
         write_json(json_path, _as_numbers(figures))
         return
     make_folder(out)
@@ -118,13 +118,16 @@ def suite(
     write_json(json_path, {label: found.to_dict() for label, found in reports.items()})
 
 
-def _signal_table(label: str, found: Mapping[str, Sequence[SignalFigures]]) -> Table:
+def signal_table(label: str, found: Mapping[str, Sequence[SignalFigures]]) -> Table:
     """Return a table of mean figures on one map, with the half width of their 95 % interval."""
     rows = [
         (title, *(_mean_cell(runs, name) for runs in found.values()))
         for name, title in SIGNAL_FIGURES.items()
     ]
-    return grid((escape(label), *found), rows)
+    heads = (escape(label), *(name.replace("_", " ") for name in found))
+    table = grid(heads, rows, wraps=True)
+    table.columns[0].no_wrap = True
+    return table
 
 
 def _mean_cell(runs: Sequence[SignalFigures], name: str) -> str:
@@ -133,9 +136,11 @@ def _mean_cell(runs: Sequence[SignalFigures], name: str) -> str:
     values = np.array([getattr(run, name) for run in runs], dtype=np.float64)
     if np.isnan(values).all():
         return "-"
-    interval = mean_interval(values)
-    spread = "" if interval is None else f" ± {0.5 * (interval.high - interval.low):.1f}"
-    return f"{values.mean():.1f}{spread}"
+    interval, mean = mean_interval(values), values.mean()
+    half = 0.0 if interval is None else 0.5 * (interval.high - interval.low)
+    digits = 1 if max(abs(mean), half) < 100.0 else 0
+    spread = "" if interval is None else f"±{half:.{digits}f}"
+    return f"{mean:.{digits}f}{spread}"
 
 
 def _as_numbers(figures: Mapping[str, Mapping[str, Sequence[SignalFigures]]]) -> dict[str, Any]:

@@ -1,11 +1,11 @@
-"""`SignalsConfig`: signals that agents control."""
+"""`SignalsConfig`: signals that agents or the caller control."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from cavmarl.config.checks import Section, Within, check_finite
+from cavmarl.config.checks import Section, Whole, Within, check_finite
 from cavmarl.core.errors import ConfigError
 
 # The named terms of a signal's reward, in the order of every array of signal terms
@@ -33,11 +33,16 @@ class SignalsConfig(Section, key="signals"):
         all_red_s: duration of red for all links, between yellow and the next green.
         min_green_s: a green lasts at least this long.
         max_green_s: at a decision, a green that has lasted this long ends; 0: no maximum.
+        greens: which phases of a program are greens. `distinct`: those with a green and no yellow
+            letter for vehicles; phases with equal letters count once. `all`: as in sumo-rl, each
+            phase without the letter `y` that has any letter but `r` and `s`.
         action: `next_phase`: the index of the next green. `keep_or_next`: 0 keeps the green, 1
             begins the next one in the order of the program.
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
+        overrides: number of links at whose signals the caller may show states of its own in a world
+            at the same time (`SignalOverrides`).
     """
 
     agents: str | tuple[str, ...] = NO_SIGNALS
@@ -47,9 +52,11 @@ class SignalsConfig(Section, key="signals"):
     all_red_s: Annotated[float, Within(0.0, 60.0)] = 0.0
     min_green_s: Annotated[float, Within(0.0, 3600.0)] = 5.0
     max_green_s: Annotated[float, Within(0.0, 3600.0)] = 60.0
+    greens: Literal["distinct", "all"] = "distinct"
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
     terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
+    overrides: Annotated[int, Whole(0, 100_000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -58,6 +58,7 @@ class SignalAgents:
             config=self._config,
             dt=self._dt,
             table=self.table,
+            observations=arrays.signal_observations,
             ticks=arrays.ticks,
             counts=arrays.signal_counts,
             states=arrays.signal_states,

@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.signal_rows import ControlledPhase, SignalRows
 
 AGENT_PROGRAM = "agent"
 MAX_GREENS = 64
-_GREENS, _YELLOWS = "gG", "yYu"
+_GREENS, _YELLOWS, _REDS = "gG", "yYu", "rs"
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class AgentProgram(NamedTuple):
         pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
         found = [*greens]
         for is_used, duration_s, make in (
-            (self.yellow, config.yellow_s, _yellow),
+            (self.yellow, config.yellow_s, between_greens),
             (self.all_red, config.all_red_s, _all_red),
         ):
             if not is_used:
@@ -72,8 +72,8 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     """Return a network in which agents choose the phases of signals.
 
     The greens of a signal are the phases of its program with a green and no yellow letter, in the
-    order of the program; equal ones count once. Other programs and timetables of these signals do
-    not run.
+    order of the program; see `signals.greens`. Other programs and timetables of these signals
+    do not run.
 
     Args:
         network: the map.
@@ -89,7 +89,7 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     if not config.are_controlled:
         return network
     greens = {
-        name: greens_of(network, row)[: MAX_GREENS + 1]
+        name: greens_of(network, row, config.greens == "all")[: MAX_GREENS + 1]
         for row, name in enumerate(network.signal_ids)
     }
     chosen = _chosen(network, config, greens)
@@ -105,22 +105,32 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     )
 
 
-def greens_of(network: RoadNetwork, signal: int) -> tuple[tuple[str, float], ...]:
-    """Return the greens of a signal's present program: letters, and duration in s; each once."""
+def greens_of(
+    network: RoadNetwork, signal: int, every: bool = False
+) -> tuple[tuple[str, float], ...]:
+    """Return the greens of a signal's present program: letters, and duration in s.
+
+    `every`: whether the greens are those of `signals.greens = all`.
+    """
     links = network.links[network.links["signal"] == signal]
     used = sorted({int(index) for index in links["signal_index"]})
     program = network.programs[network.signals["program"][signal]]
     num_links = int(network.signals["num_links"][signal])
     first = int(program["first_phase"])
-    found: dict[str, float] = {}
+    found: list[tuple[str, float]] = []
     for phase in network.phases[first : first + program["num_phases"]]:
         start = int(phase["first_state"])
         codes = network.phase_states[start : start + num_links].tolist()
         letters = "".join(SIGNAL_STATES[code] for code in codes)
-        shown = {letters[index] for index in used}
-        if shown & set(_GREENS) and not shown & set(_YELLOWS):
-            found.setdefault(letters, float(phase["duration_s"]))
-    return tuple(found.items())
+        if every:
+            is_green = "y" not in letters and bool(set(letters) - set(_REDS))
+        else:
+            shown = {letters[index] for index in used}
+            is_green = bool(shown & set(_GREENS)) and not shown & set(_YELLOWS)
+            is_green = is_green and letters not in dict(found)
+        if is_green:
+            found.append((letters, float(phase["duration_s"])))
+    return tuple(found)
 
 
 def _chosen(
@@ -165,10 +175,10 @@ def _tell_once(source_hash: str, name: str, count: int, shown: str) -> None:
     )  # fmt: skip
 
 
-def _yellow(before: str, after: str) -> str:
+def between_greens(before: str, after: str) -> str:
     """Return the letters between two greens: green links that become red show yellow."""
     return "".join(
-        "y" if old in _GREENS and new in "rs" else old
+        "y" if old in _GREENS and new in _REDS else old
         for old, new in zip(before, after, strict=True)
     )
 

@@ -27,6 +27,7 @@ class SignalView(NamedTuple):
         config: durations and kind of action.
         dt: length of a tick in s.
         table: greens, lanes and movements of S signals.
+        observations: (W, S, D) as agents get them.
         ticks: (W,) since the reset.
         counts: (W, N, COUNTS) of the watched lanes; see `signals.kernels.lane_counts`.
         states: (W, S, HELD) of the signals; see `signals.kernels.green_choices`.
@@ -37,6 +38,7 @@ class SignalView(NamedTuple):
     config: SignalsConfig
     dt: float
     table: SignalTable
+    observations: NDArray[np.float32]
     ticks: NDArray[np.int64]
     counts: NDArray[np.int64]
     states: NDArray[np.int64]

@@ -124,7 +124,7 @@ def test_the_suite_prints_a_table(tmp_path: Path) -> None:
     )
     assert found.exit_code == 0, found.output
     assert "left out: none.sumocfg" in found.output
-    assert "longest_queue" in found.output
+    assert "longest queue" in found.output
     content = (tmp_path / "all.json").read_text()
     for name in asdict(SignalFigures(0, 0, 0, None, 0.0, None, 0.0, 0.0, *[None] * 5)):
         assert f'"{name}"' in content

@@ -153,3 +153,31 @@ def test_wrong_use_of_five_seeds_is_refused(
     listed.write_text("- env\n")
     given = (word.format(small=small, list=listed) for word in words)
     assert message in refusal(capsys, "five_seeds.py", *given)
+
+
+@pytest.mark.filterwarnings("ignore")  # what the library warns of itself
+def test_a_network_for_signals_is_trained_and_compared(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="needs the extra: train")
+    sizes = ["--num-worlds", 1, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]
+    words: list[object] = [
+        *sizes,
+        "--updates",
+        2,
+        "--background",
+        20,
+        "--horizon-s",
+        60,
+        "--evaluations",
+        1,
+    ]
+    done = call("signals_sb3.py", *words, "--runs", tmp_path, "--name", "a")
+    assert done.returncode == 0, done.stderr
+    manifest = read_closed(tmp_path / "a")
+    assert manifest["program"] == "signals_sb3.py"
+    assert set(manifest["results_sha256"]) == {"model.zip", "evaluation.json"}
+    figures = json.loads((tmp_path / "a" / "evaluation.json").read_text())
+    assert figures.keys() == {"PPO", "map", "program", "longest_queue", "max_pressure"}
+    assert figures["PPO"][0]["departed"] >= 20
+    again = call("signals_sb3.py", *words, "--runs", tmp_path, "--name", "a")
+    assert again.returncode == 2
+    assert "contains a run" in again.stderr

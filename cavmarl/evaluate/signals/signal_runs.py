@@ -17,8 +17,8 @@ from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.signals.signal_meter import SignalFigures, SignalMeter
 from cavmarl.evaluate.traffic.native_side import idle_commands
 from cavmarl.evaluate.traffic.sumo_side import SumoJob, start_sumo, sumo_process
-from cavmarl.render.ground import signal_codes
-from cavmarl.signals.controllers import make_controller
+from cavmarl.roads.shown_signals import signal_codes
+from cavmarl.signals.controllers import SignalController, make_controller
 from cavmarl.signals.kernels.green_choices import SINCE
 
 TICK_S = 0.2
@@ -27,7 +27,7 @@ OWN_PROGRAM = "map"  # the map's own programs, with their own yellow; no signal 
 
 def run_controller(
     env: str | Path,
-    controller: str,
+    controller: str | SignalController,
     *,
     seconds: int,
     seeds: Sequence[int],
@@ -37,7 +37,8 @@ def run_controller(
 
     Args:
         env: as in `make_vec`; there are no agents of vehicles.
-        controller: one of `SIGNAL_CONTROLLERS`, or `map` for the map's own programs.
+        controller: one of `SIGNAL_CONTROLLERS`, or a controller of all signals; `map`: the map's
+            own programs.
         seconds: simulated time.
         seeds: of the worlds.
         overrides: values of further keys.
@@ -52,7 +53,9 @@ def run_controller(
         "horizon_s": float(seconds + 1),  # so that no world resets in the last step
     }
     if controller != OWN_PROGRAM:
-        keys |= {"signals.agents": "all", "signals.controller": controller}
+        keys["signals.agents"] = "all"
+        if isinstance(controller, str):
+            keys["signals.controller"] = controller
     if keys["clock.ctrl_dt_s"] != 1.0:
         raise ConfigError("clock.ctrl_dt_s: figures are sampled every second; leave the key out")
     world = load_world(env, agents=0, overrides=keys)
@@ -60,22 +63,26 @@ def run_controller(
     simulation = Simulation(
         world.config, world.network, demand=world.demand, partition=world.partition
     )
-    return [_measured(simulation, seconds, seed) for seed in seeds]
+    chooser = None
+    if world.config.signals.are_controlled:
+        chooser = make_controller(controller) if isinstance(controller, str) else controller
+    return [_measured(simulation, chooser, seconds, seed) for seed in seeds]
 
 
-def _measured(simulation: Simulation, seconds: int, seed: int) -> SignalFigures:
+def _measured(
+    simulation: Simulation, controller: SignalController | None, seconds: int, seed: int
+) -> SignalFigures:
     simulation.seed(seed)
     simulation.reset()
     config, network = simulation.config, simulation.network
     meter = SignalMeter(network, config.clock.sim_dt_s)
     ticks_per_s = config.clock.ticks_per_step
     commands, view = idle_commands(simulation), None
-    if config.signals.are_controlled:
-        controller = make_controller(config.signals.controller)
+    if controller is not None:
         view = simulation.signal_view()
     switches = 0
     for second in range(1, seconds + 1):
-        if view is not None:
+        if view is not None and controller is not None:
             since = view.states[..., SINCE].copy()
             commands = replace(commands, signal_choices=controller.choose(view))
         simulation.step(commands)

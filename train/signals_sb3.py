@@ -1,0 +1,170 @@
+"""stable-baselines3's PPO for signals: all signals of all worlds share one network.
+
+    python train/signals_sb3.py --env grid4x4.sumocfg --updates 160
+
+Afterwards, the network and the scripted controllers run in worlds of other seeds, and a table shows
+their figures. The run's folder has stable-baselines3's `model.zip`, the figures as
+`evaluation.json`, and `manifest.json` with the conditions of the training.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from stable_baselines3 import PPO
+
+from cavmarl.adapters.sb3_signal_env import CavSb3SignalEnv
+from cavmarl.cli.suite import signal_table
+from cavmarl.core.progress import counting
+from cavmarl.evaluate.signals.signal_meter import SignalFigures
+from cavmarl.evaluate.signals.signal_runs import OWN_PROGRAM, run_controller
+from cavmarl.learning.checkpoint import writing
+from cavmarl.learning.options import check_at_least, run_folder, run_program
+from cavmarl.learning.run_folder import RunFolder, parse_run
+from cavmarl.signals.controllers import CONTROLLERS, SignalController, SignalView
+from cavmarl.signals.kernels.green_choices import GREEN, KEEP
+
+MODEL_FILE, FIGURES_FILE = "model.zip", "evaluation.json"
+FIRST_SEED = 1000  # of the evaluation
+TICK_S = 0.2
+
+
+@dataclass(frozen=True)
+class Args:
+    """The settings of a run; each is an option of the command line."""
+
+    program: ClassVar[str] = "signals_sb3.py"
+
+    env: Annotated[str, "environment: a name, a folder, a map file or a .sumocfg"] = "grid4x4"
+    num_worlds: Annotated[int, "number of parallel worlds"] = 8
+    background: Annotated[int, "vehicles of the generator; 0: those of the demand alone"] = 0
+    horizon_s: Annotated[int, "seconds of an episode"] = 3600
+    seed: Annotated[int, "root of all random numbers"] = 0
+    updates: Annotated[int, "updates of the network"] = 160
+    num_steps: Annotated[int, "decisions of a signal per update"] = 90
+    epochs: Annotated[int, "passes over the decisions of an update"] = 4
+    minibatches: Annotated[int, "minibatches per pass"] = 10
+    learning_rate: Annotated[float, "learning rate of Adam, annealed to 0"] = 1e-3
+    gamma: Annotated[float, "discount per decision"] = 0.95
+    queue_weight: Annotated[float, "weight of the reward's term queue"] = 0.1
+    hidden: Annotated[int, "width of the two hidden layers"] = 64
+    evaluations: Annotated[int, "worlds of the evaluation"] = 5
+    runs: Annotated[str, "folder of all runs"] = "runs"
+    name: Annotated[str, "folder of this run; empty: ENV_signals_SEED"] = ""
+
+    def __post_init__(self) -> None:
+        names = "num_worlds updates num_steps epochs minibatches hidden evaluations"
+        check_at_least(self, dict.fromkeys(names.split(), 1))
+
+    @property
+    def folder(self) -> Path:
+        """The folder of this run."""
+        return run_folder(self.runs, self.name, self.env, "signals", self.seed)
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """Keys of the worlds of training and evaluation."""
+        return {
+            "clock.sim_dt_s": TICK_S,
+            "population.mode": "open",
+            "population.background": self.background,
+            "signals.max_green_s": 0.0,
+            "signals.terms": {"queue": self.queue_weight},
+        }
+
+
+class SharedNetwork:
+    """A controller of signals: the most likely action of one network for all of them.
+
+    Args:
+        model: as trained on the rows of `CavSb3SignalEnv`.
+    """
+
+    def __init__(self, model: PPO) -> None:
+        self._model = model
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Return the choice (W, S) of each agent."""
+        shape = view.states.shape[:2]
+        rows = view.observations.reshape(shape[0] * shape[1], -1)
+        actions = self._model.predict(rows, deterministic=True)[0].reshape(shape)
+        actions = np.where(actions < view.table.arrays.num_greens, actions, view.states[..., GREEN])
+        return np.where(view.decides[:, None], actions, KEEP)
+
+
+def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
+    """Create the library's PPO on the signals of all worlds."""
+    keys = {**args.overrides, "clock.ctrl_dt_s": 5.0, "horizon_s": float(args.horizon_s)}
+    rows = CavSb3SignalEnv(args.env, num_worlds=args.num_worlds, overrides=keys)
+    model = PPO(
+        "MlpPolicy",
+        rows,
+        learning_rate=lambda left: args.learning_rate * left,
+        n_steps=args.num_steps,
+        batch_size=max(args.num_steps * rows.num_envs // args.minibatches, 2),
+        n_epochs=args.epochs,
+        gamma=args.gamma,
+        ent_coef=0.01,
+        policy_kwargs={"net_arch": [args.hidden, args.hidden]},
+        seed=args.seed,
+        device="cpu",
+    )
+    return model, rows
+
+
+def evaluate(args: Args, model: PPO) -> dict[str, list[SignalFigures]]:
+    """Run the network and the scripted controllers in worlds of equal seeds."""
+    controllers: dict[str, str | SignalController]
+    controllers = {"PPO": SharedNetwork(model), OWN_PROGRAM: OWN_PROGRAM}
+    controllers |= {name: name for name in CONTROLLERS}
+    found = {}
+    with counting(Console(), "controllers") as told:
+        for done, (name, controller) in enumerate(controllers.items()):
+            told(done, len(controllers))
+            found[name] = run_controller(
+                args.env,
+                controller,
+                seconds=args.horizon_s,
+                seeds=range(FIRST_SEED, FIRST_SEED + args.evaluations),
+                overrides=args.overrides,
+            )
+    return found
+
+
+def train(args: Args) -> Path:
+    """Train for all updates, and evaluate; return the folder of the run.
+
+    Raises:
+        CavmarlError: the settings or the environment are invalid.
+    """
+    torch.set_num_threads(1)  # more threads slow small networks down
+    model, rows = make_model(args)
+    with closing(rows), RunFolder(args, rows.get_attr("worlds")[0].world) as folder:
+        model.learn(args.updates * args.num_steps * rows.num_envs)
+        with writing(args.folder / MODEL_FILE):
+            model.save(args.folder / MODEL_FILE)
+        figures = evaluate(args, model)
+        Console().print(signal_table(Path(args.env).name, figures))
+        numbers = {name: [asdict(run) for run in runs] for name, runs in figures.items()}
+        with writing(args.folder / FIGURES_FILE):
+            (args.folder / FIGURES_FILE).write_text(json.dumps(numbers, indent=1) + "\n")
+        return folder.end((MODEL_FILE, FIGURES_FILE))
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train; return 0: trained, 2: wrong usage."""
+    return run_program(lambda: train(parse_run(Args, words, __doc__)), "trained: {folder}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
