@@ -83,7 +83,7 @@ class SignalMeter:
             rows: VEHICLE (n,) all vehicles.
             tick: since the reset.
             due_ticks: (num_orders,) ticks at which vehicles of the demand were due to depart.
-            codes: (num_links,) signal states of the links, as from `roads.shown_signals.signal_codes`.
+            codes: (num_links,) states of the links' signals; see `roads.shown_signals`.
         """
         ids, speed = rows["id"], np.abs(rows["speed"])
         self._grow(int(ids.max(initial=-1)) + 1)
