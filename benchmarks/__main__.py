@@ -11,6 +11,7 @@ from cavmarl.cli import main as cavmarl
 
 KEPT = {
     "step": "Agent-steps per second compared with highway-env.",
+    "signals": "Decisions of max pressure per second compared with sumo-rl.",
     "traffic": "Traffic compared with SUMO's own run of the same demand.",
     "train": "End-to-end PPO compared with stable-baselines3.",
 }

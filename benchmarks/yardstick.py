@@ -36,8 +36,8 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.maps.defects import LEVEL_M
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
-from cavmarl.render.ground import signal_codes
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.roads.sumo_net.reader import map_name
 
 MOST_SHARE = 0.0005  # largest share of trips that may end off the road or in a collision

@@ -30,7 +30,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
 
     A step of a row lasts from one decision to the next, `signals.decide_s`. Observations are padded
     with 0 to the longest one. All rows have as many actions as the signal with most greens; an
-    action beyond a signal's greens, or one that its mask excludes, keeps the green. The mask of
+    action beyond a signal's greens, or that its mask excludes, keeps the green. The mask of
     each row is `action_mask` in its info, and `action_masks()` returns all of them.
 
     Agents of vehicles, if there are any, follow the built-in driver.

@@ -258,6 +258,11 @@ class EnvConfig(Section, key=""):
             f"traffic.source = {source}: SUMO would not see such vehicles; leave the key out",
         )
         self.need(
+            "signals.overrides",
+            self.signals.overrides == 0,
+            f"traffic.source = {source}: SUMO runs the signals; leave the key out",
+        )
+        self.need(
             "signals.agents",
             not self.signals.are_controlled,
             f"traffic.source = {source}: SUMO runs the signals; leave the key out",

@@ -1,11 +1,11 @@
-"""`SignalsConfig`: signals that agents control."""
+"""`SignalsConfig`: signals that agents or the caller control."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from cavmarl.config.checks import Section, Within, check_finite
+from cavmarl.config.checks import Section, Whole, Within, check_finite
 from cavmarl.core.errors import ConfigError
 
 # The named terms of a signal's reward, in the order of every array of signal terms
@@ -41,6 +41,8 @@ class SignalsConfig(Section, key="signals"):
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
+        overrides: number of links at whose signals the caller may show states of its own in a world
+            at the same time (`SignalOverrides`).
     """
 
     agents: str | tuple[str, ...] = NO_SIGNALS
@@ -54,6 +56,7 @@ class SignalsConfig(Section, key="signals"):
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
     terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
+    overrides: Annotated[int, Whole(0, 100_000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

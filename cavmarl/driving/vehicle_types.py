@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.codes import MODEL_IDM
+from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
 from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.kernels.models.idm import (
     ACCEL_LIMIT,
@@ -167,6 +167,10 @@ AGENT_TYPES = {
     "truck": AgentType("truck", 8.0, 2.5, 3.6, 1.5, 4.0, 6.0, 3.0, 25.0, 4.8, 0.7),
     "bus": AgentType("bus", 12.0, 2.55, 3.2, 1.2, 3.5, 5.5, 3.0, 27.8, 6.0, 0.75),
 }
+# Types of the vehicles that the caller poses or drives, besides the car.
+EXTERNAL_TYPES = AGENT_TYPES | {
+    "pedestrian": AgentType("pedestrian", 0.5, 0.5, 1.75, 1.5, 2.0, 4.0, 0.5, 5.0, 0.5, 0.7),
+}
 CAR_WHEELBASE_M = 5.0  # the axles of highway-env's car are at its bumpers
 NO_LIMIT = 1e9  # the type does not limit a policy; `action` does
 
@@ -178,18 +182,21 @@ def set_model(types: NDArray[np.void] | np.void, model: int) -> None:
 
 
 def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void]:
-    """Return VTYPE (n,) of types of agents' vehicles by name: `car` and those of `AGENT_TYPES`."""
+    """Return VTYPE (n,) of types by name: `car` and those of `EXTERNAL_TYPES`."""
     chosen = list(names)
     types = generated_types(model).repeat(len(chosen))
     for record, name in zip(types, chosen, strict=True):
         if name == "car":
             continue
-        kind = AGENT_TYPES[name]
+        kind = EXTERNAL_TYPES[name]
         for field, value in kind._asdict().items():
             if field != "vclass":
                 record[field] = value
-        record["vclass"] = VEHICLE_CLASSES.index(kind.vclass)
-        record["permissions"] |= 1 << int(record["vclass"])  # in addition to the lanes of cars
+        if kind.vclass == "pedestrian":
+            record["vclass"], record["permissions"] = CLASS_PEDESTRIAN, 0
+        else:
+            record["vclass"] = VEHICLE_CLASSES.index(kind.vclass)
+            record["permissions"] |= 1 << int(record["vclass"])  # in addition to the lanes of cars
         record["desired_max_speed"] = kind.max_speed
         record["most_accel"], record["most_decel"] = kind.accel, kind.emergency_decel
     types.setflags(write=False)

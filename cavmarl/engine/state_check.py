@@ -30,7 +30,7 @@ from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.engine.component import Component
 from cavmarl.engine.external_component import ExternalComponent
 from cavmarl.handoff.division import ZonedShards
-from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.shards.row_check import LEAST_FACTOR, MOST
 from cavmarl.shards.state import Use, names_of
 from cavmarl.signals.kernels.green_choices import NEVER_MS
@@ -247,13 +247,18 @@ class StateForm(NamedTuple):
 
 
 def wrong_phases(phases: NDArray[np.int32], roads: RoadArrays | RoadNetwork) -> str:
-    """Return what is wrong with the present phases (…, num_signals); empty if nothing."""
+    """Return what is wrong with `Worlds.signal_phase` (…, columns); empty if nothing."""
+    phases, overridden = np.split(phases, [len(roads.signals)], axis=-1)
     if _outside(phases, 0, max(len(roads.phases), 1)):
         return "signal_phase names a phase that does not exist"
     if phases.size:
         ends = roads.phases["first_state"][phases] + roads.signals["num_links"]
         if (ends > len(roads.phase_states)).any():
             return "signal_phase names a phase of another signal"
+    if _outside(overridden, 0, len(SIGNAL_STATES) + 1):
+        return "signal_phase has an unknown state"
+    if overridden.size and overridden[..., roads.links["signal"] < 0].any():
+        return "signal_phase has a state of a link without a signal"
     return ""
 
 

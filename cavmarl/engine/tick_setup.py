@@ -7,6 +7,7 @@ from cavmarl.core.memory import Zeros
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.component import Component, ComponentContext
 from cavmarl.engine.external_component import ExternalComponent
+from cavmarl.engine.override_component import OverrideComponent
 from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.scenario_cues import Cues
 from cavmarl.engine.shared_outputs import SharedOutputs
@@ -82,6 +83,8 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
     if host.config.population.external:
         parts.append(ExternalComponent(host))
+    if host.config.signals.overrides:
+        parts.append(OverrideComponent(host))
     if host.config.signals.are_controlled:
         parts.append(SignalComponent(host))
     if host.config.rig:

@@ -19,6 +19,8 @@ from cavmarl.core.records.codes import (
 from cavmarl.engine.kernels.seen_rows import write_seen
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.roads.network import SIGNAL_STATES
+from cavmarl.shards.shard import override_columns
 
 # One vehicle of a frame. Units and coordinate frames are those of `driving.vehicles.VEHICLE`.
 SEEN = np.dtype(
@@ -69,12 +71,13 @@ class WorldFrame(NamedTuple):
     tick: int  # ticks since the reset
     time_s: float
     vehicles: NDArray[np.void]  # SEEN (n,), by id
-    signals: NDArray[np.int32]  # (num_signals,) active PHASE rows
+    signals: NDArray[np.int32]  # active PHASE rows and more, see `Worlds.signal_phase`
     transfers: tuple[TransferInFlight, ...] = ()
     ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids of its ghosts
     ended: NDArray[np.void] = NONE_ENDED  # ENDED (m,): agents that are not among `vehicles`
     # kind and detail of each change that the caller made in the step before
     asked: tuple[tuple[str, str], ...] = ()
+    num_overrides: int = 0  # columns at the end of `signals` with states of the caller, by link
 
 
 class FrameEvent(NamedTuple):
@@ -123,6 +126,7 @@ def frame_of(
         view.ghosts if view is not None and ghosts else (),
         ended,
         asked,
+        override_columns(simulation.config, simulation.network),
     )
 
 
@@ -155,5 +159,12 @@ def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent
         if moved[k]:
             detail = f"{zones[k]} to {row['zone']}"
             yield FrameEvent(after.tick, "transferred", int(both[k]), agent, detail)
-    for signal in np.flatnonzero(before.signals != after.signals):
-        yield FrameEvent(after.tick, "signal", -1, -1, f"{signal}: phase {after.signals[signal]}")
+    num_signals = len(after.signals) - after.num_overrides
+    for column in np.flatnonzero(before.signals != after.signals):
+        shown = after.signals[column]
+        if column < num_signals:
+            detail = f"{column}: phase {shown}"
+        else:
+            letter = SIGNAL_STATES[shown - 1] if shown else "its program"
+            detail = f"link {column - num_signals}: shows {letter}"
+        yield FrameEvent(after.tick, "signal", -1, -1, detail)

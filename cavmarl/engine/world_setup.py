@@ -249,6 +249,7 @@ def _refuse_single_map_keys(config: EnvConfig) -> None:
         "scenario.name": config.scenario.name,
         "population.insertions": config.population.insertions,
         "population.external": config.population.external,
+        "signals.overrides": config.signals.overrides,
         "zones.layout": config.zones.layout not in ZONE_LAYOUTS and config.zones.layout,
     }
     for key, value in named.items():

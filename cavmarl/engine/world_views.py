@@ -202,7 +202,7 @@ class WorldViews:
         return [self._tick.shards[0].worlds.pending, self.outputs.observations, *rig]
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
-        """Return the present PHASE rows (num_signals,) of the signals."""
+        """Return the present PHASE rows of the signals and more, see `Worlds.signal_phase`."""
         phases: NDArray[np.int32] = self._shard.worlds.signal_phase[world]
         return phases
 

@@ -109,7 +109,7 @@ class ExternalCommands:
             y: of its centre, in m.
             heading: in rad, counter-clockwise from east.
             z: height of the ground below its centre, in m; None: of the lane.
-            vtype: `car`, `truck` or `bus`.
+            vtype: `car`, `truck`, `bus` or `pedestrian`.
             size_m: length, width and height, at most those of a bus; None: of its type.
             speed: in m/s along its heading, negative backwards.
             world: number of the world.

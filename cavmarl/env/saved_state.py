@@ -61,6 +61,7 @@ def load_session(session: StepSession, mask: NDArray[np.bool_], saved: bytes) ->
         or session.insertions.wrong(rest[:4])
         or session.decoder.wrong(rest[4:8])
         or session.external.wrong(rest[8:10])
+        or session.overrides.wrong(rest[10:11])
         or ("a world has a negative size" if (sizes < 0).any() else "")
     ):
         raise ConfigError(f"the saved state is damaged: {wrong}; save again")
@@ -75,4 +76,5 @@ def load_session(session: StepSession, mask: NDArray[np.bool_], saved: bytes) ->
 def _memory(session: StepSession, mask: NDArray[np.bool_]) -> list[NDArray[Any]]:
     """Return the arrays to save beside the worlds."""
     waiting = session.events.memory, *session.insertions.memory, *session.decoder.memory
-    return [mask, *waiting, *session.external.memory, *every_array(session.worlds.arrays)]
+    waiting = *waiting, *session.external.memory, *session.overrides.memory
+    return [mask, *waiting, *every_array(session.worlds.arrays)]

@@ -21,6 +21,7 @@ from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
+from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.env.signal_agents import SignalAgents
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
@@ -34,10 +35,10 @@ from cavmarl.signals.controllers import make_controller
 class StepSession:
     """The running worlds of one environment.
 
-    A step takes decoded actions and the waiting inputs: declared events, insertions and commands to
-    external vehicles. After each reset and step, the session records the worlds and calls its
-    watchers. A copy or a pickle of a session has its own worlds, which continue bit for bit; it has
-    no recording and no watchers.
+    A step takes decoded actions and the waiting inputs: declared events, insertions, commands to
+    external vehicles and overridden signals. After each reset and step, the session records the
+    worlds and calls its watchers. A copy or a pickle of a session has its own worlds, which
+    continue bit for bit; it has no recording and no watchers.
 
     Args:
         worlds: the worlds to step.
@@ -51,6 +52,7 @@ class StepSession:
         events: the events that agents have declared for the next step.
         insertions: vehicles and barriers for the next step.
         external: commands for the next step to vehicles that the caller poses or drives.
+        overrides: signals that show states of the caller.
         signals: the signals whose greens are chosen; None: there are none.
         signal_agents: the same if agents choose the greens, else None.
         is_ready: whether `reset` has been called.
@@ -69,6 +71,7 @@ class StepSession:
         self.events = DeclaredEvents(config, num_worlds)
         self.insertions = Insertions(config, worlds.world.network, num_worlds)
         self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
+        self.overrides = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
         self.signals = (
             SignalAgents(config, worlds.world.network, arrays)
             if config.signals.are_controlled
@@ -123,7 +126,7 @@ class StepSession:
             signal_choices = self._controller.choose(self.signals.view)
         if signal_choices is not None:
             commands = replace(commands, signal_choices=signal_choices)
-        waiting = (self.events, self.insertions, self.external)
+        waiting = (self.events, self.insertions, self.external, self.overrides)
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)
@@ -137,6 +140,7 @@ class StepSession:
         self.decoder.forget(chosen)
         self.insertions.forget(chosen)
         self.external.forget(chosen)
+        self.overrides.forget(chosen)
 
     def refuse_unready(self, call: str) -> None:
         """Raise an EpisodeError that names a call if there has been no reset yet."""
@@ -254,8 +258,8 @@ class StepSession:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Objects that refer to arrays of the worlds are created again.
-        inputs = self.events.memory, self.insertions.memory, self.external.memory
-        memory = self.decoder.memory, *inputs
+        parts = self.decoder, self.events, self.insertions, self.external, self.overrides
+        memory = tuple(part.memory for part in parts)
         kept = self.is_ready, self.simulated_s, self._first_seed
         return (
             _restored_session,
@@ -266,7 +270,7 @@ class StepSession:
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         (self.is_ready, self.simulated_s, self._first_seed), memory = state
         self.decoder.memory, self.events.memory, *memory = memory
-        self.insertions.memory, self.external.memory = memory
+        self.insertions.memory, self.external.memory, self.overrides.memory = memory
 
 
 def _restored_session(worlds: SteppedWorlds, in_place: bool) -> StepSession:

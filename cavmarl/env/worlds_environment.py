@@ -14,6 +14,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.external_commands import ExternalCommands
+from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record
 from cavmarl.env.signal_agents import SignalAgents
 from cavmarl.env.step_session import StepSession
@@ -92,6 +93,16 @@ class WorldsEnvironment(OwnWorlds):
         """
         self._session.refuse_idle("external")
         return self._session.external
+
+    @property
+    def signal_overrides(self) -> SignalOverrides:
+        """The signals that show states of the caller; see `signals.overrides`.
+
+        Raises:
+            EpisodeError: before the first reset.
+        """
+        self._session.refuse_idle("signal_overrides")
+        return self._session.overrides
 
     @property
     def signals(self) -> SignalAgents:

@@ -27,7 +27,6 @@ from cavmarl.render.canvas import (
 )
 from cavmarl.render.shapes import RoadShapes, level_of
 from cavmarl.render.viewport import Viewport
-from cavmarl.roads.network import RoadNetwork
 
 if TYPE_CHECKING:
     from pygame import Surface
@@ -40,19 +39,6 @@ MARKING_M = 0.2
 SEAM_PX = 0.25  # overlap of lanes, so that no land shows between them
 MIN_ROAD_PX = 1.6
 MIN_STOP_LINE_PX = 4.0
-
-
-def signal_codes(network: RoadNetwork, signal_phases: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Return the code shown at each link (num_links,): an index in SIGNAL_STATES, or SIGNAL_NONE.
-
-    `signal_phases`: (num_signals,) present PHASE rows.
-    """
-    codes = np.full(len(network.links), SIGNAL_NONE, dtype=np.uint8)
-    signalled = np.flatnonzero(network.links["signal"] >= 0)
-    links = network.links[signalled]
-    first = network.phases["first_state"][signal_phases[links["signal"]]]
-    codes[signalled] = network.phase_states[first + links["signal_index"]]
-    return codes
 
 
 def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:

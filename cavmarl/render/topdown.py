@@ -17,12 +17,13 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff.zone_view import ZoneView
 from cavmarl.render.canvas import load_pygame, pixels
 from cavmarl.render.cars import draw_cars, in_view
-from cavmarl.render.ground import draw_ground, draw_stop_lines, signal_codes
+from cavmarl.render.ground import draw_ground, draw_stop_lines
 from cavmarl.render.overlay import Overlay, Sample, clock_text, samples_of_drivers, samples_of_zones
 from cavmarl.render.shapes import road_shapes
 from cavmarl.render.viewport import Bounds, Viewport, suitable_size
 from cavmarl.render.zone_overlay import draw_sight, draw_transfers, draw_zones, owner_paints
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.shown_signals import signal_codes
 
 if TYPE_CHECKING:
     from pygame import Surface

@@ -69,6 +69,9 @@ class Commands:
     # (W, E, K) EXTERNAL, new commands to vehicles that the caller poses or drives; (0, 0, K): there
     # is no room for such vehicles
     external: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, EXTERNAL_FIELDS)))
+    # (W, N, 2) LINK row and 1 + SIGNAL_* code of each link whose signal the caller overrides, 0: an
+    # unused place; (0, 0, 2): overrides are not configured
+    overridden: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0, 2), np.int32))
     # (W, S) choices of the agents of signals, -1: none; (0, 0): signals have no agents
     signal_choices: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
 
@@ -135,6 +138,9 @@ class Shard:
             zeros=zeros,
             num_cues=len(travel.scripts.cues),
         )
+        if first is None and (more := override_columns(config, network)):
+            columns = zeros((num_worlds, len(network.signals) + more), dtype=np.int32)
+            self.worlds = self.worlds._replace(signal_phase=columns)
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
         # `side` and `next_side` for kernels: (2,), one array for all shards of this process.
@@ -227,6 +233,11 @@ def make_worlds(
     if common is None:
         return worlds
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
+
+
+def override_columns(config: EnvConfig, network: RoadNetwork) -> int:
+    """Return the number of columns of `Worlds.signal_phase` behind those of the signals."""
+    return len(network.links) if config.signals.overrides else 0
 
 
 def common_of(worlds: Worlds) -> SharedState:

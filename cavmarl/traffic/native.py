@@ -21,7 +21,7 @@ from cavmarl.core.records.arrays import Demand, DepartureQueue, TripTables, Worl
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
-from cavmarl.driving.vehicle_types import AGENT_TYPES, agent_types, generated_types
+from cavmarl.driving.vehicle_types import EXTERNAL_TYPES, agent_types, generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
@@ -221,7 +221,7 @@ class NativeTraffic:
     @property
     def _other_types(self) -> list[str]:
         """Names of the types of agents' and of the caller's vehicles, without the car."""
-        names = [*self.population.types, *(AGENT_TYPES if self.population.external else ())]
+        names = [*self.population.types, *(EXTERNAL_TYPES if self.population.external else ())]
         return [name for name in dict.fromkeys(names) if name != "car"]
 
     @cached_property

@@ -111,7 +111,7 @@ SPAT = np.dtype(
         ("sender", "<i8"),
         ("tick", "<i8"),
         ("signal", "<i4"),  # SIGNAL row
-        ("phase", "<i4"),  # present PHASE row, which has the letters of all links
+        ("phase", "<i4"),  # present PHASE row, with the letters of all links; −1 − row: overridden
         ("left_s", "<f8"),  # earliest remaining time of the phase, s
     ]
 )

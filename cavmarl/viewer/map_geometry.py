@@ -66,7 +66,8 @@ def map_message(network: RoadNetwork) -> bytes:
 
     Sections: `roads` and `lines` (PIECE), `surfaces` and `buildings` (CORNER, three per triangle),
     `stop_lines` (STOP_LINE), `phase_states` (uint8 positions in `SIGNAL_STATES`) and `phase_first`
-    (uint32). A signal shows `phase_states[phase_first[phase] + letter]`.
+    (uint32). A signal shows `phase_states[phase_first[phase] + letter]`, unless the frame has a
+    state of the caller for the link of the stop line (`stop_links`, uint32).
     """
     shapes = road_shapes(network)
     origin = map_origin(network)
@@ -83,6 +84,7 @@ def map_message(network: RoadNetwork) -> bytes:
         "marks": marks,
         "buildings": _quads(network.roofs, BUILDING, np.zeros(len(network.roofs)), origin),
         "stop_lines": _stop_lines(network, shapes, origin),
+        "stop_links": np.flatnonzero(network.links["signal"] >= 0).astype("<u4"),
         "phase_first": network.phases["first_state"].astype("<u4"),
         "phase_states": network.phase_states.astype("u1"),
     }

@@ -75,6 +75,7 @@ def commands_like(entry: Commands, value: int) -> Commands:
         np.full_like(entry.declared, value),
         np.full_like(entry.inserted, value),
         np.full_like(entry.external, value),
+        np.full_like(entry.overridden, value),
     )
 
 

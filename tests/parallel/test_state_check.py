@@ -200,6 +200,27 @@ def test_two_vehicles_that_are_one(make: Make) -> None:
     _refused(vec, drives_twice)
 
 
+def test_overridden_signals(make: Make) -> None:
+    vec = make("town", num_envs=2, zones=2, overrides={"signals.overrides": 3})
+    vec.reset(seed=2)
+    links = vec.network.links[vec.network.links["signal"] >= 0]
+    name = vec.network.signal_ids[links["signal"][0]]
+    vec.signal_overrides.show(name, int(links["signal_index"][0]), "r", world=1)
+    vec.step(vec.suggest_actions())
+    worlds = _worlds(vec)
+    phases = worlds.simulation.shards[0].worlds.signal_phase
+    place = next(n for n, saved in enumerate(worlds.save()) if saved is phases)
+    first = len(vec.network.signals)
+    plain = first + int(np.flatnonzero(vec.network.links["signal"] < 0)[0])
+    shown = int(np.flatnonzero(phases[1, first:])[0]) + first
+    for column, value in ((shown, 10), (shown, -1), (plain, 1)):
+
+        def forge(state: State, column: int = column, value: int = value) -> None:
+            state[place][1, column] = value
+
+        _refused(vec, forge)
+
+
 def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
     vec = make(str(actuated_grid(tmp_path)), num_envs=2, zones=2, agents=3, background=30)
     vec.reset(seed=2)

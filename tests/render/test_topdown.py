@@ -14,9 +14,9 @@ from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.render import canvas as palette
 from cavmarl.render.canvas import load_pygame
 from cavmarl.render.cars import BRAKING_MPS2
-from cavmarl.render.ground import signal_codes
 from cavmarl.render.topdown import TopDownRenderer
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.shown_signals import signal_codes
 
 pytest.importorskip("pygame")
 

@@ -102,7 +102,8 @@ class Worlds(NamedTuple):
     num_rows: NDArray[np.int64]  # (W,) rows [num_owned, num_rows) are ghosts
     ticks: NDArray[np.int64]  # (W,) since reset
     keys: NDArray[np.uint64]  # (W,) the root of all random numbers of the episode
-    signal_phase: NDArray[np.int32]  # (W, num_signals) active PHASE row
+    # (W, num_signals) active PHASE rows; then one column per link, see `signal_overrides`, or none
+    signal_phase: NDArray[np.int32]
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
     detected_s: NDArray[np.float64]  # (W, D) time when a body was last over each detector
     num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick

@@ -1,13 +1,15 @@
-"""Calls about actors: vehicles, walkers, sensors and traffic lights."""
+"""Calls about actors: vehicles, walkers and sensors."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from cavmarl.cosim.carla.call_arguments import (
     CallRefused,
+    Check,
     actor_id,
     anything,
     flag,
@@ -29,9 +31,10 @@ from cavmarl.cosim.carla.call_table import (
     refuse,
 )
 from cavmarl.cosim.carla.carla_actors import CarlaActor
-from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose, relative
+from cavmarl.cosim.carla.carla_geometry import CarlaPose, Vector, compose, relative
 from cavmarl.cosim.carla.carla_records import packed_actor, packed_box
 from cavmarl.cosim.carla.carla_session import CarlaSession
+from cavmarl.cosim.carla.external_vehicles import MASS_KG
 from cavmarl.cosim.carla.vehicle_controls import (
     FULL_STEER_RAD,
     AckermannControl,
@@ -40,9 +43,9 @@ from cavmarl.cosim.carla.vehicle_controls import (
 )
 
 _MAX_ATTRIBUTES = 256
+_SPAWNED = "vehicles and walkers that clients have spawned"
 _WORLDS = "vehicles of the world move by themselves; spawn a vehicle to place it"
 _KINEMATIC = "vehicles are kinematic: they have no mass"
-_FIXED_LIGHTS = "the programs of the map set the traffic lights"
 _NO_BONES = "walkers have no bones"
 
 description = record_of(whole, text, listed(record_of(text, whole, text), most=_MAX_ATTRIBUTES))
@@ -66,7 +69,10 @@ def get_actors_by_id(caller: Caller, session: CarlaSession, ids: list[int]) -> l
 
 
 @call(
-    "spawn_actor", description, pose, note="vehicles and sensors; a vehicle enters in the next tick"
+    "spawn_actor",
+    description,
+    pose,
+    note="vehicles, walkers and sensors; they enter in the next tick, sensors at once",
 )
 def spawn_actor(
     caller: Caller, session: CarlaSession, what: tuple[Any, ...], there: CarlaPose
@@ -115,7 +121,7 @@ def destroy_actor(caller: Caller, session: CarlaSession, number: int) -> bool:
     actor_id,
     pose,
     returns=Returns.NOTHING,
-    note="the spectator, sensors, and vehicles that clients have spawned",
+    note="the spectator, sensors, and vehicles and walkers that clients have spawned",
 )
 def set_actor_transform(
     caller: Caller, session: CarlaSession, number: int, there: CarlaPose
@@ -132,12 +138,127 @@ def set_actor_location(
     _move(session, actor, session.actors.pose_of(actor).at(there))
 
 
-@call("set_walker_state", actor_id, pose, number, returns=Returns.NOTHING, note="in batches only")
+@call(
+    "set_walker_state",
+    actor_id,
+    pose,
+    number,
+    returns=Returns.NOTHING,
+    note="in batches only; the pose is on the ground",
+)
 def set_walker_state(
     caller: Caller, session: CarlaSession, number: int, there: CarlaPose, speed: float
 ) -> None:
-    actor = session.actors.find(number, "set_walker_state")
-    _move(session, actor, there)
+    actor = _walker(session, number, "set_walker_state")
+    _move(session, actor, there.at((there.x, there.y, there.z + actor.half_m[2])))
+
+
+@call(
+    "apply_control_to_walker",
+    actor_id,
+    walker_control,
+    returns=Returns.NOTHING,
+    note="walkers that clients have spawned; they cannot jump",
+)
+def apply_control_to_walker(
+    caller: Caller, session: CarlaSession, number: int, given: tuple[Any, ...]
+) -> None:
+    actor = _walker(session, number, "apply_control_to_walker")
+    direction, speed, _ = given
+    session.world.external.walk(actor.slot, direction, speed)
+
+
+def _walker(session: CarlaSession, number: int, name: str) -> CarlaActor:
+    actor = session.actors.find(number, name)
+    if not actor.is_walker:
+        raise CallRefused(f"{actor.type_id} is not a walker")
+    if actor.slot < 0:
+        raise CallRefused("walkers of the world move by their script")
+    return actor
+
+
+def _spawned(session: CarlaSession, number: int, name: str) -> int:
+    """Return the slot of a vehicle or walker that a client has spawned."""
+    actor = session.actors.find(number, name)
+    if actor.slot < 0:
+        raise CallRefused(_WORLDS)
+    return actor.slot
+
+
+@call(
+    "set_actor_target_velocity",
+    actor_id,
+    vector,
+    returns=Returns.NOTHING,
+    note=f"{_SPAWNED}, in the next tick; then they follow their control, or roll on",
+)
+def set_actor_target_velocity(
+    caller: Caller, session: CarlaSession, number: int, velocity: tuple[float, float, float]
+) -> None:
+    slot = _spawned(session, number, "set_actor_target_velocity")
+    session.world.external.set_velocity(slot, velocity)
+
+
+@call(
+    "set_actor_target_angular_velocity",
+    actor_id,
+    vector,
+    returns=Returns.NOTHING,
+    note=f"{_SPAWNED}, in the next tick, about the vertical axis",
+)
+def set_actor_target_angular_velocity(
+    caller: Caller, session: CarlaSession, number: int, spin: tuple[float, float, float]
+) -> None:
+    slot = _spawned(session, number, "set_actor_target_angular_velocity")
+    session.world.external.set_spin(slot, math.radians(spin[2]))
+
+
+@call(
+    "enable_actor_constant_velocity",
+    actor_id,
+    vector,
+    returns=Returns.NOTHING,
+    note=f"{_SPAWNED}; steering still has an effect",
+)
+def enable_actor_constant_velocity(
+    caller: Caller, session: CarlaSession, number: int, velocity: tuple[float, float, float]
+) -> None:
+    slot = _spawned(session, number, "enable_actor_constant_velocity")
+    session.world.external.set_constant(slot, velocity)
+
+
+@call("disable_actor_constant_velocity", actor_id, returns=Returns.NOTHING)
+def disable_actor_constant_velocity(caller: Caller, session: CarlaSession, number: int) -> None:
+    actor = session.actors.find(number, "disable_actor_constant_velocity")
+    if actor.slot >= 0:
+        session.world.external.set_constant(actor.slot, None)
+
+
+def _push(name: str, *more: Check, is_force: bool) -> None:
+    @call(
+        name,
+        actor_id,
+        vector,
+        *more,
+        returns=Returns.NOTHING,
+        note=f"{_SPAWNED}: changes the velocity of a body of {MASS_KG:g} kg",
+    )
+    def push(
+        caller: Caller,
+        session: CarlaSession,
+        number: int,
+        given: Vector,
+        there: Vector | None = None,
+    ) -> None:
+        slot = _spawned(session, number, name)
+        share = (session.world.step_s if is_force else 1.0) / MASS_KG
+        session.world.external.push(slot, (given[0] * share, given[1] * share, 0.0))
+
+
+_push("add_actor_impulse", is_force=False)
+_push("add_actor_impulse_at_location", vector, is_force=False)
+_push("add_actor_force", is_force=True)
+_push("add_actor_force_at_location", vector, is_force=True)
 
 
 def _move(session: CarlaSession, actor: CarlaActor, there: CarlaPose) -> None:
@@ -185,7 +306,7 @@ def _drive(caller: Caller, session: CarlaSession, number: int, control: Control,
     if actor.agent >= 0:
         session.world.controls[actor.agent] = control
         caller.agents.add(actor.agent)
-    elif actor.slot >= 0:
+    elif actor.slot >= 0 and actor.is_vehicle:
         session.world.external.control(actor.slot, control)
     elif actor.is_vehicle:
         raise CallRefused("the built-in driver drives this vehicle; only agents can be controlled")
@@ -250,7 +371,7 @@ def get_physics_control(caller: Caller, session: CarlaSession, number: int) -> l
         wheels.append([3.5, 0.25, steer, 35.0, 1500.0, 3000.0, 2.0, 17.0, 1000.0, middle])
     torque, steering = [[0.0, 500.0], [5000.0, 500.0]], [[0.0, 1.0], [120.0, 1.0]]
     engine = [torque, 5000.0, 1.0, 0.15, 2.0, 0.35, True, 0.5, 10.0, 4.0, [[2.85, 0.5, 0.65]]]
-    return [*engine, 1845.0, 0.3, [0.0, 0.0, 0.0], steering, wheels, True]
+    return [*engine, MASS_KG, 0.3, [0.0, 0.0, 0.0], steering, wheels, True]
 
 
 @call("get_wheel_steer_angle", actor_id, whole)
@@ -275,17 +396,6 @@ def _vehicle_state(session: CarlaSession, number: int, name: str) -> np.void:
     return state
 
 
-@call("get_group_traffic_lights", actor_id)
-def get_group_traffic_lights(caller: Caller, session: CarlaSession, number: int) -> list[int]:
-    ids = session.actors.lights["id"].tolist()
-    if number not in ids:
-        raise CallRefused(f"actor {number} is not a traffic light")
-    approaches = session.map.approaches
-    signal = approaches[ids.index(number)].signal
-    return [one for one, each in zip(ids, approaches, strict=True) if each.signal == signal]
-
-
-answer_constant([], "get_light_boxes", checks=(actor_id,))
 answer_constant(
     [],
     "get_actor_bone_names",
@@ -307,43 +417,18 @@ accept(
     "show_vehicle_debug_telemetry",
     checks=(actor_id, flag),
 )
-accept("set_actor_dead", "disable_actor_constant_velocity", checks=(actor_id,))
+accept("set_actor_dead", checks=(actor_id,))
 accept("open_vehicle_door", "close_vehicle_door", checks=(actor_id, whole))
 accept("apply_ackermann_controller_settings", "apply_physics_control", checks=(actor_id, anything))
 accept("enable_sensor_for_ros", "disable_sensor_for_ros", checks=(actor_id,))
 accept("set_ignored_vehicles", checks=(actor_id, listed(actor_id)))
 accept("enable_gbuffers", checks=(actor_id, flag))
+accept("add_actor_angular_impulse", "add_actor_torque", checks=(actor_id, vector))
 accept("restore_physx_physics", checks=(actor_id,))
-refuse(
-    "set_actor_target_velocity",
-    "set_actor_target_angular_velocity",
-    "enable_actor_constant_velocity",
-    checks=(actor_id, vector),
-    because=_WORLDS,
-)
-refuse(
-    "add_actor_impulse",
-    "add_actor_force",
-    "add_actor_angular_impulse",
-    "add_actor_torque",
-    checks=(actor_id, vector),
-    because=_KINEMATIC,
-)
-refuse(
-    "add_actor_impulse_at_location",
-    "add_actor_force_at_location",
-    checks=(actor_id, vector, vector),
-    because=_KINEMATIC,
-)
 refuse("set_wheel_steer_direction", checks=(actor_id, whole, number), because=_KINEMATIC)
 refuse("enable_carsim", checks=(actor_id, text), because=_KINEMATIC)
 refuse("use_carsim_road", checks=(actor_id, flag), because=_KINEMATIC)
 refuse("enable_chrono_physics", checks=(actor_id, *[anything] * 6), because=_KINEMATIC)
-refuse(
-    "apply_control_to_walker",
-    checks=(actor_id, walker_control),
-    because="walkers of the world move by their script",
-)
 refuse(
     "set_bones_transform",
     "blend_pose",
@@ -352,18 +437,6 @@ refuse(
 )
 refuse("get_pose_from_animation", checks=(actor_id,), because=_NO_BONES)
 refuse("get_bones_transform", checks=(actor_id,), because=_NO_BONES, returns=Returns.VALUE)
-refuse("set_traffic_light_state", checks=(actor_id, whole), because=_FIXED_LIGHTS)
-refuse(
-    "set_traffic_light_green_time",
-    "set_traffic_light_yellow_time",
-    "set_traffic_light_red_time",
-    checks=(actor_id, number),
-    because=_FIXED_LIGHTS,
-)
-refuse("freeze_traffic_light", checks=(actor_id, flag), because=_FIXED_LIGHTS)
-refuse("freeze_all_traffic_lights", checks=(flag,), because=_FIXED_LIGHTS)
-accept("reset_traffic_light_group", checks=(actor_id,), note="the programs of the map run anyway")
-accept("reset_all_traffic_lights", checks=(), note="the programs of the map run anyway")
 refuse(
     "get_gbuffer_token",
     checks=(actor_id, whole),

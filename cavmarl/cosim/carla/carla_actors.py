@@ -22,7 +22,7 @@ from cavmarl.cosim.carla.carla_snapshots import (
     WALKER_STATE,
     place_state,
 )
-from cavmarl.cosim.carla.external_vehicles import ExternalBody
+from cavmarl.cosim.carla.external_vehicles import WALKER, ExternalBody
 from cavmarl.cosim.carla.hosted_world import HostedWorld
 from cavmarl.cosim.carla.vehicle_controls import (
     BRAKE_MPS2,
@@ -57,6 +57,7 @@ TAG_OF_CLASS = {
 }
 TAG_OF_BASE = {
     "car": 14, "van": 14, "truck": 15, "bus": 16, "motorcycle": 18, "bicycle": 19,
+    WALKER: 12,
 }  # fmt: skip
 _CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestrian"}
 
@@ -122,14 +123,13 @@ class ActorTable:
         self.spectator = self.add("spectator", SPECTATOR_POSE)
         self._light_states = self._make_lights(world.map)
         self._next = max(self._next, next_number)
-        self._light_since = np.zeros(len(self._light_states))
         self._ids = np.zeros(0, np.int64)
         self._listed: list[CarlaActor] = []
         self._row_of: dict[int, int] = {}
         self._is_walker = np.zeros(0, np.bool_)
         self._other_states = np.zeros(0, ACTOR_STATE)
         self.vehicle_states = np.zeros(0, VEHICLE_STATE)
-        self.take(world, 0.0)
+        self.take(world)
 
     @property
     def next_number(self) -> int:
@@ -206,15 +206,16 @@ class ActorTable:
         slot: int,
         size_m: tuple[float, float, float],
     ) -> CarlaActor:
-        """Add a vehicle that enters in the next tick."""
+        """Add a vehicle or walker that enters in the next tick."""
         length, width, height = size_m
+        base_type = blueprint.default("base_type") or WALKER
         return self.add(
             blueprint.type_id,
             pose,
             attributes=dict(attributes),
-            centre=(0.0, 0.0, 0.5 * height),
+            centre=(0.0, 0.0, 0.0 if base_type == WALKER else 0.5 * height),
             half_m=(0.5 * length, 0.5 * width, 0.5 * height),
-            tags=bytes([TAG_OF_BASE[blueprint.default("base_type")]]),
+            tags=bytes([TAG_OF_BASE[base_type]]),
             slot=slot,
         )
 
@@ -254,14 +255,14 @@ class ActorTable:
             if actor.is_attached:
                 yield actor
 
-    def take(self, world: HostedWorld, time_s: float) -> list[CarlaActor]:
+    def take(self, world: HostedWorld) -> list[CarlaActor]:
         """Take over the present state of a world; return the actors that have gone."""
         rows = world.rows
         gone: list[CarlaActor] = []
         if not np.array_equal(rows["id"], self._ids):
             gone = self._list(world, rows)
         self._write_vehicles(world, rows)
-        self._write_lights(world, time_s)
+        self._write_lights(world)
         for actor in self.attached():
             self.move_attached(actor)
         return gone
@@ -300,17 +301,16 @@ class ActorTable:
             state["signal_id"] = approach.signal_id.encode()[:31]
             place_state(state, approach.pose)
         states["state"] = ACTIVE
-        states["times_s"] = carla_map.times_s
         return states
 
-    def _write_lights(self, world: HostedWorld, time_s: float) -> None:
+    def _write_lights(self, world: HostedWorld) -> None:
         states = self._light_states
         if not len(states):
             return
-        shown = world.map.states_in(world.phases)
-        self._light_since[shown != states["light_state"]] = time_s
-        states["light_state"] = shown
-        states["elapsed_s"] = time_s - self._light_since
+        states["light_state"] = world.lights.states()
+        states["elapsed_s"] = world.lights.elapsed_s
+        states["times_s"] = world.lights.times_s
+        states["is_frozen"] = world.lights.is_frozen
 
     def _list(self, world: HostedWorld, rows: NDArray[np.void]) -> list[CarlaActor]:
         """List the actors of the rows; return those whose vehicle has left."""
@@ -408,7 +408,8 @@ class ActorTable:
         if isinstance(control, CarlaControl):
             state["throttle"], state["steer"], state["brake"] = control[:3]
             state["hand_brake"], state["reverse"], state["manual_gear"] = control[3:6]
-            state["gear"] = control.gear if control.manual_gear_shift else 1
+            automatic = -1 if control.reverse else 1
+            state["gear"] = control.gear if control.manual_gear_shift else automatic
 
     def _write_walkers(self, ahead: NDArray[np.float64], speed: NDArray[np.float64]) -> None:
         if not self._is_walker.any():

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from html import unescape
 from typing import NamedTuple
 
@@ -29,10 +30,12 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MINOR,
 )
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, carla_pose
+from cavmarl.cosim.carla.navigation_mesh import NavigationMesh, make_navigation_mesh
 from cavmarl.maps.components import strong_components
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.shown_signals import signal_codes
 
-RED, YELLOW, GREEN, OFF = 0, 1, 2, 3  # CARLA's numbers of states of traffic lights
+RED, YELLOW, GREEN, OFF = 0, 1, 2, 3  # CARLA's numbers of states of traffic lights, strict first
 
 _STATE_OF_CODE = np.zeros(len(SIGNAL_STATES), np.uint8)
 _STATE_OF_CODE[[SIGNAL_RED, SIGNAL_RED_YELLOW, SIGNAL_STOP_THEN_GO]] = RED
@@ -98,10 +101,37 @@ class CarlaMap:
         return f"Carla/Maps/{self.name}"
 
     def states_in(self, phases: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Return the state (approaches,) of each light; `phases`: PHASE rows of the signals."""
+        """Return the state (approaches,) of each light; `phases`: see `Worlds.signal_phase`."""
         signals = [approach.signal for approach in self.approaches]
         found: NDArray[np.uint8] = self.states[np.arange(len(signals)), phases[signals]]
+        if phases[len(self.network.signals) :].any():
+            shown = _STATE_OF_CODE[signal_codes(self.network, phases)[self._links]]
+            found = np.minimum.reduceat(shown, self._first_link)
         return found
+
+    @cached_property
+    def navigation_mesh(self) -> NavigationMesh | None:
+        """Where walkers may walk; None: the map has no roads, or is too large."""
+        return make_navigation_mesh(self.network, self.name)
+
+    @cached_property
+    def links_of(self) -> tuple[NDArray[np.intp], ...]:
+        """LINK rows of each light."""
+        links = self.network.links
+        return tuple(
+            np.flatnonzero((links["signal"] == one.signal) & np.isin(links["from_lane"], one.lanes))
+            for one in self.approaches
+        )
+
+    @cached_property
+    def _links(self) -> NDArray[np.intp]:
+        """LINK rows of all lights, one light after another."""
+        return np.concatenate(self.links_of)
+
+    @cached_property
+    def _first_link(self) -> NDArray[np.intp]:
+        """Where the links of each light begin in `_links`."""
+        return np.cumsum([0, *map(len, self.links_of)])[:-1]
 
 
 def make_carla_map(
@@ -223,7 +253,7 @@ def _states(network: RoadNetwork, approaches: tuple[LightApproach, ...]) -> NDAr
 
 def _joint_state(states: NDArray[np.uint8]) -> int:
     """Return the state of a light that stands for several movements: the strictest of these."""
-    return next(state for state in (RED, YELLOW, GREEN, OFF) if (states == state).any())
+    return int(states.min())
 
 
 def _times_s(network: RoadNetwork, approaches: tuple[LightApproach, ...]) -> NDArray[np.float32]:

@@ -20,7 +20,7 @@ from typing import Self
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.core.server_address import is_loopback, listen
-from cavmarl.cosim.carla import actor_calls, batch_calls, episode_calls
+from cavmarl.cosim.carla import actor_calls, batch_calls, episode_calls, light_calls
 from cavmarl.cosim.carla.call_table import Caller, answer
 from cavmarl.cosim.carla.carla_session import (
     DEFAULT_LIMITS,
@@ -39,7 +39,12 @@ log = logging.getLogger("cavmarl.carla")
 
 PORT = 2000
 LOOPBACK = "127.0.0.1"
-CALL_MODULES = (actor_calls, batch_calls, episode_calls)  # they fill the table of calls
+CALL_MODULES = (
+    actor_calls,
+    batch_calls,
+    episode_calls,
+    light_calls,
+)  # they fill the table of calls
 _LATE_S = 0.5  # a free-running world that is later than this does not catch up
 _PATIENCE_S = 0.01  # how long a tick waits for listeners of new sensors
 _LOOK_S = 0.0005

@@ -19,7 +19,7 @@ from cavmarl.cosim.carla.carla_map import CarlaMap
 from cavmarl.cosim.carla.carla_snapshots import frame_head, snapshot_body
 from cavmarl.cosim.carla.carla_streams import EPISODE_STREAM, StreamHub
 from cavmarl.cosim.carla.carla_versions import ClientVersion
-from cavmarl.cosim.carla.external_vehicles import ExternalBody
+from cavmarl.cosim.carla.external_vehicles import WALKER, ExternalBody
 from cavmarl.cosim.carla.hosted_world import (
     STEP_S,
     EndedVehicle,
@@ -143,7 +143,7 @@ class CarlaSession:
         for _ in range(max(1, round(self.delta_s / self.world.step_s))):
             for ended in self.world.step(actions):
                 self._tell_end(ended)
-        for actor in self.actors.take(self.world, self.time_s):
+        for actor in self.actors.take(self.world):
             self._forget(actor)
         self.publish()
         return self.frame
@@ -273,9 +273,9 @@ class CarlaSession:
         if type_id.startswith(("sensor.", "controller.")):
             return self._attach(blueprint, attributes, pose, parent)
         there = compose(self.actors.pose_of(self.actors.actors[parent]), pose) if parent else pose
-        if not type_id.startswith("vehicle."):
-            raise CallRefused(f"{type_id}: only vehicles and sensors can be spawned")
-        base_type = blueprint.default("base_type")
+        if not type_id.startswith(("vehicle.", "walker.")):
+            raise CallRefused(f"{type_id}: only vehicles, walkers and sensors can be spawned")
+        base_type = blueprint.default("base_type") or WALKER
         body = ExternalBody(type_id, base_type, there, blueprint.size_m)
         slot, size_m = self.world.external.spawn(body)
         return self.actors.add_spawned(blueprint, attributes, there, slot, size_m)

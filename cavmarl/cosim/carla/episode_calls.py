@@ -15,6 +15,7 @@ from cavmarl.cosim.carla.call_arguments import (
     optional,
     place,
     record_of,
+    shown,
     text,
     vector,
     whole,
@@ -257,18 +258,10 @@ accept(
     "apply_float_color_texture_to_objects",
     checks=(listed(text), whole, anything),
 )
-answer_constant([], "get_required_files", checks=(text,), note="no files")
-answer_constant(b"", "get_navigation_mesh", note="no navigation mesh")
 answer_constant([], "query_lights_state", checks=(text,), note="no street lights")
 answer_constant([], "get_names_of_all_objects")
 answer_constant([], "get_environment_objects", "get_all_level_BBs", checks=(whole,))
 answer_constant(True, "is_weather_enabled")
-refuse(
-    "request_file",
-    checks=(text,),
-    because="this server has no files",
-    returns=Returns.VALUE,
-)
 refuse("start_recorder", checks=(text, flag), because=_NO_RECORDER, returns=Returns.VALUE)
 refuse("replay_file", checks=(anything,) * 6, because=_NO_RECORDER, returns=Returns.VALUE)
 refuse("show_recorder_file_info", checks=(text, flag), because=_NO_RECORDER, returns=Returns.VALUE)
@@ -282,3 +275,23 @@ refuse(
 accept("stop_recorder", checks=())
 accept("stop_replayer", "set_replayer_ignore_hero", "set_replayer_ignore_spectator", checks=(flag,))
 accept("set_replayer_time_factor", checks=(number,))
+
+
+@call("get_required_files", text, note="the navigation mesh")
+def get_required_files(caller: Caller, session: CarlaSession, folder: str) -> list[str]:
+    mesh = session.map.navigation_mesh
+    return [mesh.name] if mesh is not None and folder == "Nav" else []
+
+
+@call("request_file", text, note="the navigation mesh")
+def request_file(caller: Caller, session: CarlaSession, name: str) -> bytes:
+    mesh = session.map.navigation_mesh
+    if mesh is None or name != mesh.name:
+        raise CallRefused(f"this server has no file {shown(name)}")
+    return mesh.content
+
+
+@call("get_navigation_mesh")
+def get_navigation_mesh(caller: Caller, session: CarlaSession) -> bytes:
+    mesh = session.map.navigation_mesh
+    return b"" if mesh is None else mesh.content

@@ -21,6 +21,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED, EVENT_OFF_ROAD
 from cavmarl.cosim.carla.carla_map import CarlaMap, make_carla_map
 from cavmarl.cosim.carla.external_vehicles import ExternalVehicles
+from cavmarl.cosim.carla.traffic_lights import TrafficLights
 from cavmarl.cosim.carla.vehicle_controls import Control, action_of
 from cavmarl.cosim.time_master import TimeMaster
 from cavmarl.engine.world_setup import find_map
@@ -45,6 +46,7 @@ SERVED_WORLD: dict[str, Any] = {
     "traffic.endless": True,  # a vehicle that a client drives does not vanish at a goal
     "traffic.trip_horizon": 0.0,
     "population.external": 64,
+    "signals.overrides": 10_000,
 }
 
 
@@ -79,6 +81,7 @@ class HostedWorld:
     Attributes:
         controls: the clients' controls, by the index of the agent that they drive.
         external: the vehicles that clients have spawned.
+        lights: the traffic lights.
 
     Raises:
         ConfigError: the actions are not continuous, or other processes run the world.
@@ -95,6 +98,7 @@ class HostedWorld:
         self.env, self.map = env, carla_map
         self.controls: dict[int, Control] = {}
         self.external = ExternalVehicles(env)
+        self.lights = TrafficLights(env, carla_map)
         self.master = TimeMaster(env)
         if not env.is_ready:
             self.master.reset(seed)
@@ -108,11 +112,6 @@ class HostedWorld:
         """VEHICLE (n,) of the present; the next step overwrites them."""
         return self.simulation.vehicles(0)
 
-    @property
-    def phases(self) -> NDArray[np.int32]:
-        """PHASE rows of the signals."""
-        return self.simulation.signal_phases(0)
-
     def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
         """Advance the world by one step, or begin the next episode if this one is over.
 
@@ -125,11 +124,13 @@ class HostedWorld:
             self.reset()
             return []
         self.external.act()
+        self.lights.advance(self.step_s)
         driven = self._driven()
         chosen = dict(driven)
         if len(driven) < len(env.agents):
             chosen = {**(env.suggest_actions() if actions is None else actions), **driven}
         self.master.step(chosen)
+        self.lights.note(self.step_s)
         ended = vehicles_that_ended(env.worlds.arrays, 0)
         return [
             EndedVehicle(agent, events, self.controls.pop(agent, None) is not None)
@@ -161,6 +162,7 @@ class HostedWorld:
         """Begin the next episode, without the vehicles of clients."""
         self.controls.clear()
         self.external.forget()
+        self.lights.forget()
         self.master.reset()
 
     def release(self) -> None:

@@ -17,6 +17,7 @@ BRAKE_MPS2 = 8.0  # deceleration at brake = 1
 _ROLLING_MPS2 = 0.2  # deceleration without throttle, and its growth with the speed
 _DRAG_PER_S = 0.02
 _LARGEST_SINE = 0.99
+_STANDING_MPS = 0.01
 _ACKERMANN_PER_S = 2.0  # acceleration per m/s of difference to the target speed
 
 
@@ -30,6 +31,10 @@ class CarlaControl(NamedTuple):
     reverse: bool = False
     manual_gear_shift: bool = False
     gear: int = 0
+
+    @property
+    def is_backward(self) -> bool:
+        return self.reverse or (self.manual_gear_shift and self.gear < 0)
 
 
 class AckermannControl(NamedTuple):
@@ -45,13 +50,45 @@ class AckermannControl(NamedTuple):
 Control = CarlaControl | AckermannControl
 
 
+def drives_backward(control: Control, speed_mps: float) -> bool:
+    """Return whether a control moves a vehicle backwards, or slows it while it rolls backwards."""
+    if abs(speed_mps) > _STANDING_MPS:
+        return speed_mps < 0.0
+    if isinstance(control, AckermannControl):
+        return control.speed < 0.0
+    is_braked = control.hand_brake or BRAKE_MPS2 * control.brake >= THROTTLE_MPS2 * control.throttle
+    return control.is_backward and not is_braked
+
+
+def backward_motion_of(control: Control, speed_mps: float) -> tuple[float, float]:
+    """Return acceleration and wheel angle, as `motion_of`, of a vehicle with a speed of 0 or less.
+
+    In the reverse gear, throttle accelerates backwards; in others, it slows the vehicle.
+    """
+    if isinstance(control, AckermannControl):
+        acceleration, angle = motion_of(
+            control._replace(speed=-control.speed, steer=-control.steer), -speed_mps
+        )
+        return -acceleration, -angle
+    forward = control._replace(reverse=False, manual_gear_shift=False, steer=-control.steer)
+    if not control.is_backward:
+        forward = forward._replace(throttle=0.0, brake=max(control.brake, control.throttle))
+    acceleration, angle = motion_of(forward, -speed_mps)
+    return -acceleration, -angle
+
+
 def motion_of(control: Control, speed_mps: float) -> tuple[float, float]:
-    """Return the acceleration in m/s² and the angle of the front wheels in rad, left positive."""
+    """Return the acceleration in m/s² and the angle of the front wheels in rad, left positive.
+
+    The speed is 0 or more. In the reverse gear, throttle slows the vehicle.
+    """
     if isinstance(control, AckermannControl):
         wanted = _ACKERMANN_PER_S * (control.speed - speed_mps)
         most = abs(control.acceleration) or THROTTLE_MPS2
         return min(max(wanted, -BRAKE_MPS2), most), -control.steer
-    throttle = 0.0 if control.reverse else min(max(control.throttle, 0.0), 1.0)
+    throttle = min(max(control.throttle, 0.0), 1.0)
+    if control.is_backward:
+        throttle = -throttle if speed_mps > 0.0 else 0.0
     brake = 1.0 if control.hand_brake else min(max(control.brake, 0.0), 1.0)
     resistance = _ROLLING_MPS2 + _DRAG_PER_S * speed_mps if speed_mps > 0.0 else 0.0
     acceleration = THROTTLE_MPS2 * throttle - BRAKE_MPS2 * brake - resistance

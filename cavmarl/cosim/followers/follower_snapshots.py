@@ -21,6 +21,7 @@ from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.worlds.step_arrays import Driven
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.sensors.mounted.frames import SensorFrames
 
 NO_SIGNAL = 255
@@ -125,14 +126,7 @@ def _array(
 
 def _signals(env: CavEnv | CavVectorEnv, world: int) -> NDArray[np.uint8]:
     """Return (1, num_links) the SIGNAL_* code that each link's signal shows."""
-    network = env.network
-    shown = np.full((1, len(network.links)), NO_SIGNAL, dtype=np.uint8)
-    signal = network.links["signal"]
-    has_one = signal >= 0
-    phase = env.worlds.signal_phases(world)[signal[has_one]]
-    letter = network.phases["first_state"][phase] + network.links["signal_index"][has_one]
-    shown[0, has_one] = network.phase_states[letter]
-    return shown
+    return signal_codes(env.network, env.worlds.signal_phases(world))[np.newaxis]
 
 
 def _view(network: RoadNetwork, vehicle: Driven) -> VehicleView:

@@ -35,7 +35,7 @@ class SignalFigures:
     never_departed: int  # vehicles whose departure was due, but that have not entered
     arrived: int  # vehicles that have reached the end of their trip
     delay_s: float | None  # mean over arrived vehicles: time lost against the desired speed
-    # RESCO's delay: mean over all trips, also unfinished ones and those that never departed, of the
+    # RESCO's delay: mean over all trips, also unfinished ones and vehicles never let in, of the
     # time lost and the delay of the departure
     delay_of_all_s: float
     trip_s: float | None  # mean over arrived vehicles
@@ -83,7 +83,7 @@ class SignalMeter:
             rows: VEHICLE (n,) all vehicles.
             tick: since the reset.
             due_ticks: (num_orders,) ticks at which vehicles of the demand were due to depart.
-            codes: (num_links,) signal states of the links, as from `render.ground.signal_codes`.
+            codes: (num_links,) states of the links' signals; see `roads.shown_signals`.
         """
         ids, speed = rows["id"], np.abs(rows["speed"])
         self._grow(int(ids.max(initial=-1)) + 1)

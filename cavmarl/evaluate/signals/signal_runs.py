@@ -17,7 +17,7 @@ from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.signals.signal_meter import SignalFigures, SignalMeter
 from cavmarl.evaluate.traffic.native_side import idle_commands
 from cavmarl.evaluate.traffic.sumo_side import SumoJob, start_sumo, sumo_process
-from cavmarl.render.ground import signal_codes
+from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.signals.controllers import SignalController, make_controller
 from cavmarl.signals.kernels.green_choices import SINCE
 

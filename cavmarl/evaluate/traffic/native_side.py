@@ -12,7 +12,7 @@ from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World, load_world
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
-from cavmarl.render.ground import signal_codes
+from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_input import read_input
 

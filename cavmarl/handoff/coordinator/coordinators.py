@@ -224,6 +224,8 @@ def _digest(commands: Commands, w: int) -> bytes:
         digest.update(commands.inserted[w].tobytes())
     if commands.external.any():
         digest.update(commands.external[w].tobytes())
+    if commands.overridden.any():
+        digest.update(commands.overridden[w].tobytes())
     if commands.signal_choices.size:
         digest.update(commands.signal_choices[w].tobytes())
     return digest.digest()

@@ -16,7 +16,7 @@ from cavmarl.parallel.worlds.tasks import Task
 
 _HEAD = struct.Struct("<II")
 _INPUTS: Mapping[Task, tuple[str, ...]] = {
-    Task.STEP: ("declared", "inserted", "external", "signal_choices"),
+    Task.STEP: ("declared", "inserted", "external", "overridden", "signal_choices"),
     Task.RESET: ("chosen",),
 }
 

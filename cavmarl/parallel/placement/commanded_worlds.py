@@ -113,6 +113,7 @@ class CommandedWorlds(ABC):
         arrays.declared[:] = commands.declared if commands.declared.size else 0
         arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
         arrays.external[:] = commands.external if commands.external.size else 0
+        arrays.overridden[:] = commands.overridden if commands.overridden.size else 0
         arrays.signal_choices[:] = commands.signal_choices if commands.signal_choices.size else KEEP
         self._command(Task.STEP)
         self._steps += 1

@@ -24,7 +24,7 @@ class SceneShape(NamedTuple):
     worlds: int  # W
     capacity: int  # C, rows of a world
     agents: int
-    signals: int
+    signals: int  # columns of `signal_phase`
     sensors: int  # S, of the rig
     workers: int  # n
 
@@ -55,7 +55,7 @@ class SceneArrays(NamedTuple):
     num_rows: NDArray[np.int64]  # (W,) number of rows
     ticks: NDArray[np.int64]  # (W,) since the reset
     keys: NDArray[np.uint64]  # (W,) see `Worlds`
-    signal_phase: NDArray[np.int32]  # (W, num_signals) see `Worlds`
+    signal_phase: NDArray[np.int32]  # (W, columns) see `Worlds`
     before: NDArray[np.void]  # POSE (W, A) of the tick before
     due: NDArray[np.int64]  # (S, 3, W) each sensor's `Due`
     lines: NDArray[np.int32]  # (n, S, W, A, 2) lines [first, last) of each frame for each worker

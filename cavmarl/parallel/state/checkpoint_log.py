@@ -122,12 +122,14 @@ def _layout(config: EnvConfig, num_worlds: int, num_signals: int) -> Layout:
     agents = (*worlds, config.population.num_ids)
     inserted = (*worlds, config.population.insertions, 3)
     external = (*worlds, config.population.external, EXTERNAL_FIELDS)
+    overridden = (*worlds, config.signals.overrides, 2)
     kinds = (
         ("<f8", (*agents, 2)),
         ("<i8", agents),
         ("<i4", agents),
         ("<f8", inserted),
         ("<f8", external),
+        ("<i4", overridden),
         ("<i8", (*worlds, num_signals)),
     )
     return dict(zip(COMMANDS, kinds, strict=True))

@@ -239,13 +239,14 @@ class LocalWorlds:
         if not self.world.config.v2x.enabled:
             return None
         reports = self.simulation.messages.mail.signals[world, agent]
-        reports = reports[reports["sender"] >= 0]
+        # The code of an overridden signal is negative: its letters are not those of a phase.
+        reports = reports[(reports["sender"] >= 0) & (reports["code"] >= 0)]
         age = self.ticks()[world] - reports["tick"]
         heard = np.stack([reports["subject"], reports["code"], age], axis=1)
         return [list(map(int, row)) for row in heard.tolist()]
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
-        """Return (num_signals,) the present PHASE rows of a world, as a view."""
+        """Return a world's row of `Worlds.signal_phase`, as a view."""
         return self.simulation.signal_phases(world)
 
     def save(self) -> list[NDArray[Any]]:

@@ -17,6 +17,7 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.worlds.world_message import make_world_message
 from cavmarl.sensors.registry import type_of
+from cavmarl.shards.shard import override_columns
 
 PROGRAM = "cavmarl.parallel.worlds.sensor_worker"
 
@@ -65,7 +66,7 @@ def sensor_workers_of(
         worlds=last - first,
         capacity=world.capacity,
         agents=config.population.num_ids,
-        signals=len(world.network.signals),
+        signals=len(world.network.signals) + override_columns(config, world.network),
         sensors=len(config.rig),
         workers=config.workers.sensors,
     )

@@ -53,6 +53,7 @@ class StepArrays(NamedTuple):
     declared: NDArray[np.int32]  # (W, A)
     inserted: NDArray[np.float64]  # (W, I, 3)
     external: NDArray[np.float64]  # (W, E, K)
+    overridden: NDArray[np.int32]  # (W, N, 2)
     signal_choices: NDArray[np.int64]  # (W, S)
     signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, like the next six
     signal_rewards: NDArray[np.float32]  # (W, S)
@@ -105,6 +106,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int, signals: Signal
         "declared": ("<i4", agents),
         "inserted": ("<f8", (num_worlds, config.population.insertions, 3)),
         "external": ("<f8", (num_worlds, config.population.external, EXTERNAL_FIELDS)),
+        "overridden": ("<i4", (num_worlds, config.signals.overrides, 2)),
         "signal_choices": ("<i8", of_signals),
         "signal_observations": observed,
         "final_signal_observations": observed,

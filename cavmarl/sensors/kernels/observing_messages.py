@@ -11,6 +11,7 @@ from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
 from cavmarl.sensors.kernels.frame_stacks import newest_frame
+from cavmarl.v2x.kernels.shown_states import phase_of, shown_at
 from cavmarl.v2x.kernels.v2x_records import (
     CAUSE_COLLISION,
     CAUSE_HARD_BRAKING,
@@ -123,8 +124,10 @@ def _observe_signal(
             return
         if report["subject"] == roads.links[link]["signal"]:
             age_s = (tick - report["tick"]) * tick_s
-            first = roads.phases[report["code"]]["first_state"]
-            letter = roads.phase_states[first + roads.links[link]["signal_index"]]
+            index = roads.links[link]["signal_index"]
+            letter = shown_at(report, index)
+            if letter < 0:
+                letter = roads.phase_states[roads.phases[phase_of(report)]["first_state"] + index]
             out[0] = 1.0
             if letter == SIGNAL_GREEN_MAJOR or letter == SIGNAL_GREEN_MINOR:
                 out[1] = 1.0

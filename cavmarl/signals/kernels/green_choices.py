@@ -16,7 +16,7 @@ from cavmarl.signals.kernels.controlled_signals import ControlledSignals, Signal
 
 # Columns of the state (W, S, HELD) of the signals that agents control.
 PREVIOUS = 0  # the green before the last change
-GREEN = 1  # the present green, or the one that begins after yellow and all red
+GREEN = 1  # the present green, or the next one during yellow and all red
 SINCE = 2  # tick of the last change
 REFUSED = 3  # choices of the episode that were not allowed
 HELD = 4

@@ -51,7 +51,7 @@ REPORT = record(
     ("tick", np.int64),  # tick of the reported state
     ("expires", np.int64),  # last tick in which a receiver keeps it
     ("kind", np.int32),  # KIND_*
-    ("code", np.int32),  # vehicle class, cause of an event, or PHASE row of a signal
+    ("code", np.int32),  # vehicle class, cause of an event, or PHASE row (see `shown_states`)
     ("x", np.float64),  # m, world frame
     ("y", np.float64),
     ("z", np.float64),

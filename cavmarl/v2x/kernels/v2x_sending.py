@@ -12,7 +12,9 @@ from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.walls import Walls
 from cavmarl.core.records.arrays import RoadArrays, SharedState, ZoneState
 from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_state
 from cavmarl.roads.kernels.signal_phases import program_at
+from cavmarl.v2x.kernels.shown_states import note_shown
 from cavmarl.v2x.kernels.v2x_channel import is_equipped, packet_word
 from cavmarl.v2x.kernels.v2x_perception import visible
 from cavmarl.v2x.kernels.v2x_records import (
@@ -349,6 +351,20 @@ def send_from_units(
                 report["left_s"] = phase_left_s(
                     roads, common.controllers[w], signal, phase, tick * sending.dt_s, sending.dt_s
                 )
+                if phase.size > roads.signals.shape[0]:
+                    _write_overrides(report, roads, signal, phase)
+
+
+@kernel
+def _write_overrides(
+    report: np.void, roads: RoadArrays, signal: int, phase: NDArray[np.int32]
+) -> None:
+    """Write the states that the caller shows at the links of a signal, if there are any."""
+    for link in range(roads.links.shape[0]):
+        shown = overridden_state(roads, link, phase)
+        if roads.links[link]["signal"] == signal and shown != NOT_OVERRIDDEN:
+            report["left_s"] = 0.0
+            note_shown(report, roads.links[link]["signal_index"], shown)
 
 
 @kernel

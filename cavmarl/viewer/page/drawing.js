@@ -244,7 +244,9 @@ export class MapLayers {
     for (let k = 0; k < count; k++) {
       const phase = phases[rows.getUint32(k * STOP_LINE_BYTES + 24, true)] ?? 0;
       const letter = rows.getUint16(k * STOP_LINE_BYTES + 28, true);
-      const code = this.map.phaseStates[this.map.phaseFirst[phase] + letter];
+      const overridden = phases[this.map.signals + this.map.stopLinks[k]];
+      const code = overridden
+        ? overridden - 1 : this.map.phaseStates[this.map.phaseFirst[phase] + letter];
       inks.set(this.map.signal_colors[code] ?? [170, 176, 182], 4 * k);
     }
     this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.stops.colors);

@@ -31,6 +31,10 @@ export function decodeMap(buffer) {
     const [at, count] = head.sections[name];
     return { count, bytes: new Uint8Array(buffer, start + at, count * rowBytes) };
   };
+  const numbers = (name) => {
+    const [at, count] = head.sections[name];
+    return new Uint32Array(buffer.slice(start + at), 0, count);
+  };
   return {
     ...head,
     roads: section("roads", PIECE_BYTES),
@@ -39,8 +43,8 @@ export function decodeMap(buffer) {
     marks: section("marks", CORNER_BYTES),
     buildings: section("buildings", CORNER_BYTES),
     stopLines: section("stop_lines", STOP_LINE_BYTES),
-    phaseFirst: new Uint32Array(buffer.slice(start + head.sections.phase_first[0]), 0,
-      head.sections.phase_first[1]),
+    stopLinks: numbers("stop_links"),
+    phaseFirst: numbers("phase_first"),
     phaseStates: section("phase_states", 1).bytes,
   };
 }

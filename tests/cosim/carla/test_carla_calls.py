@@ -165,7 +165,7 @@ def test_a_batch_answers_each_command_in_order(session: CarlaSession, call: Call
         [[spawn], [[21, [light, 2]]], [[18, [car_0(session), 3]]], [[99, [1]]], [[1, []]]],
         False,
     )
-    assert [one[0][0] for one in answers] == [1, 0, 1, 0, 0]
+    assert [one[0][0] for one in answers] == [1, 1, 1, 0, 0]
     assert call("destroy_actor", answers[0][0][1])
     assert call("get_vehicle_light_state", car_0(session)) == [3]
 

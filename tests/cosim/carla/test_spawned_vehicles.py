@@ -147,6 +147,97 @@ manager.set_synchronous_mode(False)
     assert found["aside"] < 3.0
 
 
+def test_a_client_drives_backward_and_stops() -> None:
+    with running_server(agents=1, background=0) as port:
+        found = run_client(
+            port,
+            SYNCHRONOUS
+            + FIND_FREE
+            + """
+start = points[0]
+car = world.spawn_actor(library.find("vehicle.tesla.model3"), start)
+world.tick()
+ahead = start.get_forward_vector()
+def along():
+    moved = car.get_location() - start.location
+    return moved.x * ahead.x + moved.y * ahead.y
+car.apply_control(carla.VehicleControl(throttle=0.6))
+for _ in range(20):
+    world.tick()
+found["forward"] = along()
+car.apply_control(carla.VehicleControl(throttle=0.6, reverse=True))
+for _ in range(60):
+    world.tick()
+found["backward"] = along()
+found["control"] = [car.get_control().reverse, car.get_control().gear]
+velocity = car.get_velocity()
+found["speed"] = velocity.x * ahead.x + velocity.y * ahead.y
+car.apply_control(carla.VehicleControl(throttle=0.4, reverse=True, steer=0.4))
+before = car.get_transform().rotation.yaw
+for _ in range(20):
+    world.tick()
+found["turned"] = (car.get_transform().rotation.yaw - before + 180.0) % 360.0 - 180.0
+car.apply_control(carla.VehicleControl(brake=1.0))
+for _ in range(40):
+    world.tick()
+found["stopped"] = car.get_velocity().length()
+"""
+            + FREE,
+        )
+    assert found["forward"] > 0.5
+    assert found["backward"] < found["forward"] - 2.0
+    assert found["control"] == [True, -1]
+    assert found["speed"] < -2.0
+    assert found["turned"] < -2.0, "backwards, steering to the right turns the car to the left"
+    assert found["stopped"] == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_client_sets_velocities_and_impulses() -> None:
+    with running_server(agents=1, background=0) as port:
+        found = run_client(
+            port,
+            SYNCHRONOUS
+            + FIND_FREE
+            + """
+start = points[0]
+car = world.spawn_actor(library.find("vehicle.tesla.model3"), start)
+world.tick()
+ahead = start.get_forward_vector()
+car.set_target_velocity(8.0 * ahead)
+world.tick()
+found["set"] = car.get_velocity().length()
+for _ in range(20):
+    world.tick()
+found["rolls"] = car.get_velocity().length()
+car.enable_constant_velocity(carla.Vector3D(5.0, 0.0, 0.0))
+before = car.get_location()
+for _ in range(20):
+    world.tick()
+found["constant"] = [car.get_velocity().length(), car.get_location().distance(before)]
+car.disable_constant_velocity()
+car.apply_control(carla.VehicleControl(brake=1.0))
+for _ in range(40):
+    world.tick()
+found["stopped"] = car.get_velocity().length()
+car.apply_control(carla.VehicleControl())
+car.add_impulse(3.0 * 1845.0 * ahead)
+world.tick()
+found["pushed"] = car.get_velocity().length()
+yaw = car.get_transform().rotation.yaw
+car.set_target_angular_velocity(carla.Vector3D(0.0, 0.0, 40.0))
+world.tick()
+found["turned"] = (car.get_transform().rotation.yaw - yaw + 180.0) % 360.0 - 180.0
+"""
+            + FREE,
+        )
+    assert found["set"] == pytest.approx(8.0, abs=0.1)
+    assert 6.0 < found["rolls"] < 8.0
+    assert found["constant"] == pytest.approx([5.0, 5.0], abs=0.05)
+    assert found["stopped"] == pytest.approx(0.0, abs=0.02)
+    assert found["pushed"] == pytest.approx(3.0, abs=0.3)
+    assert found["turned"] == pytest.approx(2.0, abs=0.1)
+
+
 def test_bad_spawns_are_refused(call: Call, session: CarlaSession) -> None:
     what = [0, "vehicle.tesla.model3", []]
     turned = [0.0, 0.0, 0.0]
@@ -154,8 +245,8 @@ def test_bad_spawns_are_refused(call: Call, session: CarlaSession) -> None:
         call("spawn_actor", what, [[1e6, 0.0, 0.0], turned])
     with pytest.raises(RuntimeError, match="not a finite number"):
         call("spawn_actor", what, [[float("nan"), 0.0, 0.0], turned])
-    with pytest.raises(RuntimeError, match="only vehicles and sensors can be spawned"):
-        call("spawn_actor", [0, "walker.pedestrian.0001", []], [[0.0, 0.0, 0.0], turned])
+    with pytest.raises(RuntimeError, match="actor definition not found"):
+        call("spawn_actor", [0, "walker.pedestrian.9999", []], [[0.0, 0.0, 0.0], turned])
     room = session.world.env.config.population.external
     poses = [
         [[8.0 * (place % 10) - 60.0, 8.0 * (place // 10) + 40.0, 0.0], turned]

@@ -14,6 +14,8 @@ from cavmarl.cosim.carla.vehicle_controls import (
     AckermannControl,
     CarlaControl,
     action_of,
+    backward_motion_of,
+    drives_backward,
     motion_of,
     same_turn,
 )
@@ -26,6 +28,23 @@ def test_throttle_accelerates_and_brakes_slow_down() -> None:
     assert motion_of(CarlaControl(brake=1.0), 0.0) == (-BRAKE_MPS2, 0.0)
     assert motion_of(CarlaControl(throttle=0.2, hand_brake=True), 0.0)[0] < -BRAKE_MPS2 / 2
     assert motion_of(CarlaControl(throttle=1.0, reverse=True), 0.0)[0] == 0.0
+    assert motion_of(CarlaControl(throttle=1.0, reverse=True), 5.0)[0] < -THROTTLE_MPS2
+
+
+def test_the_reverse_gear_drives_backward_from_a_standstill() -> None:
+    back = CarlaControl(throttle=1.0, reverse=True, steer=0.5)
+    assert drives_backward(back, 0.0)
+    assert not drives_backward(back, 3.0)
+    assert not drives_backward(back._replace(brake=1.0), 0.0)
+    assert not drives_backward(back._replace(hand_brake=True), 0.0)
+    assert drives_backward(CarlaControl(throttle=1.0, manual_gear_shift=True, gear=-1), 0.0)
+    assert backward_motion_of(back, 0.0) == (-THROTTLE_MPS2, pytest.approx(-0.5 * FULL_STEER_RAD))
+    for control in (CarlaControl(throttle=1.0), back._replace(throttle=0.0, brake=1.0)):
+        assert drives_backward(control, -3.0)
+        assert backward_motion_of(control, -3.0)[0] > BRAKE_MPS2
+    assert drives_backward(AckermannControl(0.1, 0.0, -2.0, 0.0, 0.0), 0.0)
+    assert backward_motion_of(AckermannControl(0.1, 0.0, -2.0, 0.0, 0.0), 0.0)[0] == -4.0
+    assert backward_motion_of(AckermannControl(0.1, 0.0, -2.0, 0.0, 0.0), 0.0)[1] == -0.1
 
 
 def test_steer_is_positive_to_the_right() -> None:

@@ -36,6 +36,7 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import (
     can_be_ignored,
 )
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
+from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_state
 
 BRISK_ACCEL = 2.5  # m/s²: assumed acceleration of a driver towards a shared area
 GENTLE_ACCEL = 1.8  # m/s²: to be safe, assumed acceleration out of a shared area
@@ -71,6 +72,9 @@ def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
     signal = roads.links[link]["signal"]
     if signal < 0:
         return SIGNAL_NONE
+    shown = overridden_state(roads, link, phase)
+    if shown != NOT_OVERRIDDEN:
+        return shown
     first = roads.phases[phase[signal]]["first_state"]
     return int(roads.phase_states[first + roads.links[link]["signal_index"]])
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import CHOSEN_BY_AGENT
+from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_state
 from cavmarl.roads.kernels.signal_phases import program_at
 
 
@@ -19,7 +20,7 @@ def time_to_change(
     # CONTROLLER (num_controllers,), the state of the actuated programs
     controllers: NDArray[np.void],
     link: int,  # LINK row that has a signal
-    phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
+    phase: NDArray[np.int32],  # (num_signals + …,) see `Worlds.signal_phase`
     time: float,  # s since the world's reset
     dt: float,  # length of a tick, s
 ) -> float:
@@ -27,8 +28,11 @@ def time_to_change(
 
     If the state never changes, the result is the length of the cycle. For an actuated program, and
     for one whose greens are chosen, it is the earliest possible time: each phase counts with its
-    minimum duration, and any green may be chosen next.
+    minimum duration, and any green may be chosen next. A state that the caller shows can change at
+    any time.
     """
+    if overridden_state(roads, link, phase) != NOT_OVERRIDDEN:
+        return 0.0
     index = roads.links[link]["signal_index"]
     signal = roads.links[link]["signal"]
     program = roads.programs[program_at(roads, signal, time, dt)]
