@@ -115,12 +115,15 @@ class ExternalComponent:
         held = held[is_held]
         return wrong_commands(held, kinds) or wrong_bodies(held, self._types)
 
-    def wrong_rows(self, ids: NDArray[np.int64], rows: NDArray[np.void]) -> str:
-        """Return what is wrong with the ids (E,) of a world's slots and its rows VEHICLE (n,)."""
+    def wrong_rows(self, ids: NDArray[np.int64], rows: NDArray[np.void], is_whole: bool) -> str:
+        """Return what is wrong with the ids (E,) of a world's slots and rows VEHICLE (n,).
+
+        `is_whole`: whether these are the rows of all zones, so that no slot lacks its vehicle.
+        """
         rows = rows[rows["driver"] == DRIVER_EXTERNAL]
-        found = np.full(len(ids), -1)
-        found[rows["order"]] = rows["id"]
-        if len(rows) != np.count_nonzero(ids >= 0) or (found != ids).any():
+        slots = rows["order"]
+        lacks = is_whole and len(rows) != np.count_nonzero(ids >= 0)
+        if lacks or len(np.unique(slots)) < len(slots) or (ids[slots] != rows["id"]).any():
             return "external vehicles and their slots do not match"
         return ""
 

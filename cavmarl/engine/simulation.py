@@ -237,18 +237,21 @@ class Simulation(WorldViews):
         tick.peers.share_rows(tick.departures, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
-        self.check(saved)
+        self.check(saved, is_whole=home is None)
         roots, episodes, *rest = saved
         ownership = self._saved_ownership(rest)
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
         self._tick.departures = snapshot.load(self._parts(), rest, ownership, home)
 
-    def check(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Check that `load` can take a state. Raises ConfigError if it cannot."""
+    def check(self, saved: Sequence[NDArray[Any]], is_whole: bool = True) -> None:
+        """Check that `load` can take a state. Raises ConfigError if it cannot.
+
+        `is_whole`: whether the state has the vehicles of all zones, not of one process alone.
+        """
         if len(saved) < 2 or saved[0].shape != (2,) or saved[1].shape != self._episodes.shape:
             raise ConfigError("the state is damaged: it lacks the seed or the episodes' numbers")
-        snapshot.form_of(self._parts()).check(saved[2:])
+        snapshot.form_of(self._parts()).check(saved[2:], is_whole)
 
     def check_share(self, share: Sequence[NDArray[Any]]) -> None:
         """Check that `join` can take a state of one world. Raises ConfigError if it cannot."""

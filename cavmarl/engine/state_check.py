@@ -59,13 +59,17 @@ class StateForm(NamedTuple):
     fixed: Sequence[Array]  # examples of the first arrays, with their dtypes and shapes
     rerouting: Sequence[Array]  # examples of the arrays of rerouting; empty without rerouting
 
-    def check(self, saved: Sequence[Array]) -> None:
+    def check(self, saved: Sequence[Array], is_whole: bool) -> None:
         """Check that worlds can resume from a state that `world_snapshot.save` returned.
+
+        Args:
+            saved: the state.
+            is_whole: whether it has the vehicles of all zones.
 
         Raises:
             ConfigError: they cannot; the message says why.
         """
-        if wrong := self._wrong(saved):
+        if wrong := self._wrong(saved, is_whole):
             raise ConfigError(
                 f"the state is damaged or belongs to different worlds: {wrong}; use the "
                 "environment and the version that saved it"
@@ -87,7 +91,7 @@ class StateForm(NamedTuple):
                     f"{array.shape}, not {shape}"
                 )
 
-    def _wrong(self, saved: Sequence[Array]) -> str:
+    def _wrong(self, saved: Sequence[Array], is_whole: bool) -> str:
         num_worlds, zones = self.division.num_worlds, self.division.count
         num_fixed, num_more = len(self.fixed), len(self.rerouting)
         number = num_fixed + 1 + num_more + 2 + num_worlds * zones
@@ -117,7 +121,7 @@ class StateForm(NamedTuple):
             or self._wrong_common(named)
             or self._wrong_attached(fixed[len(fixed) - self._num_attached :])
             or self._wrong_vehicles(named, queue, rerouting, vehicles)
-            or self._wrong_external(fixed[len(fixed) - self._num_attached :], vehicles)
+            or self._wrong_external(fixed[len(fixed) - self._num_attached :], vehicles, is_whole)
         )
 
     @property
@@ -133,7 +137,9 @@ class StateForm(NamedTuple):
             at += number
         return ""
 
-    def _wrong_external(self, arrays: Sequence[Array], vehicles: Sequence[Array]) -> str:
+    def _wrong_external(
+        self, arrays: Sequence[Array], vehicles: Sequence[Array], is_whole: bool
+    ) -> str:
         """Check that the external vehicles are those of the slots."""
         zones, at = self.division.count, 0
         for part in self.attached:
@@ -142,7 +148,7 @@ class StateForm(NamedTuple):
                 _, ids = arrays[at : at + number]
                 for w, own in enumerate(ids):
                     rows = np.concatenate(vehicles[w * zones : (w + 1) * zones])
-                    if wrong := part.wrong_rows(own, rows):
+                    if wrong := part.wrong_rows(own, rows, is_whole):
                         return f"world {w}: {wrong}"
             at += number
         return ""

@@ -19,6 +19,7 @@ import sumolib
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from cavmarl import parallel_env
 from cavmarl.adapters import sumo_rl
 from cavmarl.adapters.sumo_rl import SumoEnvironment, TrafficSignal
 from cavmarl.adapters.sumo_rl.agents import QLAgent
@@ -95,6 +96,34 @@ def test_signals_lanes_and_phases_are_those_of_the_file(routes: str) -> None:
             size = len(greens) + 1 + 2 * len(signal.lanes)
             assert signal.observation_space == spaces.Box(0.0, 1.0, (size,), np.float32)
             assert signal.action_space == spaces.Discrete(len(greens))
+
+
+def test_greens_are_counted_as_in_sumo_rl(routes: str, tmp_path: Path) -> None:
+    """Equal phases are two greens, and so are phases with `Y`; elsewhere they are not."""
+    with closing(grid(routes)) as env:
+        first, second = (phase.state for phase in env.traffic_signals["A0"].green_phases)
+        size = len(first)
+    odd = "Y" * size
+    states = [first, "y" * size, second, "r" * size, first, odd, "s" * size]
+    phases = "".join(f'<phase duration="10" state="{state}"/>' for state in states)
+    file = tmp_path / "programs.add.xml"
+    file.write_text(
+        '<additional><tlLogic id="A0" type="static" programID="other" offset="0">'
+        f"{phases}</tlLogic></additional>",
+        encoding="utf-8",
+    )
+    with closing(grid(routes, additional_sumo_cmd=f"-a {file}")) as env:
+        signal = env.traffic_signals["A0"]
+        assert [phase.state for phase in signal.green_phases] == [first, second, first, odd]
+        assert signal.all_phases[signal.yellow_dict[0, 2]].state == first
+        assert env.reset()["A0"][:4].tolist() == [1.0, 0.0, 0.0, 0.0]
+        env.step({"A0": 2})
+        env.step({"A0": 2})
+        observations, *_ = env.step({"A0": 2})
+        assert observations["A0"][:4].tolist() == [0.0, 0.0, 1.0, 0.0]
+    overrides = {"map.programs": [str(file)], "signals.agents": ["A0"], "clock.ctrl_dt_s": 1.0}
+    with closing(parallel_env(str(NET), agents=0, background=0, overrides=overrides)) as env:
+        assert env.action_space("signal_A0") == spaces.Discrete(2)
 
 
 def test_greens_change_at_the_times_of_sumo_rl(routes: str) -> None:

@@ -355,6 +355,15 @@ def test_external_vehicles_and_slots_that_do_not_match(make: Make) -> None:
 
         _refused(vec, forge)
 
+    # A node keeps the vehicles of its own zones alone.
+    part = _forged(_worlds(vec), lambda state: None)
+    for n, rows in enumerate(part):
+        if rows.dtype == VEHICLE and np.isin(ids[:2], rows["id"]).any():
+            part[n] = rows[:0]
+    _worlds(vec).check(part, is_whole=False)
+    with pytest.raises(ConfigError, match="external vehicles and their slots do not match"):
+        _worlds(vec).check(part)
+
 
 def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> None:
     vec = make("grid4x4", num_envs=2, zones=2, overrides={"signals.agents": "all"})

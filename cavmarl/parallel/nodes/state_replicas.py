@@ -197,7 +197,7 @@ class StateReplicas:
     def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
         """Read a kept state. Raises ConfigError: the worlds cannot resume from it."""
         saved = from_bytes(data, like)
-        self._worlds.check(saved)
+        self._worlds.check(saved, is_whole=False)
         return saved
 
     @property

@@ -265,10 +265,13 @@ class LocalWorlds:
         self.simulation.load_own(saved[2:], home)
         self._steps[:], self._waiting[:] = saved[:2]
 
-    def check(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Raise ConfigError if the worlds cannot resume from what `save` returned."""
+    def check(self, saved: Sequence[NDArray[Any]], is_whole: bool = True) -> None:
+        """Raise ConfigError if the worlds cannot resume from what `save` returned.
+
+        `is_whole`: see `Simulation.check`.
+        """
         self._check_own(saved)
-        self.simulation.check(saved[2:])
+        self.simulation.check(saved[2:], is_whole)
 
     def _check_own(self, saved: Sequence[NDArray[Any]]) -> None:
         if any(array.shape != self._steps.shape for array in saved[:2]):
