@@ -222,7 +222,8 @@ class SimulatorComponent:
                 f"{wanted['id'].tolist()}; each owned vehicle must be reported once",
                 zone,
             )
-        far_m = np.hypot(told["x"] - wanted["x"], told["y"] - wanted["y"])
+        dx, dy = told["x"] - wanted["x"], told["y"] - wanted["y"]
+        far_m = np.sqrt(dx * dx + dy * dy)
         most_m = self._hosted[zone].tolerance_m
         is_right = (far_m <= most_m) & np.isfinite(told["heading"]) & np.isfinite(told["speed"])
         if most_m == 0.0:

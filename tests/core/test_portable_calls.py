@@ -13,8 +13,9 @@ FOLDERS = """
     core roads maps driving zones traffic v2x rewards sensors ownership shards handoff engine
     env policies config
 """.split()
-# These do not build worlds: they compare maps with scans, and write files for other programs.
-OTHER = ("maps/fidelity/", "maps/exports/")
+# These do not build worlds: they compare maps with scans, and write files for other programs. The
+# last one drives CARLA, whose zones have a tolerance.
+OTHER = ("maps/fidelity/", "maps/exports/", "handoff/simulators/carla_zone_client.py")
 # Tables of results, and drivers.
 FILES = ("evaluate/*.py", "evaluate/scenarios/criticality.py", "../agents/*.py")
 

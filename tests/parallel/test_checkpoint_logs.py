@@ -63,7 +63,7 @@ def test_worlds_that_are_reset_when_the_log_is_full(make: Make, kind: dict[str, 
 def checkpoint_log() -> Iterator[CheckpointLog]:
     config = load_world("merge").config
     segments = make_segments(config, 1, 0)
-    yield CheckpointLog(config, 1, [segment.fd for segment in segments])
+    yield CheckpointLog(config, 1, 0, [segment.fd for segment in segments])
     for segment in segments:
         segment.close()
 
@@ -76,6 +76,7 @@ def commands_like(entry: Commands, value: int) -> Commands:
         np.full_like(entry.inserted, value),
         np.full_like(entry.external, value),
         np.full_like(entry.overridden, value),
+        np.full_like(entry.signal_choices, value),
     )
 
 

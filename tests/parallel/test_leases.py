@@ -97,7 +97,9 @@ def begun() -> tuple[ZoneEndpoints, NodeCoordinator, ZonedShards, Any]:
     wires.coordinator = coordinator
     hostings = coordinator.host(neighbours_of(division))
     checks = IndexCheck(worlds.simulation)
-    hosts = ZoneEndpoints(division, (0, 1), (0, 0), hostings, limits, wires, [], checks, ticks=2)
+    hosts = ZoneEndpoints(
+        division, (0, 1), (0, 0), hostings, limits, wires, [], checks, [], ticks=2
+    )
     hosts.reset(np.ones(1, dtype=np.bool_))
     return hosts, coordinator, division, wires
 
@@ -125,17 +127,16 @@ def test_a_vehicle_that_crosses_before_it_has_a_record_is_offered_in_a_lease_of_
 def test_an_offer_before_the_lease_of_its_episode_is_answered_after_the_lease() -> None:
     hosts, coordinator, division, wires = begun()
     hosts.report()
-    table, row = coordinator.worlds[0].directory.table, division.owned(0, 0)[0]
-    before, row["id"] = int(row["id"]), 10**6
+    table = coordinator.worlds[0].directory.table
+    vehicle = int(division.owned(0, 0)[0]["id"])
     state = division.changes.state(0, 0, 0)
-    row["id"] = before
-    offer = Offer(10**6, 0, state_digest(state), state)
+    offer = Offer(vehicle, 0, state_digest(state), state)
     prepare = Prepare(
         bytes(16), table.episode, table.tick + 1, 0, 1, 1, division.codec.schema, (offer,)
     )
-    hosts.receive(NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
+    hosts.receive(0, NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
     assert wires.answers == []
     hosts.note(unpacked(memoryview(coordinator.begin(WAIT_S)[0])))
     (ack,) = wires.answers
     assert isinstance(ack, Ack)
-    assert (ack.zone, ack.entries[0].vehicle) == (1, 10**6)
+    assert (ack.zone, ack.entries[0].vehicle) == (1, vehicle)

@@ -496,3 +496,24 @@ def test_the_time_to_a_change_is_never_later_than_the_change(change: tuple[float
                     assert soonest[k] <= later[0] - tick + 1e-9
                     is_exact += soonest[k] >= later[0] - tick - 1.0 - 1e-9
         assert is_exact > 100
+
+
+def test_a_shown_letter_wins_over_a_chosen_green() -> None:
+    def run(**more: Any) -> list[str]:
+        overrides = ALL | {"signals.overrides": 8, "horizon_s": 60.0}
+        env = parallel_env("grid4x4", agents=2, background=60, overrides=overrides, **more)
+        with closing(env):
+            env.reset(seed=2)
+            found = []
+            for step in range(30):
+                if step == 5:
+                    env.signal_overrides.show("A0", 0, "r")
+                if step == 20:
+                    env.signal_overrides.release("A0")
+                env.step(env.suggest_actions())
+                assert (env.signal_overrides.letters("A0")[0] == "r") or not 5 <= step < 20
+                found.append(env.signal_overrides.letters("A0"))
+            assert len({letters[0] for letters in found}) > 1
+            return [env.state_hash(), *found]
+
+    assert run(zones=4) == run()

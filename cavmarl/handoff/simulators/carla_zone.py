@@ -125,8 +125,9 @@ class CarlaZone:
         # Drivers see farther than CARLA needs to show.
         min_x, min_y, max_x, max_y = self._setup.rect
         x, y = ghosts["x"], ghosts["y"]
-        dx, dy = np.maximum(min_x - x, x - max_x), np.maximum(min_y - y, y - max_y)
-        near = np.hypot(np.maximum(dx, 0.0), np.maximum(dy, 0.0)) <= self._ghosts_m
+        dx = np.maximum(np.maximum(min_x - x, x - max_x), 0.0)
+        dy = np.maximum(np.maximum(min_y - y, y - max_y), 0.0)
+        near = dx * dx + dy * dy <= self._ghosts_m * self._ghosts_m
         self._call("show", ghosts=_rows(ghosts[near]), signals=letters)
 
     def advance(self, wanted: NDArray[np.void], aims: NDArray[np.float64]) -> None:

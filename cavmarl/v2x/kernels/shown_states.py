@@ -22,7 +22,7 @@ def note_shown(report: np.void, index: int, state: int) -> None:
     """Write the state of an overridden link, once per index."""
     if report["code"] >= 0:
         report["code"] = -1 - report["code"]
-    bits = (1.0 + state) * 16.0 ** (index % LETTERS_PER_FIELD)
+    bits = (1.0 + state) * np.float64(np.int64(1) << 4 * (index % LETTERS_PER_FIELD))
     field = index // LETTERS_PER_FIELD
     if shown_at(report, index) >= 0:
         return
