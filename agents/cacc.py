@@ -92,7 +92,7 @@ class CaccPolicy(Policy):
         """Return the built-in driver's actions, (W, A, 2)."""
         suggested = self.env.suggest_actions()
         if not isinstance(suggested, dict):
-            return suggested
+            return np.asarray(suggested)
         actions = np.zeros((*shape, 2), dtype=np.float32)
         for agent, action in suggested.items():
             actions[0, self.env.possible_agents.index(agent)] = action

@@ -13,6 +13,7 @@ from cavmarl.config.io import validate
 from cavmarl.parallel.memory.shared_memory import Segment, arrays_in
 from cavmarl.parallel.processes.worker_loop import Job, serve
 from cavmarl.parallel.worlds.step_arrays import StepArrays, layout_of
+from cavmarl.signals.signal_table import SignalSizes
 
 __all__ = ["TrivialJob", "make_jobs"]
 
@@ -47,7 +48,7 @@ class TrivialJob(Job):
 def make_jobs(message: Mapping[str, Any]) -> list[Job]:
     """Return the jobs of all workers."""
     config = validate(EnvConfig, message["config"], "the environment")
-    layout = layout_of(config, message["capacity"], message["num_worlds"])
+    layout = layout_of(config, message["capacity"], message["num_worlds"], SignalSizes())
     arrays = StepArrays.of(arrays_in(Segment(message["arrays"], 0).map(), layout))
     return [TrivialJob(arrays.part(first, last)) for first, last, _ in message["parts"]]
 
