@@ -26,7 +26,7 @@ class Worlds:
     def save(self) -> list[np.ndarray[Any, Any]]:
         return [np.arange(3), np.zeros(0), np.ones(2)]
 
-    def check(self, saved: list[np.ndarray[Any, Any]]) -> None:
+    def check(self, saved: list[np.ndarray[Any, Any]], is_whole: bool = True) -> None:
         if len(saved[0]) != 3:
             raise ConfigError("the state has other numbers")
 
