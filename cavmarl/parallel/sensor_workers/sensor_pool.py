@@ -270,7 +270,8 @@ class SensorWorkers:
         times.publish_s += published - began
         times.own_s += sensed - published
         times.wait_s += ended - sensed
-        times.busy_s += float(shared.busy_s.max())
+        # the workers begin while this process still senses, so their time may exceed the wait
+        times.busy_s += min(float(shared.busy_s.max()), ended - sensed)
         times.ticks += 1
         times.sent_bytes += int(shared.num_rows.sum()) * shared.rows.itemsize + sum(
             array.nbytes for array in (shared.before, shared.due, shared.signal_phase)
