@@ -84,6 +84,16 @@ class SignalAgents:
             for agent, count in zip(self.agents, self.num_choices.tolist(), strict=True)
         }
 
+    def check(self, agent: str, action: Any) -> None:
+        """Raise the ActionError of an action that is no choice of the agent's signal."""
+        s = self._index[agent]
+        if np.shape(action) != () or np.asarray(action).dtype.kind not in "iu":
+            raise ActionError(f"{agent}: the action is {action!r}, must be one whole number")
+        if not 0 <= action < self.num_choices[s]:
+            raise ActionError(
+                f"{agent}: the action is {action}, must be from 0 to {self.num_choices[s] - 1}"
+            )
+
     def from_dict(self, actions: Mapping[str, Any]) -> NDArray[np.int64]:
         """Return the choices (1, S) of one world's agents.
 
