@@ -95,11 +95,7 @@ class SignalsConfig(Section, key="signals"):
         return self.are_controlled and self.controller == BY_AGENTS
 
     def refusal_of_agents(self, what: str) -> str:
-        """Return why `what` cannot have agents of signals; empty if no signal has an agent.
-
-        Args:
-            what: the part that has agents of vehicles alone, such as `this adapter`.
-        """
+        """Return why `what` cannot have agents of signals; empty if no signal has an agent."""
         if not self.have_agents:
             return ""
         choices = ", ".join(SIGNAL_CONTROLLERS)
