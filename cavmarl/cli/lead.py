@@ -165,9 +165,7 @@ def lead(
     write_json(json_path, found)
 
 
-def run_episode(
-    world: FollowedWorld, seed: int, steps: int | None, on_lost: str
-) -> dict[str, Any]:
+def run_episode(world: FollowedWorld, seed: int, steps: int | None, on_lost: str) -> dict[str, Any]:
     """Run one episode and return its figures; the arguments are those of `lead`."""
     master, lost = world.master, []
 

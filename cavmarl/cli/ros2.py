@@ -61,9 +61,7 @@ def ros2(
     deadline_s: Annotated[
         float, about("Seconds that a step waits for a command, real time.", metavar="S")
     ] = 1.0,
-    lag_steps: Annotated[
-        int, about("A command may be this many steps old.", metavar="N")
-    ] = 0,
+    lag_steps: Annotated[int, about("A command may be this many steps old.", metavar="N")] = 0,
     ready_s: Annotated[
         float,
         about("Seconds that the first step waits for a publisher of commands.", metavar="S"),
@@ -200,7 +198,10 @@ def _start(
         thread = Thread(target=follow, args=(led.address,), daemon=True)
         thread.start()
         try:
-            led.wait_for(1, 60.0)
+            while not led.seats and thread.is_alive():
+                led.admit(0.2)
+            if errors:
+                raise errors[0]
             run = run_episode(led, world.seed, steps, "end")
         except CavmarlError:
             thread.join(options.deadline_s + 10.0)

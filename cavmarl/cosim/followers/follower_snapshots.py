@@ -84,10 +84,10 @@ def take_snapshot(
     arrays: list[NDArray[Any]] = []
     time_s = moment.tick * env.config.clock.sim_dt_s
     if truth:
-        seen = env.world_frames([world])[0].vehicles
-        data = np.stack([seen[name].astype(np.float64) for name in TRUTH], axis=-1)[np.newaxis]
-        views.append(_array("", "truth", data, np.array([time_s]), np.zeros(1, np.bool_)))
-        arrays.append(data)
+        rows = env.world_frames([world])[0].vehicles
+        true = np.stack([rows[name].astype(np.float64) for name in TRUTH], axis=-1)[np.newaxis]
+        views.append(_array("", "truth", true, np.array([time_s]), np.zeros(1, np.bool_)))
+        arrays.append(true)
     if due:
         by_agent = {vehicle.agent: vehicle for vehicle in env.worlds.driven(world, due)}
         for k in due:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from threading import Lock
 from typing import Any, NamedTuple, Self
+from weakref import WeakValueDictionary
 
 from cavmarl.core.errors import ConfigError, RosError, require
 from cavmarl.cosim.ros2.ros_types import RosTypes
@@ -29,6 +31,9 @@ _LOOPBACK = f"""<CycloneDDS><Domain id="any">
 <MaxAutoParticipantIndex>{_MAX_PARTICIPANTS}</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
+
+_DOMAINS: WeakValueDictionary[int, Any] = WeakValueDictionary()  # those of this process
+_LOCK = Lock()
 
 
 class Received(NamedTuple):
@@ -78,7 +83,7 @@ class DdsNode:
         self._domain: Any = None
         try:
             if not os.environ.get("CYCLONEDDS_URI"):
-                self._domain = self._dds["domain"].Domain(domain, _LOOPBACK)
+                self._domain = _loopback(self._dds["domain"].Domain, domain)
             quality = self._dds["qos"]
             self._participant: Any = self._dds["domain"].DomainParticipant(
                 domain, qos=quality.Qos(quality.Policy.Userdata(b"enclave=/;"))
@@ -245,6 +250,15 @@ class DdsNode:
         fields = {"gid": gid(self._participant), "node_entities_info_seq": [node]}
         data = self._types.encode(_GRAPH_KIND, fields)
         self._graph.write(_sample(self._classes[_GRAPH_KIND], data))
+
+
+def _loopback(make: Any, domain: int) -> Any:
+    """Return the domain on the loopback interface, of which a process can have only one."""
+    with _LOCK:
+        found = _DOMAINS.get(domain)
+        if found is None:
+            found = _DOMAINS[domain] = make(domain, _LOOPBACK)
+        return found
 
 
 def _sample(cls: Any, data: bytes) -> Any:

@@ -129,7 +129,7 @@ class RosBridge:
         self.steps, self.wait_wall_s = 0, 0.0
         self._looked_s = 0.0
         self._wanted: frozenset[str] = frozenset()
-        self._is_ready = False
+        self._is_first = True
         commands = {
             topic: kind for each in self._controls.values() for topic, kind in each.topics.items()
         }
@@ -160,6 +160,9 @@ class RosBridge:
         """
         try:
             for view in self._follower:
+                if self._is_first and view.snapshot.vehicles:
+                    self._is_first = False
+                    self._get_ready(view)
                 self._publish(view)
                 if view.snapshot.is_over:
                     continue
@@ -184,6 +187,19 @@ class RosBridge:
     def _close_bag(self) -> None:
         if self._bag is not None:
             self._bag.close()
+
+    def _get_ready(self, view: FollowerView) -> None:
+        """Wait for publishers of commands before the first messages, so that none is missed."""
+        bases = {name: seen.wheelbase_m for name, seen in view.snapshot.vehicles.items()}
+        self._topics.clock.set(view.snapshot.episode, view.snapshot.tick)
+        self._until(self._options.ready_s, lambda: all(map(self._has_publisher, bases)), bases)
+        if silent := [name for name in bases if not self._has_publisher(name)]:
+            log.warning(
+                "nobody publishes commands of %s on domain %d: they brake until then; topics: %s",
+                ", ".join(silent),
+                self._options.domain,
+                ", ".join(self._controls[silent[0]].topics),
+            )
 
     def _publish(self, view: FollowerView) -> None:
         now_s = time.monotonic()
@@ -235,16 +251,6 @@ class RosBridge:
     def _await(self, bases: Mapping[str, float], due_ns: int) -> None:
         """Wait until each vehicle has a command of this time, or until the deadline."""
         began_s = time.monotonic()
-        if not self._is_ready:
-            self._is_ready = True
-            self._until(self._options.ready_s, lambda: all(map(self._has_publisher, bases)), bases)
-            if silent := [name for name in bases if not self._has_publisher(name)]:
-                log.warning(
-                    "nobody publishes commands of %s on domain %d: they brake until then; topics: %s",
-                    ", ".join(silent),
-                    self._options.domain,
-                    ", ".join(self._controls[silent[0]].topics),
-                )
 
         def late() -> list[str]:
             return [name for name in bases if self._controls[name].stamp_ns < due_ns]
@@ -283,8 +289,13 @@ class RosBridge:
 
 
 def join(
-    address: str | int, vehicles: Sequence[str], options: RosOptions, *, secret: str = "",
-    joins_s: float = 60.0, steps: int | None = None,
+    address: str | int,
+    vehicles: Sequence[str],
+    options: RosOptions,
+    *,
+    secret: str = "",
+    joins_s: float = 60.0,
+    steps: int | None = None,
 ) -> dict[str, Any]:
     """Attach a bridge to a running world until it ends, and return figures; see `RosBridge`.
 

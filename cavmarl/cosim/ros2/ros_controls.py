@@ -15,6 +15,7 @@ from cavmarl.cosim.followers.follower_messages import Welcome
 from cavmarl.cosim.ros2.ros_types import RosTypes, ns_of
 
 SPEED_TIME_S = 0.5  # time constant of reaching a commanded speed
+NEVER = -(1 << 62)  # ns, before all times
 _STANDS_MPS = 0.05  # below this speed, a turn on the spot is a full turn of the wheels
 
 
@@ -97,8 +98,8 @@ class VehicleControls:
 
     @property
     def stamp_ns(self) -> int:
-        """Time of the newest command; -1: there is none."""
-        return -1 if self._last is None else self._last.stamp_ns
+        """Time of the newest command; `NEVER`: there is none."""
+        return NEVER if self._last is None else self._last.stamp_ns
 
     def take(self, topic: str, data: bytes, wheelbase_m: float) -> None:
         """Read a message in CDR. An invalid one, or one that is older, is counted."""

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 Profile = Literal["plain", "autoware"]
 
 CLOCK, TF, TF_STATIC = "/clock", "/tf", "/tf_static"
-_VEHICLES, _SIGNALS = "/vehicles", "/signals"
+VEHICLES, SIGNALS = "/vehicles", "/signals"
 _TF_KIND = "tf2_msgs/msg/TFMessage"
 _DRIVE, _AUTONOMOUS = 2, 1  # GearReport, ControlModeReport
 
@@ -45,6 +45,14 @@ _AUTOWARE_TOPICS = {
     "gnss": "/sensing/gnss/nav_sat_fix",
     "odometry": "/sensing/vehicle_velocity_converter/{}/twist",
 }
+
+
+def kinds_of_world(truth: bool) -> dict[str, str]:
+    """Return the type of each topic about the world; `truth`: whether true states are published."""
+    kinds = {CLOCK: "rosgraph_msgs/msg/Clock", SIGNALS: "std_msgs/msg/UInt8MultiArray"}
+    if truth:
+        kinds |= {TF: _TF_KIND, VEHICLES: "visualization_msgs/msg/MarkerArray"}
+    return kinds
 
 
 class RosClock:
@@ -301,13 +309,7 @@ class WorldTopics:
 
     def __init__(self, vehicles: Sequence[VehicleTopics], clock: RosClock, truth: bool) -> None:
         self.vehicles, self.clock = tuple(vehicles), clock
-        self.kinds = {
-            CLOCK: "rosgraph_msgs/msg/Clock",
-            TF_STATIC: _TF_KIND,
-            _SIGNALS: "std_msgs/msg/UInt8MultiArray",
-        }
-        if truth:
-            self.kinds |= {TF: _TF_KIND, _VEHICLES: "visualization_msgs/msg/MarkerArray"}
+        self.kinds = {TF_STATIC: _TF_KIND, **kinds_of_world(truth)}
         for vehicle in vehicles:
             if taken := sorted(self.kinds.keys() & vehicle.kinds.keys()):
                 raise ConfigError(
@@ -343,21 +345,19 @@ class WorldTopics:
             own = _dicts(rows[rows[:, 0] == seen.vehicle_id])
             state = true_state(own[0], seen.wheelbase_m) if own else None
             if state is not None:
-                moved.append(
-                    transform(clock.now_ns, "map", vehicle.base, state.place, state.turn)
-                )
+                moved.append(transform(clock.now_ns, "map", vehicle.base, state.place, state.turn))
             yield from vehicle.messages(view, clock, wanted, state)
             steering = steering_rad.get(vehicle.vehicle, 0.0)
             yield from vehicle.status(clock, wanted, steering, state)
         if moved and TF in wanted:
             yield RosMessage(TF, _TF_KIND, clock.now_ns, {"transforms": moved})
-        if _VEHICLES in wanted and len(rows):
+        if VEHICLES in wanted and len(rows):
             fields = markers(_dicts(rows), clock.now_ns, 2 * clock.step_ns)
-            yield RosMessage(_VEHICLES, self.kinds[_VEHICLES], clock.now_ns, fields)
+            yield RosMessage(VEHICLES, self.kinds[VEHICLES], clock.now_ns, fields)
         signals = view.sensors.get("", {}).get("signals")
-        if signals is not None and _SIGNALS in wanted:
+        if signals is not None and SIGNALS in wanted:
             fields = {"data": signals.values[-1]}
-            yield RosMessage(_SIGNALS, self.kinds[_SIGNALS], clock.now_ns, fields)
+            yield RosMessage(SIGNALS, self.kinds[SIGNALS], clock.now_ns, fields)
         yield self.clock_message()
 
     def _mounts(self, view: FollowerView) -> list[Fields]:

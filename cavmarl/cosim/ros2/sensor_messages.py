@@ -8,7 +8,7 @@ its body. ROS's rotation about y is positive nose down; cavmarl's pitch is posit
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -118,7 +118,7 @@ def covariance(noise: Any, first: int, count: int = 3) -> list[float]:
     """Return a diagonal matrix, row by row, from standard deviations of channels."""
     deviations = [float(one) for one in noise]
     chosen = deviations * count if len(deviations) == 1 else deviations[first : first + count]
-    return np.diag(np.square(chosen)).ravel().tolist()  # type: ignore[no-any-return]
+    return np.diag(np.square(chosen)).ravel().tolist()
 
 
 def cloud(points: NDArray[np.void], stamp_ns: int, frame: str) -> Fields:
@@ -288,7 +288,7 @@ def odometry(state: TrueState, stamp_ns: int, base: str) -> Fields:
     }
 
 
-def markers(rows: list[Mapping[str, float]], stamp_ns: int, life_ns: int) -> Fields:
+def markers(rows: Sequence[Mapping[str, float]], stamp_ns: int, life_ns: int) -> Fields:
     """Return a `visualization_msgs/msg/MarkerArray` of boxes; `rows` have columns of `TRUTH`."""
     found = []
     for row in rows:
