@@ -148,7 +148,7 @@ docs: $(SITE)/.ready ## build the site of all pages into dist/site
 	NO_MKDOCS_2_WARNING=1 $(SITE)/bin/mkdocs build --clean
 
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) $(SITE) $(DEMO) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) $(SITE) $(DEMO) $(ROS) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
 define CHECK_PYTHON

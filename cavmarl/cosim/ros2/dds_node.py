@@ -46,8 +46,8 @@ class Received(NamedTuple):
 class DdsNode:
     """A node with publishers and subscriptions on one domain.
 
-    It reaches the programs of this machine, or those that `CYCLONEDDS_URI` describes, if the
-    environment has this variable.
+    It reaches the programs of this machine. If the environment has `CYCLONEDDS_URI`, it reaches
+    the network which this configuration describes.
 
     Args:
         types: message types.
@@ -55,7 +55,7 @@ class DdsNode:
         domain: ROS_DOMAIN_ID.
         publishers: kind by topic.
         subscriptions: kind by topic.
-        latched: topics of which a late subscriber gets the last message.
+        latched: topics whose last message a late subscriber gets.
 
     Raises:
         ConfigError: the domain is out of range.
@@ -223,11 +223,14 @@ class DdsNode:
         fields = {field: described(node) for field, node in self._types.fields_of(kind)}
         cls = idl.make_idl_struct(f"{name}_", f"{package}::msg::dds_::{name}_", fields)
 
-        def serialize(self: Any, *_: Any, **__: Any) -> bytes:
+        # The signatures are those of Cyclone DDS's own methods.
+        def serialize(
+            self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None
+        ) -> bytes:
             data: bytes = self.cdr
             return data
 
-        def deserialize(data: bytes, *_: Any, **__: Any) -> Any:
+        def deserialize(data: bytes, has_header: bool = True, use_version_2: Any = None) -> Any:
             return _sample(cls, bytes(data))
 
         cls.serialize, cls.deserialize = serialize, staticmethod(deserialize)
@@ -253,7 +256,7 @@ class DdsNode:
 
 
 def _loopback(make: Any, domain: int) -> Any:
-    """Return the domain on the loopback interface, of which a process can have only one."""
+    """Return the domain on the loopback interface; a process can have each domain once."""
     with _LOCK:
         found = _DOMAINS.get(domain)
         if found is None:

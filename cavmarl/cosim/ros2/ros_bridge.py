@@ -195,7 +195,8 @@ class RosBridge:
         self._until(self._options.ready_s, lambda: all(map(self._has_publisher, bases)), bases)
         if silent := [name for name in bases if not self._has_publisher(name)]:
             log.warning(
-                "nobody publishes commands of %s on domain %d: they brake until then; topics: %s",
+                "no node publishes commands of %s on domain %d: the vehicles brake until then; "
+                "topics: %s",
                 ", ".join(silent),
                 self._options.domain,
                 ", ".join(self._controls[silent[0]].topics),
@@ -255,7 +256,7 @@ class RosBridge:
         def late() -> list[str]:
             return [name for name in bases if self._controls[name].stamp_ns < due_ns]
 
-        # A vehicle whose commands nobody publishes is not waited for.
+        # If no node publishes commands of a vehicle, the step does not wait for them.
         self._until(
             self._options.deadline_s, lambda: not any(map(self._has_publisher, late())), bases
         )

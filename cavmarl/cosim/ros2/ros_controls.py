@@ -77,7 +77,7 @@ class ControlCounts:
     used: int = 0  # steps with a command of their time
     held: int = 0  # steps with an older command, or with none: the vehicle brakes
     late: int = 0  # steps in which none came before the deadline
-    old: int = 0  # messages that are older than one that was used
+    old: int = 0  # messages older than a used message
     invalid: int = 0  # messages with NaN, infinity, or bytes that are no message
     limited: int = 0  # steps in which a command was beyond the limits of the vehicle
 
@@ -102,7 +102,7 @@ class VehicleControls:
         return NEVER if self._last is None else self._last.stamp_ns
 
     def take(self, topic: str, data: bytes, wheelbase_m: float) -> None:
-        """Read a message in CDR. An invalid one, or one that is older, is counted."""
+        """Read a message in CDR. Invalid and older messages are counted."""
         kind = self.topics[topic]
         self.counts.received += 1
         try:
