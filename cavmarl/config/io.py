@@ -22,7 +22,6 @@ import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from cavmarl.config.removed_keys import removed_key
 from cavmarl.core.errors import ConfigError
 
 T = TypeVar("T")
@@ -186,7 +185,7 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
     path = ".".join(keys)
     match details["type"]:
         case "unexpected_keyword_argument":
-            return removed_key(path) or f"{path}: unknown key; {_nearest(kind, location)}"
+            return f"{path}: unknown key; {_nearest(kind, location)}"
         case "missing":
             return f"{path}: missing; this key has no default, add it"
         case "dataclass_type" | "dict_type":
