@@ -122,10 +122,7 @@ def verify_nodes(
         return _compare(Console(), world, counts, json_path, runs)
     _refuse({"--kill": kill, "--worlds": worlds}, "does not go with --faults")
     if faults not in (SIMULATED, PROCESSES, CAMPAIGN):
-        raise ConfigError(
-            f"--faults {faults}: must be {SIMULATED}, {PROCESSES} or {CAMPAIGN}; plans of faults "
-            "were removed"
-        )
+        raise ConfigError(f"--faults {faults}: must be {SIMULATED}, {PROCESSES} or {CAMPAIGN}")
     if faults == SIMULATED:
         _refuse({"--process-runs": process_runs}, f"goes with {PROCESSES} or {CAMPAIGN}")
     if faults == PROCESSES:
