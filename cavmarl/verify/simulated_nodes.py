@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import random
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -85,13 +85,13 @@ BUSY = WorldSpec(
 )
 
 
-class SimulatedNodes:
-    """Starts nodes as processes of a simulated machine; a `NodeStarter`."""
+class SimulatedNodes(NodeStarter):
+    """Starts nodes as processes of a simulated machine, which end by themselves."""
 
     def __init__(
         self, machine: SimulatedMachine, drawn: random.Random, ghosts: bool, nodes: int
     ) -> None:
-        self.count = nodes
+        super().__init__(nodes)
         self._machine, self._drawn = machine, drawn
         self._ghosts = ghosts  # whether replaced processes may continue to run
         self.listener = SimulatedListener(machine, machine.caller)
@@ -108,23 +108,10 @@ class SimulatedNodes:
         process.not_before_s = self._machine.now_s + 10.0 ** self._drawn.uniform(*STARTED)
         return process
 
-    def trouble(self, begun: Collection[int]) -> str | None:
-        return None
-
-    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
-        self.replace(number, is_silent)
-        return None
-
     def replace(self, number: int, is_silent: bool) -> None:
         if not self._ghosts:
             self._machine.end(self._processes[number])
         self._processes[number] = self._start(number)
-
-    def stopped(self) -> set[int]:
-        return set()  # unknown, as on another machine
-
-    def close(self) -> None:
-        """Do nothing: simulated nodes end by themselves."""
 
 
 @dataclass
