@@ -24,8 +24,6 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.sensors.mounted.frames import SensorFrames
 
-NO_SIGNAL = 255
-
 
 def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -> Welcome:
     """Return the world's clock and the sensors of its vehicles.
