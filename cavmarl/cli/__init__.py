@@ -29,6 +29,7 @@ from cavmarl.cli import (
     node,
     plan,
     replay,
+    ros2,
     scenario,
     service,
     suite,
@@ -149,6 +150,13 @@ _cosim(
     carla.carla,
     "cavmarl carla grid4x4 --port 2000",
     "cavmarl carla town --agents 20 --client-version 0.10.0",
+)
+_cosim(
+    "ros2",
+    ros2.ros2,
+    "cavmarl ros2 town --rig ten_sensors --truth",
+    "cavmarl ros2 town --vehicle car_0 --vehicle car_1 --domain 5 --wait newest --pace 1",
+    "cavmarl ros2 --join town.sock --vehicle car_0",
 )
 _service("serve", service.serve, "cavmarl serve --store runs/service.sqlite")
 _service("grant", service.grant, "cavmarl grant alice --role client --secret-file admin.secret")

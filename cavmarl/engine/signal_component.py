@@ -77,7 +77,7 @@ class SignalComponent:
         self._chosen = np.ones(num_worlds, dtype=np.bool_)
         self._rewarded = np.ones(1, dtype=np.bool_)
         self._begin_step = bind(begin_signal_step, rules, worlds, self.outputs, self._choices)
-        self.end_tick = bind(end_signal_tick, rules, worlds, self.outputs)
+        self.end_tick = bind(end_signal_tick, rules, worlds, self.outputs, self._chosen)
         self.end_step = bind(
             end_signal_step,
             rules,
@@ -99,8 +99,8 @@ class SignalComponent:
         """Begin with the first green of each signal in the chosen worlds (W,)."""
         self.outputs.states[chosen] = 0
         self._stood[chosen] = 0
-        self.end_tick()
         self._chosen[:] = chosen
+        self.end_tick()
         self._rewarded[:] = False
         self.end_step()
         self._chosen[:] = self._rewarded[:] = True

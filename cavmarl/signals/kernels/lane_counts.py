@@ -33,10 +33,13 @@ def count_standing(
     rows: NDArray[np.void],  # VEHICLE (k, W, C), "lane_stood" is updated
     num_owned: NDArray[np.int64],  # (k, W)
     lane_index: NDArray[np.int32],  # see `ControlledSignals`
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has passed
 ) -> None:
     """Count for each vehicle how long it has stood on its lane, if the lane is watched."""
     for zone in range(rows.shape[0]):
         for w in range(rows.shape[1]):
+            if not chosen[w]:
+                continue
             for i in range(num_owned[zone, w]):
                 row = rows[zone, w, i]
                 if is_off_lanes(row) or lane_index[row["lane"]] < 0:

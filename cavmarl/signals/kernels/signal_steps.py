@@ -66,11 +66,16 @@ def begin_signal_step(
 
 
 @kernel
-def end_signal_tick(rules: SignalRules, worlds: SignalWorlds, outputs: SignalOutputs) -> None:
+def end_signal_tick(
+    rules: SignalRules,
+    worlds: SignalWorlds,
+    outputs: SignalOutputs,
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
+) -> None:
     """Set the phases of the present tick, and count how long vehicles have stood."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
-    count_standing(rows, worlds.num_owned, rules.controlled.lane_index)
+    count_standing(rows, worlds.num_owned, rules.controlled.lane_index, chosen)
 
 
 @kernel
