@@ -89,7 +89,7 @@ def plan_from_dict(document: object) -> Plan:
         )
     found = validate(_Document, document, "not a plan", extra="ignore")
     for name, value in (("rule", asdict(found.rule)), ("snapshot", found.snapshot.to_dict())):
-        if json.dumps(value, sort_keys=True) != json.dumps(document[name], sort_keys=True):
+        if json.loads(json.dumps(value)) != json.loads(json.dumps(document[name])):
             raise ConfigError(
                 f"not a plan: {name} = {document[name]!r} lacks a key or has unknown ones; it must "
                 f"have {', '.join(value)}; make the plan again"

@@ -103,6 +103,12 @@ def test_a_file_without_a_plan_is_refused(plan: Plan, change: dict[str, Any], sa
         plan_from_dict(plan.to_dict() | change)
 
 
+def test_a_whole_number_in_a_stored_plan_may_stand_for_a_float(plan: Plan) -> None:
+    document = json.loads(json.dumps(plan.to_dict()))
+    document["rule"]["move_s"] = 0
+    assert plan_from_dict(document).problem.rule == replace(plan.problem.rule, move_s=0.0)
+
+
 def test_an_invalid_share_in_a_stored_plan_is_refused(plan: Plan) -> None:
     document = plan.to_dict()
     document["snapshot"]["workers"][0]["use"]["cpu"] = 12.0
